@@ -1,0 +1,48 @@
+"""The ``legs`` command. Each sub-command is one module here: HELP, add_arguments(parser), run(args)."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from typing import Optional, Sequence
+
+from legs_loss._version import __version__
+from legs_loss.errors import LegsError
+
+__all__ = ["main"]
+
+COMMANDS = ("precompute", "show", "info", "train", "demo")
+
+EXIT_CODES = "exit codes: 0 done; 1 done, but some items failed; 2 bad input or usage; 130 interrupted"
+
+
+def main(argv: Optional[Sequence[str]] = None) -> int:
+    """Run ``legs`` with these arguments (default: the process's own) and return its exit code."""
+    args = _parser().parse_args(argv)
+    try:
+        return args.run(args)
+    except LegsError as error:
+        print(f"legs: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("legs: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # `legs ... | head`: the reader left, which is no error of ours
+        sys.stderr.close()
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="legs", description="The LEGS loss for 3D Gaussian Splatting.", epilog=EXIT_CODES
+    )
+    parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    commands.required = True
+    for name in COMMANDS:
+        command = importlib.import_module(f"legs_loss.cli.{name}")
+        sub = commands.add_parser(name, help=command.HELP, description=command.__doc__, epilog=EXIT_CODES)
+        command.add_arguments(sub)
+        sub.set_defaults(run=command.run)
+    return parser

@@ -1,0 +1,102 @@
+"""Curves: what turns a normalised response into the weight's shape, f: [0, 1] -> [0, 1].
+
+The LEGS paper defines C1 as the identity and shows C2 to C5 only as a picture. The formulas of C2 to C5 are
+this project's identification of that picture, not the paper's text; docs/method.md says how it was made.
+"""
+
+from __future__ import annotations
+
+from typing import Callable, Dict, Tuple
+
+import torch
+from torch import Tensor
+
+from legs_loss.errors import LegsError
+
+__all__ = ["Curve", "curve", "curve_names", "register_curve"]
+
+Curve = Callable[[Tensor], Tensor]
+
+
+def _linear(x: Tensor) -> Tensor:
+    return x
+
+
+def _square(x: Tensor) -> Tensor:
+    return x * x
+
+
+def _square_root(x: Tensor) -> Tensor:
+    return torch.sqrt(x)
+
+
+def _smoothstep(x: Tensor) -> Tensor:
+    return x * x * (3.0 - 2.0 * x)
+
+
+def _inverse_smoothstep(x: Tensor) -> Tensor:
+    # Rounding can leave the unit interval by one ulp at its ends.
+    return (0.5 - torch.sin(torch.asin(1.0 - 2.0 * x) / 3.0)).clamp(0.0, 1.0)
+
+
+_CURVES: Dict[str, Curve] = {
+    "C1": _linear,
+    "C2": _square,
+    "C3": _square_root,
+    "C4": _smoothstep,
+    "C5": _inverse_smoothstep,
+}
+
+
+def curve(name: str) -> Curve:
+    """Return the curve registered under ``name``.
+
+    Raises:
+        LegsError: no curve has that name.
+
+    Example:
+        >>> curve("C3")(torch.tensor([0.0, 0.25, 1.0]))
+        tensor([0.0000, 0.5000, 1.0000])
+    """
+    try:
+        return _CURVES[name]
+    except (KeyError, TypeError):
+        raise LegsError(
+            f"no curve is named {name!r}: choose one of {', '.join(_CURVES)}, "
+            "or add your own with register_curve(name, function)"
+        ) from None
+
+
+def curve_names() -> Tuple[str, ...]:
+    """Return the names of all registered curves, C1 to C5 first."""
+    return tuple(_CURVES)
+
+
+def register_curve(name: str, function: Curve) -> None:
+    """Add a curve of your own, for ``WeightSpec(curve=name)``.
+
+    Args:
+        name: a new name; the built-in curves cannot be replaced, since a run that says "C3" must mean C3.
+        function: maps a float tensor of any shape with values in [0, 1] to one of the same shape, in [0, 1].
+
+    Raises:
+        LegsError: the name is taken, or the function leaves [0, 1] or changes the shape.
+
+    Example:
+        >>> register_curve("cube-root", lambda x: x ** (1 / 3))
+        >>> curve("cube-root")(torch.tensor([0.125]))
+        tensor([0.5000])
+    """
+    if not isinstance(name, str) or not name:
+        raise LegsError(f"a curve's name is a non-empty string, got {name!r}")
+    if name in _CURVES:
+        raise LegsError(f"a curve named {name!r} exists already: choose another name")
+    x = torch.linspace(0.0, 1.0, 257)
+    y = function(x.clone())
+    if not isinstance(y, Tensor) or y.shape != x.shape:
+        raise LegsError(f"curve {name!r} must return a tensor of its input's shape")
+    if not bool(((y >= 0.0) & (y <= 1.0)).all()):
+        raise LegsError(
+            f"curve {name!r} must map [0, 1] into [0, 1]: its values run from {float(y.min()):g} to {float(y.max()):g}"
+        )
+    _CURVES[name] = function

@@ -1,0 +1,173 @@
+"""The LEGS loss: the weighted L1 term and D-SSIM, as a function and as a Module that forwards to it."""
+
+from __future__ import annotations
+
+from typing import Optional
+
+import torch
+from torch import Tensor, nn
+
+from legs_loss.errors import LegsError
+from legs_loss.images import as_map, check_pair
+from legs_loss.spec import Spec, as_spec
+from legs_loss.ssim import d_ssim
+from legs_loss.weights import weight_map
+
+__all__ = ["LEGSLoss", "legs_loss", "weighted_l1"]
+
+
+def weighted_l1(
+    prediction: Tensor,
+    target: Tensor,
+    weight: Optional[Tensor] = None,
+    mask: Optional[Tensor] = None,
+    renormalise: bool = False,
+    channels_last: bool = False,
+) -> Tensor:
+    """Return the mean over pixels of W times the mean over channels of |prediction - target|.
+
+    Args:
+        prediction: floats, [C, H, W] or [B, C, H, W]; channels-last on request.
+        target: the same shape.
+        weight: one value a pixel, [1, H, W], [H, W], [B, 1, H, W] or [B, H, W]; None is 1 everywhere, and then
+            the result is ``torch.abs(prediction - target).mean()`` to the last bit. It is not divided by its
+            mean, as in the paper.
+        mask: bool, or floats in [0, 1], in the weight's shapes: zeroes the weight where it is 0.
+        renormalise: divide by the mask's mean, so that masked pixels do not count as pixels without error.
+        channels_last: where the channel stands.
+
+    Returns:
+        A scalar, differentiable in prediction and target.
+
+    Raises:
+        LegsError: shapes or devices that do not fit; the message names both.
+
+    Source: the LEGS paper, its weighted L1; the mean over channels (the paper writes a sum) is 3DGS's.
+
+    Example:
+        >>> prediction, target = torch.zeros(1, 1, 2), torch.ones(1, 1, 2)
+        >>> weighted_l1(prediction, target, weight=torch.tensor([[1.0, 3.0]]))
+        tensor(2.)
+    """
+    check_pair(prediction, target)
+    error = torch.abs(prediction - target)
+    if weight is not None:
+        weight = as_map(weight, prediction, channels_last, "weight")
+        # A float64 map must not turn a float32 loss into a float64 one.
+        weight = weight.to(torch.promote_types(error.dtype, torch.float32))
+        error = weight * error
+    if mask is None:
+        return error.mean()
+    mask = as_map(mask, prediction, channels_last, "mask").to(torch.promote_types(error.dtype, torch.float32))
+    loss = (mask * error).mean()
+    if not renormalise:
+        return loss
+    covered = mask.expand_as(error).mean()
+    return loss / covered.clamp(min=torch.finfo(covered.dtype).tiny)
+
+
+def legs_loss(
+    prediction: Tensor,
+    target: Tensor,
+    spec: Spec = "legs",
+    weight: Optional[Tensor] = None,
+    mask: Optional[Tensor] = None,
+    lambda_dssim: float = 0.2,
+    padding: str = "zeros",
+    renormalise: bool = False,
+    channels_last: bool = False,
+) -> Tensor:
+    """Return (1 - lambda) * L_w + lambda * (1 - SSIM), the loss of a training step.
+
+    Args:
+        prediction: the rendering, floats in [0, 1], [C, H, W] or [B, C, H, W]; channels-last on request.
+        target: the photograph of the same view, the same shape.
+        spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own to the last bit.
+        weight: the target's weight map, where you have it already; the spec is not used then.
+        mask: zeroes the L1 weight where it is 0. SSIM is not masked, as in 3DGS's code.
+        lambda_dssim: in [0, 1], the share of D-SSIM; 3DGS's name and value.
+        padding: of SSIM, see :func:`~legs_loss.ssim`.
+        renormalise: divide the masked L1 term by the mask's mean.
+        channels_last: where the channel stands.
+
+    Returns:
+        A scalar, differentiable in the prediction.
+
+    Raises:
+        LegsError: shapes, ranges or names that do not fit, or a target with NaN or infinity (on the CPU).
+
+    Source: the LEGS paper, its total loss; 3D Gaussian Splatting (Kerbl et al. 2023), equation 7.
+
+    Example:
+        >>> target = torch.rand(3, 16, 16)
+        >>> prediction = torch.rand(3, 16, 16, requires_grad=True)
+        >>> legs_loss(prediction, target).backward()
+        >>> prediction.grad.shape
+        torch.Size([3, 16, 16])
+    """
+    spec = as_spec(spec)
+    if not 0.0 <= lambda_dssim <= 1.0:
+        raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
+    check_pair(prediction, target)
+    if weight is None and spec.beta > 0.0:
+        weight = weight_map(target, spec, channels_last)
+    photometric = weighted_l1(prediction, target, weight, mask, renormalise, channels_last)
+    if lambda_dssim == 0.0:
+        return photometric
+    return (1.0 - lambda_dssim) * photometric + lambda_dssim * d_ssim(prediction, target, padding, channels_last)
+
+
+class LEGSLoss(nn.Module):
+    """:func:`legs_loss` as a Module: the settings once, then the images of each step.
+
+    Args:
+        spec, lambda_dssim, padding, renormalise, channels_last: as for :func:`legs_loss`.
+
+    Shape:
+        prediction, target: [C, H, W] or [B, C, H, W]; weight, mask: one value a pixel; output: a scalar.
+
+    Example:
+        >>> criterion = LEGSLoss("legs-l")
+        >>> target = torch.rand(3, 16, 16)
+        >>> criterion(target, target) < 1e-6
+        tensor(True)
+    """
+
+    def __init__(
+        self,
+        spec: Spec = "legs",
+        lambda_dssim: float = 0.2,
+        padding: str = "zeros",
+        renormalise: bool = False,
+        channels_last: bool = False,
+    ) -> None:
+        super().__init__()
+        self.spec = as_spec(spec)
+        self.lambda_dssim = lambda_dssim
+        self.padding = padding
+        self.renormalise = renormalise
+        self.channels_last = channels_last
+
+    def forward(
+        self,
+        prediction: Tensor,
+        target: Tensor,
+        weight: Optional[Tensor] = None,
+        mask: Optional[Tensor] = None,
+    ) -> Tensor:
+        """Return the loss; see :func:`legs_loss`."""
+        return legs_loss(
+            prediction,
+            target,
+            self.spec,
+            weight,
+            mask,
+            self.lambda_dssim,
+            self.padding,
+            self.renormalise,
+            self.channels_last,
+        )
+
+    def extra_repr(self) -> str:
+        """Return the settings, for ``print(module)``."""
+        return f"{self.spec}, lambda_dssim={self.lambda_dssim}, padding={self.padding!r}"

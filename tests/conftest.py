@@ -1,0 +1,25 @@
+"""What every test file shares: the real capture, where it is present, and a fixed seed."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+FOX = Path(os.environ.get("LEGS_TEST_SCENE", Path(__file__).resolve().parents[2] / "shared" / "scenes" / "fox"))
+
+
+@pytest.fixture(scope="session")
+def fox() -> Path:
+    """The real COLMAP capture; a test that asks for it is skipped where the folder is absent."""
+    if not (FOX / "images").is_dir():
+        pytest.skip("the real capture is not on this machine (set LEGS_TEST_SCENE to a COLMAP scene)")
+    return FOX
+
+
+@pytest.fixture(autouse=True)
+def seed() -> None:
+    """Random inputs are the same in every run."""
+    torch.manual_seed(0)

@@ -1,0 +1,59 @@
+"""Scenes on disk: COLMAP, transforms.json and plain folders, all read as a list of views."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Optional, Tuple, Union
+
+from legs_loss.errors import LegsError
+from legs_loss.scenes.colmap import read_colmap, write_colmap
+from legs_loss.scenes.folder import read_folder
+from legs_loss.scenes.model import Camera, PointCloud, Scene, View
+from legs_loss.scenes.transforms import find_transforms, read_transforms
+
+__all__ = [
+    "Camera",
+    "PointCloud",
+    "Scene",
+    "View",
+    "read_scene",
+    "write_colmap",
+]
+
+
+def read_scene(path: Union[str, Path], images: Optional[str] = None) -> Scene:
+    """Read a scene: COLMAP's layout, transforms.json, or any folder of images.
+
+    What the folder is follows 3DGS: ``sparse/`` makes it a COLMAP scene, and else
+    ``transforms_train.json`` or ``transforms.json`` one with transforms. ``images`` names the
+    folder of the photographs, in the scene or as a path ("images" by default); a scene with
+    transforms names its files itself.
+
+    Raises :class:`LegsError` when there is nothing to read or a file of the scene is damaged.
+    A photograph that is missing is found out when it is loaded.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise LegsError(f"there is no folder {root}: a scene is a folder")
+    if (root / "sparse").is_dir():
+        return read_colmap(root, *_images_folder(root, images or "images"))
+    if find_transforms(root):
+        return read_transforms(root)
+    if images is None and not (root / "images").is_dir():
+        return read_folder(root, root, "")
+    return read_folder(root, *_images_folder(root, images or "images"))
+
+
+def _images_folder(root: Path, images: str) -> Tuple[Path, str]:
+    """The folder of the photographs and what goes before their names."""
+    folder = root / images  # pathlib keeps an absolute ``images`` as it is
+    if not folder.is_dir():
+        if not os.path.isdir(images):
+            raise LegsError(f"there is no folder {folder}: name the scene's images with --images")
+        folder = Path(images)
+    try:
+        prefix = folder.resolve().relative_to(root.resolve()).as_posix()
+    except ValueError:  # outside of the scene
+        prefix = folder.resolve().name
+    return folder, f"{prefix}/"

@@ -1,0 +1,286 @@
+"""COLMAP's sparse model, binary or text: https://colmap.github.io/format.html."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Tuple
+
+import numpy as np
+
+from legs_loss.errors import LegsError
+from legs_loss.scenes.model import Camera, PointCloud, Scene, View
+
+__all__ = ["find_model", "read_colmap", "read_points", "write_colmap"]
+
+# COLMAP's camera models in the order of their ids, each with its number of parameters.
+MODELS = (
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+)
+
+
+class _Intrinsics(NamedTuple):
+    model: str
+    width: int
+    height: int
+    params: Tuple[float, ...]
+
+
+class _Image(NamedTuple):
+    name: str
+    camera_id: int
+    quaternion: Tuple[float, ...]  # w, x, y, z: turns world axes into camera axes
+    translation: Tuple[float, ...]
+
+
+def find_model(root: Path) -> Optional[Path]:
+    """The folder of a scene's sparse model, ``sparse/0`` or else ``sparse``; None without one."""
+    for folder in (root / "sparse" / "0", root / "sparse"):
+        if (folder / "images.bin").is_file() or (folder / "images.txt").is_file():
+            return folder
+    return None
+
+
+def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
+    """Read a scene in COLMAP's layout, its photographs from the folder ``images``.
+
+    A photograph is looked for under its whole COLMAP name and then, as 3DGS does, under the last
+    part of it; ``prefix`` goes before its name in :class:`View`. Cameras other than PINHOLE and
+    SIMPLE_PINHOLE leave ``View.camera`` None. Raises :class:`LegsError` when the model is damaged.
+    """
+    model = find_model(root)
+    if model is None:
+        raise LegsError(f"{root} has no COLMAP model: there is no sparse/0/images.bin or .txt")
+    kind = "bin" if (model / "images.bin").is_file() else "txt"
+    cameras = _parse(model / f"cameras.{kind}", _cameras_bin if kind == "bin" else _cameras_txt)
+    entries = _parse(model / f"images.{kind}", _images_bin if kind == "bin" else _images_txt)
+    views = []
+    for image in entries:
+        if image.camera_id not in cameras:
+            raise LegsError(
+                f"{model / f'images.{kind}'}: {image.name} has camera {image.camera_id}, "
+                f"which cameras.{kind} does not list"
+            )
+        name = image.name.replace("\\", "/")
+        path = images / name
+        if not path.is_file() and (images / path.name).is_file():
+            path, name = images / path.name, path.name
+        intrinsics = cameras[image.camera_id]
+        views.append(
+            View(
+                name=f"{prefix}{name}",
+                path=path,
+                camera=_pinhole(intrinsics, image),
+                camera_model=intrinsics.model,
+            )
+        )
+    points = model / f"points3D.{kind}"
+    return Scene(
+        root=root,
+        kind="colmap",
+        views=tuple(sorted(views, key=lambda view: view.name)),
+        points_file=points if points.is_file() else None,
+    )
+
+
+def read_points(path: Path) -> PointCloud:
+    """Read a points3D.bin or points3D.txt. Raises :class:`LegsError` when it is damaged."""
+    return _parse(path, _points_bin if path.suffix == ".bin" else _points_txt)
+
+
+def write_colmap(root: Path, cameras: Mapping[str, Camera], points: PointCloud) -> None:
+    """Write ``root/sparse/0`` in COLMAP's binary format (PINHOLE cameras, no tracks).
+
+    ``cameras`` maps an image's name, relative to ``root/images``, to its camera.
+    """
+    folder = Path(root) / "sparse" / "0"
+    folder.mkdir(parents=True, exist_ok=True)
+    ids: Dict[Tuple[Any, ...], int] = {}
+    posed = [struct.pack("<Q", len(cameras))]
+    for number, (name, camera) in enumerate(sorted(cameras.items()), start=1):
+        intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        camera_id = ids.setdefault(intrinsics, len(ids) + 1)
+        quaternion = _quaternion(camera.world_to_camera[:3, :3])
+        pose = struct.pack("<i7d", number, *quaternion, *camera.world_to_camera[:3, 3])
+        no_points = struct.pack("<Q", 0)
+        posed.append(pose + struct.pack("<i", camera_id) + name.encode() + b"\0" + no_points)
+    lenses = [struct.pack("<Q", len(ids))]
+    lenses += [struct.pack("<iiQQ4d", number, 1, *lens) for lens, number in ids.items()]
+    cloud = [struct.pack("<Q", len(points.xyz))]
+    cloud += [
+        struct.pack("<Q3d3BdQ", number, *xyz, *rgb, 0.0, 0)
+        for number, (xyz, rgb) in enumerate(zip(points.xyz.tolist(), points.rgb.tolist()), start=1)
+    ]
+    for file, parts in (("images", posed), ("cameras", lenses), ("points3D", cloud)):
+        (folder / f"{file}.bin").write_bytes(b"".join(parts))
+
+
+def _parse(path: Path, parser: Callable[[bytes], Any]) -> Any:
+    try:
+        return parser(path.read_bytes())
+    except OSError as error:
+        raise LegsError(f"cannot read {path}: {error.strerror}") from None
+    except (struct.error, ValueError, IndexError) as error:
+        raise LegsError(f"{path} is damaged or is not a COLMAP file: {error}") from None
+
+
+def _pinhole(lens: _Intrinsics, image: _Image) -> Optional[Camera]:
+    if lens.model == "PINHOLE":
+        fx, fy, cx, cy = lens.params
+    elif lens.model == "SIMPLE_PINHOLE":
+        fx, cx, cy = lens.params
+        fy = fx
+    else:
+        return None
+    pose = np.eye(4)
+    pose[:3, :3] = _rotation(image.quaternion)
+    pose[:3, 3] = image.translation
+    return Camera(lens.width, lens.height, fx, fy, cx, cy, pose)
+
+
+def _rotation(quaternion: Tuple[float, ...]) -> np.ndarray:
+    """[3, 3] of a quaternion w, x, y, z of any length: v -> 2 u (u.v) + (w^2 - u.u) v + 2w u x v."""
+    w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
+    u = np.array([x, y, z])
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return 2 * np.outer(u, u) + (w * w - u @ u) * np.eye(3) + 2 * w * cross
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """The quaternion w, x, y, z with w >= 0 of a rotation [3, 3]."""
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
+    # Row k is 4 q_k q: the one with the largest diagonal is the safest to divide by.
+    products = np.array(
+        [
+            [1 + a + e + i, h - f, c - g, d - b],
+            [h - f, 1 + a - e - i, b + d, c + g],
+            [c - g, b + d, 1 - a + e - i, f + h],
+            [d - b, c + g, f + h, 1 - a - e + i],
+        ]
+    )
+    row = products[np.argmax(np.diag(products))]
+    return row / np.linalg.norm(row) * (1 if row[0] >= 0 else -1)
+
+
+class _Cursor:
+    """Reads a binary file from front to back; the end of the file must be the end of the data."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def take(self, layout: str) -> Tuple[Any, ...]:
+        values = struct.unpack_from(f"<{layout}", self.data, self.at)
+        self.at += struct.calcsize(f"<{layout}")
+        return values
+
+    def name(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        name = self.data[self.at : end].decode()
+        self.at = end + 1
+        return name
+
+    def skip(self, size: int) -> None:
+        self.at += size
+
+    def finish(self) -> None:
+        if self.at != len(self.data):
+            raise ValueError(f"{len(self.data)} bytes where its own counts say {self.at}")
+
+
+def _cameras_bin(data: bytes) -> Dict[int, _Intrinsics]:
+    cursor, cameras = _Cursor(data), {}
+    for _ in range(cursor.take("Q")[0]):
+        number, model, width, height = cursor.take("iiQQ")
+        if not 0 <= model < len(MODELS):
+            raise ValueError(f"camera {number} has the unknown model {model}")
+        name, count = MODELS[model]
+        cameras[number] = _intrinsics(name, width, height, cursor.take(f"{count}d"))
+    cursor.finish()
+    return cameras
+
+
+def _images_bin(data: bytes) -> List[_Image]:
+    cursor, images = _Cursor(data), []
+    for _ in range(cursor.take("Q")[0]):
+        pose = cursor.take("i7d")
+        (camera,) = cursor.take("i")
+        images.append(_image(cursor.name(), camera, pose[1:5], pose[5:8]))
+        cursor.skip(24 * cursor.take("Q")[0])  # the image's points, each x, y and an id
+    cursor.finish()
+    return images
+
+
+def _points_bin(data: bytes) -> PointCloud:
+    cursor, xyz, rgb = _Cursor(data), [], []
+    for _ in range(cursor.take("Q")[0]):
+        point = cursor.take("Q3d3BdQ")
+        xyz.append(point[1:4])
+        rgb.append(point[4:7])
+        cursor.skip(8 * point[8])  # the track: pairs of an image and a point in it
+    cursor.finish()
+    return _cloud(xyz, rgb)
+
+
+def _lines(data: bytes) -> Iterator[str]:
+    return (line for line in data.decode().splitlines() if not line.startswith("#"))
+
+
+def _cameras_txt(data: bytes) -> Dict[int, _Intrinsics]:
+    cameras = {}
+    for words in (line.split() for line in _lines(data) if line.strip()):
+        params = tuple(float(word) for word in words[4:])
+        cameras[int(words[0])] = _intrinsics(words[1], int(words[2]), int(words[3]), params)
+    return cameras
+
+
+def _images_txt(data: bytes) -> List[_Image]:
+    lines, images = _lines(data), []
+    for line in lines:
+        if not line.strip():
+            continue
+        words = line.split(None, 9)  # the name comes last and may have spaces
+        numbers = tuple(float(word) for word in words[1:8])
+        images.append(_image(words[9].rstrip(), int(words[8]), numbers[:4], numbers[4:]))
+        next(lines, None)  # the image's points, possibly an empty line
+    return images
+
+
+def _points_txt(data: bytes) -> PointCloud:
+    rows = [line.split(None, 7) for line in _lines(data) if line.strip()]
+    return _cloud(
+        [[float(word) for word in row[1:4]] for row in rows],
+        [[int(word) for word in row[4:7]] for row in rows],
+    )
+
+
+def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) -> _Intrinsics:
+    if len(params) != dict(MODELS).get(model, len(params)):
+        raise ValueError(f"a camera of model {model} has {len(params)} parameters")
+    if not (width and height and np.isfinite(params).all()):
+        raise ValueError(f"a camera of {width}x{height} pixels with parameters {params}")
+    return _Intrinsics(model, width, height, params)
+
+
+def _image(name: str, camera_id: int, quaternion: Tuple[float, ...], translation: Tuple[float, ...]) -> _Image:
+    if not np.isfinite(quaternion + translation).all() or not np.any(quaternion):
+        raise ValueError(f"the pose of {name} is not a number")
+    return _Image(name, camera_id, quaternion, translation)
+
+
+def _cloud(xyz: List[Any], rgb: List[Any]) -> PointCloud:
+    positions = np.asarray(xyz, dtype=np.float32).reshape(-1, 3)
+    colours = np.asarray(rgb).reshape(-1, 3)
+    if colours.size and (colours.min() < 0 or colours.max() > 255):
+        raise ValueError("a point's colour is outside of 0..255")
+    return PointCloud(positions, colours.astype(np.uint8))

@@ -1,0 +1,93 @@
+"""What a scene is: views with cameras, and the points to start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Optional, Tuple
+
+import numpy as np
+
+__all__ = ["Camera", "PointCloud", "Scene", "View"]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera with OpenCV axes: x right, y down, z forward.
+
+    ``fx, fy, cx, cy`` are in pixels. The origin is COLMAP's, the outer corner of the first pixel,
+    so a centred camera has ``cx = width / 2``. ``world_to_camera`` is a float64 [4, 4].
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: np.ndarray
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for the image resized to ``width`` x ``height``.
+
+        >>> camera = Camera(400, 300, 500.0, 500.0, 200.0, 150.0, np.eye(4))
+        >>> half = camera.resized(200, 150)
+        >>> half.fx, half.cy
+        (250.0, 75.0)
+        """
+        x, y = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * x,
+            fy=self.fy * y,
+            cx=self.cx * x,
+            cy=self.cy * y,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photograph of a scene.
+
+    ``name`` is the image's path relative to the scene, with forward slashes. ``camera`` is None
+    where the scene has none or where ``camera_model`` is not a pinhole; ``split`` is "train",
+    "test" or "val" where the scene says so. ``composited``: the field's loader lays this image's
+    alpha on the background before it resizes (see :func:`load_training_image`).
+    """
+
+    name: str
+    path: Path
+    camera: Optional[Camera] = None
+    split: Optional[str] = None
+    camera_model: Optional[str] = None
+    composited: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points with colours: ``xyz`` float32 [N, 3] and ``rgb`` uint8 [N, 3]."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene on disk: ``kind`` is "colmap", "transforms" or "folder"; views are sorted by name."""
+
+    root: Path
+    kind: str
+    views: Tuple[View, ...]
+    points_file: Optional[Path] = None
+
+    @property
+    def points(self) -> Optional[PointCloud]:
+        """COLMAP's points, read from disk at every call (most users of a scene need none).
+
+        Raises :class:`LegsError` when the file is damaged.
+        """
+        from legs_loss.scenes.colmap import read_points
+
+        return None if self.points_file is None else read_points(self.points_file)

@@ -1,0 +1,127 @@
+"""Scenes with transforms.json: nerfstudio's and instant-ngp's, and NeRF's synthetic ones."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import posixpath
+from pathlib import Path
+from typing import Any, Dict, List, Optional, Tuple
+
+import numpy as np
+from numpy.linalg import LinAlgError
+
+from legs_loss.errors import LegsError
+from legs_loss.scenes.folder import SUFFIXES
+from legs_loss.scenes.model import Camera, Scene, View
+
+__all__ = ["find_transforms", "read_transforms"]
+
+# OpenGL's camera looks along -z with y up; OpenCV's along z with y down.
+_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def find_transforms(root: Path) -> List[Path]:
+    """NeRF's ``transforms_{train,test,val}.json``, else ``transforms.json``; [] without any."""
+    if (root / "transforms_train.json").is_file():
+        files = [root / f"transforms_{split}.json" for split in ("train", "test", "val")]
+        return [file for file in files if file.is_file()]
+    return [file for file in [root / "transforms.json"] if file.is_file()]
+
+
+def read_transforms(root: Path) -> Scene:
+    """Read a scene whose views are listed in JSON.
+
+    A frame's intrinsics are its own, else the file's; ``file_path`` may lack its extension. A
+    distorted camera leaves ``View.camera`` None, and so does an image whose size cannot be found
+    out. A file listed twice keeps its first split. Raises :class:`LegsError` when a file is
+    damaged.
+    """
+    views: Dict[str, View] = {}
+    for file in find_transforms(root):
+        try:
+            for view in _read_file(root, file):
+                views.setdefault(view.name, view)
+        except (OSError, ValueError, TypeError, LookupError, AttributeError, LinAlgError) as error:
+            message = f"no {error}" if isinstance(error, KeyError) else error
+            raise LegsError(f"{file} is damaged or is no file of camera poses: {message}") from None
+    return Scene(root, "transforms", tuple(sorted(views.values(), key=lambda view: view.name)))
+
+
+def _read_file(root: Path, file: Path) -> List[View]:
+    common = json.loads(file.read_text(encoding="utf-8"))
+    one_split = file.stem.partition("_")[2] or None
+    splits = {
+        _image_name(root, name): split
+        for split in ("train", "test", "val")
+        for name in common.get(f"{split}_filenames") or ()
+    }
+    views = []
+    for frame in common["frames"]:
+        name = _image_name(root, frame["file_path"])
+        intrinsics = {**common, **frame}
+        model = _model(intrinsics)
+        pinhole = model in ("PINHOLE", "SIMPLE_PINHOLE")
+        views.append(
+            View(
+                name=name,
+                path=root / name,
+                camera=_camera(intrinsics, root / name) if pinhole else None,
+                split=one_split or splits.get(name),
+                camera_model=model,
+                composited=True,
+            )
+        )
+    return views
+
+
+def _image_name(root: Path, file_path: str) -> str:
+    """The image's path relative to the scene, with the extension that the file on disk has."""
+    name = posixpath.normpath(file_path.replace("\\", "/"))
+    if os.path.isabs(name):
+        name = Path(os.path.relpath(name, str(root.resolve()))).as_posix()
+    for suffix in ("", *SUFFIXES):
+        if (root / f"{name}{suffix}").is_file():
+            return f"{name}{suffix}"
+    return name
+
+
+def _model(intrinsics: Dict[str, Any]) -> str:
+    """The name of the camera's model; OPENCV without any distortion is a PINHOLE."""
+    distorted = any(intrinsics.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = intrinsics.get("camera_model", "OPENCV")
+    return "PINHOLE" if model == "OPENCV" and not distorted else str(model)
+
+
+def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
+    """A frame's camera; None where its size is not written and the image cannot be opened."""
+    size = (intrinsics["w"], intrinsics["h"]) if "w" in intrinsics else _image_size(image)
+    if size is None:
+        return None
+    width, height = (int(side) for side in size)
+    if "fl_x" in intrinsics:
+        fx = float(intrinsics["fl_x"])
+        fy = float(intrinsics.get("fl_y", fx))
+    else:
+        fx = width / 2 / math.tan(intrinsics["camera_angle_x"] / 2)
+        angle = intrinsics.get("camera_angle_y")
+        fy = fx if angle is None else height / 2 / math.tan(angle / 2)
+    cx, cy = float(intrinsics.get("cx", width / 2)), float(intrinsics.get("cy", height / 2))
+    camera_to_world = np.asarray(intrinsics["transform_matrix"], dtype=np.float64)
+    if camera_to_world.shape == (3, 4):
+        camera_to_world = np.vstack([camera_to_world, [0, 0, 0, 1]])
+    if camera_to_world.shape != (4, 4) or not np.isfinite(camera_to_world).all():
+        raise ValueError(f"the transform_matrix of {image} is no 4x4 matrix of numbers")
+    pose = np.linalg.inv(camera_to_world @ _OPENGL_TO_OPENCV)
+    return Camera(width, height, fx, fy, cx, cy, pose)
+
+
+def _image_size(path: Path) -> Optional[Tuple[int, int]]:
+    from PIL import Image
+
+    try:
+        with Image.open(str(path)) as image:
+            return image.size
+    except (OSError, ValueError):
+        return None

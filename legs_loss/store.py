@@ -1,0 +1,379 @@
+"""Weight maps on disk, or rather what every curve and beta can be made from: normalised responses.
+
+A store is a folder: ``manifest.json`` and one ``.npy`` a view, size and operator, float16 [H, W]. A map of 1 is exact;
+elsewhere float16 rounds E^ by at most 2^-12, and small values by at most 1 part in 2048.
+
+Readers open the manifest and nothing else; it is replaced as a whole, so they need no lock. Writers stage maps in a
+folder of their own and move them in, with the manifest, under a lock: whatever the manifest does not list is a leftover
+of a writer that was killed, and the next writer sweeps it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import shutil
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Tuple, Union
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from legs_loss.errors import LegsError
+from legs_loss.spec import WeightSpec
+
+__all__ = ["DamagedStoreError", "Entry", "StoreWriter", "WeightStore", "fingerprint", "stage"]
+
+MANIFEST = "manifest.json"
+VERSION = 1
+_STAGING = ".writing-"
+_LOCK = ".lock"
+_FILE_NAME = re.compile(r"[0-9a-z_]+-[0-9a-f]{16}\.npy")
+_REPAIR = "run legs precompute again to repair it"
+
+
+class DamagedStoreError(LegsError):
+    """What a store holds is not what was written to it."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A stored map, and what it was made from.
+
+    Attributes:
+        view: the photograph's path relative to the scene, forward slashes.
+        width, height: of the map in pixels.
+        operator, p, eps: the settings of its response.
+        background: "black" or "white" where the photograph was laid on one, else None.
+        fingerprint: of the training image (:func:`fingerprint`).
+        source_bytes, source_mtime_ns: size and time of the photograph's file.
+        file: the map's file in the store.
+        bytes, sha256: size and checksum of that file.
+    """
+
+    view: str
+    width: int
+    height: int
+    operator: str
+    p: float
+    eps: float
+    background: Optional[str]
+    fingerprint: str
+    source_bytes: int
+    source_mtime_ns: int
+    file: str = ""
+    bytes: int = 0
+    sha256: str = ""
+
+    @property
+    def key(self) -> Tuple[Any, ...]:
+        """What there is one map of: a view at a size with an operator."""
+        return self.view, self.height, self.width, self.operator, self.p, self.eps
+
+
+class Damage(NamedTuple):
+    """What is wrong with the files of a store: by name, entries whose map is damaged, and files of no entry."""
+
+    damaged: List[str]
+    orphans: List[str]
+
+
+class WeightStore:
+    """A store, opened for reading: only its manifest is read.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        LegsError: there is no store, or a newer version wrote it.
+        DamagedStoreError: its manifest is damaged.
+    """
+
+    def __init__(self, path: Union[str, Path]) -> None:
+        self.path = Path(path)
+        if not (self.path / MANIFEST).is_file():
+            raise LegsError(
+                f"{self.path} is no store of weight maps: it has no {MANIFEST} (legs precompute writes one)"
+            )
+        self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in _read_manifest(self.path)}
+        self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
+        for entry in self.entries.values():
+            for name in _names(entry.view):
+                key = (name, *entry.key[1:])
+                self._by_name[key] = None if key in self._by_name else entry
+
+    def find(self, view: str, height: int, width: int, spec: WeightSpec) -> Optional[Entry]:
+        """Return the entry of a view at a size for a spec's operator, or None.
+
+        Args:
+            view: the photograph's path in the scene or the last parts of it, with or without the extension, or up to
+                the first dot as 3DGS names views. A name that fits two stored views gets None: it is never guessed.
+            height, width: of the training image in pixels.
+            spec: its operator, p and eps count.
+        """
+        name = view.replace("\\", "/")
+        return self._by_name.get((name, height, width, spec.operator, spec.p, spec.eps))
+
+    def normalised_response(self, entry: Entry) -> np.ndarray:
+        """Return an entry's map E^, float16 [H, W], after checking its checksum.
+
+        Raises:
+            DamagedStoreError: the file is missing or is not the one that was written.
+        """
+        try:
+            data = (self.path / entry.file).read_bytes()
+        except OSError as error:
+            raise DamagedStoreError(f"{self.path / entry.file} cannot be read ({error.strerror}); {_REPAIR}") from None
+        if hashlib.sha256(data).hexdigest() != entry.sha256:
+            raise DamagedStoreError(f"{self.path / entry.file} is damaged: its checksum differs; {_REPAIR}")
+        normalised = np.load(io.BytesIO(data), allow_pickle=False)
+        if normalised.dtype != np.float16 or normalised.shape != (entry.height, entry.width):
+            raise DamagedStoreError(f"{self.path / entry.file} is no float16 map of {entry.width}x{entry.height}")
+        return normalised
+
+    def check(self) -> Damage:
+        """Read every map and compare checksums; list what is damaged and what belongs to no entry."""
+        damaged = []
+        for entry in self.entries.values():
+            try:
+                self.normalised_response(entry)
+            except DamagedStoreError:
+                damaged.append(entry.file)
+        return Damage(sorted(damaged), sorted(path.name for path in _leftovers(self.path, self.entries.values())))
+
+
+class StoreWriter:
+    """Writes to a store, beside other writers; a context manager.
+
+    A map is staged (from any process) and takes its place with :meth:`commit`. A writer that is killed loses what it
+    had not committed and nothing else.
+
+    Args:
+        path: the folder, made if it is missing.
+
+    Raises:
+        LegsError: the folder cannot be written, or a newer version wrote it.
+        DamagedStoreError: its manifest is damaged.
+
+    Example:
+        >>> folder = tempfile.mkdtemp()
+        >>> with StoreWriter(folder) as writer:
+        ...     made = Entry("images/1.png", 4, 3, "laplacian", 2.0, 1e-8, None, "", 0, 0)
+        ...     writer.commit([stage(writer.staging, made, np.zeros((3, 4), np.float16))])
+        >>> WeightStore(folder).find("1", 3, 4, WeightSpec()).file
+        'images_1-f5049e0ccc83ca46.npy'
+    """
+
+    def __init__(self, path: Union[str, Path]) -> None:
+        self.path = Path(path)
+
+    def __enter__(self) -> StoreWriter:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            with self._locked():
+                entries = self._entries()
+                for leftover in _leftovers(self.path, entries):
+                    _remove(leftover)
+                self.staging = Path(tempfile.mkdtemp(prefix=_STAGING, dir=str(self.path)))
+                self._alive = _Lock(self.staging / _LOCK)
+        except OSError as error:
+            raise LegsError(f"cannot write to {self.path}: {error.strerror or error}") from None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._alive.release()
+        _remove(self.staging)
+
+    def commit(self, staged: Sequence[Entry]) -> None:
+        """Move staged maps into the store and list them, in place of older ones with the same key."""
+        with self._locked():
+            entries = {entry.key: entry for entry in self._entries()}
+            before = {entry.file for entry in entries.values()}
+            for entry in staged:
+                os.replace(str(self.staging / entry.file), str(self.path / entry.file))
+                entries[entry.key] = entry
+            _write(self.staging / MANIFEST, _manifest(entries.values()))
+            os.replace(str(self.staging / MANIFEST), str(self.path / MANIFEST))
+            _sync_folder(self.path)
+            for file in before - {entry.file for entry in entries.values()}:
+                _remove(self.path / file)
+
+    def _entries(self) -> List[Entry]:
+        return _read_manifest(self.path) if (self.path / MANIFEST).is_file() else []
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        lock = _Lock(self.path / _LOCK)
+        try:
+            yield
+        finally:
+            lock.release()
+
+
+def stage(staging: Path, entry: Entry, normalised: np.ndarray) -> Entry:
+    """Write a map to a writer's staging folder and return its entry with file, bytes and checksum filled in.
+
+    Args:
+        staging: ``StoreWriter.staging``.
+        entry: without ``file``, ``bytes`` and ``sha256``.
+        normalised: E^ in [0, 1], [H, W].
+    """
+    buffer = io.BytesIO()
+    np.save(buffer, normalised.astype(np.float16, copy=False), allow_pickle=False)
+    data = buffer.getbuffer()
+    sha256 = hashlib.sha256(data).hexdigest()
+    # The name is for people; the digest, of the key and the content, keeps every two maps apart.
+    readable = re.sub(r"[^0-9a-z]+", "_", os.path.splitext(entry.view)[0].lower()).strip("_")[-40:] or "view"
+    digest = hashlib.sha256(f"{sha256}{entry.key}".encode()).hexdigest()[:16]
+    file = f"{readable}-{digest}.npy"
+    _write(staging / file, data)
+    return replace(entry, file=file, bytes=len(data), sha256=sha256)
+
+
+def fingerprint(image: Union[Tensor, np.ndarray]) -> str:
+    """Return a short name of what an image shows, to 8 bits a value.
+
+    Args:
+        image: floats in [0, 1], [C, H, W], on any device; or uint8 or uint16 [H, W, C].
+
+    Example:
+        >>> pixels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+        >>> fingerprint(pixels) == fingerprint(torch.from_numpy(pixels).permute(2, 0, 1) / 255.0)
+        True
+    """
+    if isinstance(image, np.ndarray) and image.dtype == np.uint16:
+        image = np.rint(image / np.float32(257)).astype(np.uint8)
+    elif not (isinstance(image, np.ndarray) and image.dtype == np.uint8):
+        values = torch.as_tensor(image).detach().float().clamp(0.0, 1.0) * 255.0
+        image = values.round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
+    digest = hashlib.sha256(repr(image.shape).encode())
+    digest.update(np.ascontiguousarray(image).data)
+    return digest.hexdigest()[:32]
+
+
+def _names(view: str) -> Iterator[str]:
+    """Every name that ``view`` may be asked for by: its trailing parts, with the extension and without."""
+    parts = view.split("/")
+    file = parts[-1]
+    for last in {file, os.path.splitext(file)[0], file.split(".")[0] or file}:
+        for start in range(len(parts)):
+            yield "/".join([*parts[start:-1], last])
+
+
+def _manifest(entries: Iterable[Entry]) -> bytes:
+    """The manifest's one spelling for these entries: JSON, a line an entry, sorted, under its own checksum."""
+    rows = []
+    for entry in sorted(entries, key=lambda entry: entry.key):
+        values = dict(vars(entry), p=entry.p if math.isfinite(entry.p) else "inf")
+        rows.append(json.dumps(values, sort_keys=True, allow_nan=False))
+    body = '"entries": [\n' + ",\n".join(rows) + f'\n],\n"version": {VERSION}'
+    return f'{{"checksum": "{hashlib.sha256(body.encode()).hexdigest()}",\n{body}}}\n'.encode()
+
+
+def _read_manifest(folder: Path) -> List[Entry]:
+    path = folder / MANIFEST
+    try:
+        data = path.read_bytes()
+        document = json.loads(data)
+        if document["version"] > VERSION:
+            raise LegsError(
+                f"{path} was written by a newer legs-loss (format {document['version']}, this one reads {VERSION}): "
+                "update legs-loss, or precompute to another folder"
+            )
+        entries = [Entry(**dict(row, p=float(row["p"]))) for row in document["entries"]]
+        # Whatever byte was changed, these entries would not be written like this.
+        intact = _manifest(entries) == data and all(_FILE_NAME.fullmatch(entry.file) for entry in entries)
+    except LegsError:
+        raise
+    except (OSError, ValueError, TypeError, LookupError, AttributeError):
+        intact = False
+    if not intact:
+        raise DamagedStoreError(f"{path} is damaged: delete the folder {folder} and run legs precompute again")
+    return entries
+
+
+def _leftovers(folder: Path, entries: Iterable[Entry]) -> List[Path]:
+    """What killed writers left in a store: maps of no entry, and staging folders that no one holds."""
+    listed = {entry.file for entry in entries}
+    return [
+        path
+        for path in folder.iterdir()
+        if (_FILE_NAME.fullmatch(path.name) and path.name not in listed)
+        or (path.name.startswith(_STAGING) and not _is_locked(path / _LOCK))
+    ]
+
+
+def _write(path: Path, data: Union[bytes, memoryview]) -> None:
+    with open(str(path), "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    if os.name == "posix":  # elsewhere a folder cannot be opened
+        descriptor = os.open(str(folder), os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(str(path), ignore_errors=True)
+    elif path.exists():
+        path.unlink()
+
+
+class _Lock:
+    """An exclusive lock on a file, waited for; the system releases it when its process dies."""
+
+    def __init__(self, path: Path, wait: bool = True) -> None:
+        self._file = open(str(path), "ab")  # noqa: SIM115 (held open until release)
+        try:
+            _lock_file(self._file.fileno(), wait)
+        except OSError:
+            self._file.close()
+            raise
+
+    def release(self) -> None:
+        """Let the next one in; closing the file does."""
+        self._file.close()
+
+
+def _is_locked(path: Path) -> bool:
+    try:
+        _Lock(path, wait=False).release()
+    except OSError:
+        return True
+    return False
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _lock_file(descriptor: int, wait: bool) -> None:
+        while True:
+            try:
+                msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+                return
+            except OSError:
+                if not wait:
+                    raise
+                time.sleep(0.05)
+else:
+    import fcntl
+
+    def _lock_file(descriptor: int, wait: bool) -> None:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))

@@ -10,6 +10,7 @@ from legs_loss.curves import register_curve
 from legs_loss.errors import LegsError
 from legs_loss.loss import LEGSLoss, legs_loss, weighted_l1
 from legs_loss.response import response
+from legs_loss.runtime import configure, l1_loss
 from legs_loss.spec import PRESETS, WeightSpec
 from legs_loss.ssim import d_ssim, ssim
 from legs_loss.weights import weight_map
@@ -20,7 +21,9 @@ __all__ = [
     "LegsError",
     "WeightSpec",
     "__version__",
+    "configure",
     "d_ssim",
+    "l1_loss",
     "legs_loss",
     "register_curve",
     "response",

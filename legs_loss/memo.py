@@ -1,0 +1,147 @@
+"""Weight maps in memory, bounded, each valid only for the very target that it was made from.
+
+The weight belongs to the target, not to the name of a view: a codebase may shift, shrink or composite a view's target
+from one step to the next, and a wrong weight never fails loudly. So a map is remembered under what the target *is*:
+
+- on the CPU, its bytes (a SHA-256 of them): memory that numpy shares can change without torch noticing;
+- on a device, where reading the bytes would wait for it, the tensor itself: the same storage, the same view of it,
+  still alive, and never written to since (torch counts in-place writes; only one through ``.data`` escapes it). A
+  target that is uploaded anew each step is a new tensor, so its weight is computed anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import weakref
+from collections import OrderedDict
+from typing import Callable, Hashable, Optional
+
+import torch
+from torch import Tensor
+
+__all__ = ["DEFAULT_LIMIT", "WeightMemo"]
+
+DEFAULT_LIMIT = 1 << 30  # bytes
+
+
+class WeightMemo:
+    """A mapping from targets to weight maps that holds at most ``limit`` bytes of maps.
+
+    When it is full, a map that was never asked for again makes room; where there is none, nothing is kept and the
+    caller computes. (Training visits every view once an epoch: evicting the least recently used would evict each map
+    just before its next use.)
+
+    Args:
+        limit: bytes of weight maps.
+
+    Example:
+        >>> memo, target = WeightMemo(), torch.rand(3, 4, 4)
+        >>> weight = memo.recall(target, lambda: torch.ones(1, 4, 4))
+        >>> memo.recall(target.clone(), lambda: torch.zeros(1, 4, 4)) is weight
+        True
+        >>> memo.recall(target + 0.001, lambda: torch.zeros(1, 4, 4)) is weight
+        False
+    """
+
+    def __init__(self, limit: int = DEFAULT_LIMIT) -> None:
+        self.limit = limit
+        self.bytes = 0
+        self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
+        self._lock = threading.RLock()
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def recall(self, target: Tensor, make: Callable[[], Tensor]) -> Tensor:
+        """Return the map remembered for this target; or make it, and remember it if the target can be known again."""
+        key = _key(target)
+        if key is None:
+            return make()
+        with self._lock:
+            entry = self._entries.get(key)
+            if entry is not None:
+                entry.used = True
+                return entry.weight
+        weight = make()
+        size = weight.numel() * weight.element_size()
+        with self._lock:
+            self._drop(key)
+            if self._make_room(size):
+                self._entries[key] = _Entry(weight, size, self._owner(target, key))
+                self.bytes += size
+        return weight
+
+    def clear(self) -> None:
+        """Forget everything."""
+        with self._lock:
+            self._entries.clear()
+            self.bytes = 0
+
+    def _owner(self, target: Tensor, key: Hashable) -> Optional[weakref.ref[Tensor]]:
+        # A key that names memory must die with it: the allocator hands the same address to the next tensor.
+        if target.device.type == "cpu":
+            return None
+        memo = weakref.ref(self)
+
+        def forget(_: object) -> None:
+            alive = memo()
+            if alive is not None:
+                with alive._lock:
+                    alive._drop(key)
+
+        return weakref.ref(_storage_owner(target), forget)
+
+    def _drop(self, key: Hashable) -> None:
+        entry = self._entries.pop(key, None)
+        if entry is not None:
+            self.bytes -= entry.size
+
+    def _make_room(self, size: int) -> bool:
+        unused = [key for key, entry in self._entries.items() if not entry.used]
+        for key in unused:
+            if self.bytes + size <= self.limit:
+                break
+            self._drop(key)
+        return self.bytes + size <= self.limit
+
+
+class _Entry:
+    __slots__ = ("owner", "size", "used", "weight")
+
+    def __init__(self, weight: Tensor, size: int, owner: Optional[weakref.ref[Tensor]]) -> None:
+        self.weight = weight
+        self.size = size
+        self.owner = owner
+        self.used = False
+
+
+def _key(target: Tensor) -> Optional[Hashable]:
+    rule: Callable[[Tensor], Optional[Hashable]] = _content_key if target.device.type == "cpu" else _identity_key
+    return rule(target)
+
+
+def _content_key(target: Tensor) -> Hashable:
+    values = target.detach().contiguous()
+    digest = hashlib.sha256(values.reshape(-1).view(torch.uint8).numpy().data).digest()
+    return digest, tuple(target.shape), target.dtype
+
+
+def _identity_key(target: Tensor) -> Optional[Hashable]:
+    try:
+        version = target._version
+    except RuntimeError:  # an inference tensor counts no writes
+        return None
+    return (
+        id(_storage_owner(target)),
+        target.data_ptr(),
+        version,
+        tuple(target.shape),
+        tuple(target.stride()),
+        target.dtype,
+    )
+
+
+def _storage_owner(target: Tensor) -> Tensor:
+    # `camera.original_image[:3]` is a new tensor every step; what stays is the one it is a view of.
+    return target if target._base is None else target._base

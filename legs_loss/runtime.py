@@ -1,0 +1,270 @@
+"""What a training script talks to: ``l1_loss``, in place of the codebase's own.
+
+It weights only a prediction that is being trained on; under ``no_grad`` it is the plain mean, so that reported metrics
+do not change. Where the weight comes from, in this order:
+
+1. the memo, for a target it can prove to be the same as before;
+2. the store, for a named view whose target has the fingerprint of the image that the stored map was made from;
+3. the target itself.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Optional, Sequence, Set, Tuple, Union
+
+import torch
+from torch import Tensor
+
+from legs_loss.config import Config, find_config
+from legs_loss.errors import LegsError
+from legs_loss.images import check_pair, is_compiling
+from legs_loss.loss import weighted_l1
+from legs_loss.memo import DEFAULT_LIMIT, WeightMemo
+from legs_loss.spec import Spec, as_spec
+from legs_loss.weights import weight_from_response, weight_map
+
+if TYPE_CHECKING:
+    from legs_loss.store import WeightStore
+
+__all__ = ["Counts", "configure", "counts", "l1_loss"]
+
+View = Union[str, Sequence[str], None]
+
+
+@dataclass
+class Counts:
+    """How often ``l1_loss`` was called in this process, and where its weights came from.
+
+    Attributes:
+        weighted: calls that trained with a weight.
+        plain: calls that returned the plain mean: no gradient asked for, beta 0, or LEGS_OFF.
+        remembered: weight maps taken from the memo, per view.
+        stored: weight maps taken from the store.
+        computed: weight maps computed from their target.
+    """
+
+    weighted: int = 0
+    plain: int = 0
+    remembered: int = 0
+    stored: int = 0
+    computed: int = 0
+
+
+class _Run:
+    """The state of this process's run: its settings, once found; its memo and its store."""
+
+    def __init__(self, config: Config, memo_bytes: int = DEFAULT_LIMIT) -> None:
+        self.config = config
+        self.memo = WeightMemo(memo_bytes)
+        self.said: Set[str] = set()
+        self._asked: Set[Tuple[str, int, int]] = set()
+        self._store: Optional[WeightStore] = None
+        self._store_opened = False
+
+    def weight(self, target: Tensor, view: Optional[str], channels_last: bool) -> Tensor:
+        """Return one image's weight map, [1, H, W] (channels-last: [H, W, 1])."""
+        made = _counts.stored + _counts.computed
+        weight = self.memo.recall(target, lambda: self._make(target, view, channels_last))
+        _counts.remembered += _counts.stored + _counts.computed == made
+        return weight
+
+    def say_once(self, kind: str, message: str) -> None:
+        """Print a line on stderr, the first time that this kind of thing happens."""
+        if kind not in self.said:
+            self.said.add(kind)
+            print(f"legs-loss: {message}", file=sys.stderr, flush=True)
+
+    def _make(self, target: Tensor, view: Optional[str], channels_last: bool) -> Tensor:
+        weight = self._from_store(target, view, channels_last)
+        if weight is not None:
+            _counts.stored += 1
+            return weight
+        _counts.computed += 1
+        return weight_map(target, self.config.spec, channels_last)
+
+    def _from_store(self, target: Tensor, view: Optional[str], channels_last: bool) -> Optional[Tensor]:
+        store = self._open_store()
+        if store is None or view is None:
+            return None
+        height, width = target.shape[:2] if channels_last else target.shape[1:]
+        if target.device.type != "cpu":
+            # Comparing fingerprints waits for the device. Once a view is fair; a target that is a new tensor at every
+            # step would wait at every step.
+            if (view, height, width) in self._asked:
+                return None
+            self._asked.add((view, height, width))
+        from legs_loss.store import fingerprint
+
+        try:
+            entry = store.find(view, height, width, self.config.spec)
+            if entry is None:
+                self.say_once("absent", f"the store has no map of view {view!r} at {width}x{height}: computed instead")
+                return None
+            image = target.movedim(-1, 0) if channels_last else target
+            if entry.fingerprint != fingerprint(image):
+                self.say_once(
+                    "changed",
+                    f"view {view!r}: the training image is not the one that the stored map was made from, "
+                    "so its weight is computed (said once; see docs/precompute.md)",
+                )
+                return None
+            normalised = torch.from_numpy(store.normalised_response(entry)).to(target.device).unsqueeze(0)
+        except LegsError as error:
+            self.say_once("damaged", f"{error}; the weights of such views are computed")
+            return None
+        weight = weight_from_response(normalised, self.config.spec)
+        return weight.movedim(0, -1) if channels_last else weight
+
+    def _open_store(self) -> Optional[WeightStore]:
+        if not self._store_opened:
+            self._store_opened = True
+            if self.config.store is not None:
+                from legs_loss.store import WeightStore
+
+                try:
+                    self._store = WeightStore(self.config.store)
+                except LegsError as error:
+                    self.say_once("damaged", f"{error}; weights are computed instead")
+        return self._store
+
+
+_counts = Counts()
+_run: Optional[_Run] = None
+_lock = threading.RLock()
+
+
+def l1_loss(
+    prediction: Tensor,
+    target: Tensor,
+    view: View = None,
+    mask: Optional[Tensor] = None,
+    channels_last: bool = False,
+) -> Tensor:
+    """Return the LEGS-weighted L1 loss; a drop-in for the ``l1_loss`` of a 3DGS codebase.
+
+    Args:
+        prediction: the rendering, [C, H, W] or [B, C, H, W]; channels-last on request. Where it requires no gradient
+            (evaluation, ``no_grad``) the result is ``torch.abs(prediction - target).mean()``, unweighted.
+        target: the photograph as this step supervises it, the same shape.
+        view: the name of the view (for a batch: one a view), if the target is that view's own stored image. It lets
+            maps from ``legs precompute`` be used; they are used only where the target's fingerprint says that they
+            were made from it. Without a name, weights are remembered or computed.
+        mask: one value a pixel, zeroes the weight where it is 0.
+        channels_last: where the channel stands.
+
+    Returns:
+        A scalar. With beta 0 or LEGS_OFF it is ``torch.abs(prediction - target).mean()`` to the last bit.
+
+    Raises:
+        LegsError: shapes that do not fit (both are named), on the CPU a target with NaN or infinity,
+            a setting in legs.toml or LEGS_* that is out of range.
+
+    Example:
+        >>> target = torch.rand(3, 8, 8)
+        >>> prediction = torch.rand(3, 8, 8, requires_grad=True)
+        >>> l1_loss(prediction, target) > torch.abs(prediction - target).mean()
+        tensor(True)
+    """
+    if not (prediction.requires_grad and torch.is_grad_enabled()):
+        return _plain(prediction, target, mask, channels_last)
+    run = _current_run()
+    if not run.config.active:
+        return _plain(prediction, target, mask, channels_last)
+    check_pair(prediction, target)
+    if is_compiling():  # what the compiler traces has no memory: the weight becomes part of the graph
+        weight = weight_map(target, run.config.spec, channels_last)
+        return weighted_l1(prediction, target, weight, mask, channels_last=channels_last)
+    run.say_once("active", _describe(run.config))
+    _counts.weighted += 1
+    views = _view_names(view, target)
+    with torch.no_grad():
+        if target.dim() == 3:
+            weight = run.weight(target, views[0], channels_last)
+        else:
+            weight = torch.stack([run.weight(target[i], name, channels_last) for i, name in enumerate(views)])
+    return weighted_l1(prediction, target, weight, mask, channels_last=channels_last)
+
+
+def configure(
+    spec: Optional[Spec] = None,
+    store: Union[str, Path, None] = None,
+    memo_bytes: int = DEFAULT_LIMIT,
+) -> None:
+    """Set what ``l1_loss`` uses in this process, in place of legs.toml; LEGS_OFF still turns it off.
+
+    Args:
+        spec: a preset's name or a spec; None keeps what legs.toml and the environment say.
+        store: a folder that ``legs precompute`` made.
+        memo_bytes: how much memory remembered weight maps may take.
+
+    Raises:
+        LegsError: an unknown preset, or settings elsewhere that are out of range.
+
+    Example:
+        >>> configure("legs-l")
+        >>> configure(replace(as_spec("legs"), curve="C5", beta=4.0))
+        >>> configure("legs")
+    """
+    global _run
+    config = find_config(_main_file())
+    if spec is not None:
+        config = replace(
+            config,
+            spec=as_spec(spec),
+            preset=spec if isinstance(spec, str) else "own spec",
+            source="configure()",
+        )
+    if store is not None:
+        config = replace(config, store=Path(store))
+    with _lock:
+        _run = _Run(config, memo_bytes)
+
+
+def counts() -> Counts:
+    """Return a copy of this process's counts so far."""
+    return replace(_counts)
+
+
+def _current_run() -> _Run:
+    global _run
+    if _run is None:
+        with _lock:
+            if _run is None:
+                _run = _Run(find_config(_main_file()))
+    return _run
+
+
+def _main_file() -> Optional[Path]:
+    path = getattr(sys.modules.get("__main__"), "__file__", None)
+    return Path(path) if path else Path.cwd()
+
+
+def _plain(prediction: Tensor, target: Tensor, mask: Optional[Tensor], channels_last: bool) -> Tensor:
+    if not is_compiling():
+        _counts.plain += 1
+    if mask is None:
+        return torch.abs(prediction - target).mean()
+    return weighted_l1(prediction, target, mask=mask, channels_last=channels_last)
+
+
+def _view_names(view: View, target: Tensor) -> Sequence[Optional[str]]:
+    batch = target.shape[0] if target.dim() == 4 else 1
+    if view is None:
+        return [None] * batch
+    names = [view] if isinstance(view, str) else list(view)
+    if len(names) != batch or not all(isinstance(name, str) for name in names):
+        raise LegsError(f"view must be one name a view: target {list(target.shape)} holds {batch}, got {view!r}")
+    return names
+
+
+def _describe(config: Config) -> str:
+    spec = config.spec
+    weights = f"maps from {config.store}" if config.store is not None else "maps computed from the training images"
+    return (
+        f"L1 weighted, preset {config.preset}: {spec.operator}, {spec.curve}, beta {spec.beta:g}; {weights}; "
+        f"settings from {config.source}"
+    )

@@ -194,4 +194,6 @@ def render(
             pixel_colours = blend(offsets, splats.conics[here], opacities[seen[here], 0], rgb[here], background)
             row.append(pixel_colours.T.reshape(3, len(ys), len(xs)))
         rows.append(torch.cat(row, 2))
-    return torch.cat(rows, 1), radii
+    inputs = [means, scales, quaternions, opacities, sh] + ([] if viewspace is None else [viewspace])
+    nothing = 0 * sum(tensor.sum() for tensor in inputs)  # every input has a gradient, be it zero
+    return torch.cat(rows, 1) + nothing, radii

@@ -1,0 +1,24 @@
+"""`compiled`: numba's njit with the settings that the rasterizer shares."""
+
+from __future__ import annotations
+
+from typing import Any, Callable
+
+import numba
+
+# No NaN or infinity arises from checked input, and a * b + c may be one instruction. Sums keep their order, so that
+# a run repeats; the one loop that needs its sums split over the lanes of a register says so.
+FAST = {"nnan", "ninf", "nsz", "contract"}
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function on its first call, and keep the machine code on disk where a cache can be written."""
+    options = {"fastmath": FAST, "error_model": "numpy", **options}
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError:  # neither the package's folder nor the user's can be written
+            return numba.njit(**options)(function)
+
+    return decorate

@@ -1,0 +1,420 @@
+"""The compiled rasterizer's work for each Gaussian: from three dimensions to a splat, and the gradient's way back.
+
+A splat is a row of ten float64 numbers: centre (u, v) in pixels, conic (A, B, C), opacity, colour (r, g, b), and the
+determinant of its covariance. All steps are those of oracle.py. The geometry is computed in float64, and the
+determinant as a sum of squares (Cauchy-Binet), since a needle's a c - b b cancels to nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from legs_loss.reference.compiling import compiled
+from legs_loss.reference.conventions import (
+    DILATION,
+    MIN_ALPHA,
+    NEAR,
+    SH_C0,
+    SH_C1,
+    SH_C2,
+    SH_C3,
+    TILE,
+)
+
+BLOCK = 512  # Gaussians that one thread takes at a time
+FARTHEST = 1 << 20  # pixels: a larger radius reaches every tile of any image anyway
+MARGIN = 1e-3  # in the exponent, on the safe side: what is cut away is fainter than MIN_ALPHA by more than rounding
+
+_C0, _C1 = np.float32(SH_C0), np.float32(SH_C1)
+_D0, _D1, _D2, _D3, _D4 = (np.float32(c) for c in SH_C2)
+_E0, _E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(c) for c in SH_C3)
+
+
+@compiled()
+def _rotation(q):
+    """Row-major rotation matrix, the normalised quaternion, and the length it had."""
+    w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
+    length = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    w, x, y, z = w / length, x / length, y / length, z / length
+    matrix = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+    return matrix, (w, x, y, z), length
+
+
+@compiled()
+def _to_camera(mean, pose):
+    """The centre in the camera's axes."""
+    a, b, c = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+    x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]
+    y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]
+    z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
+    return x, y, z
+
+
+@compiled()
+def _held(value, z, limit):
+    """`value` (x or y), held where value / z leaves the guard, and whether it moves freely."""
+    ratio = value / z
+    if ratio > limit:
+        return limit * z, False
+    if ratio < -limit:
+        return -limit * z, False
+    return value, True
+
+
+@compiled()
+def _linearised(fx, fy, held_x, held_y, z, pose):
+    """The 2x3 map from world directions to pixels at the Gaussian's centre, row-major."""
+    j00, j02 = fx / z, -fx * held_x / (z * z)
+    j11, j12 = fy / z, -fy * held_y / (z * z)
+    return (
+        j00 * pose[0, 0] + j02 * pose[2, 0],
+        j00 * pose[0, 1] + j02 * pose[2, 1],
+        j00 * pose[0, 2] + j02 * pose[2, 2],
+        j11 * pose[1, 0] + j12 * pose[2, 0],
+        j11 * pose[1, 1] + j12 * pose[2, 1],
+        j11 * pose[1, 2] + j12 * pose[2, 2],
+    )
+
+
+@compiled()
+def _times_rotation(t, r):
+    """A 2x3 matrix times a 3x3 one."""
+    return (
+        t[0] * r[0] + t[1] * r[3] + t[2] * r[6],
+        t[0] * r[1] + t[1] * r[4] + t[2] * r[7],
+        t[0] * r[2] + t[1] * r[5] + t[2] * r[8],
+        t[3] * r[0] + t[4] * r[3] + t[5] * r[6],
+        t[3] * r[1] + t[4] * r[4] + t[5] * r[7],
+        t[3] * r[2] + t[4] * r[5] + t[5] * r[8],
+    )
+
+
+@compiled()
+def _direction(mean, position):
+    """From the camera's centre to the Gaussian's, of length 1, and the length it had."""
+    x, y, z = mean[0] - position[0], mean[1] - position[1], mean[2] - position[2]
+    length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
+    return np.float32(x / length), np.float32(y / length), np.float32(z / length), length
+
+
+@compiled()
+def _harmonics(degree, x, y, z, basis):
+    """Fill `basis` with the spherical harmonics of a direction."""
+    two, three, four = np.float32(2), np.float32(3), np.float32(4)
+    basis[0] = _C0
+    if degree > 0:
+        basis[1], basis[2], basis[3] = -_C1 * y, _C1 * z, -_C1 * x
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        basis[4], basis[5], basis[6] = _D0 * x * y, _D1 * y * z, _D2 * (two * zz - xx - yy)
+        basis[7], basis[8] = _D3 * x * z, _D4 * (xx - yy)
+        if degree > 2:
+            basis[9] = _E0 * y * (three * xx - yy)
+            basis[10] = _E1 * x * y * z
+            basis[11] = _E2 * y * (four * zz - xx - yy)
+            basis[12] = _E3 * z * (two * zz - three * (xx + yy))
+            basis[13] = _E4 * x * (four * zz - xx - yy)
+            basis[14] = _E5 * z * (xx - yy)
+            basis[15] = _E6 * x * (xx - three * yy)
+
+
+@compiled()
+def _harmonics_gradient(degree, x, y, z, g):
+    """Gradient to the direction, from the gradient `g` to each of its harmonics."""
+    two, three, four, six, eight = np.float32(2), np.float32(3), np.float32(4), np.float32(6), np.float32(8)
+    gx = gy = gz = np.float32(0)
+    if degree > 0:
+        gx, gy, gz = -_C1 * g[3], -_C1 * g[1], _C1 * g[2]
+    if degree > 1:
+        gx += _D0 * y * g[4] - two * _D2 * x * g[6] + _D3 * z * g[7] + two * _D4 * x * g[8]
+        gy += _D0 * x * g[4] + _D1 * z * g[5] - two * _D2 * y * g[6] - two * _D4 * y * g[8]
+        gz += _D1 * y * g[5] + four * _D2 * z * g[6] + _D3 * x * g[7]
+    if degree > 2:
+        xx, yy, zz = x * x, y * y, z * z
+        gx += (
+            six * _E0 * x * y * g[9]
+            + _E1 * y * z * g[10]
+            - two * _E2 * x * y * g[11]
+            - six * _E3 * x * z * g[12]
+            + _E4 * (four * zz - three * xx - yy) * g[13]
+            + two * _E5 * x * z * g[14]
+            + three * _E6 * (xx - yy) * g[15]
+        )
+        gy += (
+            three * _E0 * (xx - yy) * g[9]
+            + _E1 * x * z * g[10]
+            + _E2 * (four * zz - xx - three * yy) * g[11]
+            - six * _E3 * y * z * g[12]
+            - two * _E4 * x * y * g[13]
+            - two * _E5 * y * z * g[14]
+            - six * _E6 * x * y * g[15]
+        )
+        gz += (
+            _E1 * x * y * g[10]
+            + eight * _E2 * y * z * g[11]
+            + three * _E3 * (two * zz - xx - yy) * g[12]
+            + eight * _E4 * x * z * g[13]
+            + _E5 * (xx - yy) * g[14]
+        )
+    return gx, gy, gz
+
+
+@compiled()
+def _tile(pixel):
+    """The tile that a coordinate lies in; -1 for all that is left of or above the image."""
+    return np.int64(math.floor(max(min(pixel / TILE, 1e6), -1.0)))
+
+
+@compiled()
+def _tile_range(centre, radius, tiles):
+    """First tile of the square around a splat, and the one past the last, by 3DGS's rounding."""
+    first, end = _tile(centre - radius), _tile(centre + radius + (TILE - 1))
+    return min(max(first, 0), tiles), min(max(end, 0), tiles)
+
+
+@compiled()
+def _project_block(
+    first, end, means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, tiles,
+    splats, depths, radii, clamped, boxes, slots,
+):  # fmt: skip
+    fx, fy, cx, cy, limit_x, limit_y = intrinsics
+    basis = np.empty(16, np.float32)
+    coefficients = (degree + 1) * (degree + 1)
+    for i in range(first, end):
+        radii[i] = 0
+        slots[i] = 0
+        x, y, z = _to_camera(means[i], pose)
+        if not z > NEAR:
+            continue
+        held_x, _ = _held(x, z, limit_x)
+        held_y, _ = _held(y, z, limit_y)
+        rotation, _, _ = _rotation(quaternions[i])
+        u = _times_rotation(_linearised(fx, fy, held_x, held_y, z, pose), rotation)
+        s0, s1, s2 = np.float64(scales[i, 0]) ** 2, np.float64(scales[i, 1]) ** 2, np.float64(scales[i, 2]) ** 2
+        a = u[0] * u[0] * s0 + u[1] * u[1] * s1 + u[2] * u[2] * s2
+        b = u[0] * u[3] * s0 + u[1] * u[4] * s1 + u[2] * u[5] * s2
+        c = u[3] * u[3] * s0 + u[4] * u[4] * s1 + u[5] * u[5] * s2
+        determinant = DILATION * (a + c + DILATION)
+        determinant += (u[0] * u[4] - u[1] * u[3]) ** 2 * s0 * s1
+        determinant += (u[0] * u[5] - u[2] * u[3]) ** 2 * s0 * s2
+        determinant += (u[1] * u[5] - u[2] * u[4]) ** 2 * s1 * s2
+        a += DILATION
+        c += DILATION
+        middle = 0.5 * (a + c)
+        largest = middle + math.sqrt(max(0.1, middle * middle - determinant))
+        radius = min(math.ceil(3 * math.sqrt(largest)), float(FARTHEST))
+        centre_x, centre_y = fx * x / z + cx - 0.5, fy * y / z + cy - 0.5
+        left, right = _tile_range(centre_x, radius, tiles[0])
+        top, bottom = _tile_range(centre_y, radius, tiles[1])
+        if right <= left or bottom <= top:
+            continue
+        radii[i] = np.int32(radius)
+
+        # Of the square's tiles, those that the ellipse where alpha falls to MIN_ALPHA may reach.
+        opacity = np.float64(opacities[i, 0])
+        if opacity < MIN_ALPHA:
+            continue
+        level = 2 * math.log(opacity / MIN_ALPHA) + 2 * MARGIN
+        reach_x, reach_y = math.sqrt(level * a), math.sqrt(level * c)
+        left, right = max(left, _tile(centre_x - reach_x)), min(right, _tile(centre_x + reach_x) + 1)
+        top, bottom = max(top, _tile(centre_y - reach_y)), min(bottom, _tile(centre_y + reach_y) + 1)
+        if right <= left or bottom <= top:
+            continue
+        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = left, top, right, bottom
+        slots[i] = (right - left) * (bottom - top)
+
+        dx, dy, dz, _ = _direction(means[i], position)
+        _harmonics(degree, dx, dy, dz, basis)
+        for channel in range(3):
+            colour = np.float32(0.5)
+            for k in range(coefficients):
+                colour += basis[k] * sh[i, k, channel]
+            clamped[i, channel] = colour < np.float32(0)
+            splats[i, 6 + channel] = max(colour, np.float32(0))
+        splats[i, 0], splats[i, 1] = centre_x, centre_y
+        splats[i, 2], splats[i, 3], splats[i, 4] = c / determinant, -b / determinant, a / determinant
+        splats[i, 5], splats[i, 9] = opacity, determinant
+        depths[i] = np.float32(z)
+
+
+@compiled(parallel=True)
+def project(
+    means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, tiles,
+    splats, depths, radii, clamped, boxes, slots,
+):  # fmt: skip
+    """Fill, for each Gaussian: splat, depth, radius, which channels were clamped, its box of tiles and their number."""
+    count = len(means)
+    for block in prange((count + BLOCK - 1) // BLOCK):
+        first = block * BLOCK
+        _project_block(
+            first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, degree, intrinsics, pose,
+            position, tiles, splats, depths, radii, clamped, boxes, slots,
+        )  # fmt: skip
+
+
+@compiled()
+def _quaternion_gradient(g, q, length):
+    """From the gradient to the rotation matrix (row-major) to that of the quaternion before its normalisation."""
+    w, x, y, z = q
+    gw = 2 * (z * (g[3] - g[1]) + y * (g[2] - g[6]) + x * (g[7] - g[5]))
+    gx = 2 * (y * (g[1] + g[3]) + z * (g[2] + g[6]) - 2 * x * (g[4] + g[8]) + w * (g[7] - g[5]))
+    gy = 2 * (x * (g[1] + g[3]) + z * (g[5] + g[7]) - 2 * y * (g[0] + g[8]) + w * (g[2] - g[6]))
+    gz = 2 * (x * (g[2] + g[6]) + y * (g[5] + g[7]) - 2 * z * (g[0] + g[4]) + w * (g[3] - g[1]))
+    along = w * gw + x * gx + y * gy + z * gz
+    return (gw - w * along) / length, (gx - x * along) / length, (gy - y * along) / length, (gz - z * along) / length
+
+
+@compiled()
+def _collect(i, splat, box, first_slot, spans, slot_gradients, sums):
+    """Sum a Gaussian's gradients over its tiles into `sums`, in a fixed order.
+
+    A slot holds the moments of h = dL/dpower about its tile's centre: h, hx, hy, hxx, hxy, hyy; then red, green,
+    blue, and the two absolute sums. `sums`: u, v, A, B, C, opacity, red, green, blue, |u|, |v|.
+    """
+    sums[:] = 0.0
+    a, b, c = splat[2], splat[3], splat[4]
+    slot = first_slot
+    for tile_y in range(box[1], box[3]):
+        for tile_x in range(box[0], box[2]):
+            if spans[slot] != 0:
+                g = slot_gradients[slot]
+                h, hx, hy = np.float64(g[0]), np.float64(g[1]), np.float64(g[2])
+                ox = tile_x * TILE + (TILE - 1) / 2 - splat[0]  # from the splat to the tile's centre
+                oy = tile_y * TILE + (TILE - 1) / 2 - splat[1]
+                sums[0] += (a * ox + b * oy) * h + a * hx + b * hy
+                sums[1] += (b * ox + c * oy) * h + b * hx + c * hy
+                sums[2] -= 0.5 * (g[3] + ox * (2 * hx + ox * h))
+                sums[3] -= g[4] + ox * hy + oy * (hx + ox * h)
+                sums[4] -= 0.5 * (g[5] + oy * (2 * hy + oy * h))
+                sums[5] += h
+                for k in range(6, 11):
+                    sums[k] += g[k]
+            slot += 1
+    sums[5] /= splat[5]
+
+
+@compiled()
+def _project_backward_block(
+    first, end, means, scales, quaternions, sh, degree, intrinsics, pose, position,
+    splats, clamped, boxes, slots, first_slots, spans, slot_gradients, half,
+    g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
+):  # fmt: skip
+    fx, fy, _, _, limit_x, limit_y = intrinsics
+    coefficients = (degree + 1) * (degree + 1)
+    basis, g_basis, sums = np.empty(16, np.float32), np.empty(16, np.float32), np.empty(11, np.float64)
+    for i in range(first, end):
+        if slots[i] == 0:
+            g_means[i] = 0
+            g_scales[i] = 0
+            g_quaternions[i] = 0
+            g_opacities[i] = 0
+            g_sh[i] = 0
+            g_view[i] = 0
+            continue
+        splat = splats[i]
+        _collect(i, splat, boxes[i], first_slots[i], spans, slot_gradients, sums)
+        g_opacities[i, 0] = sums[5]
+        g_view[i, 0], g_view[i, 1] = sums[0] * half[0], sums[1] * half[1]
+        if g_view.shape[1] == 4:
+            g_view[i, 2], g_view[i, 3] = sums[9] * half[0], sums[10] * half[1]
+
+        # Colour: to the coefficients, and through the direction to the mean.
+        dx, dy, dz, distance = _direction(means[i], position)
+        _harmonics(degree, dx, dy, dz, basis)
+        red = np.float32(0) if clamped[i, 0] else np.float32(sums[6])
+        green = np.float32(0) if clamped[i, 1] else np.float32(sums[7])
+        blue = np.float32(0) if clamped[i, 2] else np.float32(sums[8])
+        for k in range(coefficients):
+            g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = basis[k] * red, basis[k] * green, basis[k] * blue
+            g_basis[k] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
+        g_sh[i, coefficients:] = 0
+        vx, vy, vz = _harmonics_gradient(degree, dx, dy, dz, g_basis)
+        along = vx * dx + vy * dy + vz * dz
+        mx, my, mz = (vx - along * dx) / distance, (vy - along * dy) / distance, (vz - along * dz) / distance
+
+        # Conic Q to covariance: -Q G Q, G the symmetric matrix of the conic's gradient.
+        a, b, c = splat[2], splat[3], splat[4]
+        p00, p01 = a * sums[2] + b * sums[3] / 2, a * sums[3] / 2 + b * sums[4]
+        p10, p11 = b * sums[2] + c * sums[3] / 2, b * sums[3] / 2 + c * sums[4]
+        s00, s01, s11 = -(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)
+
+        # Covariance to the scaled axes U S, U = T R: 2 G U S.
+        x, y, z = _to_camera(means[i], pose)
+        held_x, free_x = _held(x, z, limit_x)
+        held_y, free_y = _held(y, z, limit_y)
+        rotation, q, length = _rotation(quaternions[i])
+        t = _linearised(fx, fy, held_x, held_y, z, pose)
+        u = _times_rotation(t, rotation)
+        n0, n1, n2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
+        e0, e3 = 2 * (s00 * u[0] + s01 * u[3]), 2 * (s01 * u[0] + s11 * u[3])
+        e1, e4 = 2 * (s00 * u[1] + s01 * u[4]), 2 * (s01 * u[1] + s11 * u[4])
+        e2, e5 = 2 * (s00 * u[2] + s01 * u[5]), 2 * (s01 * u[2] + s11 * u[5])
+        g_scales[i, 0] = n0 * (e0 * u[0] + e3 * u[3])
+        g_scales[i, 1] = n1 * (e1 * u[1] + e4 * u[4])
+        g_scales[i, 2] = n2 * (e2 * u[2] + e5 * u[5])
+        e0, e1, e2, e3, e4, e5 = e0 * n0 * n0, e1 * n1 * n1, e2 * n2 * n2, e3 * n0 * n0, e4 * n1 * n1, e5 * n2 * n2
+        g_rotation = (
+            t[0] * e0 + t[3] * e3, t[0] * e1 + t[3] * e4, t[0] * e2 + t[3] * e5,
+            t[1] * e0 + t[4] * e3, t[1] * e1 + t[4] * e4, t[1] * e2 + t[4] * e5,
+            t[2] * e0 + t[5] * e3, t[2] * e1 + t[5] * e4, t[2] * e2 + t[5] * e5,
+        )  # fmt: skip
+        w0, w1, w2, w3 = _quaternion_gradient(g_rotation, q, length)
+        g_quaternions[i, 0], g_quaternions[i, 1], g_quaternions[i, 2], g_quaternions[i, 3] = w0, w1, w2, w3
+
+        # To T = J W, to the Jacobian, and with the centre's gradient to the mean.
+        r = rotation
+        t0, t1, t2 = (
+            e0 * r[0] + e1 * r[1] + e2 * r[2],
+            e0 * r[3] + e1 * r[4] + e2 * r[5],
+            e0 * r[6] + e1 * r[7] + e2 * r[8],
+        )
+        t3, t4, t5 = (
+            e3 * r[0] + e4 * r[1] + e5 * r[2],
+            e3 * r[3] + e4 * r[4] + e5 * r[5],
+            e3 * r[6] + e4 * r[7] + e5 * r[8],
+        )
+        j00 = t0 * pose[0, 0] + t1 * pose[0, 1] + t2 * pose[0, 2]
+        j02 = t0 * pose[2, 0] + t1 * pose[2, 1] + t2 * pose[2, 2]
+        j11 = t3 * pose[1, 0] + t4 * pose[1, 1] + t5 * pose[1, 2]
+        j12 = t3 * pose[2, 0] + t4 * pose[2, 1] + t5 * pose[2, 2]
+        ax, ay = fx / z, fy / z
+        cx, cy = ax * sums[0], ay * sums[1]
+        cz = -(x * cx + y * cy + ax * j00 + ay * j11) / z
+        cz += 2 * (ax * held_x * j02 + ay * held_y * j12) / (z * z)  # as upstream, also where x or y is held
+        if free_x:
+            cx -= ax * j02 / z
+        if free_y:
+            cy -= ay * j12 / z
+        g_means[i, 0] = mx + pose[0, 0] * cx + pose[1, 0] * cy + pose[2, 0] * cz
+        g_means[i, 1] = my + pose[0, 1] * cx + pose[1, 1] * cy + pose[2, 1] * cz
+        g_means[i, 2] = mz + pose[0, 2] * cx + pose[1, 2] * cy + pose[2, 2] * cz
+
+
+@compiled(parallel=True)
+def project_backward(
+    means, scales, quaternions, sh, degree, intrinsics, pose, position,
+    splats, clamped, boxes, slots, first_slots, spans, slot_gradients, half,
+    g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
+):  # fmt: skip
+    """Fill the gradients `g_...` of each Gaussian from those of its slots."""
+    count = len(means)
+    for block in prange((count + BLOCK - 1) // BLOCK):
+        first = block * BLOCK
+        _project_backward_block(
+            first, min(first + BLOCK, count), means, scales, quaternions, sh, degree, intrinsics, pose, position,
+            splats, clamped, boxes, slots, first_slots, spans, slot_gradients, half,
+            g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
+        )  # fmt: skip

@@ -32,7 +32,7 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.spec import WeightSpec
 
-__all__ = ["DamagedStoreError", "Entry", "StoreWriter", "WeightStore", "fingerprint", "stage"]
+__all__ = ["DamagedStoreError", "Entry", "StoreWriter", "WeightStore", "fingerprint", "read_map", "stage"]
 
 MANIFEST = "manifest.json"
 VERSION = 1
@@ -130,16 +130,7 @@ class WeightStore:
         Raises:
             DamagedStoreError: the file is missing or is not the one that was written.
         """
-        try:
-            data = (self.path / entry.file).read_bytes()
-        except OSError as error:
-            raise DamagedStoreError(f"{self.path / entry.file} cannot be read ({error.strerror}); {_REPAIR}") from None
-        if hashlib.sha256(data).hexdigest() != entry.sha256:
-            raise DamagedStoreError(f"{self.path / entry.file} is damaged: its checksum differs; {_REPAIR}")
-        normalised = np.load(io.BytesIO(data), allow_pickle=False)
-        if normalised.dtype != np.float16 or normalised.shape != (entry.height, entry.width):
-            raise DamagedStoreError(f"{self.path / entry.file} is no float16 map of {entry.width}x{entry.height}")
-        return normalised
+        return read_map(self.path, entry)
 
     def check(self) -> Damage:
         """Read every map and compare checksums; list what is damaged and what belongs to no entry."""
@@ -181,8 +172,7 @@ class StoreWriter:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             with self._locked():
-                entries = self._entries()
-                for leftover in _leftovers(self.path, entries):
+                for leftover in _leftovers(self.path, self.entries()):
                     _remove(leftover)
                 self.staging = Path(tempfile.mkdtemp(prefix=_STAGING, dir=str(self.path)))
                 self._alive = _Lock(self.staging / _LOCK)
@@ -197,7 +187,7 @@ class StoreWriter:
     def commit(self, staged: Sequence[Entry]) -> None:
         """Move staged maps into the store and list them, in place of older ones with the same key."""
         with self._locked():
-            entries = {entry.key: entry for entry in self._entries()}
+            entries = {entry.key: entry for entry in self.entries()}
             before = {entry.file for entry in entries.values()}
             for entry in staged:
                 os.replace(str(self.staging / entry.file), str(self.path / entry.file))
@@ -208,7 +198,8 @@ class StoreWriter:
             for file in before - {entry.file for entry in entries.values()}:
                 _remove(self.path / file)
 
-    def _entries(self) -> List[Entry]:
+    def entries(self) -> List[Entry]:
+        """Return what the store lists now."""
         return _read_manifest(self.path) if (self.path / MANIFEST).is_file() else []
 
     @contextmanager
@@ -218,6 +209,18 @@ class StoreWriter:
             yield
         finally:
             lock.release()
+
+
+def read_map(folder: Path, entry: Entry) -> np.ndarray:
+    """Return the map E^ of an entry of the store in ``folder``: :meth:`WeightStore.normalised_response`."""
+    path = folder / entry.file
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DamagedStoreError(f"{path} cannot be read ({error.strerror}); {_REPAIR}") from None
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise DamagedStoreError(f"{path} is damaged: its checksum differs; {_REPAIR}")
+    return np.load(io.BytesIO(data), allow_pickle=False)
 
 
 def stage(staging: Path, entry: Entry, normalised: np.ndarray) -> Entry:

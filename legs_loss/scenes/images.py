@@ -5,6 +5,8 @@ Source of the rules: utils/camera_utils.py, utils/general_utils.py and scene/dat
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Iterator, Tuple
 
 import numpy as np
@@ -14,10 +16,10 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.scenes.model import View
 
-__all__ = ["image_tensor", "load_training_image", "row_strips", "training_size"]
+__all__ = ["image_size", "image_tensor", "load_training_image", "row_strips", "training_size"]
 
 WIDEST = 1600  # pixels; 3DGS shrinks wider photographs to this unless -r says otherwise
-STRIP_PIXELS = 1 << 18
+STRIP_PIXELS = 1 << 16
 
 
 def training_size(width: int, height: int, resolution: int = -1) -> Tuple[int, int]:
@@ -66,25 +68,26 @@ def load_training_image(view: View, resolution: int = -1, white_background: bool
     Raises:
         LegsError: no such file, a file that Pillow cannot decode, or floats.
     """
-    from PIL import Image
-
-    try:
-        with Image.open(str(view.path)) as image:
-            size = training_size(*image.size, resolution)
-            if image.mode.startswith("I"):
-                return _deep_gray(image, size)
-            if view.composited:
-                prepared = _on_background(image.convert("RGBA"), 255 if white_background else 0)
-            else:
-                prepared = image.convert(_colour_mode(image))
-            pixels = np.array(prepared.resize(size))
-    except LegsError as error:
-        raise LegsError(f"{view.path}: {error}") from None
-    except FileNotFoundError:
-        raise LegsError(f"{view.path}: there is no such file") from None
-    except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
-        raise LegsError(f"{view.path}: not an image that Pillow can read ({error})") from None
+    with _opened(view.path) as image:
+        size = training_size(image.width, image.height, resolution)
+        if image.mode.startswith("I"):
+            return _deep_gray(image, size)
+        if view.composited:
+            prepared = _on_background(image.convert("RGBA"), 255 if white_background else 0)
+        else:
+            prepared = image.convert(_colour_mode(image))
+        pixels = np.array(prepared.resize(size))
     return pixels[:, :, :3] if pixels.ndim == 3 else pixels[:, :, None]
+
+
+def image_size(path: Path) -> Tuple[int, int]:
+    """Return the width and height in pixels of an image file, from its header.
+
+    Raises:
+        LegsError: no such file, or none that Pillow can read.
+    """
+    with _opened(path) as image:
+        return image.size
 
 
 def image_tensor(image: np.ndarray) -> Tensor:
@@ -94,15 +97,34 @@ def image_tensor(image: np.ndarray) -> Tensor:
         >>> image_tensor(np.full((1, 2, 3), 255, np.uint8)).shape
         torch.Size([3, 1, 2])
     """
+    channels_first = np.ascontiguousarray(image.transpose(2, 0, 1))
     if image.dtype == np.uint8:
-        return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1) / 255.0
-    return torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1) / 65535.0
+        return torch.from_numpy(channels_first) / 255.0
+    return torch.from_numpy(channels_first.astype(np.float32)) / 65535.0
 
 
 def row_strips(height: int, width: int) -> Iterator[slice]:
     """Cut an image into strips of rows, small enough that temporaries of one hardly count."""
     rows = max(1, STRIP_PIXELS // width)
     return (slice(start, min(start + rows, height)) for start in range(0, height, rows))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open an image with Pillow; whatever goes wrong while it is read is one error that names the file."""
+    from PIL import Image
+
+    try:
+        with Image.open(str(path)) as image:
+            yield image
+    except LegsError as error:
+        raise LegsError(f"{path}: {error}") from None
+    except FileNotFoundError:
+        raise LegsError(f"{path}: there is no such file") from None
+    except MemoryError:
+        raise
+    except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
+        raise LegsError(f"{path}: not an image that Pillow can read ({error})") from None
 
 
 def _colour_mode(image: Any) -> str:

@@ -7,13 +7,14 @@ import math
 import os
 import posixpath
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Tuple
+from typing import Any, Dict, List, Optional
 
 import numpy as np
 from numpy.linalg import LinAlgError
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes.folder import SUFFIXES
+from legs_loss.scenes.images import image_size
 from legs_loss.scenes.model import Camera, Scene, View
 
 __all__ = ["find_transforms", "read_transforms"]
@@ -96,10 +97,13 @@ def _model(intrinsics: Dict[str, Any]) -> str:
 
 def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
     """A frame's camera; None where its size is not written and the image cannot be opened."""
-    size = (intrinsics["w"], intrinsics["h"]) if "w" in intrinsics else _image_size(image)
-    if size is None:
-        return None
-    width, height = (int(side) for side in size)
+    if "w" in intrinsics:
+        width, height = int(intrinsics["w"]), int(intrinsics["h"])
+    else:
+        try:
+            width, height = image_size(image)
+        except LegsError:  # the loader will say what is wrong with it
+            return None
     if "fl_x" in intrinsics:
         fx = float(intrinsics["fl_x"])
         fy = float(intrinsics.get("fl_y", fx))
@@ -115,13 +119,3 @@ def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
         raise ValueError(f"the transform_matrix of {image} is no 4x4 matrix of numbers")
     pose = np.linalg.inv(camera_to_world @ _OPENGL_TO_OPENCV)
     return Camera(width, height, fx, fy, cx, cy, pose)
-
-
-def _image_size(path: Path) -> Optional[Tuple[int, int]]:
-    from PIL import Image
-
-    try:
-        with Image.open(str(path)) as image:
-            return image.size
-    except (OSError, ValueError):
-        return None

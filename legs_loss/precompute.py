@@ -1,0 +1,251 @@
+"""Scene -> store: the normalised response of every photograph, made once for every later training.
+
+Views are shared out to processes, each with one photograph in memory at a time; the response is computed in strips of
+rows. What is finished is in the store within about a second, so a run that is interrupted or killed goes on where it
+was. A view is up to date, and left alone, while its photograph's file has the size and time of change that were
+recorded, its map's checksum holds, and size, operator and background are those asked for.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Union
+
+import numpy as np
+import torch
+
+from legs_loss.config import STORE_FOLDER
+from legs_loss.errors import LegsError
+from legs_loss.response import normalise_response, response
+from legs_loss.scenes import Scene, View, image_size, image_tensor, load_training_image, training_size
+from legs_loss.scenes.images import row_strips
+from legs_loss.spec import Spec, WeightSpec, as_spec
+from legs_loss.store import DamagedStoreError, Entry, StoreWriter, fingerprint, read_map, stage
+
+__all__ = ["Report", "normalised_map", "precompute"]
+
+_COMMIT_SECONDS = 1.0
+
+
+@dataclass
+class Report:
+    """What :func:`precompute` did, by the names of views: maps made, maps kept, and views skipped with the reason."""
+
+    store: Path
+    made: List[str] = field(default_factory=list)
+    kept: List[str] = field(default_factory=list)
+    skipped: Dict[str, str] = field(default_factory=dict)
+
+
+def precompute(
+    scene: Scene,
+    out: Union[str, Path, None] = None,
+    spec: Spec = "legs",
+    resolution: int = -1,
+    white_background: bool = False,
+    workers: int = 1,
+    progress: bool = False,
+) -> Report:
+    """Write the normalised response of every view of a scene to a store.
+
+    Args:
+        scene: from :func:`~legs_loss.scenes.read_scene`.
+        out: the store's folder, ``legs_weights`` in the scene by default, where a training script finds it by itself.
+            Maps already there are kept: one store holds many sizes and operators.
+        spec: its operator, p and eps are used; every curve and beta can be made from the result.
+        resolution, white_background: 3DGS's ``-r`` and ``-w``, as the training will have them.
+        workers: processes; 1 computes in this one. With more, a script needs its ``if __name__ == "__main__"``.
+        progress: show a bar on stderr.
+
+    Returns:
+        What was made, kept and skipped. A photograph that cannot be read is skipped, not raised.
+
+    Raises:
+        LegsError: the store cannot be written or is damaged; bad settings.
+    """
+    from tqdm import tqdm
+
+    out = scene.root / STORE_FOLDER if out is None else Path(out)
+    spec = as_spec(spec)
+    training_size(1 << 20, 1 << 20, resolution)  # a bad resolution is one error, not one a view
+    report = Report(out)
+    with StoreWriter(out) as writer:
+        job = _Job(spec, resolution, white_background, out, writer.staging)
+        known: Dict[str, List[Entry]] = {}
+        for entry in writer.entries():
+            known.setdefault(entry.view, []).append(entry)
+        views = {view.name: view for view in scene.views}
+        tasks = [_Task(view, known.get(name, [])) for name, view in views.items()]
+        results = _in_processes(job, tasks, workers) if workers > 1 else (_make(job, task) for task in tasks)
+        staged: List[Entry] = []
+        committed = time.monotonic()
+        try:
+            for result in tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress):
+                if result.problem is not None:
+                    report.skipped[result.view] = result.problem
+                elif result.entry is None:
+                    report.kept.append(result.view)
+                else:
+                    report.made.append(result.view)
+                    staged.append(result.entry)
+                if staged and time.monotonic() > committed + _COMMIT_SECONDS:
+                    writer.commit(staged)
+                    staged, committed = [], time.monotonic()
+        finally:
+            if staged:
+                writer.commit(staged)
+    return report
+
+
+def normalised_map(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
+    """Return E^ of a photograph uint8 or uint16 [H, W, C] as float16 [H, W], with one strip's temporaries at a time."""
+    height, width = image.shape[:2]
+    strength = torch.empty(1, height, width)
+    for rows in row_strips(height, width):
+        # Every operator reaches one row up and one down; at the photograph's own border it reflects.
+        above, below = max(rows.start - 1, 0), min(rows.stop + 1, height)
+        strip = response(image_tensor(image[above:below]), spec.operator, spec.p)
+        strength[:, rows] = strip[:, rows.start - above : rows.stop - above]
+    return normalise_response(strength, spec.eps)[0].half().numpy()
+
+
+class _Job(NamedTuple):
+    spec: WeightSpec
+    resolution: int
+    white_background: bool
+    store: Path
+    staging: Path
+
+
+class _Task(NamedTuple):
+    view: View
+    known: Sequence[Entry]  # what the store has of this view
+
+
+class _Result(NamedTuple):
+    """Of one view: a staged entry, or a problem, or neither where the store's map is up to date."""
+
+    view: str
+    entry: Optional[Entry] = None
+    problem: Optional[str] = None
+
+
+def _make(job: _Job, task: _Task) -> _Result:
+    view = task.view
+    try:
+        source = os.stat(str(view.path))
+        width, height = training_size(*image_size(view.path), job.resolution)
+        wanted: Dict[str, Any] = {
+            "view": view.name,
+            "width": width,
+            "height": height,
+            "operator": job.spec.operator,
+            "p": job.spec.p,
+            "eps": job.spec.eps,
+            "background": ("white" if job.white_background else "black") if view.composited else None,
+            "source_bytes": source.st_size,
+            "source_mtime_ns": source.st_mtime_ns,
+        }
+        if any(wanted.items() <= vars(entry).items() and _is_intact(job.store, entry) for entry in task.known):
+            return _Result(view.name)
+        image = load_training_image(view, job.resolution, job.white_background)
+        entry = Entry(fingerprint=fingerprint(image), **wanted)
+        return _Result(view.name, stage(job.staging, entry, normalised_map(image, job.spec)))
+    except LegsError as error:
+        return _Result(view.name, problem=str(error))
+    except (OSError, MemoryError) as error:
+        return _Result(view.name, problem=f"{view.path}: {error or 'not enough memory'}")
+
+
+def _is_intact(store: Path, entry: Entry) -> bool:
+    try:
+        read_map(store, entry)
+    except DamagedStoreError:
+        return False
+    return True
+
+
+def _in_processes(job: _Job, tasks: Sequence[_Task], workers: int) -> Iterator[_Result]:
+    """Yield the results of worker processes, in the order they come.
+
+    Each worker has one task at a time and a pipe of its own: a worker that dies costs one view, and when this process
+    dies, the workers find their pipes closed and end.
+    """
+    waiting = list(reversed(tasks))
+    crew: Dict[Any, _Worker] = {}  # by this side's end of their pipes
+
+    def give(worker: _Worker) -> None:
+        worker.task = waiting.pop()
+        crew[worker.connection] = worker
+        with suppress(OSError):  # it died; its pipe will say so
+            worker.connection.send(worker.task)
+
+    try:
+        for _ in range(min(workers, len(tasks))):
+            give(_Worker(job))
+        while crew:
+            for connection in wait(list(crew)):
+                worker = crew.pop(connection)
+                try:
+                    result = worker.connection.recv()
+                except (EOFError, OSError):
+                    reason = f"{worker.task.view.path}: the process that read it was killed (out of memory?)"
+                    result = _Result(worker.task.view.name, problem=reason)
+                    worker.end()
+                    worker = _Worker(job) if waiting else worker
+                if waiting:
+                    give(worker)
+                else:
+                    worker.end()
+                yield result
+    finally:
+        for worker in crew.values():
+            worker.end()
+
+
+class _Worker:
+    """A process that makes maps, and this side's end of its pipe."""
+
+    task: _Task
+
+    def __init__(self, job: _Job) -> None:
+        context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs, job), daemon=True)
+        with _interrupts_ignored():  # for good in the process: a Ctrl-C is the parent's to handle
+            self.process.start()
+        theirs.close()
+
+    def end(self) -> None:
+        self.connection.close()
+        self.process.terminate()
+        self.process.join()
+
+
+def _work(connection: Any, job: _Job) -> None:
+    torch.set_num_threads(1)
+    try:
+        while True:
+            connection.send(_make(job, connection.recv()))
+    except (EOFError, OSError):  # the parent has ended
+        pass
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # only the main thread is ever interrupted
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

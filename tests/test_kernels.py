@@ -30,7 +30,7 @@ def compare(shape, weighted, lambda_dssim, offset=0.1):
     )
     expected.backward()
     assert loss.dtype == torch.float32 and loss.shape == ()
-    assert float(loss) == pytest.approx(float(expected), rel=2e-5, abs=1e-6)
+    assert loss.item() == pytest.approx(expected.item(), rel=2e-5, abs=1e-6)
     error = (prediction.grad.double() - exact.grad).norm() / exact.grad.norm()
     assert float(error) < 2e-5
 
@@ -52,7 +52,7 @@ def test_gradient_is_zero_for_an_equal_prediction():
     prediction = target.clone().requires_grad_()
     loss = fused_loss(prediction, target)
     loss.backward()
-    assert float(loss) == pytest.approx(0.0, abs=1e-6)
+    assert loss.item() == pytest.approx(0.0, abs=1e-6)
     assert float(prediction.grad.abs().max()) < 1e-7
 
 
@@ -66,7 +66,7 @@ def test_it_repeats_bit_for_bit_on_any_number_of_threads():
         prediction = (0.9 * target).requires_grad_()
         loss = fused_loss(prediction, target)
         loss.backward()
-        results.append((float(loss), prediction.grad))
+        results.append((loss.item(), prediction.grad))
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     for value, gradient in results[1:]:
         assert value == results[0][0]

@@ -1,13 +1,16 @@
 """The whole LEGS loss and its gradient in one pass over the images, on the CPU.
 
-The loss is a scalar, so its gradient is known as soon as the images are: the forward pass computes both, and the backward
-pass scales. Each task walks down a band of rows of one channel and keeps only the eleven rows that the window sees:
+The loss is a scalar, so its gradient is known as soon as the images are: the forward pass computes both, and the
+backward pass scales. Each task walks down a tile of one channel and keeps only the eleven rows that the window sees:
 
     row -> blur along the row of x, y, x^2 + y^2, xy -> blur across eleven rows -> SSIM and its three derivatives
         -> blur along the row -> blur across eleven rows -> gradient
 
-SSIM needs the two variances only as their sum, so four blurs go in and three come back. The window is symmetric and the
-padding zero, so the blur is its own adjoint.
+SSIM needs the two variances only as their sum, so four blurs go in and three come back. The window is symmetric and
+the padding zero, so the blur is its own adjoint.
+
+A task's rows live in one flat array, most of them a constant distance apart: LLVM vectorises a loop only if it can show
+with a few comparisons that what is written is not what is read.
 """
 
 from __future__ import annotations

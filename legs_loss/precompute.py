@@ -28,7 +28,7 @@ from legs_loss.response import normalise_response, response
 from legs_loss.scenes import Scene, View, image_size, image_tensor, load_training_image, training_size
 from legs_loss.scenes.images import row_strips
 from legs_loss.spec import Spec, WeightSpec, as_spec
-from legs_loss.store import DamagedStoreError, Entry, StoreWriter, fingerprint, read_map, stage
+from legs_loss.store import Entry, StoreWriter, fingerprint, is_intact, stage
 
 __all__ = ["Report", "normalised_map", "precompute"]
 
@@ -154,7 +154,7 @@ def _make(job: _Job, task: _Task) -> _Result:
             "source_bytes": source.st_size,
             "source_mtime_ns": source.st_mtime_ns,
         }
-        if any(wanted.items() <= vars(entry).items() and _is_intact(job.store, entry) for entry in task.known):
+        if any(wanted.items() <= vars(entry).items() and is_intact(job.store, entry) for entry in task.known):
             return _Result(view.name)
         image = load_training_image(view, job.resolution, job.white_background)
         entry = Entry(fingerprint=fingerprint(image), **wanted)
@@ -163,14 +163,6 @@ def _make(job: _Job, task: _Task) -> _Result:
         return _Result(view.name, problem=str(error))
     except (OSError, MemoryError) as error:
         return _Result(view.name, problem=f"{view.path}: {error or 'not enough memory'}")
-
-
-def _is_intact(store: Path, entry: Entry) -> bool:
-    try:
-        read_map(store, entry)
-    except DamagedStoreError:
-        return False
-    return True
 
 
 def _in_processes(job: _Job, tasks: Sequence[_Task], workers: int) -> Iterator[_Result]:

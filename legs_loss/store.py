@@ -30,9 +30,10 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
+from legs_loss.scenes.model import view_names
 from legs_loss.spec import WeightSpec
 
-__all__ = ["DamagedStoreError", "Entry", "StoreWriter", "WeightStore", "fingerprint", "read_map", "stage"]
+__all__ = ["DamagedStoreError", "Entry", "StoreWriter", "WeightStore", "fingerprint", "is_intact", "read_map", "stage"]
 
 MANIFEST = "manifest.json"
 VERSION = 1
@@ -82,9 +83,9 @@ class Entry:
 
 
 class Damage(NamedTuple):
-    """What is wrong with the files of a store: by name, entries whose map is damaged, and files of no entry."""
+    """What is wrong with a store: entries whose map is damaged or missing, and files that belong to no entry."""
 
-    damaged: List[str]
+    damaged: List[Entry]
     orphans: List[str]
 
 
@@ -108,7 +109,7 @@ class WeightStore:
         self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in _read_manifest(self.path)}
         self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
         for entry in self.entries.values():
-            for name in _names(entry.view):
+            for name in view_names(entry.view):
                 key = (name, *entry.key[1:])
                 self._by_name[key] = None if key in self._by_name else entry
 
@@ -133,14 +134,10 @@ class WeightStore:
         return read_map(self.path, entry)
 
     def check(self) -> Damage:
-        """Read every map and compare checksums; list what is damaged and what belongs to no entry."""
-        damaged = []
-        for entry in self.entries.values():
-            try:
-                self.normalised_response(entry)
-            except DamagedStoreError:
-                damaged.append(entry.file)
-        return Damage(sorted(damaged), sorted(path.name for path in _leftovers(self.path, self.entries.values())))
+        """Read every map and compare checksums."""
+        entries = self.entries.values()
+        damaged = [entry for entry in entries if not is_intact(self.path, entry)]
+        return Damage(damaged, sorted(path.name for path in _leftovers(self.path, entries)))
 
 
 class StoreWriter:
@@ -223,6 +220,15 @@ def read_map(folder: Path, entry: Entry) -> np.ndarray:
     return np.load(io.BytesIO(data), allow_pickle=False)
 
 
+def is_intact(folder: Path, entry: Entry) -> bool:
+    """Return whether an entry's map can be read and is the one that was written."""
+    try:
+        read_map(folder, entry)
+    except DamagedStoreError:
+        return False
+    return True
+
+
 def stage(staging: Path, entry: Entry, normalised: np.ndarray) -> Entry:
     """Write a map to a writer's staging folder and return its entry with file, bytes and checksum filled in.
 
@@ -262,15 +268,6 @@ def fingerprint(image: Union[Tensor, np.ndarray]) -> str:
     digest = hashlib.sha256(repr(image.shape).encode())
     digest.update(np.ascontiguousarray(image).data)
     return digest.hexdigest()[:32]
-
-
-def _names(view: str) -> Iterator[str]:
-    """Every name that ``view`` may be asked for by: its trailing parts, with the extension and without."""
-    parts = view.split("/")
-    file = parts[-1]
-    for last in {file, os.path.splitext(file)[0], file.split(".")[0] or file}:
-        for start in range(len(parts)):
-            yield "/".join([*parts[start:-1], last])
 
 
 def _manifest(entries: Iterable[Entry]) -> bytes:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Optional, Tuple
+from typing import Iterator, Optional, Tuple
 
 import numpy as np
 
-__all__ = ["Camera", "PointCloud", "Scene", "View"]
+__all__ = ["Camera", "PointCloud", "Scene", "View", "view_names"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,3 +92,18 @@ class Scene:
         from legs_loss.scenes.colmap import read_points
 
         return None if self.points_file is None else read_points(self.points_file)
+
+
+def view_names(view: str) -> Iterator[str]:
+    """Yield every name that a view may be asked for by.
+
+    They are the trailing parts of its path, with the extension, without it, and up to the first dot of the file's
+    name, which is 3DGS's name of the view.
+
+    >>> sorted(view_names("images/0001.small.jpg"))
+    ['0001', '0001.small', '0001.small.jpg', 'images/0001', 'images/0001.small', 'images/0001.small.jpg']
+    """
+    *folders, file = view.split("/")
+    for last in {file, os.path.splitext(file)[0], file.split(".")[0] or file}:
+        for start in range(len(folders) + 1):
+            yield "/".join([*folders[start:], last])

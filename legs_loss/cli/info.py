@@ -1,0 +1,57 @@
+"""Say what a store of weight maps holds, and check every byte of it.
+
+STORE is the folder that legs precompute wrote, or the scene that has it as legs_weights.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Iterable
+
+HELP = "say what a store of weight maps holds, and check it"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("store", metavar="STORE", help="a store's folder, or the scene that has one")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the summary; 1 when something is damaged."""
+    from legs_loss.config import STORE_FOLDER
+    from legs_loss.store import DamagedStoreError, WeightStore
+
+    path = Path(args.store)
+    if (path / STORE_FOLDER).is_dir():
+        path = path / STORE_FOLDER
+    try:
+        store = WeightStore(path)
+    except DamagedStoreError as error:
+        print(f"legs: error: {error}", file=sys.stderr)
+        return 1
+    entries = list(store.entries.values())
+    damaged, orphans = store.check()
+    print(path)
+    print(f"  views      {len({entry.view for entry in entries})}")
+    print(f"  maps       {len(entries)} ({sum(entry.bytes for entry in entries) / 1e6:.1f} MB)")
+    print(f"  sizes      {_counted(f'{entry.width}x{entry.height}' for entry in entries)}")
+    print(f"  operators  {_counted(f'{entry.operator} p={entry.p:g} eps={entry.eps:g}' for entry in entries)}")
+    if any(entry.background for entry in entries):
+        print(f"  background {_counted(entry.background or 'none' for entry in entries)}")
+    print(f"  damaged    {len(damaged) or 'none'}")
+    for entry in damaged:
+        print(f"    {entry.view} {entry.width}x{entry.height} {entry.operator}: {entry.file}")
+    if orphans:
+        print(f"  leftovers  {len(orphans)} of interrupted runs; the next legs precompute removes them")
+        for orphan in orphans:
+            print(f"    {orphan}")
+    if damaged:
+        print("legs: error: run legs precompute again to repair the store", file=sys.stderr)
+    return 1 if damaged else 0
+
+
+def _counted(values: Iterable[str]) -> str:
+    return ", ".join(f"{value} ({count})" for value, count in Counter(values).most_common()) or "none"

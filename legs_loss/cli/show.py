@@ -1,0 +1,102 @@
+"""Draw a contact sheet (PNG): photograph, response and weight map of some views, and the curves.
+
+SCENE and IMAGE are computed anew; of a STORE the stored maps are drawn, beside the photographs of the scene it lies in.
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Callable, Dict, List, Optional, Sequence
+
+if TYPE_CHECKING:
+    from legs_loss.report.sheet import Shown
+    from legs_loss.scenes import View
+    from legs_loss.spec import WeightSpec
+
+HELP = "draw a contact sheet of weight maps, and the curves"
+
+_AT_MOST = 4  # views, unless they are chosen
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    from legs_loss.spec import PRESETS
+
+    parser.add_argument("path", metavar="SCENE|STORE|IMAGE", help="what to show")
+    parser.add_argument("--views", nargs="+", metavar="VIEW", help=f"names of views; default: {_AT_MOST} spread evenly")
+    parser.add_argument("--preset", choices=PRESETS, default="legs", help="default: legs")
+    parser.add_argument("--out", default="sheet.png", metavar="PNG", help="default: sheet.png")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw and save the sheet."""
+    from legs_loss.report.sheet import save_sheet
+    from legs_loss.scenes import View, read_scene
+    from legs_loss.spec import as_spec
+    from legs_loss.store import MANIFEST
+
+    path, spec = Path(args.path), as_spec(args.preset)
+    shown: Dict[str, Callable[[], Shown]] = {}  # by the view's name
+    if path.is_file() and path.name != MANIFEST:
+        shown[path.name] = partial(_computed, View(path.name, path), spec)
+    elif (path / MANIFEST).is_file():
+        shown = _stored(path, spec)
+    else:
+        shown = {view.name: partial(_computed, view, spec) for view in read_scene(path).views}
+    names = _choose(list(shown), args.views)
+    title = f"{args.preset}: {spec.operator}, p = {spec.p:g}, {spec.curve}, beta = {spec.beta:g}"
+    save_sheet(args.out, [shown[name]() for name in names], spec, f"{path.resolve().name}   ·   {title}")
+    print(args.out)
+    return 0
+
+
+def _computed(view: View, spec: WeightSpec) -> Shown:
+    from legs_loss.precompute import normalised_map
+    from legs_loss.report.sheet import Shown
+    from legs_loss.scenes import load_training_image
+
+    photograph = load_training_image(view)
+    return Shown(view.name, photograph, normalised_map(photograph, spec))
+
+
+def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
+    from legs_loss.errors import LegsError
+    from legs_loss.report.sheet import Shown
+    from legs_loss.scenes import View, load_training_image
+    from legs_loss.store import Entry, WeightStore
+
+    store = WeightStore(path)
+
+    def draw(entry: Entry) -> Shown:
+        view = View(entry.view, path.parent / entry.view, composited=entry.background is not None)
+        try:
+            photograph = load_training_image(view, entry.width, white_background=entry.background == "white")
+        except LegsError:  # the store lies elsewhere: the map alone
+            photograph = None
+        return Shown(f"{entry.view}\n{entry.width}x{entry.height}", photograph, store.normalised_response(entry))
+
+    # Of a view with several sizes, the largest comes last and stays.
+    entries = sorted(store.entries.values(), key=lambda entry: (entry.view, entry.width))
+    fits = [entry for entry in entries if (entry.operator, entry.p, entry.eps) == (spec.operator, spec.p, spec.eps)]
+    if not fits:
+        raise LegsError(f"{path} has no maps of operator {spec.operator}: show another preset, or precompute this one")
+    return {entry.view: partial(draw, entry) for entry in fits}
+
+
+def _choose(names: Sequence[str], chosen: Optional[Sequence[str]]) -> List[str]:
+    from legs_loss.errors import LegsError
+    from legs_loss.scenes.model import view_names
+
+    if chosen is None:
+        count = min(_AT_MOST, len(names))
+        return [names[round(i * (len(names) - 1) / max(1, count - 1))] for i in range(count)]
+    found = []
+    for wanted in chosen:
+        fits = [name for name in names if name == wanted] or [name for name in names if wanted in view_names(name)]
+        if len(fits) != 1:
+            what = f"fits {len(fits)} views" if fits else "is no view"
+            raise LegsError(f"--views: {wanted} {what}; there are {len(names)}, such as {', '.join(names[:4])}")
+        found += fits
+    return found

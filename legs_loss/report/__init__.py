@@ -1,0 +1,1 @@
+"""Pictures: contact sheets of weight maps and the curves."""

@@ -1,0 +1,127 @@
+"""3DGS's adaptive density control: clone, split and prune."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Optional
+
+import torch
+from torch import Tensor
+
+from legs_loss.reference.adam import select, stack
+from legs_loss.reference.gaussians import Gaussians
+
+__all__ = ["Change", "Schedule", "densify", "prunable"]
+
+PERCENT_DENSE = 0.01  # of the extent: a wider Gaussian is split, another one cloned
+CHILDREN = 2  # of a split; their scales are the parent's over 0.8 * CHILDREN
+MIN_OPACITY = 0.005
+MAX_SCALE = 0.1  # of the extent: a wider Gaussian is pruned once opacities have been reset
+RESET_OPACITY = 0.01
+
+
+class Schedule(NamedTuple):
+    """When things happen, in iterations."""
+
+    densify_from: int
+    densify_until: int
+    densify_every: int
+    reset_every: int
+    sh_every: int
+
+    @classmethod
+    def of(cls, iterations: int) -> Schedule:
+        """3DGS's schedule scaled from its 30,000 iterations, with floors under which a step makes no sense.
+
+        Opacities are not reset in runs so short that no time would be left to recover: the reset is due every tenth
+        of the run but never before iteration 3000, and only while densifying.
+
+        >>> Schedule.of(30000)
+        Schedule(densify_from=500, densify_until=15000, densify_every=100, reset_every=3000, sh_every=1000)
+        """
+        return cls(
+            densify_from=max(iterations // 60, min(100, iterations // 10)),
+            densify_until=iterations // 2,
+            densify_every=min(100, max(1, iterations // 40)),
+            reset_every=max(3000, iterations // 10),
+            sh_every=max(1, iterations // 30),
+        )
+
+    def densifies(self, iteration: int) -> bool:
+        """Whether this iteration, counted from 1, ends with a densification."""
+        return self.densify_from < iteration < self.densify_until and iteration % self.densify_every == 0
+
+    def resets(self, iteration: int) -> bool:
+        """Whether this iteration ends with an opacity reset."""
+        return iteration < self.densify_until and iteration % self.reset_every == 0
+
+
+class Change(NamedTuple):
+    """What a densification does to a set: which of its Gaussians stay (indices), and which are appended."""
+
+    kept: Tensor
+    new: Gaussians
+
+
+def densify(
+    gaussians: Gaussians,
+    gradient: Tensor,
+    threshold: float,
+    extent: float,
+    generator: torch.Generator,
+    max_gaussians: Optional[int] = None,
+) -> Change:
+    """Clone the small and split the large of the Gaussians whose gradient reaches the threshold.
+
+    Args:
+        gaussians: the set.
+        gradient: [N], the mean length of the view-space gradient over the renderings that showed the Gaussian, in
+            3DGS's units (pixels times half the image size).
+        threshold: 3DGS's densify_grad_threshold.
+        extent: 3DGS's cameras_extent: 1.1 times the radius of the camera centres about their mean.
+        generator: where the children of a split are placed.
+        max_gaussians: a cap: where more would be made, those with the largest gradients are.
+    """
+    chosen = gradient >= threshold
+    if max_gaussians is not None:
+        room = max(0, max_gaussians - len(gaussians))  # a clone and a split each add one Gaussian
+        if int(chosen.sum()) > room:
+            ranked = torch.sort(gradient, descending=True, stable=True).indices[:room]
+            allowed = torch.zeros_like(chosen)
+            allowed[ranked] = True
+            chosen &= allowed
+    large = gaussians.scales.detach().amax(1) > PERCENT_DENSE * extent
+    clones = select(gaussians, chosen & ~large)
+    children = _split(select(gaussians, chosen & large), generator)
+    return Change(torch.nonzero(~(chosen & large))[:, 0], stack(clones, children))
+
+
+def _split(parents: Gaussians, generator: torch.Generator) -> Gaussians:
+    """Each parent's children, drawn from the parent's own distribution."""
+    many = select(parents, torch.arange(len(parents)).repeat(CHILDREN))
+    offsets = torch.randn(len(many), 3, generator=generator) * many.scales
+    rotated = (_rotations(many.quaternions) @ offsets[:, :, None])[:, :, 0]
+    shrink = torch.log(torch.tensor(0.8 * CHILDREN))
+    return Gaussians(many.means + rotated, many.log_scales - shrink, many.quaternions, many.opacity_logits, many.sh)
+
+
+def _rotations(quaternions: Tensor) -> Tensor:
+    """[N, 3, 3] of quaternions wxyz of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=1).unbind(1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+
+
+def prunable(gaussians: Gaussians, extent: float, large_too: bool) -> Tensor:
+    """Return which Gaussians, bool [N], are all but transparent or (``large_too``) wider than a tenth of the extent.
+
+    3DGS also means to prune what covers more than 20 pixels of a screen; its code forgets the radii just before it
+    looks at them, so that it never does, and neither does this.
+    """
+    transparent = gaussians.opacities.detach()[:, 0] < MIN_OPACITY
+    if not large_too:
+        return transparent
+    return transparent | (gaussians.scales.detach().amax(1) > MAX_SCALE * extent)

@@ -1,0 +1,364 @@
+"""A small 3D Gaussian Splatting trainer on the CPU, with 3DGS's optimiser and density control.
+
+    from legs_loss.reference.trainer import TrainConfig, train
+    result = train(read_scene("my_scene"), TrainConfig(spec="legs"), out="output/my_scene")
+
+The same seed gives the same Gaussians to the last bit, whether or not the run was interrupted and resumed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Union
+
+import torch
+from torch import Tensor
+
+from legs_loss.errors import LegsError
+from legs_loss.reference.adam import Adam, position_rate
+from legs_loss.reference.checkpoint import read_checkpoint, write_checkpoint
+from legs_loss.reference.dataset import Dataset, TrainingView, extent, load_dataset
+from legs_loss.reference.densify import RESET_OPACITY, Schedule, densify, prunable
+from legs_loss.reference.gaussians import Gaussians
+from legs_loss.reference.metrics import Scores, mean_scores, psnr, score
+from legs_loss.reference.ply import write_ply
+from legs_loss.reference.rasterize import Rendering, rasterize
+from legs_loss.scenes import Scene
+from legs_loss.spec import Spec, WeightSpec, as_spec
+
+__all__ = ["Progress", "Result", "TrainConfig", "draw", "train"]
+
+CHECKPOINT = "checkpoint.npz"
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The settings of a run; those that 3DGS has carry its names.
+
+    Attributes:
+        spec: of the weight maps: a preset's name or a WeightSpec.
+        iterations: of one view each; the schedule scales with it (:class:`Schedule`).
+        resolution: 3DGS's ``-r``: 1, 2, 4, 8, -1, or a width in pixels.
+        sh_degree: of the colours, 0 to 3.
+        lambda_dssim: the share of D-SSIM in the loss.
+        l1_scale: multiplies the L1 term, weighted or not: for experiments.
+        densify_grad_threshold: a Gaussian whose mean view-space gradient reaches it is cloned or split. 3DGS's own
+            2e-4 is for photographs about 1000 pixels wide; in its units small images need more.
+        max_gaussians: a cap on their number, None for none.
+        white_background: white in place of black.
+        seed: of the order of the views and of the places of split Gaussians.
+    """
+
+    spec: Spec = "legs"
+    iterations: int = 2000
+    resolution: int = -1
+    sh_degree: int = 1
+    lambda_dssim: float = 0.2
+    l1_scale: float = 1.0
+    densify_grad_threshold: float = 5e-4
+    max_gaussians: Optional[int] = None
+    white_background: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "spec", as_spec(self.spec))
+        for name, fits, wanted in (
+            ("iterations", self.iterations >= 1, "at least 1"),
+            ("sh_degree", self.sh_degree in (0, 1, 2, 3), "0, 1, 2 or 3"),
+            ("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "in [0, 1]"),
+            ("l1_scale", 0.0 <= self.l1_scale < float("inf"), "at least 0"),
+            ("densify_grad_threshold", self.densify_grad_threshold > 0.0, "above 0"),
+            ("max_gaussians", self.max_gaussians is None or self.max_gaussians >= 1, "at least 1"),
+        ):
+            if not fits:
+                raise LegsError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
+
+    def as_dict(self) -> Dict[str, Any]:
+        """The settings as JSON holds them."""
+        values = asdict(self)
+        values["spec"]["p"] = str(self.weights.p)  # JSON has no infinity
+        return values
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
+        """The settings that :meth:`as_dict` gave."""
+        spec = WeightSpec(**dict(values["spec"], p=float(values["spec"]["p"])))
+        return cls(**dict(values, spec=spec))
+
+    @property
+    def weights(self) -> WeightSpec:
+        """``spec``, resolved."""
+        return as_spec(self.spec)
+
+    @property
+    def background(self) -> Tensor:
+        """The colour behind all Gaussians, [3]."""
+        return torch.full((3,), 1.0 if self.white_background else 0.0)
+
+
+class Progress(NamedTuple):
+    """What a running training tells: smoothed loss and PSNR of the training views, and the number of Gaussians."""
+
+    iteration: int
+    loss: float
+    psnr: float
+    gaussians: int
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A finished training: the Gaussians, and what ``metrics.json`` holds."""
+
+    gaussians: Gaussians
+    metrics: Dict[str, Any]
+
+
+def draw(gaussians: Gaussians, view: TrainingView, config: TrainConfig) -> Tensor:
+    """Return a finished scene's rendering of a view, [3, H, W], not clipped."""
+    with torch.no_grad():
+        return _rasterize(gaussians, view, config, config.sh_degree, None).image
+
+
+def train(
+    scene: Scene,
+    config: TrainConfig,
+    out: Optional[Union[str, Path]] = None,
+    resume: bool = False,
+    store: Optional[Path] = None,
+    weights: Optional[Mapping[str, Tensor]] = None,
+    checkpoint_every: int = 500,
+    on_progress: Optional[Callable[[Progress], None]] = None,
+) -> Result:
+    """Train 3D Gaussians on a scene.
+
+    Args:
+        scene: with pinhole cameras and points to start from.
+        config: the settings.
+        out: a folder for the checkpoint, ``cfg.json``, ``metrics.json`` and 3DGS's own
+            ``point_cloud/iteration_N/point_cloud.ply``; None keeps everything in memory.
+        resume: go on from the checkpoint in ``out``; with the same arguments the result is bit-equal to that of an
+            uninterrupted run.
+        store, weights: where weight maps come from, see :func:`load_dataset`.
+        checkpoint_every: iterations between checkpoints. Another one is written on Ctrl-C.
+        on_progress: called every 10 iterations.
+
+    Raises:
+        LegsError: the scene cannot be trained on, numba is missing, or the checkpoint does not fit.
+        KeyboardInterrupt: Ctrl-C, after the checkpoint.
+    """
+    data = load_dataset(scene, config.weights, config.resolution, config.white_background, store, weights)
+    folder = None if out is None else Path(out)
+    if resume:
+        if folder is None:
+            raise LegsError("there is nothing to resume from without an output folder")
+        run = _Run.restore(data, config, folder / CHECKPOINT)
+    else:
+        run = _Run.begin(data, config, scene)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_json(folder / "cfg.json", config.as_dict())
+        if not resume:
+            run.save(folder / CHECKPOINT)
+    run.go(folder, checkpoint_every, on_progress)
+    metrics = run.metrics()
+    if folder is not None:
+        place = folder / "point_cloud" / f"iteration_{config.iterations}"
+        write_ply(place / "point_cloud.ply", run.adam.gaussians)
+        _write_json(folder / "metrics.json", metrics)
+    return Result(run.adam.gaussians, metrics)
+
+
+class _Run:
+    """A training between two iterations: everything that the next one depends on."""
+
+    def __init__(self, data: Dataset, config: TrainConfig, adam: Adam) -> None:
+        self.data, self.config, self.adam = data, config, adam
+        self.extent = extent(data.train)
+        self.schedule = Schedule.of(config.iterations)
+        self.iteration = 0
+        self.seconds = 0.0
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.order: List[int] = []  # the views that this round through all of them has still to show
+        self.loss: Optional[float] = None
+        self.psnr: Optional[float] = None
+        self._forget_gradients()
+        # Photographs without a map of their own share one of 1 where the L1 term is scaled.
+        self.weights = [_scaled(view, config.l1_scale) for view in data.train]
+
+    @classmethod
+    def begin(cls, data: Dataset, config: TrainConfig, scene: Scene) -> _Run:
+        points = scene.points
+        if points is None or len(points.xyz) < 2:
+            raise LegsError(
+                f"{scene.root}: there are no points to start from: a COLMAP scene has them in sparse/0/points3D.bin"
+            )
+        return cls(data, config, Adam(Gaussians.from_points(points.xyz, points.rgb, config.sh_degree)))
+
+    @classmethod
+    def restore(cls, data: Dataset, config: TrainConfig, path: Path) -> _Run:
+        arrays, facts = read_checkpoint(path)
+        if facts["views"] != [view.name for view in data.train]:
+            raise LegsError(f"{path}: this run was made from a scene with other views")
+        if facts["config"] != config.as_dict():
+            raise LegsError(f"{path}: this run was made with other settings")
+        run = cls(data, config, Adam.restore(arrays))
+        run.iteration, run.seconds, run.order = facts["iteration"], facts["seconds"], facts["order"]
+        run.loss, run.psnr = facts["loss"], facts["psnr"]
+        run.gradient_sum = torch.from_numpy(arrays["gradient_sum"])
+        run.times_seen = torch.from_numpy(arrays["times_seen"])
+        run.generator.set_state(torch.from_numpy(arrays["generator"]))
+        return run
+
+    def save(self, path: Path) -> None:
+        arrays = dict(
+            self.adam.state(),
+            gradient_sum=self.gradient_sum.numpy(),
+            times_seen=self.times_seen.numpy(),
+            generator=self.generator.get_state().numpy(),
+        )
+        facts = {
+            "config": self.config.as_dict(),
+            "views": [view.name for view in self.data.train],
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "order": self.order,
+            "loss": self.loss,
+            "psnr": self.psnr,
+        }
+        write_checkpoint(path, arrays, facts)
+
+    def go(
+        self, folder: Optional[Path], checkpoint_every: int, on_progress: Optional[Callable[[Progress], None]]
+    ) -> None:
+        """Run to the last iteration."""
+        started = time.perf_counter() - self.seconds
+        with _ctrl_c_between_iterations() as interrupted:
+            while self.iteration < self.config.iterations:
+                self.step()
+                self.seconds = time.perf_counter() - started
+                last = self.iteration == self.config.iterations
+                if on_progress is not None and (last or self.iteration % 10 == 0):
+                    assert self.loss is not None and self.psnr is not None
+                    on_progress(Progress(self.iteration, self.loss, self.psnr, len(self.adam.gaussians)))
+                if folder is not None and (last or interrupted() or self.iteration % checkpoint_every == 0):
+                    self.save(folder / CHECKPOINT)
+                if interrupted():
+                    raise KeyboardInterrupt
+
+    def step(self) -> None:
+        """One iteration: draw, loss, gradient, Adam; and what the schedule asks for."""
+        self.iteration += 1
+        gaussians = self.adam.gaussians
+        index = self._next_view()
+        view = self.data.train[index]
+        degree = min(self.config.sh_degree, self.iteration // self.schedule.sh_every)
+        viewspace = torch.zeros(len(gaussians), 2, requires_grad=True)
+        drawn = _rasterize(gaussians, view, self.config, degree, viewspace)
+        loss = _loss(drawn.image, view.image, self.weights[index], self.config.lambda_dssim)
+        loss.backward()
+        self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image))
+        self.adam.step(position_rate(self.iteration / self.config.iterations, self.extent))
+        if self.iteration < self.schedule.densify_until:
+            assert viewspace.grad is not None
+            seen = drawn.radii > 0
+            self.gradient_sum[seen] += viewspace.grad[seen].norm(dim=1)
+            self.times_seen[seen] += 1
+            if self.schedule.densifies(self.iteration):
+                self._densify()
+            if self.schedule.resets(self.iteration):
+                self.adam.reset_opacity(RESET_OPACITY)
+
+    def metrics(self) -> Dict[str, Any]:
+        """Scores over training and held-out views, and what they cost."""
+        maps = [1.0 if weight is None else float(weight.double().mean()) for weight in self.weights]
+        return {
+            "train": self._scores(self.data.train),
+            "test": self._scores(self.data.test),
+            "gaussians": len(self.adam.gaussians),
+            "mean_weight": sum(maps) / len(maps),
+            "iterations": self.iteration,
+            "seconds": self.seconds,
+        }
+
+    def _scores(self, views: List[TrainingView]) -> Optional[Dict[str, float]]:
+        if not views:
+            return None
+        scores: List[Scores] = [score(draw(self.adam.gaussians, view, self.config), view.image) for view in views]
+        return mean_scores(scores)._asdict()
+
+    def _next_view(self) -> int:
+        if not self.order:
+            self.order = torch.randperm(len(self.data.train), generator=self.generator).tolist()
+        return self.order.pop()
+
+    def _densify(self) -> None:
+        gradient = self.gradient_sum / self.times_seen.clamp(min=1)
+        config = self.config
+        change = densify(
+            self.adam.gaussians,
+            gradient,
+            config.densify_grad_threshold,
+            self.extent,
+            self.generator,
+            config.max_gaussians,
+        )
+        self.adam.replace(change.kept, change.new)
+        remaining = ~prunable(self.adam.gaussians, self.extent, self.iteration > self.schedule.reset_every)
+        self.adam.keep(torch.nonzero(remaining)[:, 0])
+        self._forget_gradients()
+
+    def _forget_gradients(self) -> None:
+        self.gradient_sum = torch.zeros(len(self.adam.gaussians))
+        self.times_seen = torch.zeros(len(self.adam.gaussians))
+
+    def _report(self, loss: float, decibels: float) -> None:
+        self.loss = loss if self.loss is None else 0.95 * self.loss + 0.05 * loss
+        self.psnr = decibels if self.psnr is None else 0.95 * self.psnr + 0.05 * decibels
+
+
+def _rasterize(
+    gaussians: Gaussians, view: TrainingView, config: TrainConfig, degree: int, viewspace: Optional[Tensor]
+) -> Rendering:
+    g = gaussians
+    return rasterize(
+        g.means, g.scales, g.quaternions, g.opacities, g.sh, view.camera, config.background, degree, viewspace
+    )
+
+
+def _loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lambda_dssim: float) -> Tensor:
+    from legs_loss.kernels.numba_loss import fused_loss
+
+    return fused_loss(prediction, target, weight, lambda_dssim)
+
+
+def _scaled(view: TrainingView, scale: float) -> Optional[Tensor]:
+    if scale == 1.0:
+        return view.weight
+    return scale * (torch.ones_like(view.image[:1]) if view.weight is None else view.weight)
+
+
+@contextmanager
+def _ctrl_c_between_iterations() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C only sets a flag, so that it cannot fall between two updates that belong together."""
+    flag = threading.Event()
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield flag.is_set
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: flag.set())
+    try:
+        yield flag.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _write_json(path: Path, values: Mapping[str, Any]) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    os.replace(str(part), str(path))

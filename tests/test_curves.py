@@ -1,0 +1,73 @@
+"""The five curves by value, and the registry."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from legs_loss import LegsError, WeightSpec, register_curve, weight_map
+from legs_loss.curves import curve, curve_names
+
+BY_HAND = {
+    "C1": lambda x: x,
+    "C2": lambda x: x**2,
+    "C3": math.sqrt,
+    "C4": lambda x: 3 * x**2 - 2 * x**3,
+    "C5": lambda x: 0.5 - math.sin(math.asin(1 - 2 * x) / 3),
+}
+
+
+@pytest.mark.parametrize("name", sorted(BY_HAND))
+def test_values(name):
+    x = torch.linspace(0, 1, 101, dtype=torch.float64)
+    expected = torch.tensor([BY_HAND[name](float(v)) for v in x], dtype=torch.float64)
+    torch.testing.assert_close(curve(name)(x), expected)
+
+
+@pytest.mark.parametrize("name", sorted(BY_HAND))
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_unit_interval_is_kept_and_order_too(name, dtype):
+    x = torch.linspace(0, 1, 4097, dtype=dtype)
+    y = curve(name)(x)
+    assert float(y[0]) == pytest.approx(0.0, abs=1e-7)
+    assert float(y[-1]) == pytest.approx(1.0, abs=1e-7)
+    assert float(y.min()) >= 0.0
+    assert float(y.max()) <= 1.0
+    assert bool((y[1:] >= y[:-1] - 1e-6).all())
+
+
+def test_c5_undoes_c4():
+    x = torch.linspace(0, 1, 101, dtype=torch.float64)
+    torch.testing.assert_close(curve("C4")(curve("C5")(x)), x)
+
+
+def test_a_user_may_register_one():
+    register_curve("test-step", lambda x: (x > 0.5).to(x.dtype))
+    assert "test-step" in curve_names()
+    image = torch.zeros(1, 5, 5)
+    image[0, 2, 2] = 1.0
+    weight = weight_map(image, WeightSpec(curve="test-step", beta=2.0))
+    assert sorted(set(weight.flatten().tolist())) == [1.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "message"),
+    [
+        ("C3", lambda x: x, "exists already"),
+        ("", lambda x: x, "non-empty"),
+        ("test-high", lambda x: 2 * x, "from 0 to 2"),
+        ("test-nan", lambda x: x / 0 * 0, r"\[0, 1\]"),
+        ("test-shape", lambda x: x.sum(), "shape"),
+    ],
+)
+def test_what_is_no_curve_is_refused(name, function, message):
+    with pytest.raises(LegsError, match=message):
+        register_curve(name, function)
+    assert name == "C3" or name not in curve_names()
+
+
+def test_an_unknown_name_lists_what_there_is():
+    with pytest.raises(LegsError, match="C1, C2, C3, C4, C5"):
+        WeightSpec(curve="C6")

@@ -217,7 +217,10 @@ def read_map(folder: Path, entry: Entry) -> np.ndarray:
         raise DamagedStoreError(f"{path} cannot be read ({error.strerror}); {_REPAIR}") from None
     if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise DamagedStoreError(f"{path} is damaged: its checksum differs; {_REPAIR}")
-    return np.load(io.BytesIO(data), allow_pickle=False)
+    try:
+        return np.load(io.BytesIO(data), allow_pickle=False)
+    except ValueError as error:
+        raise DamagedStoreError(f"{path} holds no plain array: {error}") from None
 
 
 def is_intact(folder: Path, entry: Entry) -> bool:

@@ -1,0 +1,334 @@
+"""Scenes are read as their formats define them; what is damaged is one clear error."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from legs_loss.errors import LegsError
+from legs_loss.scenes import Camera, PointCloud, colmap, read_scene, write_colmap
+from tests.support import colmap_scene, photograph, save
+
+CAMERAS_TXT = """# a comment
+1 PINHOLE 40 30 50 51 20 15
+7 SIMPLE_PINHOLE 80 60 90 41 29
+9 OPENCV 40 30 50 51 20 15 0.1 0 0 0
+"""
+# A half turn about x; a third of a turn about (1, 1, 1); no turn. Points follow, or an empty line.
+IMAGES_TXT = """# a comment
+1 0 1 0 0 1 2 3 1 b.png
+10.5 20.5 -1 3 4 17
+2 0.5 0.5 0.5 0.5 0 0 4 7 sub dir/a.png
+
+3 1 0 0 0 0 0 0 9 c.png
+1 1 1
+"""
+POINTS_TXT = """# a comment
+1 0.5 1.5 -2.5 255 0 17 0.1 1 0 2 1
+5 7 8 9 1 2 3 0.2
+"""
+
+
+def text_scene(root, images=("b.png", "sub dir/a.png", "c.png")):
+    for name in images:
+        save(root / "images" / name, photograph(40, 30))
+    model = root / "sparse" / "0"
+    model.mkdir(parents=True)
+    for name, text in (("cameras", CAMERAS_TXT), ("images", IMAGES_TXT), ("points3D", POINTS_TXT)):
+        (model / f"{name}.txt").write_text(text)
+    return root
+
+
+class TestColmapText:
+    def test_views_and_cameras(self, tmp_path):
+        scene = read_scene(text_scene(tmp_path))
+        assert scene.kind == "colmap"
+        assert [view.name for view in scene.views] == ["images/b.png", "images/c.png", "images/sub dir/a.png"]
+        b, c, a = scene.views
+        assert (b.camera.width, b.camera.height, b.camera.fx, b.camera.fy, b.camera.cx) == (40, 30, 50, 51, 20)
+        assert np.allclose(b.camera.world_to_camera, [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]])
+        assert (a.camera.fx, a.camera.fy, a.camera.cx, a.camera.cy) == (90, 90, 41, 29)
+        # A third of a turn about the diagonal sends x to y, y to z, z to x.
+        assert np.allclose(a.camera.world_to_camera[:3, :3], [[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+        assert c.camera is None
+        assert c.camera_model == "OPENCV"
+        assert all(view.path.is_file() for view in scene.views)
+
+    def test_points(self, tmp_path):
+        points = read_scene(text_scene(tmp_path)).points
+        assert points.xyz.tolist() == [[0.5, 1.5, -2.5], [7, 8, 9]]
+        assert points.rgb.tolist() == [[255, 0, 17], [1, 2, 3]]
+
+    @pytest.mark.parametrize(
+        ("file", "text"),
+        [
+            ("cameras.txt", "1 PINHOLE 40 30 50 51 20\n"),
+            ("cameras.txt", "1 PINHOLE 0 30 50 51 20 15\n"),
+            ("cameras.txt", "1 PINHOLE 40 thirty 50 51 20 15\n"),
+            ("images.txt", "1 0 0 0 0 1 2 3 1 b.png\n\n"),
+            ("images.txt", "1 nan 1 0 0 1 2 3 1 b.png\n\n"),
+            ("images.txt", "1 1 0 0 0 1 2 3 1\n\n"),
+            ("images.txt", "1 1 0 0 0 1 2 3 5 b.png\n\n"),
+            ("points3D.txt", "1 0 0 0 256 0 0 1\n"),
+            ("points3D.txt", "1 0 0\n"),
+        ],
+    )
+    def test_damage_is_one_error_that_names_the_file(self, tmp_path, file, text):
+        root = text_scene(tmp_path)
+        (root / "sparse" / "0" / file).write_text(text)
+        with pytest.raises(LegsError, match=file):
+            read_scene(root).points  # noqa: B018 (reading it is the test)
+
+
+class TestColmapBinary:
+    def test_against_bytes_packed_by_hand(self, tmp_path):
+        model = tmp_path / "sparse" / "0"
+        model.mkdir(parents=True)
+        (tmp_path / "images").mkdir()
+        camera = struct.pack("<IiQQ4d", 3, 1, 40, 30, 50, 51, 20, 15)
+        (model / "cameras.bin").write_bytes(struct.pack("<Q", 1) + camera)
+        image = struct.pack("<I7dI", 8, 0, 1, 0, 0, 1, 2, 3, 3) + "é.png".encode() + b"\0"
+        image += struct.pack("<Q", 2) + struct.pack("<ddq", 1.5, 2.5, -1) * 2
+        (model / "images.bin").write_bytes(struct.pack("<Q", 1) + image)
+        point = struct.pack("<Q3d3Bd", 4, 1, 2, 3, 10, 20, 30, 0.5) + struct.pack("<Q4i", 2, 8, 0, 8, 1)
+        (model / "points3D.bin").write_bytes(struct.pack("<Q", 1) + point)
+        scene = read_scene(tmp_path)
+        (view,) = scene.views
+        assert view.name == "images/é.png"
+        assert (view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy) == (50, 51, 20, 15)
+        assert np.allclose(view.camera.world_to_camera[:3], [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3]])
+        assert scene.points.xyz.tolist() == [[1, 2, 3]]
+        assert scene.points.rgb.tolist() == [[10, 20, 30]]
+
+    def test_cut_short_anywhere_is_one_error(self, tmp_path):
+        root = colmap_scene(tmp_path)
+        for name in ("cameras.bin", "images.bin", "points3D.bin"):
+            file = root / "sparse" / "0" / name
+            whole = file.read_bytes()
+            for size in range(len(whole)):
+                file.write_bytes(whole[:size])
+                with pytest.raises(LegsError, match=name):
+                    read_scene(root).points  # noqa: B018
+            file.write_bytes(whole + b"\0")
+            with pytest.raises(LegsError, match=name):
+                read_scene(root).points  # noqa: B018
+            file.write_bytes(whole)
+        assert len(read_scene(root).views) == 3
+
+    def test_absurd_count_is_one_error(self, tmp_path):
+        root = colmap_scene(tmp_path)
+        file = root / "sparse" / "0" / "points3D.bin"
+        file.write_bytes(struct.pack("<Q", 2**63) + file.read_bytes()[8:])
+        with pytest.raises(LegsError, match=r"points3D\.bin"):
+            read_scene(root).points  # noqa: B018
+
+    @settings(max_examples=60, deadline=None)
+    @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
+    def test_rotations_against_scipy(self, quaternion):
+        from scipy.spatial.transform import Rotation
+
+        w, x, y, z = quaternion
+        expected = Rotation.from_quat([x, y, z, w]).as_matrix()
+        assert np.allclose(colmap._rotation(quaternion), expected)
+        # and back: a quaternion and its negative turn alike
+        back = colmap._quaternion(expected)
+        assert back[0] >= 0
+        assert np.allclose(np.abs(back @ quaternion), np.linalg.norm(quaternion))
+
+    def test_what_is_written_is_read(self, tmp_path):
+        generator = np.random.RandomState(0)
+        cameras = {}
+        for i in range(5):
+            pose = np.eye(4)
+            pose[:3, :3] = colmap._rotation(generator.randn(4))
+            pose[:3, 3] = generator.randn(3)
+            cameras[f"{i}.png"] = Camera(64, 48, 70.0 + i // 2, 71.0, 32.0, 24.0, pose)
+        cloud = PointCloud(
+            generator.randn(9, 3).astype(np.float32), generator.randint(0, 256, (9, 3)).astype(np.uint8)
+        )
+        write_colmap(tmp_path, cameras, cloud)
+        (tmp_path / "images").mkdir()
+        scene = read_scene(tmp_path)
+        for view in scene.views:
+            written = cameras[view.path.name]
+            assert (view.camera.fx, view.camera.fy) == (written.fx, written.fy)
+            assert np.allclose(view.camera.world_to_camera, written.world_to_camera)
+        assert np.array_equal(scene.points.xyz, cloud.xyz)
+        assert np.array_equal(scene.points.rgb, cloud.rgb)
+
+    def test_the_real_capture(self, fox):
+        scene = read_scene(fox)
+        assert len(scene.views) == 50
+        assert scene.points.xyz.shape == (12817, 3)
+        camera = scene.views[0].camera
+        assert (camera.width, camera.height) == (354, 631)
+        # Most points of a capture lie in front of each camera and within its frame.
+        world = np.concatenate([scene.points.xyz, np.ones((12817, 1))], axis=1)
+        x, y, z, _ = camera.world_to_camera @ world.T
+        inside = (z > 0) & (np.abs(camera.fx * x / z) < 177) & (np.abs(camera.fy * y / z) < 315.5)
+        assert inside.mean() > 0.2
+
+
+class TestImagesFolder:
+    def test_named_in_the_scene(self, tmp_path):
+        root = colmap_scene(tmp_path)
+        (root / "images").rename(root / "images_2")
+        views = read_scene(root, images="images_2").views
+        assert views[0].name == "images_2/0001.png"
+        assert views[0].path.is_file()
+
+    def test_a_path_elsewhere(self, tmp_path):
+        root = colmap_scene(tmp_path / "scene")
+        (root / "images").rename(tmp_path / "photos")
+        views = read_scene(root, images=str(tmp_path / "photos")).views
+        assert views[0].name == "photos/0001.png"
+        assert views[0].path.is_file()
+
+    def test_missing(self, tmp_path):
+        root = colmap_scene(tmp_path)
+        with pytest.raises(LegsError, match="images_4"):
+            read_scene(root, images="images_4")
+
+    def test_a_flattened_folder_is_found_by_the_last_part_of_the_name(self, tmp_path):
+        root = colmap_scene(tmp_path, names=["cam1/x.png", "cam2/y.png"])
+        (root / "images" / "cam2" / "y.png").rename(root / "images" / "y.png")
+        views = read_scene(root).views
+        assert [view.name for view in views] == ["images/cam1/x.png", "images/y.png"]
+        assert all(view.path.is_file() for view in views)
+
+    def test_a_missing_photograph_keeps_its_view(self, tmp_path):
+        root = colmap_scene(tmp_path)
+        (root / "images" / "0002.png").unlink()
+        assert [view.path.is_file() for view in read_scene(root).views] == [True, False, True]
+
+
+# OpenGL's camera at z = 4 that looks down at the origin.
+LOOKING_DOWN = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+
+
+def transforms(root, file="transforms.json", **contents):
+    root.mkdir(parents=True, exist_ok=True)
+    (root / file).write_text(json.dumps(contents))
+    return root
+
+
+def frame(path, **more):
+    return dict({"file_path": path, "transform_matrix": LOOKING_DOWN}, **more)
+
+
+class TestTransforms:
+    def test_axes_and_intrinsics(self, tmp_path):
+        save(tmp_path / "images" / "a.png", photograph(40, 30))
+        transforms(
+            tmp_path, fl_x=50, fl_y=51, cx=19, cy=16, w=40, h=30, k1=0.0, frames=[frame("images/a.png", fl_x=60)]
+        )
+        scene = read_scene(tmp_path)
+        (view,) = scene.views
+        assert (scene.kind, view.name, view.composited) == ("transforms", "images/a.png", True)
+        camera = view.camera
+        assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width) == (60, 51, 19, 16, 40)
+        # The origin is 4 ahead; what is up in the world is -y in the image.
+        assert np.allclose(camera.world_to_camera @ [0, 0, 0, 1], [0, 0, 4, 1])
+        assert np.allclose(camera.world_to_camera @ [1, 1, 0, 1], [1, -1, 4, 1])
+
+    def test_nerf_synthetic(self, tmp_path):
+        for split in ("train", "test", "val"):
+            save(tmp_path / split / "r_0.png", photograph(64, 48, channels=4))
+            transforms(tmp_path, f"transforms_{split}.json", camera_angle_x=np.pi / 2, frames=[frame(f"./{split}/r_0")])
+        views = read_scene(tmp_path).views
+        assert [(view.name, view.split) for view in views] == [
+            ("test/r_0.png", "test"),
+            ("train/r_0.png", "train"),
+            ("val/r_0.png", "val"),
+        ]
+        camera = views[0].camera
+        # A right angle over 64 pixels: 32 to each side at a distance of 32.
+        assert (camera.width, camera.height) == (64, 48)
+        assert np.allclose([camera.fx, camera.fy, camera.cx, camera.cy], [32, 32, 32, 24])
+
+    def test_splits_of_nerfstudio(self, tmp_path):
+        for name in "abc":
+            save(tmp_path / "images" / f"{name}.jpg", photograph(8, 8))
+        transforms(
+            tmp_path,
+            fl_x=9,
+            w=8,
+            h=8,
+            train_filenames=["images/a.jpg", "./images/c.jpg"],
+            test_filenames=["images/b.jpg"],
+            frames=[frame(f"images/{name}.jpg") for name in "abc"],
+        )
+        assert [view.split for view in read_scene(tmp_path).views] == ["train", "test", "train"]
+
+    @pytest.mark.parametrize(
+        ("more", "model"), [({"k1": 0.1}, "OPENCV"), ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE")]
+    )
+    def test_a_distorted_camera_keeps_its_model_name_only(self, tmp_path, more, model):
+        transforms(tmp_path, fl_x=9, w=8, h=8, frames=[frame("a.png")], **more)
+        (view,) = read_scene(tmp_path).views
+        assert view.camera is None
+        assert view.camera_model == model
+
+    def test_a_photograph_that_is_missing_keeps_its_view(self, tmp_path):
+        transforms(tmp_path, camera_angle_x=1.0, frames=[frame("./train/r_0")])
+        (view,) = read_scene(tmp_path).views
+        assert (view.name, view.camera) == ("train/r_0", None)
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "{",
+            "[]",
+            "{}",
+            '{"frames": [{}]}',
+            '{"frames": [{"file_path": 3}]}',
+            '{"fl_x": 1, "w": 8, "h": 8, "frames": [{"file_path": "a"}]}',
+            '{"w": 8, "h": 8, "frames": [{"file_path": "a", "transform_matrix": [[1]]}]}',
+            '{"fl_x": 1, "w": 8, "h": 8, "frames": [{"file_path": "a", "transform_matrix": [[1, 2], [3]]}]}',
+            json.dumps({"fl_x": 1, "w": 8, "h": 8, "frames": [frame("a", transform_matrix=np.zeros((4, 4)).tolist())]}),
+        ],
+    )
+    def test_damage_is_one_error_that_names_the_file(self, tmp_path, text):
+        (tmp_path / "transforms.json").write_text(text)
+        with pytest.raises(LegsError, match=r"transforms\.json"):
+            read_scene(tmp_path)
+
+
+class TestFolder:
+    def test_images_below_but_nothing_hidden(self, tmp_path):
+        for name in ("b.JPG", "a.png", "sub/Ünï cödé.webp", "x.tiff", ".hidden/c.png", ".d.png"):
+            save(tmp_path / name, photograph(8, 8))
+        (tmp_path / "notes.txt").write_text("no image")
+        scene = read_scene(tmp_path)
+        assert scene.kind == "folder"
+        assert [view.name for view in scene.views] == ["a.png", "b.JPG", "sub/Ünï cödé.webp", "x.tiff"]
+        assert scene.points is None
+
+    def test_a_folder_named_images_is_the_scenes(self, tmp_path):
+        for name in ("images/a.png", "images_2/a.png"):
+            save(tmp_path / name, photograph(8, 8))
+        assert [view.name for view in read_scene(tmp_path).views] == ["images/a.png"]
+        assert [view.name for view in read_scene(tmp_path, "images_2").views] == ["images_2/a.png"]
+
+    def test_nothing_to_read(self, tmp_path):
+        with pytest.raises(LegsError, match="is no scene"):
+            read_scene(tmp_path)
+        with pytest.raises(LegsError, match="no folder"):
+            read_scene(tmp_path / "absent")
+        (tmp_path / "sparse").mkdir()
+        (tmp_path / "images").mkdir()
+        with pytest.raises(LegsError, match=r"images\.bin"):
+            read_scene(tmp_path)
+
+
+def test_resized_camera_sees_the_same():
+    camera = Camera(400, 300, 500.0, 480.0, 210.0, 140.0, np.eye(4))
+    small = camera.resized(100, 60)
+    # The point in the middle of the right half of the image stays there.
+    x, y = (300 - camera.cx) / camera.fx, (150 - camera.cy) / camera.fy
+    assert np.allclose([small.fx * x + small.cx, small.fy * y + small.cy], [75, 30])

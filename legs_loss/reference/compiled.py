@@ -1,4 +1,4 @@
-"""The numba rasterizer: projection.py and tiles.py as one differentiable function of torch."""
+"""The numba rasterizer: projection.py and strips.py as one differentiable function of torch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.reference import projection, tiles
+from legs_loss.reference import projection, strips
 from legs_loss.reference.conventions import View
 
 
@@ -32,7 +32,7 @@ class _Rasterize(torch.autograd.Function):
         degree: int,
     ) -> Tuple[Tensor, Tensor]:
         count, workers = len(means), numba.get_num_threads()
-        grid = np.array(view.tiles)
+        size = np.array([view.width, view.height])
         camera = (
             np.array([view.fx, view.fy, view.cx, view.cy, *view.limits]),
             view.world_to_camera,
@@ -45,40 +45,38 @@ class _Rasterize(torch.autograd.Function):
         boxes = np.empty((count, 4), np.int32)
         slots = np.empty(count, np.int64)
         parameters = [_array(tensor) for tensor in (means, scales, quaternions, opacities, sh)]
-        projection.project(*parameters, degree, *camera, grid, splats, depths, radii, clamped, boxes, slots)
+        projection.project(*parameters, degree, *camera, size, splats, depths, radii, clamped, boxes, slots)
 
-        first_slots = np.cumsum(slots) - slots
-        spans = np.empty(int(slots.sum()), np.int32)
-        tiles.find_spans(splats, boxes, slots, first_slots, spans)
-        order = tiles.order_by_depth(depths, slots)
-        counts = np.zeros(int(grid.prod()), np.int64)
-        tiles.count_entries(order, boxes, first_slots, spans, grid, counts, workers)
-        ranges = np.concatenate([[0], np.cumsum(counts)])
-        entries = np.empty((int(ranges[-1]), tiles.FIELDS), np.float32)
-        entry_slots = np.empty(len(entries), np.int64)
-        tiles.fill_entries(
-            order, splats, boxes, first_slots, spans, grid, ranges[:-1].copy(), entries, entry_slots, workers
-        )
+        first_slots = np.empty(count, np.int64)
+        order = strips.order_by_depth(depths, slots, first_slots)
+        total = int(slots.sum())
+        spans = np.empty(total, np.int32)
+        slot_strips = np.empty(total, np.int32)
+        slot_entries = np.empty((total, strips.FIELDS), np.float32)
+        across, down = -(-view.width // strips.WIDE), -(-view.height // strips.TALL)
+        strips.find_spans(order, splats, boxes, first_slots, across, spans, slot_strips, slot_entries)
+        ranges = np.zeros(across * down + 1, np.int64)
+        entries, entry_slots = strips.fill_entries(spans, slot_strips, slot_entries, ranges)
 
         image = torch.empty(3, view.height, view.width)
-        tile_order = np.argsort(-counts, kind="stable")  # the fullest first, dealt out to the workers in turn
-        ends = np.empty_like(counts)
-        work = (tile_order, ranges, ends, entries, entry_slots, spans)
-        tiles.render(workers, *work, _array(background), grid, image.numpy())
+        ends = np.empty(across * down, np.int64)
+        strip_order = np.argsort(-np.diff(ranges), kind="stable")  # the fullest first, dealt out to the workers in turn
+        work = (strip_order, ranges, ends, entries, entry_slots, spans)
+        strips.render(workers, *work, _array(background), across, image.numpy())
 
         radii_tensor = torch.from_numpy(radii)
         ctx.mark_non_differentiable(radii_tensor)
         ctx.save_for_backward(means, scales, quaternions, sh, image)
         ctx.columns = 2 if viewspace is None else viewspace.shape[1]
-        ctx.state = (degree, camera, grid, (splats, clamped, boxes, slots, first_slots, spans), work)
+        ctx.state = (degree, camera, across, (splats, clamped, boxes, slots, first_slots, spans), work)
         return image, radii_tensor
 
     @staticmethod
     def backward(ctx: Any, g_image: Tensor, _: Any) -> Tuple[Optional[Tensor], ...]:
         means, scales, quaternions, sh, image = ctx.saved_tensors
-        degree, camera, grid, splatted, work = ctx.state
-        slot_gradients = np.empty((len(splatted[-1]), tiles.MOMENTS), np.float32)
-        tiles.render_backward(numba.get_num_threads(), *work, grid, _array(image), _array(g_image), slot_gradients)
+        degree, camera, across, splatted, work = ctx.state
+        slot_gradients = np.empty((len(splatted[-1]), strips.MOMENTS), np.float32)
+        strips.render_backward(numba.get_num_threads(), *work, across, _array(image), _array(g_image), slot_gradients)
         count = len(means)
         shapes = (means.shape, scales.shape, quaternions.shape, (count, 1), sh.shape, (count, ctx.columns))
         gradients = [torch.empty(shape) for shape in shapes]

@@ -25,6 +25,7 @@ from legs_loss.reference.conventions import (
 )
 
 BLOCK = 512  # Gaussians that one thread takes at a time
+WIDE, TALL = 8, 32  # pixels: a strip of the image, see strips.py
 FARTHEST = 1 << 20  # pixels: a larger radius reaches every tile of any image anyway
 MARGIN = 1e-3  # in the exponent, on the safe side: what is cut away is fainter than MIN_ALPHA by more than rounding
 
@@ -173,21 +174,25 @@ def _harmonics_gradient(degree, x, y, z, g):
 
 
 @compiled()
-def _tile(pixel):
-    """The tile that a coordinate lies in; -1 for all that is left of or above the image."""
-    return np.int64(math.floor(max(min(pixel / TILE, 1e6), -1.0)))
+def _floor(value):
+    return np.int64(math.floor(max(min(value, 1e8), -1e8)))
+
+
+@compiled()
+def _ceil(value):
+    return -_floor(-value)
 
 
 @compiled()
 def _tile_range(centre, radius, tiles):
     """First tile of the square around a splat, and the one past the last, by 3DGS's rounding."""
-    first, end = _tile(centre - radius), _tile(centre + radius + (TILE - 1))
+    first, end = _floor((centre - radius) / TILE), _floor((centre + radius + (TILE - 1)) / TILE)
     return min(max(first, 0), tiles), min(max(end, 0), tiles)
 
 
 @compiled()
 def _project_block(
-    first, end, means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, tiles,
+    first, end, means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, size,
     splats, depths, radii, clamped, boxes, slots,
 ):  # fmt: skip
     fx, fy, cx, cy, limit_x, limit_y = intrinsics
@@ -217,24 +222,25 @@ def _project_block(
         largest = middle + math.sqrt(max(0.1, middle * middle - determinant))
         radius = min(math.ceil(3 * math.sqrt(largest)), float(FARTHEST))
         centre_x, centre_y = fx * x / z + cx - 0.5, fy * y / z + cy - 0.5
-        left, right = _tile_range(centre_x, radius, tiles[0])
-        top, bottom = _tile_range(centre_y, radius, tiles[1])
+        left, right = _tile_range(centre_x, radius, -(-size[0] // TILE))
+        top, bottom = _tile_range(centre_y, radius, -(-size[1] // TILE))
         if right <= left or bottom <= top:
             continue
         radii[i] = np.int32(radius)
 
-        # Of the square's tiles, those that the ellipse where alpha falls to MIN_ALPHA may reach.
+        # Within the square's tiles, what the ellipse where alpha falls to MIN_ALPHA may reach.
         opacity = np.float64(opacities[i, 0])
         if opacity < MIN_ALPHA:
             continue
         level = 2 * math.log(opacity / MIN_ALPHA) + 2 * MARGIN
         reach_x, reach_y = math.sqrt(level * a), math.sqrt(level * c)
-        left, right = max(left, _tile(centre_x - reach_x)), min(right, _tile(centre_x + reach_x) + 1)
-        top, bottom = max(top, _tile(centre_y - reach_y)), min(bottom, _tile(centre_y + reach_y) + 1)
-        if right <= left or bottom <= top:
+        x0, x1 = max(TILE * left, _ceil(centre_x - reach_x)), min(TILE * right, size[0], _floor(centre_x + reach_x) + 1)
+        y0, y1 = max(TILE * top, _ceil(centre_y - reach_y)), min(TILE * bottom, size[1], _floor(centre_y + reach_y) + 1)
+        if x1 <= x0 or y1 <= y0:
             continue
-        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = left, top, right, bottom
-        slots[i] = (right - left) * (bottom - top)
+        x0, x1 = x0 // WIDE, (x1 - 1) // WIDE + 1
+        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, y0, x1, y1
+        slots[i] = (x1 - x0) * ((y1 - 1) // TALL + 1 - y0 // TALL)
 
         dx, dy, dz, _ = _direction(means[i], position)
         _harmonics(degree, dx, dy, dz, basis)
@@ -252,7 +258,7 @@ def _project_block(
 
 @compiled(parallel=True)
 def project(
-    means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, tiles,
+    means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, size,
     splats, depths, radii, clamped, boxes, slots,
 ):  # fmt: skip
     """Fill, for each Gaussian: splat, depth, radius, which channels were clamped, its box of tiles and their number."""
@@ -261,7 +267,7 @@ def project(
         first = block * BLOCK
         _project_block(
             first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, degree, intrinsics, pose,
-            position, tiles, splats, depths, radii, clamped, boxes, slots,
+            position, size, splats, depths, radii, clamped, boxes, slots,
         )  # fmt: skip
 
 
@@ -278,27 +284,35 @@ def _quaternion_gradient(g, q, length):
 
 
 @compiled()
-def _collect(i, splat, box, first_slot, spans, slot_gradients, sums):
-    """Sum a Gaussian's gradients over its tiles into `sums`, in a fixed order.
+def origin(strip_x, strip_y, span):
+    """The pixel coordinates about which a splat's polynomial in a strip is written: amid the rows that it reaches."""
+    first, end = span & 255, span >> 8
+    return strip_x * WIDE + (WIDE - 1) / 2, strip_y * TALL + (first + end - 1) / 2
 
-    A slot holds the moments of h = dL/dpower about its tile's centre: h, hx, hy, hxx, hxy, hyy; then red, green,
-    blue, and the two absolute sums. `sums`: u, v, A, B, C, opacity, red, green, blue, |u|, |v|.
+
+@compiled()
+def _collect(splat, box, first_slot, spans, slot_gradients, sums):
+    """Sum a Gaussian's gradients over its strips into `sums`, in a fixed order.
+
+    A slot holds the moments of h = dL/dpower about its origin: h, hx, hy, hxx, hxy, hyy; then red, green, blue, and
+    the two absolute sums. `sums`: u, v, A, B, C, opacity, red, green, blue, |u|, |v|.
     """
     sums[:] = 0.0
     a, b, c = splat[2], splat[3], splat[4]
     slot = first_slot
-    for tile_y in range(box[1], box[3]):
-        for tile_x in range(box[0], box[2]):
+    for strip_y in range(box[1] // TALL, (box[3] - 1) // TALL + 1):
+        for strip_x in range(box[0], box[2]):
             if spans[slot] != 0:
                 g = slot_gradients[slot]
                 h, hx, hy = np.float64(g[0]), np.float64(g[1]), np.float64(g[2])
-                ox = tile_x * TILE + (TILE - 1) / 2 - splat[0]  # from the splat to the tile's centre
-                oy = tile_y * TILE + (TILE - 1) / 2 - splat[1]
-                sums[0] += (a * ox + b * oy) * h + a * hx + b * hy
-                sums[1] += (b * ox + c * oy) * h + b * hx + c * hy
-                sums[2] -= 0.5 * (g[3] + ox * (2 * hx + ox * h))
-                sums[3] -= g[4] + ox * hy + oy * (hx + ox * h)
-                sums[4] -= 0.5 * (g[5] + oy * (2 * hy + oy * h))
+                x, y = origin(strip_x, strip_y, spans[slot])
+                x -= splat[0]
+                y -= splat[1]
+                sums[0] += (a * x + b * y) * h + a * hx + b * hy
+                sums[1] += (b * x + c * y) * h + b * hx + c * hy
+                sums[2] -= 0.5 * (g[3] + x * (2 * hx + x * h))
+                sums[3] -= g[4] + x * hy + y * (hx + x * h)
+                sums[4] -= 0.5 * (g[5] + y * (2 * hy + y * h))
                 sums[5] += h
                 for k in range(6, 11):
                     sums[k] += g[k]
@@ -325,7 +339,7 @@ def _project_backward_block(
             g_view[i] = 0
             continue
         splat = splats[i]
-        _collect(i, splat, boxes[i], first_slots[i], spans, slot_gradients, sums)
+        _collect(splat, boxes[i], first_slots[i], spans, slot_gradients, sums)
         g_opacities[i, 0] = sums[5]
         g_view[i, 0], g_view[i, 1] = sums[0] * half[0], sums[1] * half[1]
         if g_view.shape[1] == 4:

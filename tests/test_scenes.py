@@ -148,9 +148,7 @@ class TestColmapBinary:
             pose[:3, :3] = colmap._rotation(generator.randn(4))
             pose[:3, 3] = generator.randn(3)
             cameras[f"{i}.png"] = Camera(64, 48, 70.0 + i // 2, 71.0, 32.0, 24.0, pose)
-        cloud = PointCloud(
-            generator.randn(9, 3).astype(np.float32), generator.randint(0, 256, (9, 3)).astype(np.uint8)
-        )
+        cloud = PointCloud(generator.randn(9, 3).astype(np.float32), generator.randint(0, 256, (9, 3)).astype(np.uint8))
         write_colmap(tmp_path, cameras, cloud)
         (tmp_path / "images").mkdir()
         scene = read_scene(tmp_path)

@@ -28,7 +28,8 @@ def training_size(width: int, height: int, resolution: int = -1) -> Tuple[int, i
     Args:
         width, height: of the photograph, in pixels.
         resolution: 3DGS's ``-r``: 1, 2, 4 or 8 divides both sides and rounds; -1 keeps the size up to a width of
-            1600 pixels; any other number is the width. The last two cut fractions off instead of rounding.
+            1600 pixels; any other number is the width. The last two cut fractions off instead of rounding, in floating
+            point: a width of 1601 becomes 1599.
 
     Raises:
         LegsError: the resolution is none of these, or leaves no pixel.

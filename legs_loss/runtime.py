@@ -14,7 +14,7 @@ import sys
 import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Optional, Sequence, Set, Tuple, Union
+from typing import TYPE_CHECKING, Any, List, Optional, Sequence, Set, Tuple, Union
 
 import torch
 from torch import Tensor
@@ -255,7 +255,7 @@ def _view_names(view: View, target: Tensor) -> Sequence[Optional[str]]:
     batch = target.shape[0] if target.dim() == 4 else 1
     if view is None:
         return [None] * batch
-    names = [view] if isinstance(view, str) else list(view)
+    names: List[Any] = list(view) if isinstance(view, (list, tuple)) else [view]
     if len(names) != batch or not all(isinstance(name, str) for name in names):
         raise LegsError(f"view must be one name a view: target {list(target.shape)} holds {batch}, got {view!r}")
     return names

@@ -53,8 +53,7 @@ def legs(*arguments, **options):
     """Run ``legs`` as a real subprocess and return the completed process, with text output."""
     return subprocess.run(
         legs_command(*arguments),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        universal_newlines=True,
+        capture_output=True,
+        text=True,
         **{"cwd": str(ROOT), "env": legs_environment(), "timeout": 300, **options},
     )

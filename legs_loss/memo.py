@@ -81,7 +81,7 @@ class WeightMemo:
     def _owner(self, target: Tensor, key: Hashable) -> Optional[weakref.ref[Tensor]]:
         return None if target.device.type == "cpu" else self._owner_of_memory(target, key)
 
-    def _owner_of_memory(self, target: Tensor, key: Hashable) -> "weakref.ref[Tensor]":
+    def _owner_of_memory(self, target: Tensor, key: Hashable) -> weakref.ref[Tensor]:
         # A key that names memory must die with it: the allocator hands the same address to the next tensor.
         memo = weakref.ref(self)
 

@@ -23,3 +23,12 @@ def fox() -> Path:
 def seed() -> None:
     """Random inputs are the same in every run."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The embedded scene at 64x48 with 12 views, for real trainings of seconds. Not to be written to."""
+    from legs_loss.reference.embedded import write_embedded_scene
+
+    root = tmp_path_factory.mktemp("tiny") / "table"
+    return write_embedded_scene(root, views=12, width=64, height=48, points=900, samples=2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import List, Mapping, NamedTuple, Optional, Tuple
 
@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.scenes import Camera, Scene, View, image_tensor, load_training_image
 from legs_loss.spec import WeightSpec
 from legs_loss.store import WeightStore, fingerprint
 from legs_loss.weights import weight_from_response, weight_map
 
-__all__ = ["Dataset", "TrainingView", "extent", "load_dataset", "split_views"]
+__all__ = ["Dataset", "TrainingView", "extent", "load_dataset", "load_view", "split_views"]
 
 HOLD_OUT = 8  # every so manieth view, sorted by name, as in the field
-STORE = "legs_weights"
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,20 +85,27 @@ def load_dataset(
     train, test = split_views(scene)
     opened = _open_store(scene, store) if spec.beta > 0 and weights is None else None
 
-    def load(view: View, weighted: bool) -> TrainingView:
-        camera = _camera(scene, view)
-        pixels = load_training_image(view, resolution, white_background)
-        image = image_tensor(pixels)
-        image = image.expand(3, *image.shape[1:]).contiguous()
-        weight = None
-        if weighted and weights is not None:
-            weight = _explicit(weights, view, image)
-        elif weighted and spec.beta > 0:
-            weight = _weight(opened, view, pixels, spec)
-        height, width = image.shape[1:]
-        return TrainingView(view.name, camera.resized(width, height), image, weight)
+    def weighted(view: View) -> TrainingView:
+        loaded = load_view(scene, view, resolution, white_background)
+        if weights is not None:
+            return replace(loaded, weight=_explicit(weights, loaded))
+        return replace(loaded, weight=_weight(opened, loaded, spec)) if spec.beta > 0 else loaded
 
-    return Dataset([load(view, True) for view in train], [load(view, False) for view in test])
+    return Dataset(
+        [weighted(view) for view in train], [load_view(scene, view, resolution, white_background) for view in test]
+    )
+
+
+def load_view(scene: Scene, view: View, resolution: int = -1, white_background: bool = False) -> TrainingView:
+    """Load one view, without a weight map. Gray photographs become RGB.
+
+    Raises:
+        LegsError: it has no pinhole camera, or the photograph cannot be read.
+    """
+    camera = _camera(scene, view)
+    image = image_tensor(load_training_image(view, resolution, white_background))
+    height, width = image.shape[1:]
+    return TrainingView(view.name, camera.resized(width, height), image.expand(3, height, width).contiguous())
 
 
 def extent(views: List[TrainingView]) -> float:
@@ -123,24 +130,25 @@ def _camera(scene: Scene, view: View) -> Camera:
 def _open_store(scene: Scene, store: Optional[Path]) -> Optional[WeightStore]:
     if store is not None:
         return WeightStore(store)
-    default = scene.root / STORE
+    default = scene.root / STORE_FOLDER
     return WeightStore(default) if (default / "manifest.json").is_file() else None
 
 
-def _weight(store: Optional[WeightStore], view: View, pixels: np.ndarray, spec: WeightSpec) -> Tensor:
-    entry = None if store is None else store.find(view.name, pixels.shape[0], pixels.shape[1], spec)
-    if store is not None and entry is not None and entry.fingerprint == fingerprint(pixels):
-        return weight_from_response(torch.from_numpy(store.normalised_response(entry))[None], spec)
-    return weight_map(image_tensor(pixels), spec)
+def _weight(store: Optional[WeightStore], view: TrainingView, spec: WeightSpec) -> Tensor:
+    if store is not None:
+        entry = store.find(view.name, *view.image.shape[1:], spec)
+        if entry is not None and entry.fingerprint in (fingerprint(view.image), fingerprint(view.image[:1])):
+            return weight_from_response(torch.from_numpy(store.normalised_response(entry))[None], spec)
+    return weight_map(view.image, spec)
 
 
-def _explicit(weights: Mapping[str, Tensor], view: View, image: Tensor) -> Tensor:
+def _explicit(weights: Mapping[str, Tensor], view: TrainingView) -> Tensor:
     if view.name not in weights:
         raise LegsError(f"no weight map was given for the view {view.name}")
     weight = torch.as_tensor(weights[view.name], dtype=torch.float32)
-    if tuple(weight.shape) != (1,) + tuple(image.shape[1:]):
+    if weight.shape != view.image[:1].shape:
         raise LegsError(
             f"the weight map given for {view.name} has the shape {list(weight.shape)}; "
-            f"its photograph needs {[1, *image.shape[1:]]}"
+            f"its photograph needs {list(view.image[:1].shape)}"
         )
     return weight

@@ -30,18 +30,22 @@ class Schedule(NamedTuple):
 
     @classmethod
     def of(cls, iterations: int) -> Schedule:
-        """3DGS's schedule scaled from its 30,000 iterations, with floors under which a step makes no sense.
+        """3DGS's schedule, for runs of any length.
 
-        Opacities are not reset in runs so short that no time would be left to recover: the reset is due every tenth
-        of the run but never before iteration 3000, and only while densifying.
+        Densification begins after a tenth of the run, at iteration 500 at the latest, ends after three fifths of it,
+        at iteration 15000 at the latest, and is due every 100 iterations or every twentieth of a shorter run.
+        Opacities are reset every tenth of the run but not before iteration 3000, and only while densifying: a run of
+        5000 iterations or less has no time to recover from a reset.
 
         >>> Schedule.of(30000)
         Schedule(densify_from=500, densify_until=15000, densify_every=100, reset_every=3000, sh_every=1000)
+        >>> Schedule.of(1000)
+        Schedule(densify_from=100, densify_until=600, densify_every=50, reset_every=3000, sh_every=33)
         """
         return cls(
-            densify_from=max(iterations // 60, min(100, iterations // 10)),
-            densify_until=iterations // 2,
-            densify_every=min(100, max(1, iterations // 40)),
+            densify_from=min(500, iterations // 10),
+            densify_until=min(15000, iterations * 3 // 5),
+            densify_every=min(100, max(1, iterations // 20)),
             reset_every=max(3000, iterations // 10),
             sh_every=max(1, iterations // 30),
         )

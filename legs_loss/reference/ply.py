@@ -30,7 +30,7 @@ def write_ply(path: Union[str, Path], gaussians: Gaussians) -> None:
     """
     g = gaussians
     count, coefficients = g.sh.shape[:2]
-    rest = g.sh[:, 1:].transpose(1, 2).reshape(count, -1)
+    rest = g.sh[:, 1:].transpose(1, 2).reshape(count, 3 * (coefficients - 1))
     columns = [g.means, torch.zeros(count, 3), g.sh[:, 0], rest, g.opacity_logits, g.log_scales, g.quaternions]
     table = torch.cat([column.detach().float().cpu() for column in columns], dim=1).numpy().astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]

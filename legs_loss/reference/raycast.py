@@ -219,8 +219,8 @@ def bake_light(surfaces: Sequence, lamp: Lamp, cell: float = 0.06, lamp_points: 
     for quad in surfaces:
         if not isinstance(quad, Quad):
             continue
-        rows = int(np.clip(np.linalg.norm(quad.down) / cell, 4, 96))
-        columns = int(np.clip(np.linalg.norm(quad.across) / cell, 4, 96))
+        rows = int(np.clip(np.linalg.norm(quad.down) / cell, 4, 48))
+        columns = int(np.clip(np.linalg.norm(quad.across) / cell, 4, 48))
         v, u = np.mgrid[:rows, :columns] + 0.5
         points = quad.corner + (u / columns).reshape(-1, 1) * quad.across + (v / rows).reshape(-1, 1) * quad.down
         to_lamp = lamp.centre - points

@@ -9,6 +9,7 @@ The same seed gives the same Gaussians to the last bit, whether or not the run w
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import threading
@@ -33,7 +34,7 @@ from legs_loss.reference.rasterize import Rendering, rasterize
 from legs_loss.scenes import Scene
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
-__all__ = ["Progress", "Result", "TrainConfig", "draw", "train"]
+__all__ = ["Progress", "Result", "TrainConfig", "draw", "point_cloud", "train"]
 
 CHECKPOINT = "checkpoint.npz"
 
@@ -49,8 +50,8 @@ class TrainConfig:
         sh_degree: of the colours, 0 to 3.
         lambda_dssim: the share of D-SSIM in the loss.
         l1_scale: multiplies the L1 term, weighted or not: for experiments.
-        densify_grad_threshold: a Gaussian whose mean view-space gradient reaches it is cloned or split. 3DGS's own
-            2e-4 is for photographs about 1000 pixels wide; in its units small images need more.
+        densify_grad_threshold: a Gaussian whose mean view-space gradient reaches it is cloned or split. None chooses
+            it by the size of the photographs, see :func:`default_threshold`.
         max_gaussians: a cap on their number, None for none.
         white_background: white in place of black.
         seed: of the order of the views and of the places of split Gaussians.
@@ -62,7 +63,7 @@ class TrainConfig:
     sh_degree: int = 1
     lambda_dssim: float = 0.2
     l1_scale: float = 1.0
-    densify_grad_threshold: float = 5e-4
+    densify_grad_threshold: Optional[float] = None
     max_gaussians: Optional[int] = None
     white_background: bool = False
     seed: int = 0
@@ -74,7 +75,11 @@ class TrainConfig:
             ("sh_degree", self.sh_degree in (0, 1, 2, 3), "0, 1, 2 or 3"),
             ("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "in [0, 1]"),
             ("l1_scale", 0.0 <= self.l1_scale < float("inf"), "at least 0"),
-            ("densify_grad_threshold", self.densify_grad_threshold > 0.0, "above 0"),
+            (
+                "densify_grad_threshold",
+                self.densify_grad_threshold is None or self.densify_grad_threshold > 0.0,
+                "above 0",
+            ),
             ("max_gaussians", self.max_gaussians is None or self.max_gaussians >= 1, "at least 1"),
         ):
             if not fits:
@@ -88,8 +93,10 @@ class TrainConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
-        """The settings that :meth:`as_dict` gave."""
-        spec = WeightSpec(**dict(values["spec"], p=float(values["spec"]["p"])))
+        """The settings that :meth:`as_dict` gave; ``spec`` may also be a preset's name."""
+        spec = values["spec"]
+        if not isinstance(spec, str):
+            spec = WeightSpec(**dict(spec, p=float(spec["p"])))
         return cls(**dict(values, spec=spec))
 
     @property
@@ -120,10 +127,26 @@ class Result:
     metrics: Dict[str, Any]
 
 
+def default_threshold(views: List[TrainingView]) -> float:
+    """Return the densification threshold for photographs of this size: 0.12 / sqrt(width * height), at least 2e-4.
+
+    3DGS's own 2e-4 is for photographs more than 1000 pixels wide. Its gradients are per half image, so that the
+    gradient of a Gaussian that covers a given number of pixels grows as the image shrinks, and 2e-4 makes several
+    times as many Gaussians as a small image has use for. The rule gives 5e-4 at 180x321, and 2e-4 from 600x600 on.
+    """
+    pixels = sum(view.image[0].numel() for view in views) / len(views)
+    return max(2e-4, 0.12 / math.sqrt(pixels))
+
+
 def draw(gaussians: Gaussians, view: TrainingView, config: TrainConfig) -> Tensor:
     """Return a finished scene's rendering of a view, [3, H, W], not clipped."""
     with torch.no_grad():
         return _rasterize(gaussians, view, config, config.sh_degree, None).image
+
+
+def point_cloud(out: Path, config: TrainConfig) -> Path:
+    """Where a run's .ply lies in its output folder: 3DGS's own place."""
+    return out / "point_cloud" / f"iteration_{config.iterations}" / "point_cloud.ply"
 
 
 def train(
@@ -169,8 +192,7 @@ def train(
     run.go(folder, checkpoint_every, on_progress)
     metrics = run.metrics()
     if folder is not None:
-        place = folder / "point_cloud" / f"iteration_{config.iterations}"
-        write_ply(place / "point_cloud.ply", run.adam.gaussians)
+        write_ply(point_cloud(folder, config), run.adam.gaussians)
         _write_json(folder / "metrics.json", metrics)
     return Result(run.adam.gaussians, metrics)
 
@@ -182,6 +204,7 @@ class _Run:
         self.data, self.config, self.adam = data, config, adam
         self.extent = extent(data.train)
         self.schedule = Schedule.of(config.iterations)
+        self.threshold = config.densify_grad_threshold or default_threshold(data.train)
         self.iteration = 0
         self.seconds = 0.0
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -263,13 +286,13 @@ class _Run:
         drawn = _rasterize(gaussians, view, self.config, degree, viewspace)
         loss = _loss(drawn.image, view.image, self.weights[index], self.config.lambda_dssim)
         loss.backward()
-        self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image))
+        if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
+            self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image))
         self.adam.step(position_rate(self.iteration / self.config.iterations, self.extent))
         if self.iteration < self.schedule.densify_until:
             assert viewspace.grad is not None
-            seen = drawn.radii > 0
-            self.gradient_sum[seen] += viewspace.grad[seen].norm(dim=1)
-            self.times_seen[seen] += 1
+            self.gradient_sum += viewspace.grad.norm(dim=1)  # 0 where it was not seen
+            self.times_seen += drawn.radii > 0
             if self.schedule.densifies(self.iteration):
                 self._densify()
             if self.schedule.resets(self.iteration):
@@ -282,6 +305,7 @@ class _Run:
             "train": self._scores(self.data.train),
             "test": self._scores(self.data.test),
             "gaussians": len(self.adam.gaussians),
+            "densify_grad_threshold": self.threshold,
             "mean_weight": sum(maps) / len(maps),
             "iterations": self.iteration,
             "seconds": self.seconds,
@@ -304,7 +328,7 @@ class _Run:
         change = densify(
             self.adam.gaussians,
             gradient,
-            config.densify_grad_threshold,
+            self.threshold,
             self.extent,
             self.generator,
             config.max_gaussians,
@@ -319,8 +343,8 @@ class _Run:
         self.times_seen = torch.zeros(len(self.adam.gaussians))
 
     def _report(self, loss: float, decibels: float) -> None:
-        self.loss = loss if self.loss is None else 0.95 * self.loss + 0.05 * loss
-        self.psnr = decibels if self.psnr is None else 0.95 * self.psnr + 0.05 * decibels
+        self.loss = loss if self.loss is None else 0.6 * self.loss + 0.4 * loss
+        self.psnr = decibels if self.psnr is None else 0.6 * self.psnr + 0.4 * decibels
 
 
 def _rasterize(
@@ -348,7 +372,8 @@ def _scaled(view: TrainingView, scale: float) -> Optional[Tensor]:
 def _ctrl_c_between_iterations() -> Iterator[Callable[[], bool]]:
     """Ctrl-C only sets a flag, so that it cannot fall between two updates that belong together."""
     flag = threading.Event()
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+    elsewhere = threading.current_thread() is not threading.main_thread()  # only the main thread handles signals
+    if elsewhere or signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         yield flag.is_set
         return
     before = signal.signal(signal.SIGINT, lambda *_: flag.set())

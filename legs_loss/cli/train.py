@@ -1,0 +1,162 @@
+"""Train 3D Gaussians on a scene, on the CPU: for small images and short runs.
+
+SCENE is a folder with COLMAP's model (sparse/0, pinhole cameras). Every 8th view, sorted by name, is held out. Weight
+maps are taken from SCENE/legs_weights where `legs precompute` left them, else computed. The flags have 3DGS's names
+where 3DGS has them. The output folder gets point_cloud/iteration_N/point_cloud.ply, which viewers of 3DGS open,
+cfg.json and metrics.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
+
+if TYPE_CHECKING:
+    from legs_loss.reference.trainer import Progress, TrainConfig
+
+HELP = "train 3D Gaussians on a scene, on the CPU"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    from legs_loss.spec import PRESETS
+
+    parser.add_argument("scene", metavar="SCENE", help="a COLMAP scene")
+    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
+    parser.add_argument(
+        "-m",
+        "--out",
+        "--model_path",
+        dest="out",
+        type=Path,
+        metavar="DIR",
+        help="the run's folder; default: output/SCENE-PRESET",
+    )
+    parser.add_argument("--resume", action="store_true", help="go on with the run in the output folder")
+    parser.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")
+    parser.add_argument("--threads", type=int, metavar="N", help="default: one a core")
+    parser.add_argument(
+        "--checkpoint_every", type=int, default=500, metavar="N", help="iterations between checkpoints; default: 500"
+    )
+    # Settings of the run. One that is not given is absent, so that --resume can tell.
+    settings = parser.add_argument_group("settings", argument_default=argparse.SUPPRESS)
+    settings.add_argument("--preset", dest="spec", choices=PRESETS, help="the loss; default: legs")
+    settings.add_argument("--iterations", type=int, metavar="N", help="default: 2000")
+    settings.add_argument(
+        "-r", "--resolution", type=int, metavar="1|2|4|8|WIDTH", help="as in 3DGS; default: at most 1600 wide"
+    )
+    settings.add_argument("-w", "--white_background", action="store_true", help="white in place of black")
+    settings.add_argument("--sh_degree", type=int, choices=range(4), help="of the colours; default: 1")
+    settings.add_argument("--lambda_dssim", type=float, metavar="X", help="share of D-SSIM in the loss; default: 0.2")
+    settings.add_argument("--l1_scale", type=float, metavar="X", help="multiplies the L1 term; default: 1")
+    settings.add_argument(
+        "--densify_grad_threshold",
+        type=float,
+        metavar="X",
+        help="default: 0.12 / sqrt(width * height), at least 3DGS's 2e-4, which is too low for small images",
+    )
+    settings.add_argument("--max_gaussians", type=int, metavar="N", help="a cap on their number; default: none")
+    settings.add_argument("--seed", type=int, metavar="N", help="default: 0")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, or go on training, and print the scores."""
+    from legs_loss.errors import LegsError
+    from legs_loss.reference.trainer import CHECKPOINT, TrainConfig, point_cloud, train
+    from legs_loss.scenes import read_scene
+
+    set_threads(args.threads)
+    given = {name: value for name, value in vars(args).items() if name in TrainConfig.__dataclass_fields__}
+    preset = given.get("spec", "legs")
+    out = args.out or Path("output") / f"{Path(args.scene).resolve().name}-{preset}"
+    checkpoint = out / CHECKPOINT
+    if args.checkpoint_every < 1:
+        raise LegsError(f"--checkpoint_every must be at least 1, got {args.checkpoint_every}")
+    if args.resume:
+        config = _resumed(checkpoint, given)
+    elif checkpoint.exists():
+        raise LegsError(f"{out} already holds a run: go on with it (--resume), or choose another folder (--out)")
+    else:
+        config = TrainConfig(**given)
+    scene = read_scene(args.scene, args.images)
+    with progress_bar(config.iterations, out.name) as show:
+        result = train(
+            scene,
+            config,
+            out=out,
+            resume=args.resume,
+            store=args.store,
+            checkpoint_every=args.checkpoint_every,
+            on_progress=show,
+        )
+    _print(result.metrics)
+    print(point_cloud(out, config))
+    return 0
+
+
+def set_threads(count: Optional[int]) -> None:
+    """Use so many threads for drawing, the loss and torch; None leaves numba's and torch's own choice.
+
+    Raises:
+        LegsError: not between 1 and the number of cores; or numba is missing.
+    """
+    from legs_loss.errors import LegsError
+
+    try:
+        import numba
+    except ImportError:
+        raise LegsError("training needs numba: pip install legs-loss[cpu]") from None
+    import torch
+
+    if count is None:
+        return
+    most = numba.config.NUMBA_NUM_THREADS
+    if not 1 <= count <= most:
+        raise LegsError(f"--threads must be between 1 and {most}, the number of cores, got {count}")
+    numba.set_num_threads(count)
+    torch.set_num_threads(count)
+
+
+@contextmanager
+def progress_bar(iterations: int, name: str, position: int = 0) -> Iterator[Callable[[Progress], None]]:
+    """Show a bar with loss, PSNR and Gaussians; yields what ``train`` takes as ``on_progress``."""
+    from tqdm import tqdm
+
+    with tqdm(total=iterations, desc=name, position=position, leave=position == 0, mininterval=0.5) as bar:
+
+        def show(progress: Progress) -> None:
+            if bar.n == 0 and progress.iteration > 10:  # resumed: these iterations did not take this run's time
+                bar.initial = bar.n = progress.iteration
+            bar.set_postfix_str(
+                f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, {progress.gaussians} Gaussians", refresh=False
+            )
+            bar.update(progress.iteration - bar.n)
+
+        yield show
+
+
+def _resumed(checkpoint: Path, given: Dict[str, Any]) -> TrainConfig:
+    """The settings of the run in the output folder; the flags that were given must be the same."""
+    from legs_loss.errors import LegsError
+    from legs_loss.reference.checkpoint import read_checkpoint
+    from legs_loss.reference.trainer import TrainConfig
+
+    stored = read_checkpoint(checkpoint)[1]["config"]
+    wanted = TrainConfig.from_dict(dict(stored, **given))
+    different = [name for name in given if wanted.as_dict()[name] != stored[name]]
+    if different:
+        raise LegsError(
+            f"{checkpoint.parent} holds a run with another {' and '.join(different)}: leave the flag out to go on with "
+            "it, or choose another folder (--out)"
+        )
+    return wanted
+
+
+def _print(metrics: Dict[str, Any]) -> None:
+    for label, name in (("training views", "train"), ("held-out views", "test")):
+        scores = metrics[name]
+        if scores:
+            print(f"{label}: PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
+    print(f"{metrics['gaussians']} Gaussians, {metrics['seconds']:.0f} s")

@@ -1,0 +1,96 @@
+"""Several trainings at once, each in a process of its own with one thread: the fair and the fast way to compare."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence
+
+from legs_loss.errors import LegsError
+from legs_loss.reference.trainer import Progress, TrainConfig, train
+from legs_loss.scenes import read_scene
+
+__all__ = ["Arm", "train_side_by_side"]
+
+
+class Arm(NamedTuple):
+    """One training: its name, and what `train` needs. ``images`` is the folder that ``read_scene`` takes."""
+
+    name: str
+    scene: Path
+    config: TrainConfig
+    out: Path
+    images: Optional[str] = None
+    store: Optional[Path] = None
+
+
+def train_side_by_side(
+    arms: Sequence[Arm], processes: int, on_progress: Callable[[str, Progress], None]
+) -> Dict[str, Dict[str, Any]]:
+    """Train all arms, in order, ``processes`` at a time; return their metrics by name.
+
+    Uses fresh processes, so a script that calls it needs its ``if __name__ == "__main__"``.
+
+    Raises:
+        LegsError: an arm failed; the message names it. The others are ended.
+    """
+    waiting: List[Arm] = list(reversed(arms))
+    running: Dict[Any, _Process] = {}  # by this side's end of their pipes
+    metrics: Dict[str, Dict[str, Any]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < processes:
+                process = _Process(waiting.pop())
+                running[process.connection] = process
+            for connection in wait(list(running)):
+                name = running[connection].name
+                try:
+                    message = connection.recv()  # type: ignore[union-attr]
+                except (EOFError, OSError):
+                    raise LegsError(f"{name}: its process was killed (out of memory?)") from None
+                if isinstance(message, Progress):
+                    on_progress(name, message)
+                    continue
+                if isinstance(message, str):
+                    raise LegsError(f"{name}: {message}")
+                metrics[name] = message
+                running.pop(connection).end()
+    finally:
+        for process in running.values():
+            process.end()
+    return {arm.name: metrics[arm.name] for arm in arms}
+
+
+class _Process:
+    def __init__(self, arm: Arm) -> None:
+        self.name = arm.name
+        context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs, arm), daemon=True)
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # for good in the process: Ctrl-C is the parent's
+        try:
+            self.process.start()
+        finally:
+            signal.signal(signal.SIGINT, before)
+        theirs.close()
+
+    def end(self) -> None:
+        self.connection.close()
+        self.process.terminate()
+        self.process.join()
+
+
+def _work(connection: Connection, arm: Arm) -> None:
+    import numba
+    import torch
+
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    try:
+        scene = read_scene(arm.scene, arm.images)
+        result = train(scene, arm.config, out=arm.out, store=arm.store, on_progress=connection.send)
+        connection.send(result.metrics)
+    except LegsError as error:
+        connection.send(str(error))

@@ -47,41 +47,43 @@ class _Rasterize(torch.autograd.Function):
         parameters = [_array(tensor) for tensor in (means, scales, quaternions, opacities, sh)]
         projection.project(*parameters, degree, *camera, size, splats, depths, radii, clamped, boxes, slots)
 
-        first_slots = np.empty(count, np.int64)
-        order = strips.order_by_depth(depths, slots, first_slots)
+        first_slots = np.cumsum(slots) - slots
         total = int(slots.sum())
-        spans = np.empty(total, np.int32)
-        slot_strips = np.empty(total, np.int32)
-        slot_entries = np.empty((total, strips.FIELDS), np.float32)
+        slot_strips, slot_rows, places = (np.empty(total, kind) for kind in (np.int32, np.int32, np.int64))
         across, down = -(-view.width // strips.WIDE), -(-view.height // strips.TALL)
-        strips.find_spans(order, splats, boxes, first_slots, across, spans, slot_strips, slot_entries)
+        strips.find_rows(splats, boxes, slots, first_slots, across, slot_strips, slot_rows)
+        order = strips.order_by_depth(depths, slots)
         ranges = np.zeros(across * down + 1, np.int64)
-        entries, entry_slots = strips.fill_entries(spans, slot_strips, slot_entries, ranges)
+        strips.sort_slots(order, slots, first_slots, slot_strips, ranges, places)
+        entries = np.empty((int(ranges[-1]), strips.FIELDS), np.float32)
+        entry_slots = np.empty(len(entries), np.int64)
+        strips.expand(order, splats, boxes, first_slots, slot_rows, places, entries, entry_slots)
 
         image = torch.empty(3, view.height, view.width)
         ends = np.empty(across * down, np.int64)
         strip_order = np.argsort(-np.diff(ranges), kind="stable")  # the fullest first, dealt out to the workers in turn
-        work = (strip_order, ranges, ends, entries, entry_slots, spans)
+        work = (strip_order, ranges, ends, entries)
         strips.render(workers, *work, _array(background), across, image.numpy())
 
         radii_tensor = torch.from_numpy(radii)
         ctx.mark_non_differentiable(radii_tensor)
-        ctx.save_for_backward(means, scales, quaternions, sh, image)
+        ctx.save_for_backward(means, scales, quaternions, opacities, sh, image)
         ctx.columns = 2 if viewspace is None else viewspace.shape[1]
-        ctx.state = (degree, camera, across, (splats, clamped, boxes, slots, first_slots, spans), work)
+        splatted = (splats, clamped, boxes, slots, first_slots, slot_rows)
+        ctx.state = (degree, camera, splatted, across, (*work, entry_slots))
         return image, radii_tensor
 
     @staticmethod
     def backward(ctx: Any, g_image: Tensor, _: Any) -> Tuple[Optional[Tensor], ...]:
-        means, scales, quaternions, sh, image = ctx.saved_tensors
-        degree, camera, across, splatted, work = ctx.state
+        means, scales, quaternions, opacities, sh, image = ctx.saved_tensors
+        degree, camera, splatted, across, work = ctx.state
         slot_gradients = np.empty((len(splatted[-1]), strips.MOMENTS), np.float32)
         strips.render_backward(numba.get_num_threads(), *work, across, _array(image), _array(g_image), slot_gradients)
         count = len(means)
-        shapes = (means.shape, scales.shape, quaternions.shape, (count, 1), sh.shape, (count, ctx.columns))
+        shapes = (means.shape, scales.shape, quaternions.shape, opacities.shape, sh.shape, (count, ctx.columns))
         gradients = [torch.empty(shape) for shape in shapes]
         projection.project_backward(
-            *[_array(tensor) for tensor in (means, scales, quaternions, sh)],
+            *[_array(tensor) for tensor in (means, scales, quaternions, opacities, sh)],
             degree,
             *camera,
             *splatted,

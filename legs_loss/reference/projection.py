@@ -1,8 +1,8 @@
 """The compiled rasterizer's work for each Gaussian: from three dimensions to a splat, and the gradient's way back.
 
-A splat is a row of ten float64 numbers: centre (u, v) in pixels, conic (A, B, C), opacity, colour (r, g, b), and the
-determinant of its covariance. All steps are those of oracle.py. The geometry is computed in float64, and the
-determinant as a sum of squares (Cauchy-Binet), since a needle's a c - b b cancels to nothing.
+A splat is a row of ten float64 numbers: centre (u, v) in pixels, conic (A, B, C), logarithm of the opacity, colour
+(r, g, b), and the determinant of its covariance. All steps are those of oracle.py. The geometry is computed in
+float64, and the determinant as a sum of squares (Cauchy-Binet), since a needle's a c - b b cancels to nothing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from legs_loss.reference.conventions import (
 BLOCK = 512  # Gaussians that one thread takes at a time
 WIDE, TALL = 8, 32  # pixels: a strip of the image, see strips.py
 FARTHEST = 1 << 20  # pixels: a larger radius reaches every tile of any image anyway
-MARGIN = 1e-3  # in the exponent, on the safe side: what is cut away is fainter than MIN_ALPHA by more than rounding
+FAINTEST = math.log(MIN_ALPHA) - 1e-3  # what is left out is fainter than MIN_ALPHA by more than rounding
 
 _C0, _C1 = np.float32(SH_C0), np.float32(SH_C1)
 _D0, _D1, _D2, _D3, _D4 = (np.float32(c) for c in SH_C2)
@@ -35,11 +35,13 @@ _E0, _E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(c) for c in SH_C3)
 
 
 @compiled()
-def _rotation(q):
+def _rotation(quaternions, i):
     """Row-major rotation matrix, the normalised quaternion, and the length it had."""
-    w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
+    w, x = np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1])
+    y, z = np.float64(quaternions[i, 2]), np.float64(quaternions[i, 3])
     length = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    w, x, y, z = w / length, x / length, y / length, z / length
+    shorter = 1 / length
+    w, x, y, z = w * shorter, x * shorter, y * shorter, z * shorter
     matrix = (
         1 - 2 * (y * y + z * z),
         2 * (x * y - w * z),
@@ -55,9 +57,9 @@ def _rotation(q):
 
 
 @compiled()
-def _to_camera(mean, pose):
+def _to_camera(means, i, pose):
     """The centre in the camera's axes."""
-    a, b, c = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+    a, b, c = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]
     y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]
     z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
@@ -67,19 +69,16 @@ def _to_camera(mean, pose):
 @compiled()
 def _held(value, z, limit):
     """`value` (x or y), held where value / z leaves the guard, and whether it moves freely."""
-    ratio = value / z
-    if ratio > limit:
-        return limit * z, False
-    if ratio < -limit:
-        return -limit * z, False
-    return value, True
+    most = limit * z
+    return max(min(value, most), -most), abs(value) <= most
 
 
 @compiled()
 def _linearised(fx, fy, held_x, held_y, z, pose):
     """The 2x3 map from world directions to pixels at the Gaussian's centre, row-major."""
-    j00, j02 = fx / z, -fx * held_x / (z * z)
-    j11, j12 = fy / z, -fy * held_y / (z * z)
+    inverse = 1 / z
+    j00, j11 = fx * inverse, fy * inverse
+    j02, j12 = -j00 * held_x * inverse, -j11 * held_y * inverse
     return (
         j00 * pose[0, 0] + j02 * pose[2, 0],
         j00 * pose[0, 1] + j02 * pose[2, 1],
@@ -104,11 +103,12 @@ def _times_rotation(t, r):
 
 
 @compiled()
-def _direction(mean, position):
+def _direction(means, i, position):
     """From the camera's centre to the Gaussian's, of length 1, and the length it had."""
-    x, y, z = mean[0] - position[0], mean[1] - position[1], mean[2] - position[2]
+    x, y, z = means[i, 0] - position[0], means[i, 1] - position[1], means[i, 2] - position[2]
     length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
-    return np.float32(x / length), np.float32(y / length), np.float32(z / length), length
+    shorter = 1 / length
+    return np.float32(x * shorter), np.float32(y * shorter), np.float32(z * shorter), length
 
 
 @compiled()
@@ -201,12 +201,12 @@ def _project_block(
     for i in range(first, end):
         radii[i] = 0
         slots[i] = 0
-        x, y, z = _to_camera(means[i], pose)
+        x, y, z = _to_camera(means, i, pose)
         if not z > NEAR:
             continue
         held_x, _ = _held(x, z, limit_x)
         held_y, _ = _held(y, z, limit_y)
-        rotation, _, _ = _rotation(quaternions[i])
+        rotation, _, _ = _rotation(quaternions, i)
         u = _times_rotation(_linearised(fx, fy, held_x, held_y, z, pose), rotation)
         s0, s1, s2 = np.float64(scales[i, 0]) ** 2, np.float64(scales[i, 1]) ** 2, np.float64(scales[i, 2]) ** 2
         a = u[0] * u[0] * s0 + u[1] * u[1] * s1 + u[2] * u[2] * s2
@@ -232,7 +232,8 @@ def _project_block(
         opacity = np.float64(opacities[i, 0])
         if opacity < MIN_ALPHA:
             continue
-        level = 2 * math.log(opacity / MIN_ALPHA) + 2 * MARGIN
+        summit = math.log(opacity)
+        level = 2 * (summit - FAINTEST)
         reach_x, reach_y = math.sqrt(level * a), math.sqrt(level * c)
         x0, x1 = max(TILE * left, _ceil(centre_x - reach_x)), min(TILE * right, size[0], _floor(centre_x + reach_x) + 1)
         y0, y1 = max(TILE * top, _ceil(centre_y - reach_y)), min(TILE * bottom, size[1], _floor(centre_y + reach_y) + 1)
@@ -242,7 +243,7 @@ def _project_block(
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, y0, x1, y1
         slots[i] = (x1 - x0) * ((y1 - 1) // TALL + 1 - y0 // TALL)
 
-        dx, dy, dz, _ = _direction(means[i], position)
+        dx, dy, dz, _ = _direction(means, i, position)
         _harmonics(degree, dx, dy, dz, basis)
         for channel in range(3):
             colour = np.float32(0.5)
@@ -251,8 +252,9 @@ def _project_block(
             clamped[i, channel] = colour < np.float32(0)
             splats[i, 6 + channel] = max(colour, np.float32(0))
         splats[i, 0], splats[i, 1] = centre_x, centre_y
-        splats[i, 2], splats[i, 3], splats[i, 4] = c / determinant, -b / determinant, a / determinant
-        splats[i, 5], splats[i, 9] = opacity, determinant
+        inverse = 1 / determinant
+        splats[i, 2], splats[i, 3], splats[i, 4] = c * inverse, -b * inverse, a * inverse
+        splats[i, 5], splats[i, 9] = summit, determinant
         depths[i] = np.float32(z)
 
 
@@ -280,50 +282,51 @@ def _quaternion_gradient(g, q, length):
     gy = 2 * (x * (g[1] + g[3]) + z * (g[5] + g[7]) - 2 * y * (g[0] + g[8]) + w * (g[2] - g[6]))
     gz = 2 * (x * (g[2] + g[6]) + y * (g[5] + g[7]) - 2 * z * (g[0] + g[4]) + w * (g[3] - g[1]))
     along = w * gw + x * gx + y * gy + z * gz
-    return (gw - w * along) / length, (gx - x * along) / length, (gy - y * along) / length, (gz - z * along) / length
+    scale = 1 / length
+    return (gw - w * along) * scale, (gx - x * along) * scale, (gy - y * along) * scale, (gz - z * along) * scale
 
 
 @compiled()
-def origin(strip_x, strip_y, span):
+def origin(strip_x, strip_y, rows):
     """The pixel coordinates about which a splat's polynomial in a strip is written: amid the rows that it reaches."""
-    first, end = span & 255, span >> 8
-    return strip_x * WIDE + (WIDE - 1) / 2, strip_y * TALL + (first + end - 1) / 2
+    return strip_x * WIDE + 0.5 * (WIDE - 1), strip_y * TALL + 0.5 * ((rows & 255) + (rows >> 8) - 1)
 
 
 @compiled()
-def _collect(splat, box, first_slot, spans, slot_gradients, sums):
-    """Sum a Gaussian's gradients over its strips into `sums`, in a fixed order.
+def _collect(splats, boxes, i, slot_rows, slot, gradients, sums):
+    """Sum a Gaussian's gradients over its slots, from `slot` on, into `sums`, in a fixed order.
 
-    A slot holds the moments of h = dL/dpower about its origin: h, hx, hy, hxx, hxy, hyy; then red, green, blue, and
-    the two absolute sums. `sums`: u, v, A, B, C, opacity, red, green, blue, |u|, |v|.
+    A row of `gradients` holds the moments of h = dL/dpower about its origin: h, hx, hy, hxx, hxy, hyy; then red, green,
+    blue, and the two absolute sums. `sums`: u, v, A, B, C, h, red, green, blue, |u|, |v|.
     """
     sums[:] = 0.0
-    a, b, c = splat[2], splat[3], splat[4]
-    slot = first_slot
-    for strip_y in range(box[1] // TALL, (box[3] - 1) // TALL + 1):
-        for strip_x in range(box[0], box[2]):
-            if spans[slot] != 0:
-                g = slot_gradients[slot]
-                h, hx, hy = np.float64(g[0]), np.float64(g[1]), np.float64(g[2])
-                x, y = origin(strip_x, strip_y, spans[slot])
-                x -= splat[0]
-                y -= splat[1]
+    u, v, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
+    for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
+        for strip_x in range(boxes[i, 0], boxes[i, 2]):
+            if slot_rows[slot] != 0:
+                h, hx, hy = (
+                    np.float64(gradients[slot, 0]),
+                    np.float64(gradients[slot, 1]),
+                    np.float64(gradients[slot, 2]),
+                )
+                x, y = origin(strip_x, strip_y, slot_rows[slot])
+                x -= u
+                y -= v
                 sums[0] += (a * x + b * y) * h + a * hx + b * hy
                 sums[1] += (b * x + c * y) * h + b * hx + c * hy
-                sums[2] -= 0.5 * (g[3] + x * (2 * hx + x * h))
-                sums[3] -= g[4] + x * hy + y * (hx + x * h)
-                sums[4] -= 0.5 * (g[5] + y * (2 * hy + y * h))
+                sums[2] -= 0.5 * (gradients[slot, 3] + x * (2 * hx + x * h))
+                sums[3] -= gradients[slot, 4] + x * hy + y * (hx + x * h)
+                sums[4] -= 0.5 * (gradients[slot, 5] + y * (2 * hy + y * h))
                 sums[5] += h
-                for k in range(6, 11):
-                    sums[k] += g[k]
+                for field in range(6, 11):
+                    sums[field] += gradients[slot, field]
             slot += 1
-    sums[5] /= splat[5]
 
 
 @compiled()
 def _project_backward_block(
-    first, end, means, scales, quaternions, sh, degree, intrinsics, pose, position,
-    splats, clamped, boxes, slots, first_slots, spans, slot_gradients, half,
+    first, end, means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position,
+    splats, clamped, boxes, slots, first_slots, slot_rows, slot_gradients, half,
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
 ):  # fmt: skip
     fx, fy, _, _, limit_x, limit_y = intrinsics
@@ -338,15 +341,14 @@ def _project_backward_block(
             g_sh[i] = 0
             g_view[i] = 0
             continue
-        splat = splats[i]
-        _collect(splat, boxes[i], first_slots[i], spans, slot_gradients, sums)
-        g_opacities[i, 0] = sums[5]
+        _collect(splats, boxes, i, slot_rows, first_slots[i], slot_gradients, sums)
+        g_opacities[i, 0] = sums[5] / opacities[i, 0]
         g_view[i, 0], g_view[i, 1] = sums[0] * half[0], sums[1] * half[1]
         if g_view.shape[1] == 4:
             g_view[i, 2], g_view[i, 3] = sums[9] * half[0], sums[10] * half[1]
 
         # Colour: to the coefficients, and through the direction to the mean.
-        dx, dy, dz, distance = _direction(means[i], position)
+        dx, dy, dz, distance = _direction(means, i, position)
         _harmonics(degree, dx, dy, dz, basis)
         red = np.float32(0) if clamped[i, 0] else np.float32(sums[6])
         green = np.float32(0) if clamped[i, 1] else np.float32(sums[7])
@@ -357,19 +359,20 @@ def _project_backward_block(
         g_sh[i, coefficients:] = 0
         vx, vy, vz = _harmonics_gradient(degree, dx, dy, dz, g_basis)
         along = vx * dx + vy * dy + vz * dz
-        mx, my, mz = (vx - along * dx) / distance, (vy - along * dy) / distance, (vz - along * dz) / distance
+        nearness = 1 / distance
+        mx, my, mz = (vx - along * dx) * nearness, (vy - along * dy) * nearness, (vz - along * dz) * nearness
 
         # Conic Q to covariance: -Q G Q, G the symmetric matrix of the conic's gradient.
-        a, b, c = splat[2], splat[3], splat[4]
+        a, b, c = splats[i, 2], splats[i, 3], splats[i, 4]
         p00, p01 = a * sums[2] + b * sums[3] / 2, a * sums[3] / 2 + b * sums[4]
         p10, p11 = b * sums[2] + c * sums[3] / 2, b * sums[3] / 2 + c * sums[4]
         s00, s01, s11 = -(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)
 
         # Covariance to the scaled axes U S, U = T R: 2 G U S.
-        x, y, z = _to_camera(means[i], pose)
+        x, y, z = _to_camera(means, i, pose)
         held_x, free_x = _held(x, z, limit_x)
         held_y, free_y = _held(y, z, limit_y)
-        rotation, q, length = _rotation(quaternions[i])
+        rotation, q, length = _rotation(quaternions, i)
         t = _linearised(fx, fy, held_x, held_y, z, pose)
         u = _times_rotation(t, rotation)
         n0, n1, n2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
@@ -404,14 +407,16 @@ def _project_backward_block(
         j02 = t0 * pose[2, 0] + t1 * pose[2, 1] + t2 * pose[2, 2]
         j11 = t3 * pose[1, 0] + t4 * pose[1, 1] + t5 * pose[1, 2]
         j12 = t3 * pose[2, 0] + t4 * pose[2, 1] + t5 * pose[2, 2]
-        ax, ay = fx / z, fy / z
+        inverse = 1 / z
+        ax, ay = fx * inverse, fy * inverse
         cx, cy = ax * sums[0], ay * sums[1]
-        cz = -(x * cx + y * cy + ax * j00 + ay * j11) / z
-        cz += 2 * (ax * held_x * j02 + ay * held_y * j12) / (z * z)  # as upstream, also where x or y is held
+        cz = -(x * cx + y * cy + ax * j00 + ay * j11) * inverse
+        # As upstream: the derivative of held_x / z^2 as if held_x were a constant; where x is free, exactly right.
+        cz += 2 * (ax * held_x * j02 + ay * held_y * j12) * inverse * inverse
         if free_x:
-            cx -= ax * j02 / z
+            cx -= ax * j02 * inverse
         if free_y:
-            cy -= ay * j12 / z
+            cy -= ay * j12 * inverse
         g_means[i, 0] = mx + pose[0, 0] * cx + pose[1, 0] * cy + pose[2, 0] * cz
         g_means[i, 1] = my + pose[0, 1] * cx + pose[1, 1] * cy + pose[2, 1] * cz
         g_means[i, 2] = mz + pose[0, 2] * cx + pose[1, 2] * cy + pose[2, 2] * cz
@@ -419,8 +424,8 @@ def _project_backward_block(
 
 @compiled(parallel=True)
 def project_backward(
-    means, scales, quaternions, sh, degree, intrinsics, pose, position,
-    splats, clamped, boxes, slots, first_slots, spans, slot_gradients, half,
+    means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position,
+    splats, clamped, boxes, slots, first_slots, slot_rows, slot_gradients, half,
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
 ):  # fmt: skip
     """Fill the gradients `g_...` of each Gaussian from those of its slots."""
@@ -428,7 +433,7 @@ def project_backward(
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
         _project_backward_block(
-            first, min(first + BLOCK, count), means, scales, quaternions, sh, degree, intrinsics, pose, position,
-            splats, clamped, boxes, slots, first_slots, spans, slot_gradients, half,
+            first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, degree, intrinsics, pose,
+            position, splats, clamped, boxes, slots, first_slots, slot_rows, slot_gradients, half,
             g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
         )  # fmt: skip

@@ -24,18 +24,19 @@ from numba.extending import intrinsic
 
 from legs_loss.reference.compiling import FAST, compiled
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from legs_loss.reference.projection import BLOCK, MARGIN, TALL, WIDE, origin
+from legs_loss.reference.projection import BLOCK, FAINTEST, TALL, WIDE, origin
 
 PIXELS = WIDE * TALL
 CHECK = 16  # splats between two looks at whether a strip is finished
-FIELDS = 9  # of an entry: e, gx, gy, a, b, c, red, green, blue
+FIELDS = 11  # of an entry: e, gx, gy, a, b, c, red, green, blue, and the rows [first, end) that it reaches
 MOMENTS = 11  # of a slot's gradient: h, hx, hy, hxx, hxy, hyy, red, green, blue, |u|, |v|
 
 # Planes of a strip's state. T: transmittance, its sign turned once the pixel is finished (or is outside the image).
 X, Y, T = 0, PIXELS, 2 * PIXELS
 RED, GREEN, BLUE = 3 * PIXELS, 4 * PIXELS, 5 * PIXELS  # forward: the colour so far; backward: the gradient to it
 REST = 6 * PIXELS  # backward: the gradient's product with the colour that is still to come
-PLANES = 7
+WORK = 7 * PIXELS  # what one loop leaves for the next: short loops overlap in the processor, one long loop does not
+PLANES = 8
 
 _MAX, _MIN, _LAST = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -52,7 +53,7 @@ _P0, _P1, _P2, _P3, _P4, _P5 = (
         0.001324088770716,
     )
 )
-_UNDERFLOW = np.float32(-100)
+_UNDERFLOW = np.float32(-32)
 _BIAS, _MANTISSA = np.int32(127), np.int32(23)
 
 
@@ -72,7 +73,8 @@ def exp2(x):
     x = max(x, _UNDERFLOW)
     whole = np.int32(x - _HALF)
     f = x - np.float32(whole)
-    fraction = _P0 + f * (_P1 + f * (_P2 + f * (_P3 + f * (_P4 + f * _P5))))
+    ff = f * f
+    fraction = (_P0 + _P1 * f) + ff * ((_P2 + _P3 * f) + ff * (_P4 + _P5 * f))  # in pairs: a shorter chain
     return fraction * _as_float((whole + _BIAS) << _MANTISSA)
 
 
@@ -80,11 +82,8 @@ def exp2(x):
 
 
 @compiled()
-def order_by_depth(depths, slots, first_slots):
-    """Indices of the Gaussians that are drawn, front to back; equal depths keep their order. A radix sort.
-
-    Gives each its first slot too, in the same order.
-    """
+def order_by_depth(depths, slots):
+    """Indices of the Gaussians that are drawn, front to back; equal depths keep their order. A radix sort."""
     bits, count = depths.view(np.uint32), 0
     order = np.empty(len(slots), np.int32)
     for i in range(len(slots)):
@@ -104,10 +103,6 @@ def order_by_depth(depths, slots, first_slots):
             other[starts[digit]] = i
             starts[digit] += 1
         order, other = other, order
-    slot = 0
-    for i in order:
-        first_slots[i] = slot
-        slot += slots[i]
     return order
 
 
@@ -135,63 +130,100 @@ def _rows(left, top, u, v, a, b, c, determinant, level, y0, y1):
 
 
 @compiled()
-def _find_spans_block(first_rank, end_rank, order, splats, boxes, first_slots, across, spans, slot_strips, slot_entries):
-    for rank in range(first_rank, end_rank):
-        i = order[rank]
-        u, v, a, b, c, opacity = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4], splats[i, 5]
-        red, green, blue, determinant = splats[i, 6], splats[i, 7], splats[i, 8], 1 / splats[i, 9]
+def _find_rows_block(first, end, splats, boxes, slots, first_slots, across, slot_strips, slot_rows):
+    for i in range(first, end):
+        if slots[i] == 0:
+            continue
+        u, v, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
+        determinant = 1 / splats[i, 9]
         x0, y0, x1, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
-        summit = math.log(opacity)
-        level = 2 * (summit - math.log(MIN_ALPHA)) + 2 * MARGIN
+        level = 2 * (splats[i, 5] - FAINTEST)
+        # The ellipse's upper and lower edge over dx are (-B dx +- sqrt(C level - D dx^2)) / C, D = A C - B^2. Their
+        # extreme points are at dx = -+ summit, or, where the strip does not have them, at its nearer side.
+        wide = math.sqrt(level * c / determinant)
+        summit = -b * math.sqrt(level / (a * determinant))
+        tall, slope, bend = level / c, -b / c, determinant / (c * c)
         slot = first_slots[i]
         for strip_y in range(y0 // TALL, (y1 - 1) // TALL + 1):
+            top = strip_y * TALL
+            lowest, highest = max(top, y0) - v, min(top + TALL, y1) - 1 - v
             for strip_x in range(x0, x1):
-                first, end = _rows(strip_x * WIDE, strip_y * TALL, u, v, a, b, c, determinant, level, y0, y1)
-                span = first | end << 8
-                spans[slot] = span
-                slot_strips[slot] = strip_y * across + strip_x if span != 0 else -1
-                x, y = origin(strip_x, strip_y, span)
-                x -= u
-                y -= v
-                entry = slot_entries[slot]
-                entry[0] = _LOG2E * (summit - 0.5 * (a * x * x + c * y * y) - b * x * y)
-                entry[1] = -_LOG2E * (a * x + b * y)
-                entry[2] = -_LOG2E * (b * x + c * y)
-                entry[3], entry[4], entry[5] = -0.5 * _LOG2E * a, -_LOG2E * b, -0.5 * _LOG2E * c
-                entry[6], entry[7], entry[8] = red, green, blue
+                near, far = max(strip_x * WIDE - u, -wide), min(strip_x * WIDE + (WIDE - 1) - u, wide)
+                slot_strips[slot], slot_rows[slot] = -1, 0
+                if near <= far:
+                    at = min(max(-summit, near), far)
+                    row = math.ceil(v + max(lowest, slope * at - math.sqrt(max(tall - bend * at * at, 0.0))))
+                    at = min(max(summit, near), far)
+                    end_row = math.floor(v + min(highest, slope * at + math.sqrt(max(tall - bend * at * at, 0.0)))) + 1
+                    if row < end_row:
+                        slot_strips[slot] = strip_y * across + strip_x
+                        slot_rows[slot] = np.int32(row - top) | np.int32(end_row - top) << 8
                 slot += 1
 
 
 @compiled(parallel=True)
-def find_spans(order, splats, boxes, first_slots, across, spans, slot_strips, slot_entries):
-    """Fill, for each strip in each Gaussian's box: the rows that it reaches (0: none), the strip, the polynomial."""
-    count = len(order)
+def find_rows(splats, boxes, slots, first_slots, across, slot_strips, slot_rows):
+    """Fill the slots, one for each strip in each Gaussian's box: the strip, or -1, and its rows."""
+    count = len(slots)
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
-        _find_spans_block(
-            first, min(first + BLOCK, count), order, splats, boxes, first_slots, across, spans, slot_strips, slot_entries
+        _find_rows_block(
+            first, min(first + BLOCK, count), splats, boxes, slots, first_slots, across, slot_strips, slot_rows
         )
 
 
 @compiled()
-def fill_entries(spans, slot_strips, slot_entries, ranges):
-    """Sort the slots, which are in depth order, by strip. Fills where each strip begins; returns the sorted entries."""
+def sort_slots(order, slots, first_slots, slot_strips, ranges, places):
+    """Give each slot that reaches its strip a place: by strip, and in a strip by depth. Fills where strips begin."""
     for strip in slot_strips:
         if strip >= 0:
             ranges[strip + 1] += 1
     for strip in range(1, len(ranges)):
         ranges[strip] += ranges[strip - 1]
-    cursors, count = ranges.copy(), ranges[-1]
-    entries, entry_slots = np.empty((count, FIELDS), np.float32), np.empty(count, np.int64)
-    for slot in range(len(spans)):
-        strip = slot_strips[slot]
-        if strip >= 0:
-            k = cursors[strip]
-            cursors[strip] += 1
-            entry_slots[k] = slot
-            for field in range(FIELDS):
-                entries[k, field] = slot_entries[slot, field]
-    return entries, entry_slots
+    cursors = ranges.copy()
+    for i in order:
+        for slot in range(first_slots[i], first_slots[i] + slots[i]):
+            strip = slot_strips[slot]
+            if strip >= 0:
+                places[slot] = cursors[strip]
+                cursors[strip] += 1
+
+
+@compiled()
+def _expand_block(first_rank, end_rank, order, splats, boxes, first_slots, slot_rows, places, entries, entry_slots):
+    for rank in range(first_rank, end_rank):
+        i = order[rank]
+        u, v, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
+        red, green, blue = splats[i, 6], splats[i, 7], splats[i, 8]
+        summit = splats[i, 5]
+        slot = first_slots[i]
+        for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
+            for strip_x in range(boxes[i, 0], boxes[i, 2]):
+                rows, p = slot_rows[slot], places[slot]
+                if rows == 0:
+                    slot += 1
+                    continue
+                x, y = origin(strip_x, strip_y, rows)
+                x -= u
+                y -= v
+                entries[p, 0] = _LOG2E * (summit - 0.5 * (a * x * x + c * y * y) - b * x * y)
+                entries[p, 1], entries[p, 2] = -_LOG2E * (a * x + b * y), -_LOG2E * (b * x + c * y)
+                entries[p, 3], entries[p, 4], entries[p, 5] = -0.5 * _LOG2E * a, -_LOG2E * b, -0.5 * _LOG2E * c
+                entries[p, 6], entries[p, 7], entries[p, 8] = red, green, blue
+                entries[p, 9], entries[p, 10] = rows & 255, rows >> 8
+                entry_slots[p] = slot
+                slot += 1
+
+
+@compiled(parallel=True)
+def expand(order, splats, boxes, first_slots, slot_rows, places, entries, entry_slots):
+    """Write the polynomial of every entry to its place, and which slot it is."""
+    count = len(order)
+    for block in prange((count + BLOCK - 1) // BLOCK):
+        first = block * BLOCK
+        _expand_block(
+            first, min(first + BLOCK, count), order, splats, boxes, first_slots, slot_rows, places, entries, entry_slots
+        )
 
 
 # Blending
@@ -216,19 +248,20 @@ def _unfinished(state):
 
 
 @compiled()
-def _render_strip(state, begin, end, entries, entry_slots, spans):
+def _blend(state, begin, end, entries):
     """Blend a strip's entries; returns the one after the last that mattered."""
     for k in range(begin, end):
         if (k - begin) % CHECK == 0 and not _unfinished(state):
             return k
         e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
         red, green, blue = entries[k, 6], entries[k, 7], entries[k, 8]
-        span = spans[entry_slots[k]]
-        first, last = span & 255, span >> 8 & 255
-        middle = np.float32(first + last - 1) * _HALF
+        first, last = np.uint32(entries[k, 9]) & 63, np.uint32(entries[k, 10]) & 63
+        middle = (entries[k, 9] + entries[k, 10] - _ONE) * _HALF
         for i in range(first * WIDE, last * WIDE):
-            x, y, before = state[X + i], state[Y + i] - middle, state[T + i]
-            alpha = min(exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e)), _MAX)
+            x, y = state[X + i], state[Y + i] - middle
+            state[WORK + i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
+        for i in range(first * WIDE, last * WIDE):
+            alpha, before = min(state[WORK + i], _MAX), state[T + i]
             alpha = alpha if alpha >= _MIN else _ZERO
             after = before - alpha * before
             drawn = after >= _LAST  # false for a finished pixel too, whose transmittance is negative
@@ -241,7 +274,7 @@ def _render_strip(state, begin, end, entries, entry_slots, spans):
 
 
 @compiled()
-def _render_worker(worker, workers, strip_order, ranges, ends, entries, entry_slots, spans, background, across, image):
+def _render_worker(worker, workers, strip_order, ranges, ends, entries, background, across, image):
     state = np.empty(PLANES * PIXELS, np.float32)
     height, width = image.shape[1], image.shape[2]
     for turn in range(worker, len(strip_order), workers):
@@ -250,7 +283,7 @@ def _render_worker(worker, workers, strip_order, ranges, ends, entries, entry_sl
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
         _place(state, wide, tall)
         state[RED : RED + 3 * PIXELS] = 0
-        ends[strip] = _render_strip(state, ranges[strip], ranges[strip + 1], entries, entry_slots, spans)
+        ends[strip] = _blend(state, ranges[strip], ranges[strip + 1], entries)
         for y in range(tall):
             for x in range(wide):
                 pixel = y * WIDE + x
@@ -261,17 +294,15 @@ def _render_worker(worker, workers, strip_order, ranges, ends, entries, entry_sl
 
 
 @compiled(parallel=True)
-def render(workers, strip_order, ranges, ends, entries, entry_slots, spans, background, across, image):
+def render(workers, strip_order, ranges, ends, entries, background, across, image):
     """Fill the image, and for each strip the end of the entries that mattered."""
     for worker in prange(workers):
-        _render_worker(
-            worker, workers, strip_order, ranges, ends, entries, entry_slots, spans, background, across, image
-        )
+        _render_worker(worker, workers, strip_order, ranges, ends, entries, background, across, image)
 
 
 @compiled(fastmath=FAST | {"reassoc"})
-def _render_backward_strip(state, begin, end, entries, entry_slots, spans, slot_gradients):
-    """As `_render_strip`, front to back, filling the slots' gradients: moments of h = dL/dpower, and the colour's.
+def _blend_backward(state, begin, end, entries, entry_slots, gradients):
+    """As `_blend`, front to back, filling the slots' gradients: moments of h = dL/dpower, and the colour's.
 
     dL/dalpha = T (g . colour) - rest / (1 - alpha), where rest = g . (all the colour behind this splat): what is left
     of g . (the pixel's colour) after what came before. Nothing is carried from back to front.
@@ -280,15 +311,15 @@ def _render_backward_strip(state, begin, end, entries, entry_slots, spans, slot_
     for k in range(begin, end):
         e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
         red, green, blue = entries[k, 6], entries[k, 7], entries[k, 8]
-        slot = entry_slots[k]
-        span = spans[slot]
-        first, last = span & 255, span >> 8 & 255
-        middle = np.float32(first + last - 1) * _HALF
+        first, last = np.uint32(entries[k, 9]) & 63, np.uint32(entries[k, 10]) & 63
+        middle = (entries[k, 9] + entries[k, 10] - _ONE) * _HALF
         a2, c2 = a + a, c + c
         m = mx = my = mxx = mxy = myy = r = g = bl = au = av = _ZERO
         for i in range(first * WIDE, last * WIDE):
-            x, y, before = state[X + i], state[Y + i] - middle, state[T + i]
-            response = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
+            x, y = state[X + i], state[Y + i] - middle
+            state[WORK + i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
+        for i in range(first * WIDE, last * WIDE):
+            response, before = state[WORK + i], state[T + i]
             alpha = min(response, _MAX)
             alpha = alpha if alpha >= _MIN else _ZERO
             after = before - alpha * before
@@ -300,7 +331,12 @@ def _render_backward_strip(state, begin, end, entries, entry_slots, spans, slot_
             rest = state[REST + i] - weight * own
             state[REST + i] = rest
             h = response * (before * own - rest / (_ONE - alpha))
-            h = h if weight > _ZERO else _ZERO
+            state[WORK + i] = h if weight > _ZERO else _ZERO
+            r += weight * g_red
+            g += weight * g_green
+            bl += weight * g_blue
+        for i in range(first * WIDE, last * WIDE):
+            x, y, h = state[X + i], state[Y + i] - middle, state[WORK + i]
             hx, hy = h * x, h * y
             m += h
             mx += hx
@@ -308,19 +344,29 @@ def _render_backward_strip(state, begin, end, entries, entry_slots, spans, slot_
             mxx += hx * x
             mxy += hx * y
             myy += hy * y
-            r += weight * g_red
-            g += weight * g_green
-            bl += weight * g_blue
             au += abs(h * (a2 * x + (b * y + gx)))
             av += abs(h * (c2 * y + (b * x + gy)))
-        out = slot_gradients[slot]
-        out[0], out[1], out[2], out[3], out[4], out[5] = m, mx, my, mxx, mxy, myy
-        out[6], out[7], out[8], out[9], out[10] = r, g, bl, au * scale, av * scale
+        slot = entry_slots[k]
+        (
+            gradients[slot, 0],
+            gradients[slot, 1],
+            gradients[slot, 2],
+            gradients[slot, 3],
+            gradients[slot, 4],
+            gradients[slot, 5],
+        ) = m, mx, my, mxx, mxy, myy
+        gradients[slot, 6], gradients[slot, 7], gradients[slot, 8], gradients[slot, 9], gradients[slot, 10] = (
+            r,
+            g,
+            bl,
+            au * scale,
+            av * scale,
+        )
 
 
 @compiled()
 def _render_backward_worker(
-    worker, workers, strip_order, ranges, ends, entries, entry_slots, spans, across, image, g_image, slot_gradients
+    worker, workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, gradients
 ):
     state = np.empty(PLANES * PIXELS, np.float32)
     height, width = image.shape[1], image.shape[2]
@@ -339,18 +385,15 @@ def _render_backward_worker(
                     state[RED + channel * PIXELS + pixel] = gradient
                     rest += gradient * image[channel, top + y, left + x]
                 state[REST + pixel] = rest
-        _render_backward_strip(state, ranges[strip], ends[strip], entries, entry_slots, spans, slot_gradients)
+        _blend_backward(state, ranges[strip], ends[strip], entries, entry_slots, gradients)
         for k in range(ends[strip], ranges[strip + 1]):
-            slot_gradients[entry_slots[k]] = 0
+            gradients[entry_slots[k]] = 0
 
 
 @compiled(parallel=True)
-def render_backward(
-    workers, strip_order, ranges, ends, entries, entry_slots, spans, across, image, g_image, slot_gradients
-):
-    """Fill the gradient of every slot that has an entry."""
+def render_backward(workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, gradients):
+    """Fill the gradient of every slot that reaches its strip."""
     for worker in prange(workers):
         _render_backward_worker(
-            worker, workers, strip_order, ranges, ends, entries, entry_slots, spans, across, image, g_image,
-            slot_gradients,
-        )  # fmt: skip
+            worker, workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, gradients
+        )

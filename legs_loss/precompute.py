@@ -13,11 +13,11 @@ import os
 import signal
 import threading
 import time
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Union
+from typing import Any, Dict, Generator, Iterator, List, NamedTuple, Optional, Sequence, Union
 
 import numpy as np
 import torch
@@ -86,22 +86,22 @@ def precompute(
         tasks = [_Task(view, known.get(name, [])) for name, view in views.items()]
         results = _in_processes(job, tasks, workers) if workers > 1 else (_make(job, task) for task in tasks)
         staged: List[Entry] = []
-        committed = time.monotonic()
-        try:
-            for result in tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress):
-                if result.problem is not None:
-                    report.skipped[result.view] = result.problem
-                elif result.entry is None:
-                    report.kept.append(result.view)
-                else:
-                    report.made.append(result.view)
-                    staged.append(result.entry)
-                if staged and time.monotonic() > committed + _COMMIT_SECONDS:
-                    writer.commit(staged)
-                    staged, committed = [], time.monotonic()
-        finally:
-            if staged:
-                writer.commit(staged)
+        due = time.monotonic()  # the first at once, so that there is a store
+        with closing(results):
+            try:
+                for result in tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress):
+                    if result.problem is not None:
+                        report.skipped[result.view] = result.problem
+                    elif result.entry is None:
+                        report.kept.append(result.view)
+                    else:
+                        report.made.append(result.view)
+                        staged.append(result.entry)
+                    if staged and time.monotonic() >= due:
+                        _commit(writer, staged)
+                        due = time.monotonic() + _COMMIT_SECONDS
+            finally:
+                _commit(writer, staged)
     return report
 
 
@@ -165,7 +165,7 @@ def _make(job: _Job, task: _Task) -> _Result:
         return _Result(view.name, problem=f"{view.path}: {error or 'not enough memory'}")
 
 
-def _in_processes(job: _Job, tasks: Sequence[_Task], workers: int) -> Iterator[_Result]:
+def _in_processes(job: _Job, tasks: Sequence[_Task], workers: int) -> Generator[_Result, None, None]:
     """Yield the results of worker processes, in the order they come.
 
     Each worker has one task at a time and a pipe of its own: a worker that dies costs one view, and when this process
@@ -212,7 +212,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, job), daemon=True)
-        with _interrupts_ignored():  # for good in the process: a Ctrl-C is the parent's to handle
+        with _on_interrupt(signal.SIG_IGN):  # the process inherits it: a Ctrl-C is the parent's to handle
             self.process.start()
         theirs.close()
 
@@ -231,12 +231,25 @@ def _work(connection: Any, job: _Job) -> None:
         pass
 
 
+def _commit(writer: StoreWriter, staged: List[Entry]) -> None:
+    """Commit what is staged, and empty the list; an interrupt waits until that is done."""
+    interrupts: List[int] = []
+    with _on_interrupt(lambda number, _: interrupts.append(number)):
+        if staged:
+            writer.commit(staged)
+        staged.clear()
+    if interrupts:
+        raise KeyboardInterrupt
+
+
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():  # only the main thread is ever interrupted
+def _on_interrupt(handler: Any) -> Iterator[None]:
+    """Handle SIGINT otherwise for a while, where it is handled at all: in the main thread, if it is not ignored."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, handler)
     try:
         yield
     finally:

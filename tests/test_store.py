@@ -242,6 +242,13 @@ class TestWriters:
         # Either nothing of the commit is seen, or all of it.
         assert outcomes == {(("a.png", False), ("b.png", False)), (("a.png", True), ("b.png", False), ("c.png", True))}
 
+    def test_who_reads_the_manifest_meanwhile_reads_the_old_one(self, tmp_path):
+        put(tmp_path, BLANK)
+        before = (tmp_path / MANIFEST).read_bytes()
+        with open(str(tmp_path / MANIFEST), "rb") as reader:
+            put(tmp_path, *views("b.png"))
+            assert reader.read() == before
+
     @needs_fork
     def test_two_at_once_lose_nothing(self, tmp_path):
         context = multiprocessing.get_context("fork")

@@ -57,7 +57,7 @@ class _Rasterize(torch.autograd.Function):
         strips.sort_slots(order, slots, first_slots, slot_strips, ranges, places)
         entries = np.empty((int(ranges[-1]), strips.FIELDS), np.float32)
         entry_slots = np.empty(len(entries), np.int64)
-        strips.expand(order, splats, boxes, first_slots, slot_rows, places, entries, entry_slots)
+        strips.expand(splats, boxes, slots, first_slots, slot_rows, places, entries, entry_slots)
 
         image = torch.empty(3, view.height, view.width)
         ends = np.empty(across * down, np.int64)

@@ -135,14 +135,22 @@ def _check_shapes(tensors: Any, sh_degree: int, viewspace: Optional[Tensor]) -> 
 
 
 def _check_values(tensors: Any, background: Tensor) -> None:
-    for name, tensor in list(tensors.items()) + [("background", background)]:
-        # A sum is far cheaper than a mask of the whole, and finite whenever everything is (overflow apart).
-        if not torch.isfinite(tensor.detach().sum()) and not torch.isfinite(tensor).all():
-            rows = torch.nonzero(~torch.isfinite(tensor.reshape(tensor.shape[0], -1)).all(1))[:, 0]
+    for name, tensor in [*tensors.items(), ("background", background)]:
+        if not _finite(tensor.detach()):
+            rows = torch.nonzero(~torch.isfinite(tensor.detach().reshape(len(tensor), -1)).all(1))[:, 0]
             raise LegsError(
-                f"{name} {list(tensor.shape)} holds NaN or infinity in {len(rows)} of its {tensor.shape[0]} rows, "
+                f"{name} {list(tensor.shape)} holds NaN or infinity in {len(rows)} of its {len(tensor)} rows, "
                 f"first in row {int(rows[0])}"
             )
+
+
+def _finite(tensor: Tensor) -> bool:
+    # A sum is finite whenever everything is (overflow apart), and numpy's is far cheaper than a mask of the whole.
+    if tensor.dtype in (torch.float32, torch.float64):
+        with np.errstate(all="ignore"):
+            if np.isfinite(tensor.numpy().sum()):
+                return True
+    return bool(torch.isfinite(tensor).all())
 
 
 def _check_camera(camera: Any) -> View:

@@ -190,9 +190,10 @@ def sort_slots(order, slots, first_slots, slot_strips, ranges, places):
 
 
 @compiled()
-def _expand_block(first_rank, end_rank, order, splats, boxes, first_slots, slot_rows, places, entries, entry_slots):
-    for rank in range(first_rank, end_rank):
-        i = order[rank]
+def _expand_block(first, end, splats, boxes, slots, first_slots, slot_rows, places, entries, entry_slots):
+    for i in range(first, end):
+        if slots[i] == 0:
+            continue
         u, v, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
         red, green, blue = splats[i, 6], splats[i, 7], splats[i, 8]
         summit = splats[i, 5]
@@ -216,13 +217,13 @@ def _expand_block(first_rank, end_rank, order, splats, boxes, first_slots, slot_
 
 
 @compiled(parallel=True)
-def expand(order, splats, boxes, first_slots, slot_rows, places, entries, entry_slots):
+def expand(splats, boxes, slots, first_slots, slot_rows, places, entries, entry_slots):
     """Write the polynomial of every entry to its place, and which slot it is."""
-    count = len(order)
+    count = len(slots)
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
         _expand_block(
-            first, min(first + BLOCK, count), order, splats, boxes, first_slots, slot_rows, places, entries, entry_slots
+            first, min(first + BLOCK, count), splats, boxes, slots, first_slots, slot_rows, places, entries, entry_slots
         )
 
 

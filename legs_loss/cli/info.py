@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     damaged, orphans = store.check()
     print(path)
     print(f"  views      {len({entry.view for entry in entries})}")
-    print(f"  maps       {len(entries)} ({sum(entry.bytes for entry in entries) / 1e6:.1f} MB)")
+    print(f"  maps       {len(entries)} ({sum(entry.bytes for entry in entries) / 1e6:.3g} MB)")
     print(f"  sizes      {_counted(f'{entry.width}x{entry.height}' for entry in entries)}")
     print(f"  operators  {_counted(f'{entry.operator} p={entry.p:g} eps={entry.eps:g}' for entry in entries)}")
     if any(entry.background for entry in entries):

@@ -1,0 +1,54 @@
+"""``legs info`` says what a store holds and what is wrong with it."""
+
+from __future__ import annotations
+
+import pytest
+
+from legs_loss.precompute import precompute
+from legs_loss.scenes import read_scene
+from legs_loss.store import WeightStore
+from tests.support import colmap_scene, legs
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return colmap_scene(tmp_path / "scene", names=[f"{i}.png" for i in range(6)])
+
+
+@pytest.fixture
+def store(scene):
+    return precompute(read_scene(scene)).store
+
+
+class TestInfo:
+    def test_what_a_store_holds(self, scene, store):
+        precompute(read_scene(scene), spec="eggs", resolution=2)
+        for path in (store, scene):
+            done = legs("info", path)
+            assert done.returncode == 0, done.stderr
+            for line in ("views      6", "maps       12", "20x15 (6), 40x30 (6)", "laplacian p=2", "damaged    none"):
+                assert line in done.stdout
+
+    def test_damaged_and_orphaned_files_are_named(self, store):
+        damaged = sorted(WeightStore(store).entries.values(), key=lambda entry: entry.view)[1]
+        data = (store / damaged.file).read_bytes()
+        (store / damaged.file).write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+        (store / "lost-0123456789abcdef.npy").write_bytes(b"")
+        done = legs("info", store)
+        assert done.returncode == 1
+        assert "damaged    1" in done.stdout
+        assert damaged.view in done.stdout
+        assert "lost-0123456789abcdef.npy" in done.stdout
+        assert "legs precompute again" in done.stderr
+
+    def test_a_damaged_manifest(self, store):
+        manifest = store / "manifest.json"
+        manifest.write_bytes(manifest.read_bytes().replace(b"laplacian", b"laplacien", 1))
+        done = legs("info", store)
+        assert done.returncode == 1
+        assert "manifest.json is damaged" in done.stderr
+
+    def test_no_store(self, tmp_path):
+        done = legs("info", tmp_path)
+        assert done.returncode == 2
+        assert "is no store" in done.stderr

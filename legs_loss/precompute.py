@@ -235,9 +235,9 @@ def _commit(writer: StoreWriter, staged: List[Entry]) -> None:
     """Commit what is staged, and empty the list; an interrupt waits until that is done."""
     interrupts: List[int] = []
     with _on_interrupt(lambda number, _: interrupts.append(number)):
-        if staged:
-            writer.commit(staged)
-        staged.clear()
+        batch, staged[:] = list(staged), []
+        if batch:
+            writer.commit(batch)
     if interrupts:
         raise KeyboardInterrupt
 

@@ -166,15 +166,11 @@ class StoreWriter:
         self.path = Path(path)
 
     def __enter__(self) -> StoreWriter:
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            with self._locked():
-                for leftover in _leftovers(self.path, self.entries()):
-                    _remove(leftover)
-                self.staging = Path(tempfile.mkdtemp(prefix=_STAGING, dir=str(self.path)))
-                self._alive = _Lock(self.staging / _LOCK)
-        except OSError as error:
-            raise LegsError(f"cannot write to {self.path}: {error.strerror or error}") from None
+        with self._locked():
+            for leftover in _leftovers(self.path, self.entries()):
+                _remove(leftover)
+            self.staging = Path(tempfile.mkdtemp(prefix=_STAGING, dir=str(self.path)))
+            self._alive = _Lock(self.staging / _LOCK)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -201,11 +197,15 @@ class StoreWriter:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        lock = _Lock(self.path / _LOCK)
         try:
-            yield
-        finally:
-            lock.release()
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock = _Lock(self.path / _LOCK)
+            try:
+                yield
+            finally:
+                lock.release()
+        except OSError as error:
+            raise LegsError(f"cannot write to {self.path}: {error.strerror or error}") from None
 
 
 def read_map(folder: Path, entry: Entry) -> np.ndarray:

@@ -218,6 +218,7 @@ class TestDamage:
 
 
 class TestWriters:
+    @pytest.mark.slow
     @needs_fork
     def test_killed_at_any_line_the_store_is_usable(self, tmp_path):
         """Kill a writer that replaces one map and adds another, at every line that it runs."""
@@ -268,6 +269,20 @@ class TestWriters:
             first.commit(staged)
         assert {entry.view for entry in WeightStore(tmp_path).entries.values()} == {"images/a.png", "b.png"}
         assert not list(tmp_path.glob(".writing-*"))
+
+    def test_a_full_disk_is_one_error_and_changes_nothing(self, tmp_path, monkeypatch):
+        put(tmp_path, BLANK)
+
+        def full(*_):
+            raise OSError(28, "No space left on device")
+
+        with StoreWriter(tmp_path) as writer:
+            staged = [stage(writer.staging, BLANK, ramp(BLANK, 5))]
+            monkeypatch.setattr(store_module, "_write", full)
+            with pytest.raises(LegsError, match=r"cannot write to .*No space left"):
+                writer.commit(staged)
+        monkeypatch.undo()
+        assert np.array_equal(read_map(tmp_path, *WeightStore(tmp_path).entries.values()), ramp(BLANK).astype("f2"))
 
     def test_files_of_others_are_left_alone(self, tmp_path):
         for name in ("features.npy", "notes.txt", "a-b.npy"):

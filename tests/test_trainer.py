@@ -263,7 +263,7 @@ def test_a_gray_photograph_trains_as_rgb(scene: Scene, tmp_path: Path) -> None:
 def test_scenes_that_cannot_be_trained_on_say_why(scene: Scene) -> None:
     fisheye = replace(scene.views[1], camera=None, camera_model="OPENCV_FISHEYE")
     for broken, message in (
-        (replace(scene, points_file=None), "no points to start from"),
+        (replace(scene, read_points=None), "no points to start from"),
         (replace(scene, views=(scene.views[0], fisheye)), "OPENCV_FISHEYE.*undistort"),
         (replace(scene, views=(scene.views[0], replace(fisheye, camera_model=None))), "has no camera"),
         (replace(scene, views=scene.views[:1]), "none is left to train on"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Tuple
 
@@ -90,7 +91,7 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
         root=root,
         kind="colmap",
         views=tuple(sorted(views, key=lambda view: view.name)),
-        points_file=points if points.is_file() else None,
+        read_points=partial(read_points, points) if points.is_file() else None,
     )
 
 

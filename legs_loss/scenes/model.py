@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Iterator, Optional, Tuple
+from typing import Callable, Iterator, Optional, Tuple
 
 import numpy as np
 
@@ -81,17 +81,15 @@ class Scene:
     root: Path
     kind: str
     views: Tuple[View, ...]
-    points_file: Optional[Path] = None
+    read_points: Optional[Callable[[], PointCloud]] = None
 
     @property
     def points(self) -> Optional[PointCloud]:
-        """COLMAP's points, read from disk at every call (most users of a scene need none).
+        """COLMAP's points, or None; read from disk at every call, since most users of a scene need none.
 
         Raises :class:`LegsError` when the file is damaged.
         """
-        from legs_loss.scenes.colmap import read_points
-
-        return None if self.points_file is None else read_points(self.points_file)
+        return None if self.read_points is None else self.read_points()
 
 
 def view_names(view: str) -> Iterator[str]:

@@ -10,9 +10,11 @@ TILE = 16  # pixels: the side of a tile
 NEAR = 0.2  # world units: a Gaussian whose centre is not beyond it is not drawn
 GUARD = 1.3  # times tan(fov / 2): where x/z and y/z are held when the projection is linearised
 DILATION = 0.3  # pixels^2: added to the diagonal of the 2D covariance
-MAX_ALPHA = 0.99
-MIN_ALPHA = 1.0 / 255.0  # a fainter contribution is skipped
-MIN_TRANSMITTANCE = 1e-4  # a pixel is finished before its transmittance falls below
+# The three thresholds are float32 numbers there, and here in every type: in float64, 0.01 * 0.01 would not be below
+# 1e-4, and a pixel behind two opaque Gaussians would not be finished.
+MAX_ALPHA = float(np.float32(0.99))
+MIN_ALPHA = float(np.float32(1 / 255))  # a fainter contribution is skipped
+MIN_TRANSMITTANCE = float(np.float32(1e-4))  # a pixel is finished before its transmittance falls below
 
 # The real spherical harmonics of degrees 0 to 3, in the order and with the signs that 3DGS stores them.
 SH_C0 = 0.28209479177387814

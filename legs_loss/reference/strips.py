@@ -146,15 +146,15 @@ def _find_rows_block(first, end, splats, boxes, slots, first_slots, across, slot
         slot = first_slots[i]
         for strip_y in range(y0 // TALL, (y1 - 1) // TALL + 1):
             top = strip_y * TALL
-            lowest, highest = max(top, y0) - v, min(top + TALL, y1) - 1 - v
+            first_row, last_row = float(max(top, y0)), float(min(top + TALL, y1) - 1)
             for strip_x in range(x0, x1):
                 near, far = max(strip_x * WIDE - u, -wide), min(strip_x * WIDE + (WIDE - 1) - u, wide)
                 slot_strips[slot], slot_rows[slot] = -1, 0
                 if near <= far:
                     at = min(max(-summit, near), far)
-                    row = math.ceil(v + max(lowest, slope * at - math.sqrt(max(tall - bend * at * at, 0.0))))
+                    row = math.ceil(max(first_row, v + slope * at - math.sqrt(max(tall - bend * at * at, 0.0))))
                     at = min(max(summit, near), far)
-                    end_row = math.floor(v + min(highest, slope * at + math.sqrt(max(tall - bend * at * at, 0.0)))) + 1
+                    end_row = math.floor(min(last_row, v + slope * at + math.sqrt(max(tall - bend * at * at, 0.0)))) + 1
                     if row < end_row:
                         slot_strips[slot] = strip_y * across + strip_x
                         slot_rows[slot] = np.int32(row - top) | np.int32(end_row - top) << 8

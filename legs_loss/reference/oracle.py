@@ -164,7 +164,8 @@ def render(
     to_camera = torch.as_tensor(view.world_to_camera, dtype=dtype)
     points = means @ to_camera[:3, :3].T + to_camera[:3, 3]
     seen = torch.nonzero(points[:, 2] > NEAR)[:, 0]
-    seen = seen[torch.argsort(points[seen, 2].detach(), stable=True)]  # front to back; equal depths keep their order
+    # Front to back; equal depths keep their order. As upstream, depths are compared as float32 in whatever type.
+    seen = seen[torch.argsort(points[seen, 2].detach().to(torch.float32), stable=True)]
 
     splats = project(points[seen], scales[seen], quaternions[seen], view)
     directions = torch.nn.functional.normalize(means[seen] - torch.as_tensor(view.position, dtype=dtype), dim=1)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from legs_loss import LegsError, configure, l1_loss, memo, runtime, weight_map
+from legs_loss import LegsError, WeightSpec, configure, l1_loss, memo, runtime, weight_map
 from legs_loss.precompute import precompute
 from legs_loss.runtime import counts
 from legs_loss.scenes import read_scene
@@ -249,3 +249,35 @@ def test_it_can_be_compiled():
     compiled = torch.compile(lambda p, t: l1_loss(p, t))
     prediction, target = pair(3, 16, 16)
     torch.testing.assert_close(compiled(prediction, target), weighted(prediction, target))
+
+
+class TestOtherDevices:
+    """On the meta device reading a value is an error, so what works there never waits for a device."""
+
+    @pytest.mark.parametrize("spec", ["legs", "eggs", WeightSpec(normalise="mean"), WeightSpec(percentile=99.0)])
+    def test_a_step_reads_nothing_from_the_device(self, spec):
+        if not isinstance(spec, str) and spec.percentile < 100 and not hasattr(torch, "compile"):
+            pytest.skip("torch 1 has no kthvalue on this device")
+        configure(spec)
+        prediction = torch.empty(3, 16, 16, device="meta", requires_grad=True)
+        target = torch.empty(4, 16, 16, device="meta")[:3]
+        for _ in range(2):
+            loss = l1_loss(prediction, target, view="a", mask=torch.empty(16, 16, device="meta"))
+            loss.backward()
+        assert loss.device.type == "meta"
+        with pytest.raises((RuntimeError, NotImplementedError)):
+            loss.item()
+
+    def test_a_target_that_stays_is_computed_once(self):
+        stored = torch.empty(4, 16, 16, device="meta")
+        prediction = torch.empty(3, 16, 16, device="meta", requires_grad=True)
+        for _ in range(3):
+            l1_loss(prediction, stored[:3])
+        assert (counts().computed, counts().remembered) == (1, 2)
+        stored.add_(1)
+        l1_loss(prediction, stored[:3])
+        assert counts().computed == 2
+
+    def test_devices_that_differ_are_named(self):
+        with pytest.raises(LegsError, match="prediction is on cpu and target on meta"):
+            l1_loss(torch.rand(3, 4, 4, requires_grad=True), torch.empty(3, 4, 4, device="meta"))

@@ -14,14 +14,14 @@ import sys
 import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, List, Optional, Sequence, Set, Tuple, Union
+from typing import TYPE_CHECKING, Any, Callable, List, Optional, Sequence, Set, Tuple, Union
 
 import torch
 from torch import Tensor
 
 from legs_loss.config import Config, find_config
 from legs_loss.errors import LegsError
-from legs_loss.images import check_pair, is_compiling
+from legs_loss.images import as_map, check_pair, is_compiling
 from legs_loss.loss import weighted_l1
 from legs_loss.memo import DEFAULT_LIMIT, WeightMemo
 from legs_loss.spec import Spec, as_spec
@@ -30,9 +30,10 @@ from legs_loss.weights import weight_from_response, weight_map
 if TYPE_CHECKING:
     from legs_loss.store import WeightStore
 
-__all__ = ["Counts", "configure", "counts", "l1_loss"]
+__all__ = ["Counts", "active", "configure", "counts", "l1_loss"]
 
 View = Union[str, Sequence[str], None]
+Own = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass
@@ -143,6 +144,8 @@ def l1_loss(
     view: View = None,
     mask: Optional[Tensor] = None,
     channels_last: bool = False,
+    reduction: str = "mean",
+    own: Optional[Own] = None,
 ) -> Tensor:
     """Return the LEGS-weighted L1 loss; a drop-in for the ``l1_loss`` of a 3DGS codebase.
 
@@ -155,12 +158,18 @@ def l1_loss(
             were made from it. Without a name, weights are remembered or computed.
         mask: one value a pixel, zeroes the weight where it is 0.
         channels_last: where the channel stands.
+        reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.
+        own: the codebase's own L1 of (prediction, target), where that is more than a mean: what it makes of the
+            difference (a mask, another mean) it makes of the weighted difference. It must depend on nothing but the
+            difference. Unweighted it is called as it is.
 
     Returns:
-        A scalar. With beta 0 or LEGS_OFF it is ``torch.abs(prediction - target).mean()`` to the last bit.
+        A scalar, or what ``reduction`` or ``own`` say. With beta 0 or LEGS_OFF it is
+        ``torch.abs(prediction - target).mean()``, or ``own(prediction, target)``, to the last bit.
 
     Raises:
-        LegsError: shapes that do not fit (both are named), on the CPU a target with NaN or infinity,
+        LegsError: shapes that do not fit (both are named), images that lie the other way around than
+            ``channels_last`` says, on the CPU a target with NaN or infinity,
             a setting in legs.toml or LEGS_* that is out of range.
 
     Example:
@@ -169,15 +178,20 @@ def l1_loss(
         >>> l1_loss(prediction, target) > torch.abs(prediction - target).mean()
         tensor(True)
     """
+    if reduction not in ("mean", "none"):
+        raise LegsError(f'reduction must be "mean" or "none", got {reduction!r}')
+    if own is not None and (mask is not None or reduction != "mean"):
+        raise LegsError("own= replaces mask= and reduction=: what it returns is returned")
     if not (prediction.requires_grad and torch.is_grad_enabled()):
-        return _plain(prediction, target, mask, channels_last)
+        return _plain(prediction, target, mask, channels_last, reduction, own)
     run = _current_run()
     if not run.config.active:
-        return _plain(prediction, target, mask, channels_last)
+        return _plain(prediction, target, mask, channels_last, reduction, own)
     check_pair(prediction, target)
+    _check_layout(target, channels_last)
     if is_compiling():  # what the compiler traces has no memory: the weight becomes part of the graph
         weight = weight_map(target, run.config.spec, channels_last)
-        return weighted_l1(prediction, target, weight, mask, channels_last=channels_last)
+        return _weighted(prediction, target, weight, mask, channels_last, reduction, own)
     run.say_once("active", _describe(run.config))
     _counts.weighted += 1
     views = _view_names(view, target)
@@ -186,7 +200,7 @@ def l1_loss(
             weight = run.weight(target, views[0], channels_last)
         else:
             weight = torch.stack([run.weight(target[i], name, channels_last) for i, name in enumerate(views)])
-    return weighted_l1(prediction, target, weight, mask, channels_last=channels_last)
+    return _weighted(prediction, target, weight, mask, channels_last, reduction, own)
 
 
 def configure(
@@ -224,6 +238,15 @@ def configure(
         _run = _Run(config, memo_bytes)
 
 
+def active() -> bool:
+    """Return whether ``l1_loss`` weights what is trained: not with beta 0, nor with LEGS_OFF.
+
+    Raises:
+        LegsError: a setting in legs.toml or LEGS_* that is out of range.
+    """
+    return _current_run().config.active
+
+
 def counts() -> Counts:
     """Return a copy of this process's counts so far."""
     return replace(_counts)
@@ -243,12 +266,66 @@ def _main_file() -> Optional[Path]:
     return Path(path) if path else Path.cwd()
 
 
-def _plain(prediction: Tensor, target: Tensor, mask: Optional[Tensor], channels_last: bool) -> Tensor:
+def _plain(
+    prediction: Tensor,
+    target: Tensor,
+    mask: Optional[Tensor],
+    channels_last: bool,
+    reduction: str,
+    own: Optional[Own],
+) -> Tensor:
     if not is_compiling():
         _counts.plain += 1
-    if mask is None:
-        return torch.abs(prediction - target).mean()
-    return weighted_l1(prediction, target, mask=mask, channels_last=channels_last)
+    if own is not None:
+        return own(prediction, target)
+    return _reduced(prediction, target, None, mask, channels_last, reduction)
+
+
+def _weighted(
+    prediction: Tensor,
+    target: Tensor,
+    weight: Tensor,
+    mask: Optional[Tensor],
+    channels_last: bool,
+    reduction: str,
+    own: Optional[Own],
+) -> Tensor:
+    if own is None:
+        return _reduced(prediction, target, weight, mask, channels_last, reduction)
+    # The weight is not negative, so W * |U - F| = |W * (U - F) - 0|: any L1 of the difference becomes the weighted one.
+    weight = as_map(weight, prediction, channels_last, "weight").to(prediction.dtype)
+    difference = weight * (prediction - target)
+    return own(difference, torch.zeros_like(difference))
+
+
+def _reduced(
+    prediction: Tensor,
+    target: Tensor,
+    weight: Optional[Tensor],
+    mask: Optional[Tensor],
+    channels_last: bool,
+    reduction: str,
+) -> Tensor:
+    if reduction == "mean":
+        if weight is None and mask is None:
+            return torch.abs(prediction - target).mean()
+        return weighted_l1(prediction, target, weight, mask, channels_last=channels_last)
+    error = torch.abs(prediction - target)
+    for factor, name in ((weight, "weight"), (mask, "mask")):
+        if factor is not None:
+            error = as_map(factor, prediction, channels_last, name).to(error.dtype) * error
+    return error
+
+
+def _check_layout(target: Tensor, channels_last: bool) -> None:
+    first, last = (target.shape[-3], target.shape[-1])
+    if channels_last:
+        first, last = last, first
+    if first > 4 and last in (1, 3, 4):
+        raise LegsError(
+            f"target {list(target.shape)} has its channels {'first' if channels_last else 'last'}: "
+            f"call l1_loss with channels_last={not channels_last}"
+        )
 
 
 def _view_names(view: View, target: Tensor) -> Sequence[Optional[str]]:

@@ -1,0 +1,177 @@
+"""Give a 3D Gaussian Splatting codebase the LEGS loss, or take it back.
+
+Finds the photometric L1 term of every training step in FOLDER and rewrites it to call legs_loss.l1_loss; evaluation,
+scoring and every other L1 stay as they are. Writes legs.toml beside it, and remembers how to undo all of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import Optional, Sequence, Tuple
+
+from legs_loss import LegsError, __version__
+
+__all__ = ["main"]
+
+EXIT_CODES = (
+    "exit codes: 0 done, or nothing to do; 1 --check: something would change, or --partial: a term was left to you; "
+    "2 nothing was changed: bad usage, a term that cannot be decided, no term found, uncommitted changes; "
+    "130 interrupted"
+)
+
+
+def main(argv: Optional[Sequence[str]] = None) -> int:
+    """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
+    args = _parser().parse_args(argv)
+    try:
+        return _undo(args) if args.undo else _patch(args)
+    except LegsError as error:
+        print(f"legs-patch: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("legs-patch: interrupted; nothing was changed", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except ModuleNotFoundError as error:
+        if error.name != "libcst":
+            raise
+        print("legs-patch: error: LibCST is missing: pip install 'legs-loss[patch]'", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="legs-patch", description=__doc__, epilog=EXIT_CODES)
+    parser.add_argument("folder", metavar="FOLDER", help="the checkout")
+    parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--diff", action="store_true", help="show what would change as a unified diff; write nothing")
+    what.add_argument("--check", action="store_true", help="exit with 1 if something would change; write nothing")
+    what.add_argument("--undo", action="store_true", help="take the patch back, byte for byte")
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="patch although git has uncommitted changes; with --undo: put the patch's own lines back in files that "
+        "were edited since, and leave the edits",
+    )
+    parser.add_argument("--partial", action="store_true", help="patch what can be decided although something cannot")
+    parser.add_argument(
+        "--site", action="append", default=[], metavar="FILE:LINE", help="patch this term, and no other; repeatable"
+    )
+    parser.add_argument(
+        "--exclude", action="append", default=[], metavar="GLOB", help="files or folders not to look at; repeatable"
+    )
+    parser.add_argument("--json", action="store_true", help="report as JSON")
+    settings = parser.add_argument_group("settings, written to legs.toml")
+    settings.add_argument("--preset", metavar="NAME", help="3dgs, eggs, legs-l or legs; default: legs")
+    settings.add_argument("--beta", type=float, metavar="X", help="how far the strongest response lifts the weight")
+    settings.add_argument("--curve", metavar="NAME", help="C1 to C5")
+    settings.add_argument("--operator", metavar="NAME", help="laplacian, laplacian8, sobel, scharr or central")
+    settings.add_argument("--store", metavar="DIR", help="weight maps that legs precompute wrote")
+    return parser
+
+
+def _patch(args: argparse.Namespace) -> int:
+    from legs_adapters.patch import plan, write
+    from legs_adapters.repo import check_root
+    from legs_adapters.report import as_diff, as_json, as_table
+    from legs_adapters.settings import SETTINGS_FILE, settings_text
+
+    root = check_root(args.folder)
+    given = {name: getattr(args, name) for name in ("preset", "beta", "curve", "operator", "store")}
+    settings: Optional[str] = settings_text(root, **given)
+    chosen = any(value is not None for value in given.values())
+    if not chosen and (root / SETTINGS_FILE).exists():
+        settings = None  # the user's, or an earlier run's: it stays
+    found = plan(root, args.exclude, [_site(root, text) for text in args.site])
+    problems, nothing = found.findings.problems, not found.after
+    if not found.findings.sites and not found.findings.patched:
+        settings = None
+    found = found._replace(settings=settings)
+    if problems and not args.partial:
+        if args.json:
+            print(as_json(found, []), end="")
+        else:
+            print(as_table(found), end="")
+        for problem in problems:
+            print(_advice(problem), file=sys.stderr)
+        print(
+            "legs-patch: nothing was changed (--partial patches the rest, --exclude leaves files out)", file=sys.stderr
+        )
+        return 2
+    if nothing and not found.findings.patched and not problems:
+        print(as_json(found, []) if args.json else as_table(found), end="")
+        raise LegsError(
+            f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
+        )
+    changes = bool(found.after) or settings is not None
+    if args.diff:
+        print(as_json(found, []) if args.json else as_diff(found, _colour()), end="")
+        return 0
+    if args.check:
+        print(as_json(found, []) if args.json else as_table(found), end="")
+        if not args.json:
+            print("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
+        return 1 if found.after else 0
+    wrote = write(found, args.force) if changes else []
+    if args.json:
+        print(as_json(found, wrote), end="")
+    else:
+        print(as_table(found), end="")
+        if wrote:
+            print(f"\nwrote {', '.join(wrote)}; take it back with: legs-patch --undo {args.folder}")
+        else:
+            print("\nnothing to do: it is patched")
+    for problem in problems:
+        print(_advice(problem), file=sys.stderr)
+    return 1 if problems else 0
+
+
+def _undo(args: argparse.Namespace) -> int:
+    import json
+
+    from legs_adapters.patch import undo
+
+    done = undo(args.folder, args.force)
+    if args.json:
+        print(json.dumps({"restored": done.restored, "removed": done.removed, "kept": done.kept}, indent=2))
+        return 0
+    for name in done.restored:
+        print(f"restored {name}")
+    for name in done.removed:
+        print(f"removed {name}")
+    for name, reason in done.kept:
+        print(f"kept {name}: {reason}")
+    return 0
+
+
+def _advice(problem: object) -> str:
+    return (
+        f"legs-patch: error: {problem.path}:{problem.line}: {problem.reason}\n"  # type: ignore[attr-defined]
+        f"    {problem.text}\n"  # type: ignore[attr-defined]
+        f"  if this is the loss between rendering and photograph, write there: {problem.advice}\n"  # type: ignore[attr-defined]
+        f"  (rendering first), and import legs_loss at the top"
+    )
+
+
+def _site(root: Path, text: str) -> Tuple[str, int]:
+    name, _, line = text.rpartition(":")
+    if not name or not line.isdigit():
+        raise LegsError(f"--site wants FILE:LINE, got {text!r}")
+    for base in (root, Path.cwd()):
+        full = Path(os.path.abspath(str(base / name)))
+        if full.is_file() and root in full.parents:
+            return full.relative_to(root).as_posix(), int(line)
+    raise LegsError(f"--site {text}: there is no such file in {root}")
+
+
+def _colour() -> bool:
+    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,441 @@
+"""What reaches what inside one function: for every name that is read, the assignments that it can come from.
+
+The analysis follows the order of execution: branches are joined, loops go around, an assignment ends what stood in the
+name before. ``losses["im"] = x`` and ``self.x = y`` are places of their own and also belong to the whole
+(``losses``, ``self``); ``losses.append(x)`` adds to the whole.
+"""
+
+from __future__ import annotations
+
+from typing import Dict, FrozenSet, Iterator, List, Optional, Sequence, Set, Tuple
+
+import libcst as cst
+
+from legs_adapters.syntax import call_name, children, constant, dotted, path_of
+
+__all__ = ["Definition", "Flow"]
+
+_MUTATORS = {"append", "add", "extend", "insert", "update", "setdefault", "appendleft", "__setitem__"}
+_NO_GRAD = {"no_grad", "inference_mode", "set_grad_enabled"}
+
+
+class Definition:
+    """One way in which a place got its value.
+
+    Attributes:
+        place: ``x``, ``self.x`` or ``losses['im']``.
+        kind: "assign", "augment" (``x += v``), "element" (of a loop, or of what is unpacked), "parameter", "import",
+            "function", "class", "mutate" (``x.append(v)``), "store" (``x[...] = v``, seen from ``x``), "with",
+            "inplace" (``x.mul_(v)``).
+        node: the statement, parameter or expression that did it.
+        value: where the value comes from, if that is an expression.
+        index: which element of the value, where it is unpacked and known.
+        key: for a store under a literal key: the key.
+    """
+
+    __slots__ = ("index", "key", "kind", "node", "place", "value")
+
+    def __init__(
+        self,
+        place: str,
+        kind: str,
+        node: cst.CSTNode,
+        value: Optional[cst.CSTNode] = None,
+        index: Optional[int] = None,
+        key: object = None,
+    ) -> None:
+        self.place = place
+        self.kind = kind
+        self.node = node
+        self.value = value
+        self.index = index
+        self.key = key
+
+
+Env = Dict[str, FrozenSet[Definition]]
+
+
+class Flow:
+    """The reaching definitions of one function body (or of a module's top level).
+
+    Args:
+        body: its statements.
+        parameters: the function's parameters; None for a module.
+
+    Attributes:
+        definitions: every definition by place, in source order: what a nested function sees.
+        calls: every call in the body, in source order, nested functions excepted.
+        returns: the expressions that it returns or yields.
+        functions, classes: what is defined in it, directly or inside of its branches.
+        without_grad: ids of nodes under ``torch.no_grad()`` and its like.
+        conditions: by a call's id, the names that must be true where it runs: ``if tracking:``.
+    """
+
+    def __init__(self, body: cst.BaseSuite | cst.Module, parameters: Optional[cst.Parameters] = None) -> None:
+        self.definitions: Dict[str, List[Definition]] = {}
+        self.calls: List[cst.Call] = []
+        self.expressions: List[cst.CSTNode] = []
+        self.returns: List[cst.BaseExpression] = []
+        self.functions: List[cst.FunctionDef] = []
+        self.classes: List[cst.ClassDef] = []
+        self.imports: List[cst.CSTNode] = []
+        self.without_grad: Set[int] = set()
+        self._reaching: Dict[int, Set[Definition]] = {}
+        self._names: Dict[int, List[Env]] = {}
+        self._made: Dict[Tuple[int, str, str], Definition] = {}
+        self._seen: Set[int] = set()
+        self.conditions: Dict[int, Tuple[str, ...]] = {}
+        self._no_grad = 0
+        self._conditions: Tuple[str, ...] = ()
+        self._breaks: List[List[Env]] = []
+        self._continues: List[List[Env]] = []
+        env: Env = {}
+        if parameters is not None:
+            for param in _parameters(parameters):
+                self._bind(env, self._define(param.name.value, "parameter", param, param.default))
+        self._block(_statements(body), env)
+
+    def reaching(self, node: cst.CSTNode) -> FrozenSet[Definition]:
+        """Return the definitions that this use of a place can come from; empty for what is not local."""
+        return frozenset(self._reaching.get(id(node), ()))
+
+    def names_at(self, node: cst.CSTNode, place: str) -> FrozenSet[Definition]:
+        """Return the definitions of a place that reach a call or an operation, whether or not it reads it."""
+        found: Set[Definition] = set()
+        for env in self._names.get(id(node), ()):
+            found |= env.get(place, frozenset())
+        return frozenset(found)
+
+    # -- definitions
+
+    def _define(
+        self,
+        place: str,
+        kind: str,
+        node: cst.CSTNode,
+        value: Optional[cst.CSTNode] = None,
+        index: Optional[int] = None,
+        key: object = None,
+    ) -> Definition:
+        known = (id(node), place, kind)
+        if known not in self._made:
+            self._made[known] = Definition(place, kind, node, value, index, key)
+            self.definitions.setdefault(place, []).append(self._made[known])
+        return self._made[known]
+
+    @staticmethod
+    def _bind(env: Env, definition: Definition) -> None:
+        place = definition.place
+        for other in [other for other in env if other.startswith((place + ".", place + "["))]:
+            del env[other]
+        env[place] = frozenset([definition])
+
+    @staticmethod
+    def _add(env: Env, definition: Definition) -> None:
+        env[definition.place] = env.get(definition.place, frozenset()) | {definition}
+
+    def _assign(
+        self,
+        env: Env,
+        target: cst.CSTNode,
+        value: Optional[cst.CSTNode],
+        node: cst.CSTNode,
+        kind: str = "assign",
+        index: Optional[int] = None,
+    ) -> None:
+        if isinstance(target, (cst.Tuple, cst.List)):
+            elements = target.elements
+            parts = value.elements if isinstance(value, (cst.Tuple, cst.List)) and kind == "assign" else None
+            plain = not any(isinstance(element, cst.StarredElement) for element in elements)
+            for i, element in enumerate(elements):
+                if parts is not None and plain and len(parts) == len(elements):
+                    self._assign(env, element.value, parts[i].value, node)
+                else:
+                    self._assign(env, element.value, value, node, "element", i if plain else None)
+            return
+        if isinstance(target, cst.StarredElement):
+            self._assign(env, target.value, value, node, "element")
+            return
+        place = path_of(target)
+        if place is not None:
+            self._bind(env, self._define(place, kind, node if kind != "element" else target, value, index))
+        if isinstance(target, (cst.Attribute, cst.Subscript)):
+            self._visit(target.value, env)
+            if isinstance(target, cst.Subscript):
+                for part in target.slice:
+                    self._visit(part, env)
+            whole = path_of(target.value)
+            while whole is None and isinstance(target.value, (cst.Attribute, cst.Subscript)):
+                target = target.value
+                whole = path_of(target.value)
+            if whole is not None:
+                key: object = None
+                if isinstance(target, cst.Attribute):
+                    key = "." + target.attr.value
+                elif len(target.slice) == 1 and isinstance(target.slice[0].slice, cst.Index):
+                    key = constant(target.slice[0].slice.value)
+                self._add(env, self._define(whole, "store", target, value, None, key))
+
+    # -- statements
+
+    def _block(self, statements: Sequence[cst.CSTNode], env: Optional[Env]) -> Optional[Env]:
+        for statement in statements:
+            if env is None:
+                # Not reached (it follows a return or a continue), yet its names are worth knowing.
+                self._statement(statement, {})
+                continue
+            env = self._statement(statement, env)
+        return env
+
+    def _statement(self, node: cst.CSTNode, env: Env) -> Optional[Env]:
+        if isinstance(node, cst.SimpleStatementLine):
+            return self._block(node.body, env)
+        if isinstance(node, cst.If):
+            self._visit(node.test, env)
+            outer = self._conditions
+            self._conditions = outer + _true_names(node.test)
+            taken = self._block(_statements(node.body), dict(env))
+            self._conditions = outer
+            if node.orelse is None:
+                return _join([taken, env])
+            if isinstance(node.orelse, cst.If):
+                return _join([taken, self._statement(node.orelse, dict(env))])
+            return _join([taken, self._block(_statements(node.orelse.body), dict(env))])
+        if isinstance(node, (cst.For, cst.While)):
+            return self._loop(node, env)
+        if isinstance(node, cst.With):
+            silent = False
+            for item in node.items:
+                self._visit(item.item, env)
+                silent = silent or _stops_gradients(item.item)
+                if item.asname is not None:
+                    self._assign(env, item.asname.name, item.item, item, "with")
+            self._no_grad += silent
+            after = self._block(_statements(node.body), env)
+            self._no_grad -= silent
+            return after
+        if isinstance(node, (cst.Try, cst.TryStar)):
+            before = dict(env)
+            body = self._block(_statements(node.body), env)
+            ends = []
+            for handler in node.handlers:
+                entry = _join([before, body]) or dict(before)
+                if handler.name is not None:
+                    self._assign(entry, handler.name.name, handler.type, handler, "with")
+                ends.append(self._block(_statements(handler.body), dict(entry)))
+            if node.orelse is not None:
+                body = self._block(_statements(node.orelse.body), body)
+            after = _join([body, *ends])
+            if node.finalbody is not None:
+                reached = after is not None
+                after = self._block(_statements(node.finalbody.body), after if after is not None else dict(before))
+                return after if reached else None
+            return after
+        if isinstance(node, cst.FunctionDef):
+            for decorator in node.decorators:
+                self._visit(decorator.decorator, env)
+            if id(node) not in self._seen:
+                self._seen.add(id(node))
+                self.functions.append(node)
+                if self._no_grad:
+                    self.without_grad.add(id(node))
+            self._bind(env, self._define(node.name.value, "function", node))
+            return env
+        if isinstance(node, cst.ClassDef):
+            if id(node) not in self._seen:
+                self._seen.add(id(node))
+                self.classes.append(node)
+            self._bind(env, self._define(node.name.value, "class", node))
+            return env
+        if type(node).__name__ == "Match":
+            self._visit(node.subject, env)  # type: ignore[attr-defined]
+            ends = [env]
+            for case in node.cases:  # type: ignore[attr-defined]
+                ends.append(self._block(_statements(case.body), dict(env)))
+            return _join(ends)
+        return self._small(node, env)
+
+    def _small(self, node: cst.CSTNode, env: Env) -> Optional[Env]:
+        if isinstance(node, cst.Assign):
+            self._visit(node.value, env)
+            for target in node.targets:
+                self._assign(env, target.target, node.value, node)
+        elif isinstance(node, cst.AnnAssign):
+            if node.value is not None:
+                self._visit(node.value, env)
+                self._assign(env, node.target, node.value, node)
+        elif isinstance(node, cst.AugAssign):
+            self._visit(node.target, env)
+            self._visit(node.value, env)
+            place = path_of(node.target)
+            if place is not None:
+                self._bind(env, self._define(place, "augment", node, node.value))
+            if isinstance(node.target, (cst.Attribute, cst.Subscript)):
+                whole = path_of(node.target.value)
+                if whole is not None:
+                    self._add(env, self._define(whole, "store", node, node.value))
+        elif isinstance(node, cst.Expr):
+            self._visit(node.value, env)
+            self._mutation(node.value, env)
+        elif isinstance(node, cst.Return):
+            if node.value is not None:
+                self._visit(node.value, env)
+                if id(node) not in self._seen:
+                    self._seen.add(id(node))
+                    self.returns.append(node.value)
+            return None
+        elif isinstance(node, cst.Raise):
+            return None
+        elif isinstance(node, cst.Break):
+            if self._breaks:
+                self._breaks[-1].append(env)
+            return None
+        elif isinstance(node, cst.Continue):
+            if self._continues:
+                self._continues[-1].append(env)
+            return None
+        elif isinstance(node, (cst.Import, cst.ImportFrom)):
+            self._import(node, env)
+        elif isinstance(node, cst.Del):
+            pass
+        else:
+            for child in children(node):
+                self._visit(child, env)
+        return env
+
+    def _loop(self, node: cst.For | cst.While, env: Env) -> Optional[Env]:
+        if isinstance(node, cst.For):
+            self._visit(node.iter, env)
+        entry: Optional[Env] = env
+        breaks: List[Env] = []
+        for _ in range(2):  # the second time around, with what the first leaves behind
+            self._breaks.append([])
+            self._continues.append([])
+            around: Env = dict(entry or {})
+            if isinstance(node, cst.For):
+                self._assign(around, node.target, node.iter, node, "element")
+            else:
+                self._visit(node.test, around)
+            end = self._block(_statements(node.body), around)
+            breaks = breaks + self._breaks.pop()
+            entry = _join([env, end, *self._continues.pop()])
+        if node.orelse is not None:
+            entry = self._block(_statements(node.orelse.body), entry)
+        return _join([entry, *breaks])
+
+    def _mutation(self, node: cst.CSTNode, env: Env) -> None:
+        if not isinstance(node, cst.Call) or not isinstance(node.func, cst.Attribute):
+            return
+        whole, name = path_of(node.func.value), node.func.attr.value
+        if whole is None:
+            return
+        if name in _MUTATORS:
+            self._add(env, self._define(whole, "mutate", node, node))
+        elif name.endswith("_") and not name.endswith("__"):
+            self._add(env, self._define(whole, "inplace", node, node))
+
+    def _import(self, node: cst.Import | cst.ImportFrom, env: Env) -> None:
+        if id(node) not in self._seen:
+            self._seen.add(id(node))
+            self.imports.append(node)
+        if isinstance(node.names, cst.ImportStar):
+            return
+        for alias in node.names:
+            if alias.asname is not None:
+                name = path_of(alias.asname.name)
+            else:
+                name = (dotted(alias.name) or "").split(".")[0]
+            if name:
+                self._bind(env, self._define(name, "import", alias, node))
+
+    # -- expressions
+
+    def _visit(self, node: cst.CSTNode, env: Env) -> None:
+        if self._no_grad:
+            self.without_grad.add(id(node))
+        first = id(node) not in self._seen
+        if isinstance(node, cst.Call):
+            self.conditions[id(node)] = self._conditions
+            self._names.setdefault(id(node), []).append(dict(env))
+        if first and isinstance(node, (cst.Call, cst.BinaryOperation)):
+            self._seen.add(id(node))
+            self.expressions.append(node)
+            if isinstance(node, cst.Call):
+                self.calls.append(node)
+        if isinstance(node, (cst.Name, cst.Attribute, cst.Subscript)):
+            place = path_of(node)
+            if place is not None and place in env:
+                self._reaching.setdefault(id(node), set()).update(env[place])
+        if isinstance(node, cst.Attribute):
+            self._visit(node.value, env)
+            return
+        if isinstance(node, cst.NamedExpr):
+            self._visit(node.value, env)
+            self._assign(env, node.target, node.value, node)
+            return
+        if isinstance(node, cst.Yield) and first:
+            self._seen.add(id(node))
+            if isinstance(node.value, cst.BaseExpression):
+                self.returns.append(node.value)
+        if isinstance(node, cst.Lambda):
+            inner = dict(env)
+            for param in _parameters(node.params):
+                self._bind(inner, self._define(param.name.value, "parameter", param, param.default))
+            self._visit(node.body, inner)
+            return
+        if isinstance(node, (cst.GeneratorExp, cst.ListComp, cst.SetComp, cst.DictComp)):
+            inner = dict(env)
+            loop: Optional[cst.CompFor] = node.for_in
+            while loop is not None:
+                self._visit(loop.iter, inner)
+                self._assign(inner, loop.target, loop.iter, loop, "element")
+                for condition in loop.ifs:
+                    self._visit(condition.test, inner)
+                loop = loop.inner_for_in
+            for part in (node.key, node.value) if isinstance(node, cst.DictComp) else (node.elt,):
+                self._visit(part, inner)
+            return
+        for child in children(node):
+            if isinstance(node, cst.Arg) and child is node.keyword:
+                continue
+            self._visit(child, env)
+
+
+def _statements(body: cst.BaseSuite | cst.Module) -> Sequence[cst.CSTNode]:
+    return body.body
+
+
+def _parameters(parameters: cst.Parameters) -> Iterator[cst.Param]:
+    for group in (parameters.posonly_params, parameters.params, parameters.kwonly_params):
+        yield from group
+    for extra in (parameters.star_arg, parameters.star_kwarg):
+        if isinstance(extra, cst.Param):
+            yield extra
+
+
+def _join(envs: Sequence[Optional[Env]]) -> Optional[Env]:
+    alive = [env for env in envs if env is not None]
+    if not alive:
+        return None
+    joined = dict(alive[0])
+    for env in alive[1:]:
+        for place, definitions in env.items():
+            joined[place] = joined[place] | definitions if place in joined else definitions
+    return joined
+
+
+def _true_names(test: cst.BaseExpression) -> Tuple[str, ...]:
+    """Return the names that are true where a test is: of ``tracking and x > 0``: tracking."""
+    if isinstance(test, cst.BooleanOperation) and isinstance(test.operator, cst.And):
+        return _true_names(test.left) + _true_names(test.right)
+    name = dotted(test)
+    return () if name is None else (name.split(".")[-1],)
+
+
+def _stops_gradients(node: cst.BaseExpression) -> bool:
+    if isinstance(node, cst.Call) and call_name(node) in _NO_GRAD:
+        if call_name(node) == "no_grad":
+            return True
+        value = constant(node.args[0].value) if node.args else True
+        return bool(value) if call_name(node) == "inference_mode" else value is False
+    return False

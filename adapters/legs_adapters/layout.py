@@ -1,0 +1,158 @@
+"""Where the channel stands in an image, from the code around it: [C, H, W] as in 3DGS, or [H, W, C] as in gsplat."""
+
+from __future__ import annotations
+
+from typing import List, Optional, Set, Tuple
+
+import libcst as cst
+
+from legs_adapters.program import Function, Program
+from legs_adapters.syntax import arguments, call_name, constant
+
+__all__ = ["is_channels_last"]
+
+_TO_LAST = {(1, 2, 0), (0, 2, 3, 1)}
+_TO_FIRST = {(2, 0, 1), (0, 3, 1, 2)}
+_LAST_RENDERERS = {"rasterization", "rasterization_2dgs", "rasterize_gaussians", "rasterization_inria_wrapper"}
+
+
+def is_channels_last(program: Program, function: Function, *images: cst.CSTNode) -> bool:
+    """Return whether the images are [H, W, C] or [B, H, W, C]; without a sign of it they are not."""
+    votes = [vote for image in images for vote in _votes(function, image, set(), 0)]
+    return sum(votes) > 0
+
+
+def _votes(function: Function, node: cst.CSTNode, seen: Set[int], depth: int) -> List[int]:
+    if depth > 10 or id(node) in seen:
+        return []
+    seen.add(id(node))
+    if isinstance(node, cst.Call):
+        order = _permutation(node)
+        if order in _TO_LAST:
+            return [3]
+        if order in _TO_FIRST:
+            return [-3]
+        pattern = _pattern(node)
+        if pattern is not None:
+            after = pattern.split("->")[-1].split()
+            return [3] if after[-1:] == ["c"] else [-3]
+        if call_name(node) in _LAST_RENDERERS:
+            return [2]
+        inner: List[cst.CSTNode] = [node.func.value] if isinstance(node.func, cst.Attribute) else []
+        inner += arguments(node)[0][:1]
+        return [vote for part in inner for vote in _votes(function, part, seen, depth + 1)]
+    votes: List[int] = []
+    if isinstance(node, cst.Subscript):
+        votes.extend(_slice_vote(node))
+        votes.extend(_votes(function, node.value, seen, depth + 1))
+        return votes
+    if isinstance(node, cst.BinaryOperation):
+        for side in (node.left, node.right):
+            if isinstance(side, cst.Subscript) and _is_spread(side):
+                votes.append(2)
+            else:
+                votes.extend(_votes(function, side, seen, depth + 1))
+        return votes
+    if isinstance(node, (cst.Name, cst.Attribute)):
+        for use in _uses(function, node):
+            votes.extend(use)
+        for definition in function.flow.reaching(node):
+            if definition.value is None:
+                continue
+            if definition.kind == "element" and isinstance(definition.value, cst.Call):
+                # what a call returns says something of its first element only
+                if not definition.index and call_name(definition.value) in _LAST_RENDERERS:
+                    votes.append(2)
+            elif definition.kind in ("assign", "augment"):
+                votes.extend(_votes(function, definition.value, seen, depth + 1))
+    return votes
+
+
+def _uses(function: Function, node: cst.CSTNode) -> List[List[int]]:
+    """What else the function does with the same value: permuting it for SSIM tells how it lay before."""
+    definitions = function.flow.reaching(node)
+    if not definitions or not isinstance(node, cst.Name):
+        return []
+    found: List[List[int]] = []
+    for call in function.flow.calls:
+        order, subject = _permutation(call), _subject(call)
+        pattern = _pattern(call)
+        if subject is None or not isinstance(subject, cst.Name) or subject.value != node.value:
+            continue
+        if not (function.flow.reaching(subject) & definitions):
+            continue
+        if order in _TO_FIRST:
+            found.append([3])
+        elif order in _TO_LAST:
+            found.append([-3])
+        elif pattern is not None:
+            found.append([3] if pattern.split("->")[0].split()[-1:] == ["c"] else [-3])
+    return found
+
+
+def _permutation(node: cst.Call) -> Optional[Tuple[int, ...]]:
+    if call_name(node) != "permute":
+        return None
+    positional, keywords, _ = arguments(node)
+    values = [constant(value) for value in positional]
+    if "dims" in keywords:
+        values.append(constant(keywords["dims"]))
+    if values and isinstance(values[-1], tuple):
+        order = values[-1]
+    else:
+        order = tuple(value for value in values if isinstance(value, int))
+    rank = len(order)
+    return tuple(i % rank for i in order) if rank in (3, 4) and all(isinstance(i, int) for i in order) else None
+
+
+def _subject(node: cst.Call) -> Optional[cst.CSTNode]:
+    if (
+        isinstance(node.func, cst.Attribute)
+        and isinstance(node.func.value, cst.Name)
+        and node.func.value.value in ("torch", "einops")
+    ):
+        return node.args[0].value if node.args else None
+    if isinstance(node.func, cst.Attribute):
+        return node.func.value
+    return node.args[0].value if node.args else None
+
+
+def _pattern(node: cst.Call) -> Optional[str]:
+    if call_name(node) not in ("rearrange", "repeat", "reduce"):
+        return None
+    for value in arguments(node)[0][1:2]:
+        text = constant(value)
+        if isinstance(text, str) and "->" in text and "c" in text.split():
+            return text
+    return None
+
+
+def _slice_vote(node: cst.Subscript) -> List[int]:
+    parts = [element.slice for element in node.slice]
+    spread = isinstance(parts[0], cst.Index) and isinstance(parts[0].value, cst.Ellipsis)
+    last = parts[-1]
+    if spread and len(parts) == 2 and isinstance(last, cst.Slice) and constant(last.upper) == 3:
+        return [2]
+    first = parts[0]
+    if isinstance(first, cst.Slice) and constant(first.upper) == 3:
+        return [-2]
+    if (
+        len(parts) >= 2
+        and isinstance(parts[1], cst.Slice)
+        and constant(parts[1].upper) == 3
+        and isinstance(first, cst.Slice)
+    ):
+        return [-2]
+    return []
+
+
+def _is_spread(node: cst.Subscript) -> bool:
+    """``mask[..., None]``: the channel is added at the end."""
+    parts = [element.slice for element in node.slice]
+    return (
+        len(parts) >= 2
+        and isinstance(parts[-1], cst.Index)
+        and constant(parts[-1].value, "") is None
+        and isinstance(parts[0], cst.Index)
+        and isinstance(parts[0].value, cst.Ellipsis)
+    )

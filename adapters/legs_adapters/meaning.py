@@ -1,0 +1,327 @@
+"""What an expression stands for in a training step: which kind of picture it is, and whether it was rendered.
+
+The evidence is the dataflow (where a value comes from, through assignments, clamps, indexing, exposure, ``.cuda()``)
+and the field's words in the names on the way. A name that says "depth" or "feature" on the way outweighs one
+that says "image": ``gt_image = cam.depth`` is a depth.
+"""
+
+from __future__ import annotations
+
+from typing import Dict, Iterable, NamedTuple, Optional, Set
+
+import libcst as cst
+
+from legs_adapters.flow import Definition
+from legs_adapters.program import Function, Program
+from legs_adapters.syntax import arguments, call_name, constant, key_of, words
+from legs_adapters.training import Training
+from legs_adapters.vocabulary import DATA, KINDS, kind_of_words, role_of_words
+
+__all__ = ["Meaning", "Meanings"]
+
+_PARAMETERS = {"params", "param", "parameters", "variables", "splats", "gauss_params"}
+_SAME = {
+    "cuda", "cpu", "to", "float", "half", "double", "type", "clone", "contiguous", "detach", "clamp", "clip", "clamp_",
+    "clamp_min", "clamp_max", "squeeze", "unsqueeze", "permute", "transpose", "view", "reshape", "flatten", "expand",
+    "repeat", "requires_grad_", "mean", "pow", "flip", "T", "type_as", "movedim", "index_select", "masked_fill", "mul",
+    "mul_", "add", "sub", "div", "div_", "nan_to_num", "round", "narrow", "view_as", "reshape_as", "copy", "cumsum",
+    "roll", "chunk", "split", "unbind", "select",
+}  # fmt: skip
+_FIRST = {
+    "clamp", "clip", "interpolate", "grid_sample", "pad", "permute", "squeeze", "unsqueeze", "flatten", "reshape",
+    "transpose", "sigmoid", "relu", "from_numpy", "tensor", "as_tensor", "mean", "nan_to_num", "rearrange", "resize",
+    "movedim", "pow", "index_select", "masked_select", "gather", "avg_pool2d", "flip", "rot90", "einsum", "checkpoint",
+    "conv2d", "mul", "where_first", "abs", "array", "enumerate", "iter", "next", "list", "tuple", "reversed", "zip",
+    "tqdm", "DataLoader", "deepcopy", "no_grad", "max_pool2d", "center_crop", "crop", "gaussian_blur",
+}  # fmt: skip
+_JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
+_DEPTH = 24
+
+
+class Meaning(NamedTuple):
+    """``kind``: image, depth, normal, ... or None; ``role``: "render", "target", "both" or None."""
+
+    kind: Optional[str]
+    role: Optional[str]
+
+
+_UNKNOWN = Meaning(None, None)
+
+
+class Meanings:
+    """Answers for the expressions of one program."""
+
+    def __init__(self, program: Program, training: Training) -> None:
+        self.program = program
+        self.training = training
+        self._known: Dict[int, Meaning] = {}
+        self._here: Dict[int, Meaning] = {}
+        self._open: Set[int] = set()
+
+    def of(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Meaning:
+        """Return what an expression stands for."""
+        if id(node) in self._known:
+            return self._known[id(node)]
+        if id(node) in self._here:
+            return self._here[id(node)]
+        if id(node) in self._open or depth > _DEPTH:
+            return _UNKNOWN
+        outermost = not self._open
+        self._open.add(id(node))
+        try:
+            meaning = self._of(function, node, depth + 1)
+        finally:
+            self._open.discard(id(node))
+        # What was found inside of a loop is incomplete: it serves this question only.
+        self._here[id(node)] = meaning
+        if outermost:
+            self._known[id(node)] = meaning
+            self._here.clear()
+        return meaning
+
+    def _of(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
+        if isinstance(node, cst.Name):
+            return self._named(node.value, self._flow(function, node, depth))
+        if isinstance(node, cst.Attribute):
+            return self._attribute(function, node, depth)
+        if isinstance(node, cst.Subscript):
+            return self._subscript(function, node, depth)
+        if isinstance(node, cst.Call):
+            return self._call(function, node, depth)
+        if isinstance(node, cst.BinaryOperation):
+            return _mix([self.of(function, node.left, depth), self.of(function, node.right, depth)])
+        if isinstance(node, cst.Comparison):
+            return Meaning("mask", None)
+        if isinstance(node, cst.UnaryOperation):
+            return self.of(function, node.expression, depth)
+        if isinstance(node, cst.IfExp):
+            return _mix([self.of(function, node.body, depth), self.of(function, node.orelse, depth)])
+        if isinstance(node, cst.BooleanOperation):
+            return _mix([self.of(function, node.left, depth), self.of(function, node.right, depth)])
+        if isinstance(node, (cst.Tuple, cst.List)):
+            return _mix([self.of(function, element.value, depth) for element in node.elements])
+        if isinstance(node, (cst.ListComp, cst.GeneratorExp)):
+            return self.of(function, node.elt, depth)
+        return _UNKNOWN
+
+    @staticmethod
+    def _named(name: str, flow: Meaning) -> Meaning:
+        kind = kind_of_words(name)
+        if kind == "image" and flow.kind == "feature":
+            return Meaning("image", role_of_words(name) or flow.role)  # `rgb = outputs["features"]`: colours, there
+        kinds = [k for k in (kind, flow.kind) if k is not None]
+        return Meaning(min(kinds, key=KINDS.index) if kinds else None, role_of_words(name) or flow.role)
+
+    def _flow(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
+        """Join what the definitions say that reach this use."""
+        definitions = self.program.lookup(function, node) if depth <= _DEPTH else None
+        if definitions is None:
+            return _UNKNOWN
+        return _mix([self._definition(where, definition, depth) for where, definition in definitions])
+
+    def _definition(self, function: Function, definition: Definition, depth: int) -> Meaning:
+        value = definition.value
+        if definition.kind == "parameter":
+            return self._parameter(function, definition, depth)
+        if value is None or definition.kind in ("import", "function", "class"):
+            return _UNKNOWN
+        if definition.kind == "augment":
+            assert isinstance(definition.node, cst.AugAssign)
+            old = self._flow(function, definition.node.target, depth + 1)
+            return _mix([old, self.of(function, value, depth)])
+        if definition.kind == "element" and definition.index is not None:
+            return self._element(function, value, definition.index, depth)
+        if definition.kind in ("mutate", "inplace", "store"):
+            inner = arguments(value)[0] if isinstance(value, cst.Call) and definition.kind != "store" else [value]
+            return _mix([self.of(function, part, depth) for part in inner])
+        return self.of(function, value, depth)
+
+    def _element(self, function: Function, value: cst.CSTNode, index: int, depth: int) -> Meaning:
+        if isinstance(value, cst.Call):
+            name = call_name(value)
+            positional, _, _ = arguments(value)
+            if name == "zip" and index < len(positional):
+                return self.of(function, positional[index], depth)
+            if name == "enumerate":
+                return self.of(function, positional[0], depth) if index == 1 and positional else _UNKNOWN
+            # A renderer that returns a tuple returns the image first; the rest have names of their own.
+            meaning = self.of(function, value, depth)
+            if meaning.kind == "image" and index > 0:
+                return Meaning(None, meaning.role)
+            returned = self._returned(function, value, index, depth)
+            return returned if returned.kind is not None else meaning
+        if isinstance(value, (cst.Tuple, cst.List)) and index < len(value.elements):
+            return self.of(function, value.elements[index].value, depth)
+        meaning = self.of(function, value, depth)
+        return Meaning(None, meaning.role)
+
+    def _returned(self, function: Function, call: cst.Call, index: int, depth: int) -> Meaning:
+        found = []
+        for reference in self.program.resolve(function, call.func):
+            if reference.kind == "function" and isinstance(reference.target, Function) and not reference.guess:
+                for value in reference.target.flow.returns:
+                    if isinstance(value, cst.Tuple) and index < len(value.elements):
+                        found.append(self.of(reference.target, value.elements[index].value, depth))
+        return _mix(found)
+
+    def _parameter(self, function: Function, definition: Definition, depth: int) -> Meaning:
+        """A parameter is what it is given where training calls the function."""
+        names = function.parameters
+        if definition.place not in names:
+            return _UNKNOWN
+        position, found = names.index(definition.place), []
+        for caller, call in self.training.sites.get(function, [])[:8]:
+            positional, keywords, _ = arguments(call)
+            if definition.place in keywords:
+                found.append(self.of(caller, keywords[definition.place], depth))
+            elif position < len(positional):
+                found.append(self.of(caller, positional[position], depth))
+        return _mix(found)
+
+    def _attribute(self, function: Function, node: cst.Attribute, depth: int) -> Meaning:
+        name = node.attr.value
+        if isinstance(node.value, cst.Name) and node.value.value in _PARAMETERS:
+            return Meaning("parameter", None)
+        local = self._flow(function, node, depth) if function.flow.reaching(node) else _UNKNOWN
+        if local == _UNKNOWN and isinstance(node.value, cst.Name) and node.value.value == "self":
+            owner = self.program.owner_of(function)
+            stores = owner.stores(name) if owner is not None else []
+            local = _mix([self._definition(method, d, depth) for method, d in stores[:6]])
+        kind = kind_of_words(name)
+        if kind is None and name in ("T", "data", "grad", "real"):
+            return self.of(function, node.value, depth)
+        role = role_of_words(name) or local.role
+        if role is None or role == "target":
+            role = role or self._role_of_holder(function, node.value, depth)
+        return Meaning(_closer(kind, local.kind), role)
+
+    def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> Meaning:
+        key = key_of(node)
+        if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in _PARAMETERS:
+            return Meaning("parameter", None)
+        if isinstance(key, str):
+            local = self._flow(function, node, depth) if function.flow.reaching(node) else _UNKNOWN
+            role = role_of_words(key)
+            if role is None or key == "render":
+                role = local.role or self._role_of_holder(function, node.value, depth) or role
+            return Meaning(_closer(kind_of_words(key), local.kind), role)
+        return self.of(function, node.value, depth)
+
+    def _role_of_holder(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[str]:
+        """``outputs["rgb"]`` was rendered, ``batch["rgb"]`` and ``viewpoint.image`` were photographed."""
+        if isinstance(node, cst.Name):
+            found = set(words(node.value))
+            name_role = role_of_words(node.value)
+            if name_role is not None:
+                return name_role
+            flow = self._flow(function, node, depth + 1)
+            if flow.role is not None:
+                return flow.role
+            return "target" if found & DATA else None
+        if isinstance(node, cst.Attribute):
+            role = role_of_words(node.attr.value)
+            return role or (
+                "target"
+                if set(words(node.attr.value)) & DATA
+                else self._role_of_holder(function, node.value, depth + 1)
+            )
+        if isinstance(node, cst.Subscript):
+            return self._role_of_holder(function, node.value, depth + 1)
+        return self.of(function, node, depth).role
+
+    def _call(self, function: Function, node: cst.Call, depth: int) -> Meaning:
+        name = call_name(node)
+        positional, keywords, _ = arguments(node)
+        values = [*positional, *keywords.values()]
+        base = node.func.value if isinstance(node.func, cst.Attribute) else None
+        module = isinstance(base, cst.Name) and base.value in ("torch", "F", "np", "nn", "einops", "functional", "TF")
+        if name == "get" and positional and isinstance(constant(positional[0]), str) and base is not None:
+            key = constant(positional[0])
+            role = role_of_words(key) or self._role_of_holder(function, base, depth)
+            return Meaning(kind_of_words(key), role)
+        if name == "where" and len(values) == 3:
+            return _mix([self.of(function, value, depth) for value in values[1:]])
+        if name in _JOIN and values:
+            return self.of(function, values[0], depth)
+        if base is not None and not module and name in _SAME:
+            return self.of(function, base, depth)
+        if (module or base is None) and (name in _FIRST or name in _SAME) and values:
+            return self.of(function, values[0], depth)
+        if base is not None and name in ("pop", "popleft", "__getitem__", "cuda"):
+            return self.of(function, base, depth)
+        spoken = set(words(name))
+        kind = kind_of_words(name)
+        if "compute" in spoken and kind is None:
+            spoken = spoken - {"compute"}
+        if spoken & {
+            "render",
+            "rendering",
+            "rasterize",
+            "rasterization",
+            "rasterizer",
+            "renderer",
+            "raster",
+            "splat",
+            "splatting",
+            "project",
+        }:
+            return Meaning(kind if kind is not None else "image", "render")
+        if kind is not None and kind not in ("image", "mask", "parameter"):
+            return Meaning(kind, role_of_words(name))
+        if kind == "image" and (role_of_words(name) == "target" or spoken & {"load", "read", "get", "open", "fetch"}):
+            holder = self._role_of_holder(function, base, depth) if base is not None else None
+            return Meaning("image", role_of_words(name) or holder or "target")
+        # A function of an image is an image, unless its name says otherwise: exposure, appearance, a background.
+        parts = [self.of(function, value, depth) for value in values]
+        images = [part for part in parts if part.kind == "image"]
+        if images:
+            return _mix(images)
+        if isinstance(node.func, cst.Call):  # Renderer(settings)(**means)
+            return self.of(function, node.func, depth)
+        if isinstance(node.func, (cst.Name, cst.Attribute)):
+            made = self._made_by(function, node.func, depth)
+            if made is not None:
+                return made
+        if base is not None and not module:
+            return Meaning(kind, self.of(function, base, depth).role if kind else None)
+        return Meaning(kind, None)
+
+    def _made_by(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[Meaning]:
+        """``rasterizer = GaussianRasterizer(...)``, then ``rasterizer(...)``; a function whose returns are images."""
+        for reference in self.program.resolve(function, node):
+            if reference.kind in ("instance", "class", "made by", "external", "function"):
+                name = getattr(reference.target, "name", str(reference.target))
+                if set(words(name)) & {"renderer", "rasterizer", "rasterization", "render", "rasterize"}:
+                    return Meaning("image", "render")
+            if reference.kind == "function" and isinstance(reference.target, Function) and not reference.guess:
+                found = [self.of(reference.target, value, depth) for value in reference.target.flow.returns]
+                if found and all(m.kind is not None or m.role is not None for m in found):
+                    return _mix(found)
+        return None
+
+
+def root_of(node: cst.Name | cst.Attribute) -> str:
+    """Return the last name of ``a.b``: b."""
+    return node.value if isinstance(node, cst.Name) else node.attr.value
+
+
+def _closer(word: Optional[str], flow: Optional[str]) -> Optional[str]:
+    kinds = [kind for kind in (word, flow) if kind is not None]
+    return min(kinds, key=KINDS.index) if kinds else None
+
+
+def _mix(parts: Iterable[Meaning]) -> Meaning:
+    """Join the meanings of an expression's parts: a mask or a number laid over an image leaves an image."""
+    known = [part for part in parts if part != _UNKNOWN]
+    if not known:
+        return _UNKNOWN
+    pictures = [part for part in known if part.kind not in (None, "mask", "parameter")]
+    if pictures:
+        kind = min((part.kind for part in pictures if part.kind is not None), key=KINDS.index)
+        roles = {part.role for part in pictures if part.role is not None}
+    else:
+        kinds = [part.kind for part in known if part.kind is not None]
+        kind = min(kinds, key=KINDS.index) if kinds else None  # type: ignore[assignment]
+        roles = {part.role for part in known if part.role is not None}
+    role = roles.pop() if len(roles) == 1 else "both" if roles else None
+    return Meaning(kind, role)

@@ -1,0 +1,550 @@
+"""A checkout as one program: its modules, functions and classes, and what a name in one of them refers to.
+
+Files are parsed when they are first asked for. What Python decides at run time (a method of an unknown object) is
+looked up by its name: everything that it could be is returned.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import PurePosixPath
+from typing import Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
+
+import libcst as cst
+
+from legs_adapters.flow import Definition, Flow
+from legs_adapters.repo import Source, Unreadable
+from legs_adapters.syntax import arguments, call_name, dotted, path_of, word_set
+
+__all__ = ["Class", "Function", "Module", "Program", "Reference", "mention"]
+
+_DEFINED = re.compile(r"^[ \t]*(?:async[ \t]+)?(?:def|class)[ \t]+(\w+)", re.M)
+_PRINT_STATEMENT = re.compile(
+    r"^\s*(print\s+[\"'\w]|exec\s+[\"']|raise\s+\w+\s*,)|^\s*except\s+[\w.]+\s*,\s*\w+\s*:", re.M
+)
+_COMMON = word_set(
+    """
+    __init__ get items keys values copy to cuda cpu clone detach load save append update mean sum size step
+    zero_grad train eval close write read format join split pop item view reshape permute squeeze unsqueeze
+    clamp
+    """
+)
+_DEPTH = 12
+
+
+class Function:
+    """A function, a method, or a module's top level.
+
+    Attributes:
+        module, node, name: where it stands.
+        parent: the function around it; a module's top level for what is defined there; None for the top level itself.
+        owner: its class, for a method.
+    """
+
+    def __init__(
+        self,
+        module: Module,
+        node: cst.FunctionDef | cst.Module,
+        parent: Optional[Function] = None,
+        owner: Optional[Class] = None,
+    ) -> None:
+        self.module = module
+        self.node = node
+        self.parent = parent
+        self.owner = owner
+        self.name = node.name.value if isinstance(node, cst.FunctionDef) else ""
+        self._flow: Optional[Flow] = None
+
+    def __repr__(self) -> str:
+        return f"<{self.module.path}:{self.name or 'top level'}>"
+
+    @property
+    def flow(self) -> Flow:
+        """Its reaching definitions, computed once."""
+        if self._flow is None:
+            if isinstance(self.node, cst.FunctionDef):
+                self._flow = Flow(self.node.body, self.node.params)
+            else:
+                self._flow = Flow(self.node)
+        return self._flow
+
+    @property
+    def parameters(self) -> List[str]:
+        """Positional parameters' names, ``self`` and ``cls`` excepted."""
+        if not isinstance(self.node, cst.FunctionDef):
+            return []
+        names = [param.name.value for param in (*self.node.params.posonly_params, *self.node.params.params)]
+        return names[1:] if self.owner is not None and not self.static and names else names
+
+    @property
+    def static(self) -> bool:
+        """Whether it is a static method."""
+        return "staticmethod" in self.decorators
+
+    @property
+    def decorators(self) -> List[str]:
+        """The last names of its decorators."""
+        if not isinstance(self.node, cst.FunctionDef):
+            return []
+        names = []
+        for decorator in self.node.decorators:
+            node = decorator.decorator
+            names.append((dotted(node.func if isinstance(node, cst.Call) else node) or "").split(".")[-1])
+        return names
+
+
+def mention(name: str, called: bool = False) -> re.Pattern[str]:
+    """Return a pattern for texts that mention a name, or call it."""
+    return re.compile(r"\b" + re.escape(name) + (r"\s*\(" if called else r"\b"))
+
+
+class Class:
+    """A class: its methods, and what is stored in its attributes by any of them."""
+
+    def __init__(self, module: Module, node: cst.ClassDef, parent: Function) -> None:
+        self.module = module
+        self.node = node
+        self.parent = parent
+        self.name = node.name.value
+        self.methods: Dict[str, Function] = {}
+        self.fields: Dict[str, cst.BaseExpression] = {}
+        self._stores: Optional[Dict[str, List[Tuple[Function, Definition]]]] = None
+
+    @property
+    def bases(self) -> List[str]:
+        """The last names of its base classes."""
+        return [(dotted(arg.value) or "").split(".")[-1] for arg in self.node.bases]
+
+    def stores(self, attribute: str) -> List[Tuple[Function, Definition]]:
+        """Return what its methods assign to ``self.attribute``."""
+        if self._stores is None:
+            self._stores = {}
+            for method in self.methods.values():
+                for place, definitions in method.flow.definitions.items():
+                    if place.startswith("self.") and place.count(".") == 1 and "[" not in place:
+                        entries = self._stores.setdefault(place[5:], [])
+                        entries.extend((method, d) for d in definitions if d.kind not in ("store",))
+        return self._stores.get(attribute, [])
+
+
+class Module:
+    """A parsed file.
+
+    Attributes:
+        functions: every function in it, methods and nested functions too, in source order; ``top`` is its top level.
+        classes: every class in it.
+    """
+
+    def __init__(self, path: str, tree: cst.Module, text: str) -> None:
+        self.path = path
+        self.tree = tree
+        self.text = text
+        self.top = Function(self, tree)
+        self.functions: List[Function] = []
+        self.classes: List[Class] = []
+        self.by_node: Dict[int, Function | Class] = {}
+        self._collect(self.top)
+        self._names: Optional[Set[str]] = None
+
+    def _collect(self, function: Function) -> None:
+        for node in function.flow.functions:
+            self._add(Function(self, node, function))
+        for class_node in function.flow.classes:
+            self._add_class(class_node, function)
+
+    def _add(self, function: Function) -> None:
+        self.functions.append(function)
+        self.by_node[id(function.node)] = function
+        self._collect(function)
+
+    def _add_class(self, node: cst.ClassDef, parent: Function) -> None:
+        owner = Class(self, node, parent)
+        self.classes.append(owner)
+        self.by_node[id(node)] = owner
+        for statement in node.body.body:
+            if isinstance(statement, cst.FunctionDef):
+                method = Function(self, statement, parent, owner)
+                owner.methods.setdefault(method.name, method)
+                self._add(method)
+            elif isinstance(statement, cst.ClassDef):
+                self._add_class(statement, parent)
+            elif isinstance(statement, cst.SimpleStatementLine):
+                for small in statement.body:
+                    if isinstance(small, cst.Assign):
+                        for target in small.targets:
+                            if isinstance(target.target, cst.Name):
+                                owner.fields[target.target.value] = small.value
+                    elif isinstance(small, cst.AnnAssign) and isinstance(small.target, cst.Name) and small.value:
+                        owner.fields[small.target.value] = small.value
+
+    def everything(self) -> List[Function]:
+        """Every function and the top level."""
+        return [self.top, *self.functions]
+
+
+class Reference(NamedTuple):
+    """What an expression refers to.
+
+    ``kind``: "function", "class", "instance" (of a class), "module", "external" (a dotted name outside of the
+    checkout), "lambda". ``guess``: found by its name alone.
+    """
+
+    kind: str
+    target: object
+    guess: bool = False
+
+
+class Program:
+    """The files of a checkout, linked.
+
+    Args:
+        sources: the readable files.
+
+    Attributes:
+        unreadable: files that turned out not to parse, with the reason.
+    """
+
+    def __init__(self, sources: Iterable[Source]) -> None:
+        self.sources: Dict[str, Source] = {source.path: source for source in sources}
+        self.unreadable: Dict[str, Unreadable] = {}
+        self._modules: Dict[str, Optional[Module]] = {}
+        self._defined: Dict[str, List[str]] = {}
+        for source in self.sources.values():
+            for name in set(_DEFINED.findall(source.text)):
+                self._defined.setdefault(name, []).append(source.path)
+
+    def module(self, path: str) -> Optional[Module]:
+        """Return a parsed file; None where it does not parse (it is then among ``unreadable``)."""
+        if path not in self._modules:
+            self._modules[path] = self._parse(self.sources[path])
+        return self._modules[path]
+
+    def _parse(self, source: Source) -> Optional[Module]:
+        try:
+            tree = cst.parse_module(source.text)
+        except cst.ParserSyntaxError as error:
+            line = getattr(error, "raw_line", 0)
+            python2 = _PRINT_STATEMENT.search(source.text) is not None
+            reason = "Python 2" if python2 else f"does not parse (line {line})"
+            self.unreadable[source.path] = Unreadable(source.path, reason)
+            return None
+        except (RecursionError, ValueError) as error:
+            self.unreadable[source.path] = Unreadable(source.path, f"cannot be parsed: {type(error).__name__}")
+            return None
+        if tree.code != source.text:
+            self.unreadable[source.path] = Unreadable(source.path, "cannot be written back exactly")
+            return None
+        try:
+            return Module(source.path, tree, source.text)
+        except RecursionError:
+            self.unreadable[source.path] = Unreadable(source.path, "is nested too deeply")
+            return None
+
+    def matching(self, pattern: re.Pattern[str]) -> List[Module]:
+        """Return the modules whose text matches."""
+        found = [self.module(path) for path, source in self.sources.items() if pattern.search(source.text)]
+        return [module for module in found if module is not None]
+
+    # -- names
+
+    def resolve(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[Reference]:
+        """Return what an expression may refer to; empty where nothing is known."""
+        if depth > _DEPTH:
+            return []
+        if isinstance(node, cst.Name):
+            found = self._definitions(function, node)
+            if found is None:
+                return self._global(function.module, node.value, depth + 1)
+            references: List[Reference] = []
+            for where, definition in found:
+                references.extend(self._of_definition(where, definition, depth + 1))
+            return _unique(references)
+        if isinstance(node, cst.Attribute):
+            return self._attribute(function, node, depth + 1)
+        if isinstance(node, cst.Call):
+            if call_name(node) == "partial" and node.args:
+                return self.resolve(function, node.args[0].value, depth + 1)
+            if call_name(node) == "super":
+                return []
+            made = self.resolve(function, node.func, depth + 1)
+            instances = [Reference("instance", ref.target) for ref in made if ref.kind == "class"]
+            instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
+            return instances
+        if isinstance(node, cst.Subscript):
+            return self._subscript(function, node, depth + 1)
+        if isinstance(node, cst.IfExp):
+            return _unique(
+                self.resolve(function, node.body, depth + 1) + self.resolve(function, node.orelse, depth + 1)
+            )
+        if isinstance(node, cst.BooleanOperation):
+            return _unique(self.resolve(function, node.left, depth + 1) + self.resolve(function, node.right, depth + 1))
+        if isinstance(node, cst.Lambda):
+            return [Reference("lambda", node)]
+        return []
+
+    def lookup(self, function: Function, node: cst.CSTNode) -> Optional[List[Tuple[Function, Definition]]]:
+        """Return the definitions that a place may come from, each with the function it stands in; None if unknown."""
+        return self._definitions(function, node)
+
+    def _definitions(self, function: Function, node: cst.CSTNode) -> Optional[List[Tuple[Function, Definition]]]:
+        local = function.flow.reaching(node)
+        if local:
+            return [(function, definition) for definition in sorted(local, key=lambda d: (d.place, d.kind))]
+        place = path_of(node)
+        scope = function.parent
+        while place is not None and scope is not None:
+            if scope.parent is None:  # the module's top level
+                break
+            if place in scope.flow.definitions:
+                return [(scope, definition) for definition in scope.flow.definitions[place]]
+            scope = scope.parent
+        if place is not None and place in function.module.top.flow.definitions:
+            return [(function.module.top, d) for d in function.module.top.flow.definitions[place]]
+        return None
+
+    def _of_definition(self, where: Function, definition: Definition, depth: int) -> List[Reference]:
+        if definition.kind in ("function", "class"):
+            target = where.module.by_node.get(id(definition.node))
+            return [Reference(definition.kind, target)] if target is not None else []
+        if definition.kind == "import":
+            return self._imported(where.module, definition, depth)
+        if definition.kind in ("assign", "with") and definition.value is not None:
+            return self.resolve(where, definition.value, depth)
+        if definition.kind == "parameter" and definition.value is not None:
+            return self.resolve(where, definition.value, depth)
+        return []
+
+    def _global(self, module: Module, name: str, depth: int) -> List[Reference]:
+        if depth > _DEPTH:
+            return []
+        definitions = module.top.flow.definitions.get(name)
+        if definitions:
+            references: List[Reference] = []
+            for definition in definitions:
+                references.extend(self._of_definition(module.top, definition, depth + 1))
+            return _unique(references)
+        for node in module.top.flow.imports:
+            if isinstance(node, cst.ImportFrom) and isinstance(node.names, cst.ImportStar):
+                other = self._find_module(module, node)
+                if isinstance(other, Module) and other is not module:
+                    found = self._global(other, name, depth + 1)
+                    if found:
+                        return found
+        return []
+
+    def _imported(self, module: Module, definition: Definition, depth: int) -> List[Reference]:
+        alias, node = definition.node, definition.value
+        assert isinstance(alias, cst.ImportAlias)
+        name = dotted(alias.name) or ""
+        if isinstance(node, cst.Import):
+            full = name if alias.asname is not None else name.split(".")[0]
+            found = self.find_module(module, full, 0)
+            return [Reference("module", found)] if isinstance(found, Module) else [Reference("external", full)]
+        assert isinstance(node, cst.ImportFrom)
+        base = self._find_module(module, node)
+        inside = self.find_module(module, ((_from(node) + ".") if _from(node) else "") + name, len(node.relative))
+        if isinstance(base, Module):
+            found_names = self._global(base, name, depth + 1)
+            if found_names:
+                return found_names
+        if isinstance(inside, Module):
+            return [Reference("module", inside)]
+        if isinstance(base, Module):
+            return []
+        return [Reference("external", f"{_from(node)}.{name}" if _from(node) else name)]
+
+    def _find_module(self, module: Module, node: cst.ImportFrom) -> Optional[Module]:
+        return self.find_module(module, _from(node), len(node.relative))
+
+    def find_module(self, module: Module, name: str, level: int) -> Optional[Module]:
+        """Return the checkout's module of this name, as seen from another; None where it is not the checkout's."""
+        here = PurePosixPath(module.path).parent
+        inner = name.replace(".", "/")
+        if level:
+            for _ in range(level - 1):
+                here = here.parent
+            candidates = [here]
+        else:
+            candidates = [here, *here.parents, PurePosixPath("src")]
+        for base in candidates:
+            stem = (base / inner).as_posix() if inner else base.as_posix()
+            for path in (f"{stem}.py", f"{stem}/__init__.py" if stem != "." else "__init__.py"):
+                path = path[2:] if path.startswith("./") else path
+                if path in self.sources:
+                    return self.module(path)
+        if level or not inner:
+            return None
+        # Scripts put folders on sys.path: the one file whose path ends so is it.
+        ends = [p for p in self.sources if p.endswith((f"/{inner}.py", f"/{inner}/__init__.py"))]
+        return self.module(ends[0]) if len(ends) == 1 and "/" in inner else None
+
+    # -- attributes
+
+    def _attribute(self, function: Function, node: cst.Attribute, depth: int) -> List[Reference]:
+        name = node.attr.value
+        local = function.flow.reaching(node)
+        if local:
+            references: List[Reference] = []
+            for definition in local:
+                references.extend(self._of_definition(function, definition, depth))
+            if references:
+                return _unique(references)
+        if isinstance(node.value, cst.Name) and node.value.value in ("self", "cls"):
+            owner = self.owner_of(function)
+            if owner is not None:
+                return _unique(self.member(owner, name, depth) + self._overrides(owner, name))
+        if isinstance(node.value, cst.Call) and call_name(node.value) == "super":
+            owner = self.owner_of(function)
+            found = [self.member(base, name, depth) for base in self.bases(owner)] if owner is not None else []
+            return _unique([ref for refs in found for ref in refs])
+        references = []
+        for base in self.resolve(function, node.value, depth):
+            if base.kind == "module":
+                assert isinstance(base.target, Module)
+                references.extend(self._global(base.target, name, depth))
+                inner = self.find_module(base.target, name, 1)
+                if inner is not None and base.target.path.endswith("__init__.py"):
+                    references.append(Reference("module", inner))
+            elif base.kind == "external":
+                references.append(Reference("external", f"{base.target}.{name}"))
+            elif base.kind in ("instance", "class"):
+                assert isinstance(base.target, Class)
+                references.extend(self.member(base.target, name, depth))
+        if references:
+            return _unique(references)
+        if name in _COMMON:
+            return []
+        return [Reference("function", method, True) for method in self.methods_named(name)]
+
+    def owner_of(self, function: Function) -> Optional[Class]:
+        """Return the class whose ``self`` a function sees."""
+        scope: Optional[Function] = function
+        while scope is not None:
+            if scope.owner is not None:
+                return scope.owner
+            scope = scope.parent
+        return None
+
+    def _overrides(self, owner: Class, name: str) -> List[Reference]:
+        """``self.step()`` in a base class: the methods of classes that derive from it."""
+        if name.startswith("__"):
+            return []
+        found = []
+        for method in self.methods_named(name) if name not in _COMMON else []:
+            assert method.owner is not None
+            if method.owner is not owner and self._derives(method.owner, owner):
+                found.append(Reference("function", method))
+        return found
+
+    def _derives(self, derived: Class, owner: Class) -> bool:
+        seen: Set[int] = set()
+        queue = self.bases(derived)
+        while queue:
+            current = queue.pop()
+            if current is owner:
+                return True
+            if id(current) not in seen:
+                seen.add(id(current))
+                queue.extend(self.bases(current))
+        return False
+
+    def bases(self, owner: Class) -> List[Class]:
+        """Return the base classes that stand in the checkout."""
+        found = []
+        for arg in owner.node.bases:
+            for ref in self.resolve(owner.parent, arg.value):
+                if ref.kind == "class" and isinstance(ref.target, Class) and ref.target is not owner:
+                    found.append(ref.target)
+        return found
+
+    def member(self, owner: Class, name: str, depth: int = 0) -> List[Reference]:
+        """Return what ``instance.name`` may be: a method, or what methods of the class store there."""
+        references: List[Reference] = []
+        seen: Set[int] = set()
+        queue = [owner]
+        while queue and depth <= _DEPTH:
+            current = queue.pop(0)
+            if id(current) in seen:
+                continue
+            seen.add(id(current))
+            if name in current.methods:
+                references.append(Reference("function", current.methods[name]))
+                break
+            if name in current.fields:
+                references.extend(self.resolve(current.parent, current.fields[name], depth + 1))
+            for method, definition in current.stores(name):
+                references.extend(self._of_definition(method, definition, depth + 1))
+            queue.extend(self.bases(current))
+        return _unique(references)
+
+    def methods_named(self, name: str) -> List[Function]:
+        """Return every method of this name in the checkout."""
+        found: List[Function] = []
+        for path in self._defined.get(name, []):
+            module = self.module(path)
+            if module is not None:
+                found.extend(f for f in module.functions if f.name == name and f.owner is not None)
+        return found
+
+    def functions_named(self, name: str) -> List[Function]:
+        """Return every function or method of this name in the checkout."""
+        found: List[Function] = []
+        for path in self._defined.get(name, []):
+            module = self.module(path)
+            if module is not None:
+                found.extend(f for f in module.functions if f.name == name)
+        return found
+
+    def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> List[Reference]:
+        definitions = self._definitions(function, node.value)
+        literals: List[Tuple[Function, cst.CSTNode]] = []
+        if definitions is not None:
+            literals = [(where, d.value) for where, d in definitions if d.value is not None and d.kind == "assign"]
+            references = []
+            for where, definition in definitions:
+                if definition.kind == "import":
+                    references.extend(self._dictionary(where, definition, depth))
+            if references:
+                return _unique(references)
+        else:
+            literals = [(function, node.value)]
+        references = []
+        for where, value in literals:
+            references.extend(self._values(where, value, depth))
+        return _unique(references)
+
+    def _dictionary(self, where: Function, definition: Definition, depth: int) -> List[Reference]:
+        alias, node = definition.node, definition.value
+        if not isinstance(node, cst.ImportFrom) or not isinstance(alias, cst.ImportAlias):
+            return []
+        base = self._find_module(where.module, node)
+        if base is None:
+            return []
+        references: List[Reference] = []
+        for d in base.top.flow.definitions.get(dotted(alias.name) or "", []):
+            if d.value is not None and d.kind == "assign":
+                references.extend(self._values(base.top, d.value, depth))
+        return references
+
+    def _values(self, where: Function, value: cst.CSTNode, depth: int) -> List[Reference]:
+        references: List[Reference] = []
+        if isinstance(value, cst.Dict):
+            for element in value.elements:
+                if isinstance(element, cst.DictElement):
+                    references.extend(self.resolve(where, element.value, depth))
+        elif isinstance(value, cst.Call) and call_name(value) == "dict":
+            for argument in arguments(value)[1].values():
+                references.extend(self.resolve(where, argument, depth))
+        return references
+
+
+def _from(node: cst.ImportFrom) -> str:
+    return "" if node.module is None else (dotted(node.module) or "")
+
+
+def _unique(references: Iterable[Reference]) -> List[Reference]:
+    found: Dict[Tuple[str, object], Reference] = {}
+    for ref in references:
+        key = (ref.kind, ref.target if isinstance(ref.target, str) else id(ref.target))
+        found.setdefault(key, ref)
+    return list(found.values())

@@ -1,0 +1,183 @@
+"""Whether a target is a view's own stored image, untouched between loading and the loss: only then may it be named.
+
+The proof wants three things: the target is ``camera.original_image`` (or what the codebase calls it), moved between
+devices and types but not changed; ``camera`` is the same view where the name is asked; and the camera's class stores
+both the image and ``image_name``.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import List, NamedTuple, Optional, Set, Tuple
+
+import libcst as cst
+
+from legs_adapters.flow import Definition
+from legs_adapters.program import Class, Function, Program
+from legs_adapters.syntax import arguments, call_name, code, constant, dotted, words
+
+__all__ = ["View", "Views"]
+
+_MOVES = {"cuda", "to", "cpu", "float", "contiguous", "clone", "detach", "type"}
+_IMAGES = {"original_image", "image", "gt_image", "rgb", "original_rgb", "img", "image_tensor"}
+_NAME = "image_name"
+
+
+class View(NamedTuple):
+    """The verdict: the text to pass as ``view=``, or None; and the reason, in words."""
+
+    text: Optional[str]
+    reason: str
+
+
+class Views:
+    """Verdicts for one program."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self._cameras: Optional[List[Class]] = None
+
+    def of(self, function: Function, target: cst.CSTNode, site: cst.CSTNode) -> View:
+        """Return the verdict for the target of one site."""
+        images: List[Tuple[cst.Attribute, Function]] = []
+        problem = self._trace(function, target, images, set())
+        if problem is not None:
+            return View(None, problem)
+        if not images:
+            return View(None, "not a view's own image")
+        if len({(code(image), where) for image, where in images}) != 1:
+            return View(None, "comes from several places")
+        image, where = images[0]
+        holder = image.value
+        if where is not function or not isinstance(holder, cst.Name):
+            return View(None, f"{code(image)} is not named where the loss is")
+        stored = self._stored(image.attr.value)
+        if stored is not None:
+            return View(None, stored)
+        if not self._still(function, holder, target, site):
+            return View(None, f"{holder.value} may be another view by then")
+        overwritten = self._overwritten(function, holder.value, image.attr.value)
+        if overwritten is not None:
+            return View(None, overwritten)
+        return View(f"{holder.value}.{_NAME}", f"{code(image)}, untouched")
+
+    def _trace(
+        self, function: Function, node: cst.CSTNode, images: List[Tuple[cst.Attribute, Function]], seen: Set[int]
+    ) -> Optional[str]:
+        """Follow the target to where it is stored; return why that fails, if it does."""
+        if isinstance(node, cst.Attribute) and node.attr.value in _IMAGES and dotted(node.value) not in (None, "self"):
+            images.append((node, function))
+            return None
+        if isinstance(node, cst.Name):
+            definitions = function.flow.reaching(node)
+            if not definitions:
+                return f"{node.value} is not made in this function"
+            for definition in sorted(definitions, key=lambda d: d.kind):
+                problem = self._definition(function, definition, images, seen)
+                if problem is not None:
+                    return problem
+            return None
+        if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
+            name = node.func.attr.value
+            if name in _MOVES:
+                return self._trace(function, node.func.value, images, seen)
+            if name in ("clamp", "clip") and _unit_range(node, 0):
+                return self._trace(function, node.func.value, images, seen)
+            if dotted(node.func) in ("torch.clamp", "torch.clip") and node.args and _unit_range(node, 1):
+                return self._trace(function, node.args[0].value, images, seen)
+            if name in ("cat", "stack", "concat"):
+                return "batched"
+        if isinstance(node, cst.Subscript):
+            if _first_channels(node):
+                return self._trace(function, node.value, images, seen)
+            if isinstance(node.slice[0].slice, cst.Index) and isinstance(constant(node.slice[0].slice.value), str):
+                return f"{_short(node)} has no name of its own"
+            return self._trace(function, node.value, images, seen) or f"indexed: {_short(node)}"
+        if isinstance(node, cst.Call):
+            name = call_name(node)
+            spoken = set(words(name))
+            if spoken & {"interpolate", "resize", "downsample", "avg"}:
+                return f"resized by {name}"
+            if spoken & {"offset", "shift", "shifted", "warp", "translate", "roll"}:
+                return f"shifted by {name}"
+            return f"changed by {name or 'a call'}"
+        if isinstance(node, cst.BinaryOperation):
+            if isinstance(node.operator, (cst.Divide, cst.Multiply)) and constant(node.right) is not None:
+                return f"scaled: {_short(node)}"
+            return f"composited: {_short(node)}"
+        if isinstance(node, cst.IfExp):
+            return self._trace(function, node.body, images, seen) or self._trace(function, node.orelse, images, seen)
+        return f"not traced: {_short(node)}"
+
+    def _definition(
+        self, function: Function, definition: Definition, images: List[Tuple[cst.Attribute, Function]], seen: Set[int]
+    ) -> Optional[str]:
+        if id(definition) in seen:
+            return None
+        seen.add(id(definition))
+        if definition.kind == "assign" and definition.value is not None:
+            return self._trace(function, definition.value, images, seen)
+        if definition.kind == "parameter":
+            return f"{definition.place} is a parameter"
+        if definition.kind in ("augment", "inplace", "store", "mutate"):
+            return f"changed in place: {_short(definition.node)}"
+        return f"{definition.place} comes out of a batch"
+
+    def _still(self, function: Function, holder: cst.Name, target: cst.CSTNode, site: cst.CSTNode) -> bool:
+        """Whether the camera's name at the loss can only be the camera that the target was taken from."""
+        then = function.flow.reaching(holder)
+        now = function.flow.names_at(site, holder.value)
+        return bool(then) and now == then
+
+    def _stored(self, attribute: str) -> Optional[str]:
+        if self._cameras is None:
+            self._cameras = []
+            for module in self.program.matching(re.compile(r"self\.image_name\s*=")):
+                self._cameras.extend(c for c in module.classes if c.stores(_NAME))
+        if not self._cameras:
+            return f"no class of this codebase stores {_NAME}"
+        if not any(camera.stores(attribute) or attribute in camera.methods for camera in self._cameras):
+            return f"no class of this codebase stores both {attribute} and {_NAME}"
+        for camera in self._cameras:
+            if attribute in camera.methods and "property" in camera.methods[attribute].decorators:
+                return f"{attribute} is computed anew each time"
+        return None
+
+    @staticmethod
+    def _overwritten(function: Function, holder: str, attribute: str) -> Optional[str]:
+        place = f"{holder}.{attribute}"
+        for definition in function.flow.definitions.get(place, []):
+            return f"{place} is written here: {_short(definition.node)}"
+        return None
+
+
+def _unit_range(node: cst.Call, skip: int) -> bool:
+    positional, keywords, starred = arguments(node)
+    bounds = [constant(value) for value in positional[skip:]]
+    bounds += [constant(keywords[key]) for key in ("min", "max") if key in keywords]
+    return not starred and len(bounds) == 2 and bounds[0] == 0 and bounds[1] == 1
+
+
+def _first_channels(node: cst.Subscript) -> bool:
+    """``[:3]``, ``[0:3, :, :]``, ``[:3, ...]``: the colour channels of a channels-first image, all of its pixels."""
+    for i, element in enumerate(node.slice):
+        part = element.slice
+        if isinstance(part, cst.Index):
+            if not isinstance(part.value, cst.Ellipsis):
+                return False
+            continue
+        assert isinstance(part, cst.Slice)
+        lower, upper = constant(part.lower, None), constant(part.upper, None)
+        if part.step is not None or (lower not in (None, 0)) or (part.lower is not None and lower is None):
+            return False
+        if i == 0:
+            if upper != 3 and part.upper is not None:
+                return False
+        elif part.upper is not None:
+            return False
+    return True
+
+
+def _short(node: cst.CSTNode) -> str:
+    text = " ".join(code(node).split())
+    return text if len(text) <= 60 else text[:57] + "..."

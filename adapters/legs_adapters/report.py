@@ -1,0 +1,105 @@
+"""What a run found and did, as a table for people and as JSON for scripts; and the diff."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from typing import Dict, List, Sequence, Tuple
+
+from legs_adapters.patch import Plan
+from legs_adapters.repo import Source, decode
+from legs_adapters.syntax import code
+
+__all__ = ["as_diff", "as_json", "as_table"]
+
+_RED, _GREEN, _CYAN, _BOLD, _PLAIN = "\033[31m", "\033[32m", "\033[36m", "\033[1m", "\033[0m"
+
+
+def as_table(plan: Plan) -> str:
+    """Return one line for every L1 term: where it is, what is done with it, and why."""
+    rows: List[Tuple[str, int, str, str]] = []
+    found = plan.findings
+    for site in found.sites:
+        verdict = f"view={site.view.text}" if site.view.text else "no view="
+        rows.append((site.path, site.line, "weighted", f"{verdict}: {site.view.reason}"))
+    rows += [(entry.path, entry.line, "is there", "patched before") for entry in found.patched]
+    rows += [(entry.path, entry.line, "left", entry.reason) for entry in found.left]
+    rows += [(entry.path, entry.line, "ERROR", entry.reason) for entry in found.problems]
+    rows.sort()
+    table = [(f"{path}:{line}", what, why) for path, line, what, why in rows]
+    table += [(entry.path, "not read", entry.reason) for entry in found.unreadable]
+    if not table:
+        return ""
+    wide = max(len(where) for where, _, _ in table)
+    return "".join(f"{where:<{wide}}  {what:<8}  {why}\n" for where, what, why in table)
+
+
+def as_json(plan: Plan, wrote: Sequence[str]) -> str:
+    """Return all of it for a script; see docs/patching.md for the fields."""
+    found = plan.findings
+    content: Dict[str, object] = {
+        "root": str(plan.root),
+        "sites": [
+            {
+                "file": site.path,
+                "line": site.line,
+                "column": site.column,
+                "function": site.function,
+                "code": " ".join(code(site.form.node).split()),
+                "view": site.view.text,
+                "view_reason": site.view.reason,
+                "channels_last": site.channels_last,
+            }
+            for site in found.sites
+        ],
+        "left": [{"file": e.path, "line": e.line, "code": e.text, "reason": e.reason} for e in found.left],
+        "patched": [{"file": e.path, "line": e.line, "code": e.text} for e in found.patched],
+        "problems": [
+            {"file": e.path, "line": e.line, "code": e.text, "reason": e.reason, "advice": e.advice}
+            for e in found.problems
+        ],
+        "unreadable": [{"file": e.path, "reason": e.reason} for e in found.unreadable],
+        "would_change": sorted(plan.after),
+        "wrote": list(wrote),
+    }
+    return json.dumps(content, indent=2) + "\n"
+
+
+def as_diff(plan: Plan, colour: bool) -> str:
+    """Return a unified diff of what would be written."""
+    parts: List[str] = []
+    for path, after in plan.after.items():
+        before = plan.findings.program.sources[path]
+        changed = decode(path, after)
+        assert isinstance(changed, Source)
+        parts.extend(_unified(path, before.text, changed.text))
+    if plan.settings is not None:
+        parts.extend(_unified("legs.toml", "", plan.settings, new=True))
+    return "".join(_coloured(line) if colour else line for line in parts)
+
+
+def _unified(path: str, before: str, after: str, new: bool = False) -> List[str]:
+    lines = difflib.unified_diff(
+        _lines(before), _lines(after), "/dev/null" if new else f"a/{path}", f"b/{path}", lineterm="\n"
+    )
+    shown = []
+    for line in lines:
+        shown.append(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n")
+    return shown
+
+
+def _lines(text: str) -> List[str]:
+    # splitlines() would also split at form feeds and at letters that only look like line ends
+    return (
+        text.replace("\r\n", "\n").replace("\r", "\n").splitlines(keepends=True)
+        if "\f" not in text
+        else [line + "\n" for line in text.replace("\r\n", "\n").split("\n")]
+    )
+
+
+def _coloured(line: str) -> str:
+    colour = {"+": _GREEN, "-": _RED, "@": _CYAN}.get(line[:1], "")
+    if line.startswith(("+++", "---")):
+        colour = _BOLD
+    body = line.rstrip("\n")
+    return f"{colour}{body}{_PLAIN}{line[len(body) :]}" if colour else line

@@ -1,0 +1,327 @@
+"""The edit: sites in, spans of text out. What is not between a span's ends is not touched, not even a space.
+
+    Ll1 = l1_loss(image, gt_image)
+    Ll1 = legs_loss.l1_loss(image, gt_image, view=viewpoint_cam.image_name)
+
+An edit never changes the number of lines of the expression it replaces: comments and line breaks inside are kept.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+
+import libcst as cst
+from libcst.metadata import ByteSpanPositionProvider, MetadataWrapper, PositionProvider
+
+from legs_adapters.program import Module, mention
+from legs_adapters.repo import Source, decode
+from legs_adapters.sites import Site
+from legs_adapters.syntax import code, dotted
+from legs_loss import LegsError
+
+__all__ = ["Edit", "apply_edits", "rewrite"]
+
+PACKAGE = "legs_loss"
+
+
+class Edit(NamedTuple):
+    """Bytes from ``start`` to ``end`` of a file (its byte order mark counted) become ``after``."""
+
+    start: int
+    end: int
+    before: bytes
+    after: bytes
+
+
+def apply_edits(data: bytes, edits: Sequence[Edit]) -> bytes:
+    """Return the file's bytes with the edits made."""
+    parts, at = [], 0
+    for edit in sorted(edits):
+        assert edit.start >= at and data[edit.start : edit.end] == edit.before
+        parts += [data[at : edit.start], edit.after]
+        at = edit.end
+    return b"".join([*parts, data[at:]])
+
+
+def rewrite(source: Source, module: Module, sites: Sequence[Site], in_place: bool = False) -> List[Edit]:
+    """Return the edits that give one file the LEGS loss.
+
+    Args:
+        source, module: the file, and its parsed form.
+        sites: its sites.
+        in_place: put the import on a line that is there, so that every line keeps its number.
+
+    Raises:
+        LegsError: an edit would not parse (a fault of this tool; nothing is written then).
+    """
+    text = _Text(source, module)
+    name, imported = _package_name(module)
+    edits = [edit for site in sites for edit in text.edits_for(site, name)]
+    if sites and not imported:
+        edits.append(text.import_edit(name, in_place))
+    edits.sort()
+    after = apply_edits(source.data, edits)
+    checked = decode(source.path, after)
+    try:
+        assert isinstance(checked, Source)
+        cst.parse_module(checked.text)
+    except (AssertionError, cst.ParserSyntaxError):
+        raise LegsError(f"{source.path}: the rewritten file would not parse; please report this") from None
+    return edits
+
+
+class _Text:
+    """A file's bytes, and where its nodes stand in them."""
+
+    def __init__(self, source: Source, module: Module) -> None:
+        self.source = source
+        self.module = module
+        self.bytes = source.text.encode("utf-8")
+        self.shift = len(source.bom)
+        wrapper = MetadataWrapper(module.tree, unsafe_skip_copy=True)
+        resolved = wrapper.resolve_many([ByteSpanPositionProvider, PositionProvider])
+        self.spans: Mapping[cst.CSTNode, Any] = resolved[ByteSpanPositionProvider]
+        self.positions: Mapping[cst.CSTNode, Any] = resolved[PositionProvider]
+
+    def span(self, node: cst.CSTNode, brackets: bool = False) -> Tuple[int, int]:
+        """Where a node begins and ends, on request with the brackets around it."""
+        found = self.spans[node]
+        start, end = found.start, found.start + found.length
+        if brackets and isinstance(node, cst.BaseExpression):
+            start -= sum(len(code(part).encode()) for part in node.lpar)
+            end += sum(len(code(part).encode()) for part in node.rpar)
+        return start, end
+
+    def text(self, start: int, end: int) -> str:
+        return self.bytes[start:end].decode("utf-8")
+
+    def edit(self, start: int, end: int, after: str) -> Edit:
+        return Edit(start + self.shift, end + self.shift, self.bytes[start:end], after.encode("utf-8"))
+
+    # -- one site
+
+    def edits_for(self, site: Site, name: str) -> List[Edit]:
+        form = site.form
+        if form.reduction == "registered":
+            assert form.callee is not None
+            own = f"lambda input, target: {name}.l1_loss(input, target, own={code(form.callee)})"
+            return [self.edit(*self.span(form.node, True), own)]
+        if form.reduction == "callable":
+            return [self.edit(*self.span(form.node, True), f"{name}.l1_loss")]
+        if form.callee is None:
+            return self._absolute(site, name)
+        return self._call(site, name)
+
+    def _settings(self, site: Site, name: str, reduction: str, own: str) -> str:
+        parts = []
+        if site.view.text is not None:
+            parts.append(f"view={site.view.text}")
+        if site.channels_last:
+            parts.append("channels_last=True")
+        if reduction == "none":
+            parts.append('reduction="none"')
+        if own:
+            parts.append(f"own={own}")
+        return "".join(f", {part}" for part in parts)
+
+    def _call(self, site: Site, name: str) -> List[Edit]:
+        form, call = site.form, site.form.call
+        assert form.callee is not None
+        taken = [arg for arg in call.args if arg.value is form.first or arg.value is form.second]
+        extras = [arg for arg in call.args if arg not in taken]
+        edits = [self.edit(*self.span(call.func, True), f"{name}.l1_loss")]
+        texts = [self._argument(arg.value, site.selection) for arg in taken]
+        if site.swapped:
+            texts.reverse()
+        order = ("prediction", "target")
+        for i, (arg, text) in enumerate(zip(taken, texts)):
+            keyword = f"{order[i]}=" if arg.keyword is not None else ""
+            edits.append(self.edit(*self.span(arg), keyword + text))
+        reduction, own, tail = form.reduction, "", ""
+        if form.reduction == "own":
+            own = self._own(site)
+        elif site.selection:
+            tail = site.selection + (".mean()" if form.reduction == "mean" else "")
+            reduction = "none"
+        after_taken = self.span(taken[-1])[1]
+        drop = [arg for arg in extras]
+        edits_end = after_taken
+        residue = ""
+        if drop:
+            ends = [self.span(arg)[1] for arg in drop]
+            starts = [self.span(arg)[0] for arg in drop]
+            if min(starts) < after_taken:
+                raise LegsError(
+                    f"{site.path}:{site.line}: the images are not the first two arguments: "
+                    f"write {name}.l1_loss(...) there by hand"
+                )
+            edits_end = max(ends)
+            residue = _residue(self.text(after_taken, edits_end))
+        settings = self._settings(site, name, reduction, own)
+        if settings or residue or edits_end != after_taken:
+            edits.append(self.edit(after_taken, edits_end, settings + residue))
+        if tail:
+            end = self.span(call)[1]
+            edits.append(self.edit(end, end, tail))
+        return edits
+
+    def _argument(self, node: cst.BaseExpression, index: str) -> str:
+        if index and isinstance(node, cst.Subscript):
+            start, end = self.span(node.value, True)
+            return self.text(start, end) + _residue(self.text(end, self.span(node)[1]))
+        start, end = self.span(node, True)
+        return self.text(start, end)
+
+    def _own(self, site: Site) -> str:
+        """The codebase's own function, with what else it is given."""
+        form = site.form
+        assert form.callee is not None
+        callee = " ".join(code(form.callee).split())
+        if not form.extras and not site.selection:
+            return callee
+        extras = ", ".join(_flat(arg) for arg in form.extras)
+        used = set(re.findall(r"\w+", f"{callee} {extras} {site.selection}"))
+        a, b = (
+            ("a", "b")
+            if not used & {"a", "b"}
+            else ("prediction", "target")
+            if not used & {"prediction", "target"}
+            else ("_a", "_b")
+        )
+        index = " ".join(site.selection.split())
+        return f"lambda {a}, {b}: {callee}({a}{index}, {b}{index}{', ' + extras if extras else ''})"
+
+    def _absolute(self, site: Site, name: str) -> List[Edit]:
+        """``torch.abs(a - b).mean()``: the words around the difference go, the difference becomes two arguments."""
+        form = site.form
+        difference = form.difference
+        assert difference is not None
+        start, end = self.span(form.node)
+        left, right = self.span(difference.left, True), self.span(difference.right, True)
+        texts = [self._argument(difference.left, site.selection), self._argument(difference.right, site.selection)]
+        if site.swapped:
+            texts.reverse()
+        middle = _residue(self.text(left[1], right[0]))
+        reduction = "none" if site.selection or form.reduction == "none" else "mean"
+        tail = site.selection + (".mean()" if site.selection and form.reduction == "mean" else "")
+        settings = self._settings(site, name, reduction, "")
+        before = _residue(self.text(start, left[0]))
+        after = _residue(self.text(right[1], end))
+        return [
+            self.edit(start, left[0], f"{name}.l1_loss({before}"),
+            self.edit(left[0], left[1], texts[0]),
+            self.edit(left[1], right[0], f",{middle}" if middle else ", "),
+            self.edit(right[0], right[1], texts[1]),
+            self.edit(right[1], end, f"{settings}{after}){tail}"),
+        ]
+
+    # -- the import
+
+    def import_edit(self, name: str, in_place: bool) -> Edit:
+        line = f"import {PACKAGE}" + ("" if name == PACKAGE else f" as {name}")
+        anchor = self._anchor()
+        if anchor is None:
+            at = self._before_first()
+            if in_place and self.module.tree.body and isinstance(self.module.tree.body[0], cst.SimpleStatementLine):
+                return self.edit(at, at, f"{line}; ")
+            return self.edit(at, at, line + self._newline())
+        first, last = anchor.body[0], anchor.body[-1]
+        if in_place:
+            if isinstance(first, (cst.Import, cst.ImportFrom)) and not _is_future(first):
+                at = self.span(first)[0]
+                return self.edit(at, at, f"{line}; ")
+            at = self.span(last)[1]
+            return self.edit(at, at, f"; {line}")
+        at, newline = self._next_line(self.positions[anchor].end.line)
+        if newline:
+            return self.edit(at, at, line + newline)
+        return self.edit(at, at, self._newline() + line)  # the last line of a file that does not end in one
+
+    def _anchor(self) -> Optional[cst.SimpleStatementLine]:
+        """The statement that the import goes after: the last ``import torch...`` at the top, or the last import."""
+        imports: List[cst.SimpleStatementLine] = []
+        torch: List[cst.SimpleStatementLine] = []
+        header: Optional[cst.SimpleStatementLine] = None
+        for i, statement in enumerate(self.module.tree.body):
+            if not isinstance(statement, cst.SimpleStatementLine):
+                if imports and not isinstance(statement, (cst.If, cst.Try, cst.With)):
+                    break
+                continue
+            first = statement.body[0]
+            if isinstance(first, (cst.Import, cst.ImportFrom)):
+                if _is_future(first):
+                    header = statement
+                    continue
+                imports.append(statement)
+                if any(root == "torch" for root in _roots(first)):
+                    torch.append(statement)
+            elif (
+                i == 0
+                and isinstance(first, cst.Expr)
+                and isinstance(first.value, (cst.SimpleString, cst.ConcatenatedString))
+            ):
+                header = statement
+        if torch:
+            return torch[-1]
+        return imports[-1] if imports else header
+
+    def _before_first(self) -> int:
+        body = self.module.tree.body
+        if not body:
+            return len(self.bytes)
+        return self._line_start(self._first_line(body[0]))
+
+    def _first_line(self, statement: cst.CSTNode) -> int:
+        line = self.positions[statement].start.line
+        decorators = getattr(statement, "decorators", ())
+        return min([line, *(self.positions[decorator].start.line for decorator in decorators)])
+
+    def _newline(self) -> str:
+        return self.module.tree.default_newline
+
+    def _line_start(self, line: int) -> int:
+        at = 0
+        for _ in range(line - 1):
+            match = re.compile(rb"\r\n|\r|\n").search(self.bytes, at)
+            assert match is not None
+            at = match.end()
+        return at
+
+    def _next_line(self, line: int) -> Tuple[int, str]:
+        match = re.compile(rb"\r\n|\r|\n").search(self.bytes, self._line_start(line))
+        return (len(self.bytes), "") if match is None else (match.end(), match.group().decode())
+
+
+def _package_name(module: Module) -> Tuple[str, bool]:
+    """The name that legs_loss has, or will have, in a file; and whether the file imports it already."""
+    for definition in module.top.flow.definitions.get(PACKAGE, []):
+        alias = definition.node
+        if isinstance(alias, cst.ImportAlias) and isinstance(definition.value, cst.Import):
+            return PACKAGE, dotted(alias.name) == PACKAGE
+    if mention(PACKAGE).search(module.text):
+        return f"{PACKAGE}_", False  # the name is taken, by a variable say
+    return PACKAGE, False
+
+
+def _is_future(node: cst.CSTNode) -> bool:
+    return isinstance(node, cst.ImportFrom) and node.module is not None and dotted(node.module) == "__future__"
+
+
+def _roots(node: cst.Import | cst.ImportFrom) -> List[str]:
+    if isinstance(node, cst.ImportFrom):
+        return [] if node.relative or node.module is None else [(dotted(node.module) or "").split(".")[0]]
+    return [(dotted(alias.name) or "").split(".")[0] for alias in node.names]
+
+
+def _flat(arg: cst.Arg) -> str:
+    value = " ".join(code(arg.value).split())
+    return f"{arg.keyword.value}={value}" if arg.keyword is not None else f"{arg.star}{value}"
+
+
+def _residue(text: str) -> str:
+    """What must stay of text that goes: its comments and its line breaks."""
+    if "\n" not in text and "\r" not in text:
+        return ""
+    kept = re.findall(r"[ \t]*#[^\r\n]*|\\?(?:\r\n|\r|\n)[ \t]*", text)
+    return "".join(kept)

@@ -1,0 +1,148 @@
+"""A training script with the LEGS loss, its files untouched: the same edits as legs-patch makes, while Python imports.
+
+    legs run train.py -s scene/
+
+Every line keeps its number, so that tracebacks point at the right lines.
+"""
+
+from __future__ import annotations
+
+import importlib.machinery
+import importlib.util
+import linecache
+import os
+import signal
+import sys
+import types
+from pathlib import Path
+from types import CodeType, TracebackType
+from typing import Dict, Optional, Sequence
+
+from legs_adapters.patch import plan
+from legs_adapters.repo import check_root
+from legs_loss import LegsError
+
+__all__ = ["checkout_of", "run_script"]
+
+
+def checkout_of(script: Path) -> Path:
+    """Return the folder that is looked at for a script: its git checkout's root, or its own folder."""
+    folder = script.resolve().parent
+    for candidate in (folder, *folder.parents):
+        if (candidate / ".git").exists() or (candidate / ".legs-patch.json").exists():
+            return candidate
+    return folder
+
+
+def run_script(script: str | os.PathLike[str], arguments: Sequence[str]) -> int:
+    """Run a script as ``python script arguments`` does, with the LEGS loss in it.
+
+    Returns:
+        The exit code, where the script does not leave by ``sys.exit`` (which goes on as it is).
+
+    Raises:
+        LegsError: there is no such script; or its codebase has a term that cannot be decided, or none.
+    """
+    path = Path(script)
+    if not path.is_file():
+        raise LegsError(f"{script} is not a file: give the training script")
+    root = check_root(checkout_of(path))
+    found = plan(root, in_place=True)
+    if found.findings.problems:
+        problem = found.findings.problems[0]
+        raise LegsError(f"{problem.path}:{problem.line}: {problem.reason}; write there by hand: {problem.advice}")
+    if not found.after and not found.findings.patched:
+        raise LegsError(f"no photometric L1 term was found in {root}")
+    sources = {os.path.realpath(str(root / name)): data for name, data in found.after.items()}
+    for site in found.findings.sites:
+        print(f"legs-loss: {site.path}:{site.line} is weighted in this run", file=sys.stderr, flush=True)
+    sys.meta_path.insert(0, _Finder(sources))
+    main = _main_module(str(script))
+    sys.argv[:] = [str(script), *arguments]
+    sys.path[0] = os.path.dirname(os.path.realpath(str(script)))
+    sys.modules["__main__"] = main
+    loader = _Loader("__main__", str(script), sources.get(os.path.realpath(str(script))))
+    try:
+        exec(loader.code(), main.__dict__)
+    except SystemExit:
+        raise
+    except KeyboardInterrupt as error:
+        sys.excepthook(type(error), error, _from_script(error.__traceback__))
+        return _interrupted()
+    except BaseException as error:
+        sys.excepthook(type(error), error, _from_script(error.__traceback__))
+        return 1
+    return 0
+
+
+class _Loader(importlib.machinery.SourceFileLoader):
+    """Loads a file's rewritten source in place of what is on disk; never from, nor into, a bytecode cache."""
+
+    def __init__(self, name: str, path: str, data: Optional[bytes]) -> None:
+        super().__init__(name, path)
+        self._data = data
+
+    def get_data(self, path: str | os.PathLike[str]) -> bytes:
+        if self._data is not None and os.fspath(path) == self.path:
+            return self._data
+        return super().get_data(os.fspath(path))
+
+    def get_code(self, fullname: str) -> Optional[CodeType]:
+        return self.code()
+
+    def code(self) -> CodeType:
+        """Compile what is to run, and let tracebacks quote it."""
+        data = self.get_data(self.path)
+        if self._data is not None:
+            text = importlib.util.decode_source(data)
+            # Without a time of last change, linecache does not look at the disk again.
+            linecache.cache[self.path] = (len(text), None, text.splitlines(keepends=True), self.path)
+        return self.source_to_code(data, self.path)
+
+
+class _Finder:
+    """Finds modules as Python does, and swaps the loader of those that were rewritten."""
+
+    def __init__(self, sources: Dict[str, bytes]) -> None:
+        self._sources = sources
+
+    def find_spec(
+        self, name: str, path: Optional[Sequence[str]] = None, target: Optional[types.ModuleType] = None
+    ) -> Optional[importlib.machinery.ModuleSpec]:
+        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        if spec is None or not spec.origin or type(spec.loader) is not importlib.machinery.SourceFileLoader:
+            return None
+        data = self._sources.get(os.path.realpath(spec.origin))
+        if data is None:
+            return None
+        spec.loader = _Loader(name, spec.origin, data)
+        return spec
+
+
+def _main_module(script: str) -> types.ModuleType:
+    module = types.ModuleType("__main__")
+    module.__dict__.update(
+        __file__=script,
+        __builtins__=sys.modules["builtins"],
+        __spec__=None,
+        __package__=None,
+        __cached__=None,
+        __loader__=importlib.machinery.SourceFileLoader("__main__", script),
+        __annotations__={},
+    )
+    return module
+
+
+def _from_script(traceback: Optional[TracebackType]) -> Optional[TracebackType]:
+    """Leave out our own frame: the traceback begins where the script does."""
+    return traceback.tb_next if traceback is not None and traceback.tb_next is not None else traceback
+
+
+def _interrupted() -> int:
+    """End as Python does on Ctrl-C: by the signal, so that a shell's loop ends too."""
+    if os.name == "posix":
+        sys.stdout.flush()
+        sys.stderr.flush()
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGINT)
+    return 130

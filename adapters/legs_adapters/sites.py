@@ -1,0 +1,472 @@
+"""The photometric L1 terms of a checkout's training steps; and every other L1 in it, with the reason it was left.
+
+A site is an L1 between a rendering and the ground truth whose value reaches a backward pass. Everything is decided from
+the tree (see flow, training, l1, meaning); what cannot be decided is a problem that a person settles, never a guess.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Dict, Iterable, List, NamedTuple, Optional, Sequence, Set, Tuple
+
+import libcst as cst
+from libcst.metadata import MetadataWrapper, PositionProvider
+
+from legs_adapters.l1 import Form, forms, own_shape
+from legs_adapters.layout import is_channels_last
+from legs_adapters.meaning import Meaning, Meanings
+from legs_adapters.program import Function, Module, Program, mention
+from legs_adapters.provenance import View, Views
+from legs_adapters.repo import Source, Unreadable
+from legs_adapters.syntax import (
+    attribute_chain,
+    call_name,
+    code,
+    constant,
+    dotted,
+    same,
+    walk_expressions,
+    word_set,
+    words,
+)
+from legs_adapters.training import Training
+from legs_adapters.upstreams import registered
+from legs_adapters.vocabulary import kind_of_words
+
+__all__ = ["Findings", "Left", "Problem", "Site", "find"]
+
+_MAY_HAVE_L1 = re.compile(r"[lL]1|\babs\s*\(")
+_SPLATS = re.compile(r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_pkg|3dgs|surfel", re.I)
+_MASK_WORDS = {
+    "mask",
+    "masks",
+    "valid",
+    "bool",
+    "fg",
+    "region",
+    "visible",
+    "hit",
+    "keep",
+    "inside",
+    "foreground",
+    "sel",
+}
+_EVALUATION = word_set(
+    """
+    eval evaluate evaluation test testing report reports metric metrics valid validate validation render
+    visualize vis benchmark compare psnr quality
+    """
+)
+_SCORING = word_set(
+    """
+    score scores scoring importance densify densification prune pruning sensitivity sample sampling error
+    """
+)
+_NOT_TRAINING = {"render", "eval", "evaluate", "test", "validate", "validation", "inference"}
+_POSE = {"tracking", "track", "localize", "localization", "relocalize", "relocalization"}
+_WHY = {
+    "depth": "depth", "normal": "normals", "feature": "features", "flow": "flow", "mask": "mask", "warp": "synthetic",
+    "gradient": "gradients", "parameter": "regulariser",
+}  # fmt: skip
+
+
+class Site(NamedTuple):
+    """One photometric L1 term.
+
+    Attributes:
+        path, line, column: where it begins; the line counts from 1, the column from 0.
+        last_line: where it ends.
+        form: the expression.
+        swapped: the ground truth is the first of the two arguments.
+        selection: the index by a mask that both arguments carry, as written with its brackets; empty without.
+        channels_last: the images are [H, W, C].
+        view: the verdict on ``view=``.
+        function: the name of the function that it stands in.
+    """
+
+    path: str
+    line: int
+    column: int
+    last_line: int
+    form: Form
+    swapped: bool
+    selection: str
+    channels_last: bool
+    view: View
+    function: str
+
+    def named_by(self, line: int) -> bool:
+        """Whether a line that a person names is one of its lines."""
+        return self.line <= line <= self.last_line
+
+
+class Left(NamedTuple):
+    """An L1 that was seen and left, with one word why."""
+
+    path: str
+    line: int
+    text: str
+    reason: str
+
+
+class Problem(NamedTuple):
+    """A term that a person must settle: where it is, what it says, and what to write there by hand."""
+
+    path: str
+    line: int
+    text: str
+    reason: str
+    advice: str
+
+
+class Findings(NamedTuple):
+    """All that was found; in the order of the files."""
+
+    sites: List[Site]
+    left: List[Left]
+    problems: List[Problem]
+    patched: List[Left]
+    unreadable: List[Unreadable]
+    program: Program
+
+
+def find(sources: Iterable[Source], by_hand: Sequence[Tuple[str, int]] = ()) -> Findings:
+    """Find the photometric terms of a checkout.
+
+    Args:
+        sources: its files.
+        by_hand: (path, line) of L1 terms that are sites because the user says so; nothing else is a site then.
+    """
+    return _Finder(Program(sources), by_hand).run()
+
+
+class _Finder:
+    def __init__(self, program: Program, by_hand: Sequence[Tuple[str, int]]) -> None:
+        self.program = program
+        self.by_hand = set(by_hand)
+        self.training = Training(program)
+        self.meanings = Meanings(program, self.training)
+        self.views = Views(program)
+        self.found = Findings([], [], [], [], [], program)
+        self._forms: Dict[Function, List[Form]] = {}
+        self._handed: Set[Function] = set()
+        self._references: Dict[Function, List[Tuple[cst.BaseExpression, str, List[Tuple[Function, cst.Call]]]]] = {}
+
+    def run(self) -> Findings:
+        modules = [m for m in self.program.matching(_MAY_HAVE_L1)]
+        for module in modules:
+            for function in module.everything():
+                self._forms[function] = forms(self.program, function)
+        self._hand_over()
+        for module in modules:
+            if (
+                any(self._forms[function] for function in module.everything())
+                or "legs_loss" in module.text
+                or registered.MENTIONED.search(module.text)
+            ):
+                self._module(module)
+        self.found.unreadable.extend(self.program.unreadable[path] for path in sorted(self.program.unreadable))
+        return self.found
+
+    def _module(self, module: Module) -> None:
+        positions = MetadataWrapper(module.tree, unsafe_skip_copy=True).resolve(PositionProvider)
+        lines = module.text.splitlines()
+        entries: List[Tuple[Tuple[int, int], object]] = []
+        by_hand = bool(self.by_hand)
+        chosen = {line for path, line in self.by_hand if path == module.path}
+        for function in module.everything():
+            for form in self._forms[function]:
+                start = positions[form.node].start
+                where = (start.line, start.column)
+                end = positions[form.node].end.line
+                text = lines[start.line - 1].strip()
+                verdict = self._verdict(
+                    module, function, form, where, end, text, any(start.line <= line <= end for line in chosen)
+                )
+                if by_hand and not isinstance(verdict, Left):
+                    assert verdict is None or isinstance(verdict, (Site, Problem))
+                    if not any(start.line <= line <= end for line in chosen):
+                        verdict = Left(module.path, start.line, text, "not chosen")
+                if verdict is not None and not (isinstance(verdict, Left) and _is_noise(form, verdict)):
+                    entries.append((where, verdict))
+            for reference in self._referenced(module, function, lines, positions):
+                if not by_hand or reference.line in chosen:
+                    entries.append(((reference.line, 0), reference))
+            for call in function.flow.calls:
+                if dotted(call.func) == "legs_loss.l1_loss":
+                    start = positions[call].start
+                    text = lines[start.line - 1].strip()
+                    self.found.patched.append(Left(module.path, start.line, text, "patched"))
+                callable_form = registered.form_of(self.program, function, call)
+                if callable_form is not None:
+                    start = positions[callable_form.node].start
+                    where = (start.line, start.column)
+                    if not by_hand or start.line in chosen:
+                        view = View(None, "a registered callable has no view")
+                        site = Site(
+                            module.path, *where, start.line, callable_form, False, "", False, view, function.name
+                        )
+                        entries.append((where, site))
+        for _, entry in sorted(entries, key=lambda item: item[0]):
+            if isinstance(entry, Site):
+                self.found.sites.append(entry)
+            elif isinstance(entry, Problem):
+                self.found.problems.append(entry)
+            elif isinstance(entry, Left):
+                self.found.left.append(entry)
+        self.found.patched.sort(key=lambda entry: (entry.path, entry.line))
+
+    # -- one form
+
+    def _verdict(
+        self, module: Module, function: Function, form: Form, where: Tuple[int, int], end: int, text: str, by_hand: bool
+    ) -> Site | Left | Problem | None:
+        line = where[0]
+        if isinstance(form.call.func, cst.Attribute) and dotted(form.call.func) == "legs_loss.l1_loss":
+            return None
+        first, second, index = self._indexed(function, form)
+        a, b = self.meanings.of(function, first), self.meanings.of(function, second)
+        if not by_hand:
+            reason = self._why_left(module, function, form, a, b)
+            if reason is not None:
+                return Left(module.path, line, text, reason)
+        swapped = self._swapped(a, b)
+        if swapped is None:
+            if not by_hand:
+                if not (_speaks_of_images(first) and _speaks_of_images(second)):
+                    return Left(module.path, line, text, "unknown")
+                return self._unclear(module, line, text, form, a, b)
+            swapped = False
+        if not form.direct:
+            return self._problem(module.path, line, text, form, swapped, "the difference has a name of its own")
+        prediction, target = (second, first) if swapped else (first, second)
+        last = is_channels_last(self.program, function, prediction, target)
+        view = self.views.of(function, target, form.call)
+        return Site(module.path, *where, end, form, swapped, index, last, view, function.name)
+
+    def _indexed(self, function: Function, form: Form) -> Tuple[cst.BaseExpression, cst.BaseExpression, str]:
+        """Take an index by one mask off both arguments: the weight map needs the whole image."""
+        first, second = form.first, form.second
+        if isinstance(first, cst.Subscript) and isinstance(second, cst.Subscript):
+            inner = [code(node)[len(code(node.value)) :] for node in (first, second)]
+            squeezed = [re.sub(r"\s+", "", text) for text in inner]
+            if squeezed[0] == squeezed[1] and any(self._is_mask(function, element) for element in first.slice):
+                return first.value, second.value, inner[0].strip()
+        return first, second, ""
+
+    def _is_mask(self, function: Function, element: cst.SubscriptElement) -> bool:
+        if not isinstance(element.slice, cst.Index):
+            return False
+        node: cst.CSTNode = element.slice.value
+        if isinstance(node, (cst.Comparison, cst.UnaryOperation)):
+            return constant(node) is None
+        if isinstance(node, cst.BinaryOperation):
+            return isinstance(node.operator, (cst.BitAnd, cst.BitOr, cst.BitXor))
+        if isinstance(node, cst.Call):
+            return call_name(node) in ("bool", "squeeze", "expand", "expand_as", "repeat", "logical_not", "logical_and")
+        name = node.value if isinstance(node, cst.Name) else node.attr.value if isinstance(node, cst.Attribute) else ""
+        if set(words(name)) & _MASK_WORDS:
+            return True
+        return self.meanings.of(function, node).kind == "mask"
+
+    def _why_left(self, module: Module, function: Function, form: Form, a: Meaning, b: Meaning) -> Optional[str]:
+        if self._is_definition(function, form):
+            return "definition"
+        for meaning in (a, b):
+            if meaning.kind in _WHY:
+                return _WHY[meaning.kind]
+        if constant(form.first) is not None or constant(form.second) is not None:
+            return "regulariser"
+        trained = self.training.includes(form.node) or self.training.includes(form.call)
+        if not trained or self._without_grad(function, form):
+            return self._why_untrained(function, form)
+        if "image" not in (a.kind, b.kind):
+            return "unknown"
+        if _same_root(form):
+            return "regulariser"
+        if a.role == b.role == "render":
+            return "distillation"
+        if _detached(form.second if self._swapped(a, b) else form.first):
+            return "weighting"
+        spoken = {w for name in (function.name, *function.flow.conditions.get(id(form.call), ())) for w in words(name)}
+        if spoken & _POSE:
+            return "tracking"
+        if len(words(function.name)) > 1 and words(function.name)[0] in _NOT_TRAINING:
+            return "evaluation"
+        if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
+            return "evaluation"
+        if not self._about_splats(function):
+            return "other"
+        return None
+
+    def _is_definition(self, function: Function, form: Form) -> bool:
+        """Whether this is the body of the codebase's own L1 function, whose calls are what counts."""
+        if own_shape(self.program, function) is None:
+            return False
+        calls = self.training.sites.get(function, [])
+        known = {id(f.call) for caller, _ in calls for f in self._forms_of(caller)}
+        return function in self._handed or all(
+            id(call) in known or own_shape(self.program, caller) is not None for caller, call in calls
+        )
+
+    def _hand_over(self) -> None:
+        """Find where an L1 function is handed over by its name, ``self.criterion = l1_loss``, and called elsewhere."""
+        for function, calls in list(self.training.sites.items()):
+            shape = own_shape(self.program, function)
+            if shape is None:
+                continue
+            known = {id(f.call) for caller, _ in calls for f in self._forms_of(caller)}
+            unknown = [
+                (caller, call)
+                for caller, call in calls
+                if id(call) not in known and own_shape(self.program, caller) is None and len(call.args) == 2
+            ]
+            if not unknown:
+                continue
+            for module in self.program.matching(mention(function.name)):
+                for holder in module.everything():
+                    for definitions in list(holder.flow.definitions.values()):
+                        for definition in definitions:
+                            value = definition.value
+                            if definition.kind != "assign" or not isinstance(value, (cst.Name, cst.Attribute)):
+                                continue
+                            references = self.program.resolve(holder, value)
+                            if [r.target for r in references] != [function] or references[0].guess:
+                                continue
+                            self._handed.add(function)
+                            self._references.setdefault(holder, []).append((value, shape, unknown))
+
+    def _referenced(self, module: Module, holder: Function, lines: List[str], positions: object) -> List[Site | Left]:
+        found: List[Site | Left] = []
+        for value, shape, calls in self._references.get(holder, []):
+            caller, call = calls[0]
+            first, second = call.args[0].value, call.args[1].value
+            a, b = self.meanings.of(caller, first), self.meanings.of(caller, second)
+            start = positions[value].start  # type: ignore[index]
+            form = Form(value, call, first, second, "callable" if shape == "mean" else "registered", value)
+            reason = self._why_left(caller.module, caller, form, a, b)
+            if reason is None and self._swapped(a, b) is not False:
+                reason = "unknown"
+            if reason is not None:
+                found.append(Left(module.path, start.line, lines[start.line - 1].strip(), reason))
+            else:
+                view = View(None, "a callable that is handed over has no view")
+                found.append(
+                    Site(module.path, start.line, start.column, start.line, form, False, "", False, view, holder.name)
+                )
+        return found
+
+    def _forms_of(self, function: Function) -> List[Form]:
+        if function not in self._forms:
+            self._forms[function] = forms(self.program, function)
+        return self._forms[function]
+
+    def _without_grad(self, function: Function, form: Form) -> bool:
+        scope: Optional[Function] = function
+        if id(form.call) in function.flow.without_grad or id(form.node) in function.flow.without_grad:
+            return True
+        while scope is not None:
+            if set(scope.decorators) & {"no_grad", "inference_mode"}:
+                return True
+            if scope.parent is not None and id(scope.node) in scope.parent.flow.without_grad:
+                return True
+            scope = scope.parent
+        return False
+
+    def _why_untrained(self, function: Function, form: Form) -> str:
+        names, queue = [function], [function]
+        for _ in range(2):
+            queue = [caller for callee in queue for caller in self._callers(callee)]
+            names.extend(queue)
+        spoken = {word for f in names for word in (*words(f.name), *words(f.module.path.rsplit("/", 1)[-1]))}
+        if spoken & _SCORING:
+            return "scoring"
+        if spoken & _EVALUATION or self._without_grad(function, form):
+            return "evaluation"
+        return "untrained"
+
+    def _callers(self, function: Function) -> List[Function]:
+        if not function.name or function.name.startswith("__"):
+            return []
+        pattern = mention(function.name, called=True)
+        modules = [m for m in self.program.matching(pattern) if m is function.module or function.name in m.text]
+        return [
+            caller
+            for module in modules
+            for caller in module.functions
+            if caller is not function and any(call_name(call) == function.name for call in caller.flow.calls)
+        ][:8]
+
+    def _about_splats(self, function: Function) -> bool:
+        """Whether the file, or a file that trains through it, is about Gaussian splatting: not a network for depth."""
+        seen: Set[Function] = set()
+        queue = [function]
+        while queue:
+            current = queue.pop()
+            if current in seen:
+                continue
+            seen.add(current)
+            if _SPLATS.search(current.module.text):
+                return True
+            queue.extend(caller for caller, _ in self.training.sites.get(current, []))
+        return False
+
+    @staticmethod
+    def _swapped(a: Meaning, b: Meaning) -> Optional[bool]:
+        """Which of the two is the ground truth; None where that is not clear."""
+        if b.role == "target" and a.role != "target":
+            return False
+        if a.role == "target" and b.role != "target":
+            return True
+        if a.role == "render" and b.role is None:
+            return False
+        if b.role == "render" and a.role is None:
+            return True
+        return None
+
+    # -- what cannot be decided
+
+    def _unclear(self, module: Module, line: int, text: str, form: Form, a: Meaning, b: Meaning) -> Problem:
+        sides = f"{_short(form.first)} and {_short(form.second)}"
+        reason = f"cannot tell which of {sides} is the rendering and which the photograph"
+        return self._problem(module.path, line, text, form, False, reason)
+
+    @staticmethod
+    def _problem(path: str, line: int, text: str, form: Form, swapped: bool, reason: str) -> Problem:
+        a, b = (form.second, form.first) if swapped else (form.first, form.second)
+        reduction = ', reduction="none"' if form.reduction == "none" else ""
+        advice = f"legs_loss.l1_loss({_short(a)}, {_short(b)}{reduction})"
+        return Problem(path, line, text, reason, advice)
+
+
+def _speaks_of_images(node: cst.CSTNode) -> bool:
+    return any(
+        kind_of_words(part.value) == "image" for part in walk_expressions(node) if isinstance(part, cst.Name)
+    ) or any(
+        kind_of_words(str(constant(part))) == "image"
+        for part in walk_expressions(node)
+        if isinstance(part, cst.SimpleString)
+    )
+
+
+def _same_root(form: Form) -> bool:
+    """``x[1:] - x[:-1]``: a picture against itself."""
+    a, b = form.first, form.second
+    return isinstance(a, cst.Subscript) and isinstance(b, cst.Subscript) and same(a.value, b.value) and not same(a, b)
+
+
+def _detached(node: cst.CSTNode) -> bool:
+    return any(isinstance(part, cst.Call) and call_name(part) in ("detach", "item") for part in attribute_chain(node))
+
+
+def _is_noise(form: Form, left: Left) -> bool:
+    """An absolute difference that is no loss: of angles, sizes, neighbouring pixels."""
+    return (
+        form.callee is None
+        and form.reduction == "none"
+        and left.reason not in ("definition", "tracking", "distillation")
+    )
+
+
+def _short(node: cst.CSTNode) -> str:
+    return " ".join(code(node).split())

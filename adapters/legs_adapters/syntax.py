@@ -1,0 +1,181 @@
+"""Small questions to a LibCST tree: what is this node called, which words are in its name, which constant is it."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+from functools import lru_cache
+from typing import Any, Dict, FrozenSet, Iterator, List, Optional, Tuple
+
+import libcst as cst
+
+__all__ = [
+    "arguments", "attribute_chain", "call_name", "children", "code", "constant", "dotted", "key_of", "path_of", "same",
+    "strip_parens", "walk_expressions", "words",
+]  # fmt: skip
+
+_CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+_EMPTY = cst.Module(body=[])
+_MISSING = object()
+
+
+def code(node: cst.CSTNode) -> str:
+    """Return a node's source text, exactly."""
+    return _EMPTY.code_for_node(node)
+
+
+def dotted(node: cst.CSTNode) -> Optional[str]:
+    """Return ``a.b.c`` for a chain of names, else None."""
+    if isinstance(node, cst.Name):
+        return node.value
+    if isinstance(node, cst.Attribute):
+        base = dotted(node.value)
+        return None if base is None else f"{base}.{node.attr.value}"
+    return None
+
+
+def word_set(text: str) -> FrozenSet[str]:
+    """Return the words of a text as a set: a long list that is pleasant to read."""
+    return frozenset(text.split())
+
+
+def words(name: str) -> Tuple[str, ...]:
+    """Return the words of an identifier, lower case: ``gtImage_2`` is gt, image, 2."""
+    return tuple(word.lower() for word in _CAMEL.findall(name))
+
+
+def constant(node: Optional[cst.CSTNode], default: Any = None) -> Any:
+    """Return the value of a literal (also a negative number, a tuple of literals), else ``default``."""
+    if node is None:
+        return default
+    if isinstance(node, cst.SimpleString):
+        try:
+            return node.evaluated_value
+        except Exception:
+            return default
+    if isinstance(node, (cst.Integer, cst.Float)):
+        return ast.literal_eval(node.value)
+    if isinstance(node, cst.Name) and node.value in ("None", "True", "False"):
+        return {"None": None, "True": True, "False": False}[node.value]
+    if isinstance(node, cst.UnaryOperation) and isinstance(node.operator, cst.Minus):
+        value = constant(node.expression, _MISSING)
+        return -value if isinstance(value, (int, float)) else default
+    if isinstance(node, (cst.Tuple, cst.List)):
+        values = [constant(element.value, _MISSING) for element in node.elements]
+        return default if _MISSING in values else tuple(values)
+    return default
+
+
+def key_of(node: cst.CSTNode) -> Any:
+    """Return the literal key of ``x["key"]`` or ``x[0]``, else None."""
+    if isinstance(node, cst.Subscript) and len(node.slice) == 1:
+        index = node.slice[0].slice
+        if isinstance(index, cst.Index) and index.star is None:
+            value = constant(index.value)
+            return value if isinstance(value, (str, int)) and not isinstance(value, bool) else None
+    return None
+
+
+def path_of(node: cst.CSTNode) -> Optional[str]:
+    """Return one spelling for a place that can be assigned: ``x``, ``self.x``, ``losses['im']``; else None."""
+    if isinstance(node, cst.Name):
+        return node.value
+    if isinstance(node, cst.Attribute):
+        base = path_of(node.value)
+        return None if base is None else f"{base}.{node.attr.value}"
+    if isinstance(node, cst.Subscript):
+        base, key = path_of(node.value), key_of(node)
+        return None if base is None or key is None else f"{base}[{key!r}]"
+    return None
+
+
+def attribute_chain(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    """Yield the node, then what it is an attribute, an item or a call of, down to the root."""
+    while True:
+        yield node
+        if isinstance(node, (cst.Attribute, cst.Subscript)):
+            node = node.value
+        elif isinstance(node, cst.Call):
+            node = node.func
+        else:
+            return
+
+
+def call_name(node: cst.Call) -> str:
+    """Return the last name of what is called: ``f`` of ``a.b.f(x)``; empty where it has none."""
+    if isinstance(node.func, cst.Name):
+        return node.func.value
+    if isinstance(node.func, cst.Attribute):
+        return node.func.attr.value
+    return ""
+
+
+def arguments(node: cst.Call) -> Tuple[List[cst.BaseExpression], Dict[str, cst.BaseExpression], bool]:
+    """Return positional arguments, keyword arguments, and whether there is a ``*`` or ``**`` among them."""
+    positional: List[cst.BaseExpression] = []
+    keywords: Dict[str, cst.BaseExpression] = {}
+    starred = False
+    for arg in node.args:
+        if arg.star:
+            starred = True
+        elif arg.keyword is not None:
+            keywords[arg.keyword.value] = arg.value
+        else:
+            positional.append(arg.value)
+    return positional, keywords, starred
+
+
+def strip_parens(text: str) -> str:
+    """Return text without the pairs of brackets around all of it."""
+    text = text.strip()
+    while text.startswith("(") and text.endswith(")"):
+        depth = 0
+        for i, letter in enumerate(text):
+            depth += (letter == "(") - (letter == ")")
+            if depth == 0 and i < len(text) - 1:
+                return text
+        text = text[1:-1].strip()
+    return text
+
+
+def children(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    """Yield a node's direct children in source order, without white space and punctuation."""
+    for name in _fields(type(node)):
+        value = getattr(node, name)
+        if isinstance(value, cst.CSTNode):
+            yield value
+        elif isinstance(value, (list, tuple)):
+            for item in value:
+                if isinstance(item, cst.CSTNode):
+                    yield item
+
+
+def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    """Yield a node and every node under it, but not the bodies of functions and classes under it."""
+    stack = [node]
+    while stack:
+        node = stack.pop()
+        yield node
+        below = [child for child in children(node) if not isinstance(child, (cst.FunctionDef, cst.ClassDef))]
+        stack.extend(reversed(below))
+
+
+@lru_cache(maxsize=None)
+def _fields(kind: type) -> Tuple[str, ...]:
+    return tuple(
+        field.name
+        for field in dataclasses.fields(kind)
+        if not field.name.startswith(("whitespace", "lpar", "rpar", "lbrac", "rbrac"))
+        and field.name
+        not in ("leading_lines", "trailing_whitespace", "header", "footer", "comma", "equal", "semicolon")
+    )
+
+
+def same(a: cst.CSTNode, b: cst.CSTNode) -> bool:
+    """Return whether two expressions are written alike, brackets and spaces aside."""
+    return _squeeze(a) == _squeeze(b)
+
+
+def _squeeze(node: cst.CSTNode) -> str:
+    return re.sub(r"\s+|#[^\n]*", "", strip_parens(code(node)))

@@ -1,0 +1,42 @@
+"""A loss registered as a callable: NeRFICG, and FasterGS in it.
+
+``self.add_loss_metric('L1_Color', torch.nn.functional.l1_loss, weight)`` hands the function over; the framework
+calls it later, with ``input=`` and ``target=``. What is replaced is the callable.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Optional
+
+import libcst as cst
+
+from legs_adapters.l1 import Form, is_l1_name
+from legs_adapters.program import Function, Program
+from legs_adapters.syntax import arguments, call_name, constant, dotted, words
+
+__all__ = ["MENTIONED", "form_of"]
+
+MENTIONED = re.compile(r"\badd_loss_metric\s*\(")
+_COLOUR = {"color", "colour", "rgb", "image", "photometric", "l1"}
+
+
+def form_of(program: Program, function: Function, call: cst.Call) -> Optional[Form]:
+    """Return the form of a registered photometric L1, whose node is the callable; None for any other call."""
+    if call_name(call) != "add_loss_metric":
+        return None
+    positional, keywords, _ = arguments(call)
+    name = constant(keywords.get("name", positional[0] if positional else None))
+    metric = keywords.get("metric", positional[1] if len(positional) > 1 else None)
+    if not isinstance(name, str) or metric is None or not _is_l1(program, function, metric):
+        return None
+    if not set(words(name)) & _COLOUR or set(words(name)) & {"depth", "normal", "alpha", "mask", "flow", "feature"}:
+        return None
+    return Form(metric, call, cst.Name("input"), cst.Name("target"), "registered", metric)
+
+
+def _is_l1(program: Program, function: Function, node: cst.BaseExpression) -> bool:
+    references = program.resolve(function, node)
+    if references:
+        return all(is_l1_name(str(getattr(r.target, "name", r.target)).split(".")[-1]) for r in references)
+    return is_l1_name((dotted(node) or "").split(".")[-1])

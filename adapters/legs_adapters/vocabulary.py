@@ -1,0 +1,89 @@
+"""The field's words in names: which kind of picture a name speaks of, and whether it was rendered or photographed."""
+
+from __future__ import annotations
+
+from typing import Optional
+
+from legs_adapters.syntax import word_set, words
+
+__all__ = ["DATA", "KINDS", "kind_of_words", "role_of_words"]
+
+# The more special kinds first: a "depth image" is a depth.
+_WORDS = {
+    "flow": """
+        flow flows motion motions optical velocity velocities coor coords coordinate coordinates trajectory track
+    """,
+    "normal": "normal normals nrm",
+    "depth": """
+        depth depths disp disparity disparities invdepth inverse idepth zbuf lidar distortion dist monodepth midas
+    """,
+    "feature": """
+        feature features feat feats semantic semantics sem language lang clip dino dinov2 lseg sam embedding embeddings
+        latent latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors
+        classes objects
+    """,
+    "warp": """
+        warp warped warping reproj reprojected reprojection pseudo virtual unseen sds diffusion inpaint inpainted edit
+        edited
+    """,
+    "gradient": "grad gradient gradients edge edges laplacian sobel curv curvature hessian canny",
+    "mask": """
+        mask masks alpha alphas opacity opacities silhouette sil acc accumulation seg segmentation visibility
+        transmittance occupancy sky
+    """,
+    "parameter": """
+        scaling scalings scale scales xyz xyzs rotation rotations rot rots quat quats sh shs sh0 shn offset offsets grid
+        grids plane planes pose poses deform deformation delta deltas residual means mean2d pts points point light
+        lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds c2w w2c intrinsics
+        extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints vertex vertices verts
+        bone bones smpl center centers knn
+    """,
+    "image": """
+        image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering
+        renderings pixel pixels photo photos picture pbr comp frame frames
+    """,
+}
+KINDS = tuple(_WORDS)
+_KIND_OF = {word: kind for kind in reversed(KINDS) for word in _WORDS[kind].split()}
+_TARGET = word_set(
+    """
+    gt gts target targets tgt ground truth original orig real true observed obs reference pixels
+    """
+)
+_RENDER = word_set(
+    """
+    render renders rendered rendering renderings renderer rasterize rasterizer rasterization raster pred preds
+    predict predicted prediction predictions out output outputs rets comp synth synthesized splat splatting
+    network student recon reconstructed reconstruction est estimated
+    """
+)
+DATA = word_set(
+    """
+    data batch sample item items datum cam camera cameras cams view views viewpoint viewpoints info infos
+    keyframe frame dataset input inputs entry
+    """
+)
+
+
+def kind_of_words(name: str) -> Optional[str]:
+    """Return the kind that a name speaks of; the more special where it has several."""
+    spoken = words(name)
+    if [word for word in spoken if not word.isdigit()][-1:] in (
+        ["mask"],
+        ["masks"],
+        ["valid"],
+        ["weight"],
+        ["weights"],
+    ):
+        return "mask"  # of whatever: laid over an image, it leaves an image
+    kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF}
+    return min(kinds, key=KINDS.index) if kinds else None
+
+
+def role_of_words(name: str) -> Optional[str]:
+    """Return the role that a name speaks of, if it speaks of one."""
+    found = set(words(name))
+    target, render = bool(found & _TARGET), bool(found & _RENDER)
+    if target and render:  # rendered_gt, gt_pred: only a closer look can tell
+        return None
+    return "target" if target else "render" if render else None

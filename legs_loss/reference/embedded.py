@@ -26,7 +26,7 @@ def _room(random: np.random.RandomState) -> List[Quad]:
     left, right, front, back, top = -3.4, 3.4, -3.6, 2.6, 3.0
     width, depth = right - left, back - front
     floor = textures.checker((930, 1020), 60, (0.34, 0.33, 0.35), (0.72, 0.69, 0.64), random)
-    brick = textures.brick((600, 1360), 48, 18, random)
+    brick = textures.brick((600, 1360), 80, 30, random)
     wallpaper = textures.stripes(
         (8, 1240),
         (50, 6, 22, 6, 50, 2, 8, 2),
@@ -230,9 +230,9 @@ def _sparse_points(
 def write_embedded_scene(
     path: Union[str, Path],
     views: int = 32,
-    width: int = 320,
-    height: int = 240,
-    points: int = 4000,
+    width: int = 288,
+    height: int = 216,
+    points: int = 10000,
     samples: int = 3,
     seed: int = 0,
 ) -> Path:

@@ -125,11 +125,11 @@ def brick(size: Tuple[int, int], length: int, course: int, random: np.random.Ran
     rows, columns = np.arange(size[0])[:, None], np.arange(size[1])[None, :]
     layer = rows // course
     shifted = columns + (layer % 2) * (length // 2)
-    joint = max(1, course // 8)
+    joint = max(1, course // 9)
     mortar = (rows % course < joint) | (shifted % length < joint)
     tones = random.rand(size[0] // course + 1, (size[1] + length) // length + 1)
-    tone = 0.65 * tones[layer, shifted // length] + 0.35 * fractal_noise(size, 40, 3, random)
-    bricks = tint(tone.astype(np.float32), (0.42, 0.17, 0.12), (0.78, 0.42, 0.30))
+    tone = 0.65 * tones[layer, shifted // length] + 0.35 * fractal_noise(size, 20, 3, random)
+    bricks = tint(tone.astype(np.float32), (0.47, 0.20, 0.14), (0.74, 0.40, 0.29))
     bricks[mortar] = (0.80, 0.77, 0.72)
     return bricks * (1 - 0.08 * random.rand(*size))[..., None].astype(np.float32)
 

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
+from legs_loss.reference.metrics import strongest
+from legs_loss.response import normalise_response, response
 
 __all__ = ["Compared", "check_matplotlib", "save_pictures"]
 
@@ -81,9 +83,14 @@ def _sheet(
     for axes in grid.ravel():
         axes.set(xticks=[], yticks=[], frame_on=False)
     detail = _detail(photograph)
+    normalised = normalise_response(response(photograph))[0].numpy()
     grid[0, 0].imshow(_bytes(photograph))
     grid[0, 1].imshow(_bytes(photograph)[detail], interpolation="nearest")
+    grid[0, 2].imshow(strongest(photograph).numpy(), cmap="gray")
+    grid[0, 3].imshow(normalised, cmap="magma", vmax=float(np.quantile(normalised, 0.99)) or 1.0)
     grid[0, 0].set_ylabel("photograph", fontsize=11, color=_INK)
+    for axes, heading in zip(grid[0], ("", "detail", "strongest 10% of the response", r"response  $\hat{E}$")):
+        axes.set_title(heading, fontsize=11, color=_INK)
     for row, (arm, error) in zip(grid[1:], zip(arms, errors)):
         row[0].imshow(_bytes(arm.rendering))
         row[1].imshow(_bytes(arm.rendering)[detail], interpolation="nearest")
@@ -93,16 +100,14 @@ def _sheet(
         row[0].set_xlabel(arm.caption, fontsize=8, color=_INK)
     for axes, heading in zip(grid[1], ("rendering", "detail", "error  $|U - F|$", "weight  $W$")):
         axes.set_title(heading, fontsize=11, color=_INK)
-    for axes, shown in ((grid[0, 2], shown_error), (grid[0, 3], shown_weight)):
-        bar = figure.colorbar(shown, ax=axes, orientation="horizontal", fraction=0.12, aspect=14)
+    for axes, shown in ((grid[-1, 2], shown_error), (grid[-1, 3], shown_weight)):
+        bar = figure.colorbar(shown, ax=axes, orientation="horizontal", fraction=0.1, aspect=30)
         bar.ax.tick_params(labelsize=8)
     figure.savefig(str(path), dpi=130, facecolor="white")
 
 
 def _detail(photograph: Tensor) -> Tuple[slice, slice]:
     """The window of a third of the size with the most contours, for a closer look."""
-    from legs_loss.response import response
-
     height, width = photograph.shape[1:]
     size = max(1, height // 3), max(1, width // 3)
     strength = torch.nn.functional.avg_pool2d(response(photograph)[None], size, stride=1)[0, 0]

@@ -78,7 +78,9 @@ class _Rasterize(torch.autograd.Function):
         means, scales, quaternions, opacities, sh, image = ctx.saved_tensors
         degree, camera, splatted, across, work = ctx.state
         slot_gradients = np.empty((len(splatted[-1]), strips.MOMENTS), np.float32)
-        strips.render_backward(numba.get_num_threads(), *work, across, _array(image), _array(g_image), slot_gradients)
+        strips.render_backward(
+            numba.get_num_threads(), *work, across, _array(image), _array(g_image), ctx.columns == 4, slot_gradients
+        )
         count = len(means)
         shapes = (means.shape, scales.shape, quaternions.shape, opacities.shape, sh.shape, (count, ctx.columns))
         gradients = [torch.empty(shape) for shape in shapes]

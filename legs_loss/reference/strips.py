@@ -302,7 +302,7 @@ def render(workers, strip_order, ranges, ends, entries, background, across, imag
 
 
 @compiled(fastmath=FAST | {"reassoc"})
-def _blend_backward(state, begin, end, entries, entry_slots, gradients):
+def _blend_backward(state, begin, end, entries, entry_slots, absolute, gradients):
     """As `_blend`, front to back, filling the slots' gradients: moments of h = dL/dpower, and the colour's.
 
     dL/dalpha = T (g . colour) - rest / (1 - alpha), where rest = g . (all the colour behind this splat): what is left
@@ -345,8 +345,11 @@ def _blend_backward(state, begin, end, entries, entry_slots, gradients):
             mxx += hx * x
             mxy += hx * y
             myy += hy * y
-            au += abs(h * (a2 * x + (b * y + gx)))
-            av += abs(h * (c2 * y + (b * x + gy)))
+        if absolute:
+            for i in range(first * WIDE, last * WIDE):
+                x, y, h = state[X + i], state[Y + i] - middle, state[WORK + i]
+                au += abs(h * (a2 * x + (b * y + gx)))
+                av += abs(h * (c2 * y + (b * x + gy)))
         slot = entry_slots[k]
         (
             gradients[slot, 0],
@@ -367,7 +370,7 @@ def _blend_backward(state, begin, end, entries, entry_slots, gradients):
 
 @compiled()
 def _render_backward_worker(
-    worker, workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, gradients
+    worker, workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, absolute, gradients
 ):
     state = np.empty(PLANES * PIXELS, np.float32)
     height, width = image.shape[1], image.shape[2]
@@ -386,15 +389,28 @@ def _render_backward_worker(
                     state[RED + channel * PIXELS + pixel] = gradient
                     rest += gradient * image[channel, top + y, left + x]
                 state[REST + pixel] = rest
-        _blend_backward(state, ranges[strip], ends[strip], entries, entry_slots, gradients)
+        _blend_backward(state, ranges[strip], ends[strip], entries, entry_slots, absolute, gradients)
         for k in range(ends[strip], ranges[strip + 1]):
             gradients[entry_slots[k]] = 0
 
 
 @compiled(parallel=True)
-def render_backward(workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, gradients):
-    """Fill the gradient of every slot that reaches its strip."""
+def render_backward(
+    workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, absolute, gradients
+):
+    """Fill the gradient of every slot that reaches its strip; the absolute sums, if asked for."""
     for worker in prange(workers):
         _render_backward_worker(
-            worker, workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, gradients
+            worker,
+            workers,
+            strip_order,
+            ranges,
+            ends,
+            entries,
+            entry_slots,
+            across,
+            image,
+            g_image,
+            absolute,
+            gradients,
         )

@@ -160,8 +160,8 @@ def l1_loss(
         channels_last: where the channel stands.
         reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.
         own: the codebase's own L1 of (prediction, target), where that is more than a mean: what it makes of the
-            difference (a mask, another mean) it makes of the weighted difference. It must depend on nothing but the
-            difference. Unweighted it is called as it is.
+            difference (a mask, another mean) it makes of the weighted difference: it is given the target, and a
+            prediction moved away from it by the weight. Unweighted it is called as it is.
 
     Returns:
         A scalar, or what ``reduction`` or ``own`` say. With beta 0 or LEGS_OFF it is
@@ -292,10 +292,10 @@ def _weighted(
 ) -> Tensor:
     if own is None:
         return _reduced(prediction, target, weight, mask, channels_last, reduction)
-    # The weight is not negative, so W * |U - F| = |W * (U - F) - 0|: any L1 of the difference becomes the weighted one.
+    # |F + W * (U - F) - F| = W * |U - F|: any L1 of the difference becomes the weighted one, and masks that the
+    # codebase makes from the target stay as they are.
     weight = as_map(weight, prediction, channels_last, "weight").to(prediction.dtype)
-    difference = weight * (prediction - target)
-    return own(difference, torch.zeros_like(difference))
+    return own(target + weight * (prediction - target), target)
 
 
 def _reduced(

@@ -404,6 +404,9 @@ def _only_differences(program: Program, function: Function, a: str, b: str, dept
             if pair and any(_l1_reference(program, r, node, depth) for r in program.resolve(function, node.func)):
                 allowed.update(id(n) for value in positional[:2] for n in walk_expressions(value))
                 absolute = True
+        elif isinstance(node, cst.Comparison):
+            # A mask made from the second, `gt != 0`: it is handed over as it is.
+            allowed.update(id(n) for n in walk_expressions(node) if isinstance(n, cst.Name) and n.value == b)
         elif isinstance(node, cst.Attribute) and node.attr.value in _SHAPE_ONLY:
             allowed.add(id(node.value))
         elif isinstance(node, (cst.Assign, cst.AugAssign)):

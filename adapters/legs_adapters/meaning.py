@@ -170,13 +170,14 @@ class Meanings:
         if definition.place not in names:
             return _UNKNOWN
         position, found = names.index(definition.place), []
-        for caller, call in self.training.sites.get(function, [])[:8]:
+        for caller, call in self.training.sites.get(function, [])[:12]:
             positional, keywords, _ = arguments(call)
             if definition.place in keywords:
                 found.append(self.of(caller, keywords[definition.place], depth))
             elif position < len(positional):
                 found.append(self.of(caller, positional[position], depth))
-        return _mix(found)
+        images = [meaning for meaning in found if meaning.kind == "image"]
+        return _mix(images or found)
 
     def _attribute(self, function: Function, node: cst.Attribute, depth: int) -> Meaning:
         name = node.attr.value
@@ -196,13 +197,13 @@ class Meanings:
         return Meaning(_closer(kind, local.kind), role)
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> Meaning:
-        key = key_of(node)
+        key = key_of(node) or _formatted_key(node)
         if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in _PARAMETERS:
             return Meaning("parameter", None)
         if isinstance(key, str):
             local = self._flow(function, node, depth) if function.flow.reaching(node) else _UNKNOWN
             role = role_of_words(key)
-            if role is None or key == "render":
+            if role is None:
                 role = local.role or self._role_of_holder(function, node.value, depth) or role
             return Meaning(_closer(kind_of_words(key), local.kind), role)
         return self.of(function, node.value, depth)
@@ -298,6 +299,14 @@ class Meanings:
                 if found and all(m.kind is not None or m.role is not None for m in found):
                     return _mix(found)
         return None
+
+
+def _formatted_key(node: cst.Subscript) -> Optional[str]:
+    """Return what is literal in the key of ``outputs[f"image_{i}"]``."""
+    element = node.slice[0].slice
+    if len(node.slice) != 1 or not isinstance(element, cst.Index) or not isinstance(element.value, cst.FormattedString):
+        return None
+    return "_".join(p.value for p in element.value.parts if isinstance(p, cst.FormattedStringText)) or None
 
 
 def root_of(node: cst.Name | cst.Attribute) -> str:

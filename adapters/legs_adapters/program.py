@@ -123,7 +123,8 @@ class Class:
                 for place, definitions in method.flow.definitions.items():
                     if place.startswith("self.") and place.count(".") == 1 and "[" not in place:
                         entries = self._stores.setdefault(place[5:], [])
-                        entries.extend((method, d) for d in definitions if d.kind not in ("store",))
+                        # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
+                        entries.extend((method, d) for d in definitions if not str(d.key).startswith("."))
         return self._stores.get(attribute, [])
 
 

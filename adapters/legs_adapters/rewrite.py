@@ -178,7 +178,7 @@ class _Text:
         form = site.form
         assert form.callee is not None
         callee = " ".join(code(form.callee).split())
-        if not form.extras and not site.selection:
+        if not form.extras and not site.selection and not site.swapped:
             return callee
         extras = ", ".join(_flat(arg) for arg in form.extras)
         used = set(re.findall(r"\w+", f"{callee} {extras} {site.selection}"))
@@ -190,7 +190,8 @@ class _Text:
             else ("_a", "_b")
         )
         index = " ".join(site.selection.split())
-        return f"lambda {a}, {b}: {callee}({a}{index}, {b}{index}{', ' + extras if extras else ''})"
+        first, second = (b, a) if site.swapped else (a, b)
+        return f"lambda {a}, {b}: {callee}({first}{index}, {second}{index}{', ' + extras if extras else ''})"
 
     def _absolute(self, site: Site, name: str) -> List[Edit]:
         """``torch.abs(a - b).mean()``: the words around the difference go, the difference becomes two arguments."""

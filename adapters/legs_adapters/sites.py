@@ -37,6 +37,7 @@ __all__ = ["Findings", "Left", "Problem", "Site", "find"]
 
 _MAY_HAVE_L1 = re.compile(r"[lL]1|\babs\s*\(")
 _SPLATS = re.compile(r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_pkg|3dgs|surfel", re.I)
+_RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
 _MASK_WORDS = {
     "mask",
     "masks",
@@ -63,7 +64,7 @@ _SCORING = word_set(
     """
 )
 _NOT_TRAINING = {"render", "eval", "evaluate", "test", "validate", "validation", "inference"}
-_POSE = {"tracking", "track", "localize", "localization", "relocalize", "relocalization"}
+_POSE = {"tracking", "track", "tracker", "localize", "localization", "relocalize", "relocalization"}
 _WHY = {
     "depth": "depth", "normal": "normals", "feature": "features", "flow": "flow", "mask": "mask", "warp": "synthetic",
     "gradient": "gradients", "parameter": "regulariser",
@@ -278,6 +279,7 @@ class _Finder:
         if constant(form.first) is not None or constant(form.second) is not None:
             return "regulariser"
         trained = self.training.includes(form.node) or self.training.includes(form.call)
+        trained = trained or self._called_by_framework(function)
         if not trained or self._without_grad(function, form):
             return self._why_untrained(function, form)
         if "image" not in (a.kind, b.kind):
@@ -288,14 +290,16 @@ class _Finder:
             return "distillation"
         if _detached(form.second if self._swapped(a, b) else form.first):
             return "weighting"
-        spoken = {w for name in (function.name, *function.flow.conditions.get(id(form.call), ())) for w in words(name)}
-        if spoken & _POSE:
+        owner = self.program.owner_of(function)
+        names = (function.name, *function.flow.conditions.get(id(form.call), ()))
+        spoken = {word for name in names for word in words(name)}
+        if (spoken | set(words(owner.name if owner is not None else ""))) & _POSE:
             return "tracking"
         if len(words(function.name)) > 1 and words(function.name)[0] in _NOT_TRAINING:
             return "evaluation"
         if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
             return "evaluation"
-        if not self._about_splats(function):
+        if not (self._about_splats(function) or self._rendered(module, function, form)):
             return "other"
         return None
 
@@ -361,6 +365,17 @@ class _Finder:
             self._forms[function] = forms(self.program, function)
         return self._forms[function]
 
+    def _called_by_framework(self, function: Function) -> bool:
+        """Whether it makes the loss of a module's ``forward``, and who calls that is settled at run time (a registry)."""
+        if "loss" not in words(function.name) and "losses" not in words(function.name):
+            return False
+        above = [function, *self._callers(function)]
+        if any(set(words(f.name)) & (_EVALUATION | _SCORING) for f in above):
+            return False
+        return bool(self.training.roots) and any(
+            f.name == "forward" and f.owner is not None and f not in self.training.sites for f in above
+        )
+
     def _without_grad(self, function: Function, form: Form) -> bool:
         scope: Optional[Function] = function
         if id(form.call) in function.flow.without_grad or id(form.node) in function.flow.without_grad:
@@ -410,6 +425,21 @@ class _Finder:
                 return True
             queue.extend(caller for caller, _ in self.training.sites.get(current, []))
         return False
+
+    def _rendered(self, module: Module, function: Function, form: Form) -> bool:
+        """Whether the rendering says so itself, in a codebase that is about splats and a file that is not about rays."""
+        sides: List[cst.CSTNode] = [*walk_expressions(form.first), *walk_expressions(form.second)]
+        for part in list(sides):
+            if isinstance(part, cst.Name):
+                for definition in function.flow.reaching(part):
+                    if definition.value is not None:
+                        sides.extend(walk_expressions(definition.value))
+        names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
+        return (
+            any(word.startswith(("render", "raster")) for word in names)
+            and not _RAYS.search(module.text)
+            and bool(self.program.matching(_SPLATS))
+        )
 
     @staticmethod
     def _swapped(a: Meaning, b: Meaning) -> Optional[bool]:

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import importlib
 from typing import Any, Dict
 
 import legs_loss
 from legs_loss.runtime import active
-
-__all__ = ["METHOD", "legs_model", "splatfacto_legs"]  # splatfacto_legs: made when it is asked for
 
 METHOD = "splatfacto-legs"
 DESCRIPTION = "Gaussian Splatting with the LEGS loss: splatfacto, its L1 weighted towards contours and thin structures."
@@ -23,6 +22,12 @@ DESCRIPTION = "Gaussian Splatting with the LEGS loss: splatfacto, its L1 weighte
 def __getattr__(name: str) -> Any:
     if name == "splatfacto_legs":
         return _specification()
+    if name == "SplatfactoLegsModel" and name in globals():
+        return globals()[name]
+    if name == "SplatfactoLegsModel":  # under this name it stands in the config.yml of a run
+        base = importlib.import_module("nerfstudio.models.splatfacto").SplatfactoModel
+        globals()[name] = model = legs_model(base)
+        return model
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
@@ -33,14 +38,8 @@ def _specification() -> Any:
 
     trainer = copy.deepcopy(method_configs["splatfacto"])
     trainer.method_name = METHOD
-    trainer.pipeline.model = _with_legs(trainer.pipeline.model)
+    trainer.pipeline.model = dataclasses.replace(trainer.pipeline.model, _target=__getattr__("SplatfactoLegsModel"))
     return MethodSpecification(config=trainer, description=DESCRIPTION)
-
-
-def _with_legs(model: Any) -> Any:
-    settings = {field.name: getattr(model, field.name) for field in dataclasses.fields(model) if field.init}
-    settings["_target"] = legs_model(model._target)
-    return type(model)(**settings)
 
 
 def legs_model(base: Any) -> Any:
@@ -69,4 +68,5 @@ def legs_model(base: Any) -> Any:
                 prediction, target = prediction * mask, target * mask
             return prediction, target
 
+    SplatfactoLegsModel.__module__, SplatfactoLegsModel.__qualname__ = __name__, "SplatfactoLegsModel"
     return SplatfactoLegsModel

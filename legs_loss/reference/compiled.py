@@ -8,6 +8,7 @@ import numba
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from legs_loss.reference import projection, strips
 from legs_loss.reference.conventions import View
@@ -32,7 +33,7 @@ class _Rasterize(torch.autograd.Function):
         degree: int,
     ) -> Tuple[Tensor, Tensor]:
         count, workers = len(means), numba.get_num_threads()
-        size = np.array([view.width, view.height])
+        size = np.array([view.width, view.height], np.int64)
         camera = (
             np.array([view.fx, view.fy, view.cx, view.cy, *view.limits]),
             view.world_to_camera,
@@ -47,6 +48,7 @@ class _Rasterize(torch.autograd.Function):
         parameters = [_array(tensor) for tensor in (means, scales, quaternions, opacities, sh)]
         projection.project(*parameters, degree, *camera, size, splats, depths, radii, clamped, boxes, slots)
 
+        # A slot is a strip in a Gaussian's box of strips; an entry, one that it reaches, sorted by strip and depth.
         first_slots = np.cumsum(slots) - slots
         total = int(slots.sum())
         slot_strips, slot_rows, places = (np.empty(total, kind) for kind in (np.int32, np.int32, np.int64))
@@ -74,6 +76,7 @@ class _Rasterize(torch.autograd.Function):
         return image, radii_tensor
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, g_image: Tensor, _: Any) -> Tuple[Optional[Tensor], ...]:
         means, scales, quaternions, opacities, sh, image = ctx.saved_tensors
         degree, camera, splatted, across, work = ctx.state
@@ -93,9 +96,8 @@ class _Rasterize(torch.autograd.Function):
             np.array([image.shape[2] / 2, image.shape[1] / 2]),
             *[gradient.numpy() for gradient in gradients],
         )
-        if not ctx.needs_input_grad[5]:
-            gradients[5] = None
-        return (*gradients, None, None, None)
+        viewspace = gradients.pop() if ctx.needs_input_grad[5] else None
+        return (*gradients[:5], viewspace, None, None, None)
 
 
 def render(

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from legs_loss.reference.conventions import (
     DILATION,
+    FARTHEST,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_TRANSMITTANCE,
@@ -24,8 +25,6 @@ from legs_loss.reference.conventions import (
     TILE,
     View,
 )
-
-FARTHEST = 1 << 20  # pixels: a larger radius reaches every tile of any image anyway
 
 
 class Splats(NamedTuple):

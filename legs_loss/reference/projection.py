@@ -5,6 +5,9 @@ A splat is a row of ten float64 numbers: centre (u, v) in pixels, conic (A, B, C
 float64, and the determinant as a sum of squares (Cauchy-Binet), since a needle's a c - b b cancels to nothing.
 """
 
+# mypy: ignore-errors
+# (numba infers the types, by its own rules: arrays of float32, or of float64 for geometry, and of integers)
+
 from __future__ import annotations
 
 import math
@@ -15,6 +18,7 @@ from numba import prange
 from legs_loss.reference.compiling import compiled
 from legs_loss.reference.conventions import (
     DILATION,
+    FARTHEST,
     MIN_ALPHA,
     NEAR,
     SH_C0,
@@ -26,7 +30,6 @@ from legs_loss.reference.conventions import (
 
 BLOCK = 512  # Gaussians that one thread takes at a time
 WIDE, TALL = 8, 32  # pixels: a strip of the image, see strips.py
-FARTHEST = 1 << 20  # pixels: a larger radius reaches every tile of any image anyway
 FAINTEST = math.log(MIN_ALPHA) - 1e-3  # what is left out is fainter than MIN_ALPHA by more than rounding
 
 _C0, _C1 = np.float32(SH_C0), np.float32(SH_C1)
@@ -263,7 +266,7 @@ def project(
     means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, size,
     splats, depths, radii, clamped, boxes, slots,
 ):  # fmt: skip
-    """Fill, for each Gaussian: splat, depth, radius, which channels were clamped, its box of tiles and their number."""
+    """Fill, for each Gaussian: splat, depth, radius, which channels are clamped, box of strips, how many they are."""
     count = len(means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK

@@ -12,6 +12,9 @@ Within a strip a splat is the polynomial
 whose coefficients are computed in float64: as precise for a needle a thousand pixels long as for a dot.
 """
 
+# mypy: ignore-errors
+# (numba infers the types, by its own rules: arrays of float32, or of float64 for geometry, and of integers)
+
 from __future__ import annotations
 
 import math
@@ -39,7 +42,7 @@ WORK = 7 * PIXELS  # what one loop leaves for the next: short loops overlap in t
 PLANES = 8
 
 _MAX, _MIN, _LAST = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
-_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _LOG2E = 1 / math.log(2)
 # 2^f on [-1/2, 1/2]: least relative error, 2e-7 with float32's rounding.
 _P0, _P1, _P2, _P3, _P4, _P5 = (
@@ -107,29 +110,6 @@ def order_by_depth(depths, slots):
 
 
 @compiled()
-def _rows(left, top, u, v, a, b, c, determinant, level, y0, y1):
-    """Rows [first, end) of the strip at (left, top) where A dx^2 + 2 B dx dy + C dy^2 <= level; end 0: none.
-
-    The ellipse's upper and lower edge over dx are (-B dx +- sqrt(C level - D dx^2)) / C, D = A C - B^2; their
-    extreme points are at dx = -+ B sqrt(level / (A D)), or, where the strip does not have them, at its nearer side.
-    """
-    wide = math.sqrt(level * c / determinant)
-    near, far = max(left - u, -wide), min(left + (WIDE - 1) - u, wide)
-    if near > far:
-        return 0, 0
-    summit = -b * math.sqrt(level / (a * determinant))
-    at = min(max(summit, near), far)
-    highest = v + (-b * at + math.sqrt(max(c * level - determinant * at * at, 0.0))) / c
-    at = min(max(-summit, near), far)
-    lowest = v + (-b * at - math.sqrt(max(c * level - determinant * at * at, 0.0))) / c
-    first = np.int64(math.ceil(max(lowest, max(top, y0)))) - top
-    end = np.int64(math.floor(min(highest, min(top + TALL, y1) - 1))) + 1 - top
-    if end <= first:
-        return 0, 0
-    return first, end
-
-
-@compiled()
 def _find_rows_block(first, end, splats, boxes, slots, first_slots, across, slot_strips, slot_rows):
     for i in range(first, end):
         if slots[i] == 0:
@@ -139,7 +119,7 @@ def _find_rows_block(first, end, splats, boxes, slots, first_slots, across, slot
         x0, y0, x1, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
         level = 2 * (splats[i, 5] - FAINTEST)
         # The ellipse's upper and lower edge over dx are (-B dx +- sqrt(C level - D dx^2)) / C, D = A C - B^2. Their
-        # extreme points are at dx = -+ summit, or, where the strip does not have them, at its nearer side.
+        # extreme points are at dx = summit and -summit, or, where the strip does not have them, at its nearer side.
         wide = math.sqrt(level * c / determinant)
         summit = -b * math.sqrt(level / (a * determinant))
         tall, slope, bend = level / c, -b / c, determinant / (c * c)
@@ -351,21 +331,10 @@ def _blend_backward(state, begin, end, entries, entry_slots, absolute, gradients
                 au += abs(h * (a2 * x + (b * y + gx)))
                 av += abs(h * (c2 * y + (b * x + gy)))
         slot = entry_slots[k]
-        (
-            gradients[slot, 0],
-            gradients[slot, 1],
-            gradients[slot, 2],
-            gradients[slot, 3],
-            gradients[slot, 4],
-            gradients[slot, 5],
-        ) = m, mx, my, mxx, mxy, myy
-        gradients[slot, 6], gradients[slot, 7], gradients[slot, 8], gradients[slot, 9], gradients[slot, 10] = (
-            r,
-            g,
-            bl,
-            au * scale,
-            av * scale,
-        )
+        gradients[slot, 0], gradients[slot, 1], gradients[slot, 2] = m, mx, my
+        gradients[slot, 3], gradients[slot, 4], gradients[slot, 5] = mxx, mxy, myy
+        gradients[slot, 6], gradients[slot, 7], gradients[slot, 8] = r, g, bl
+        gradients[slot, 9], gradients[slot, 10] = au * scale, av * scale
 
 
 @compiled()
@@ -401,16 +370,6 @@ def render_backward(
     """Fill the gradient of every slot that reaches its strip; the absolute sums, if asked for."""
     for worker in prange(workers):
         _render_backward_worker(
-            worker,
-            workers,
-            strip_order,
-            ranges,
-            ends,
-            entries,
-            entry_slots,
-            across,
-            image,
-            g_image,
-            absolute,
+            worker, workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, absolute,
             gradients,
-        )
+        )  # fmt: skip

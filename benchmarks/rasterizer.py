@@ -66,7 +66,7 @@ def contributing_pairs(leaves, camera):
     bounds = oracle.tile_bounds(splats.centres, splats.radii, view.tiles)
     xs, ys = torch.arange(view.width, dtype=torch.float32), torch.arange(view.height, dtype=torch.float32)
     gaussians, pixels = [], []
-    for i in torch.argsort(splats.depths, stable=True).tolist():
+    for i in torch.sort(splats.depths, stable=True).indices.tolist():
         left, top, right, bottom = (16 * bounds[i]).tolist()
         dx, dy = xs[left:right] - splats.centres[i, 0], ys[top:bottom, None] - splats.centres[i, 1]
         a, b, c = splats.conics[i].tolist()
@@ -75,7 +75,7 @@ def contributing_pairs(leaves, camera):
         pixels.append((y + top) * view.width + x + left)
         gaussians.append(torch.full_like(pixels[-1], i))
     gaussian_ids, pixel_ids = torch.cat(gaussians), torch.cat(pixels)
-    order = torch.argsort(pixel_ids, stable=True)
+    order = torch.sort(pixel_ids, stable=True).indices
     tiles = int((bounds[:, 2:] - bounds[:, :2]).clamp_min(0).prod(1).sum())
     return gaussian_ids[order], pixel_ids[order], tiles
 

@@ -164,7 +164,7 @@ def render(
     points = means @ to_camera[:3, :3].T + to_camera[:3, 3]
     seen = torch.nonzero(points[:, 2] > NEAR)[:, 0]
     # Front to back; equal depths keep their order. As upstream, depths are compared as float32 in whatever type.
-    seen = seen[torch.argsort(points[seen, 2].detach().to(torch.float32), stable=True)]
+    seen = seen[torch.sort(points[seen, 2].detach().to(torch.float32), stable=True).indices]
 
     splats = project(points[seen], scales[seen], quaternions[seen], view)
     directions = torch.nn.functional.normalize(means[seen] - torch.as_tensor(view.position, dtype=dtype), dim=1)

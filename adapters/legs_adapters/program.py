@@ -221,8 +221,10 @@ class Program:
         return self._modules[path]
 
     def _parse(self, source: Source) -> Optional[Module]:
+        # A form feed is white space to Python, and LibCST may lose it: a space stands at the same place.
+        text = source.text.replace("\f", " ")
         try:
-            tree = cst.parse_module(source.text)
+            tree = cst.parse_module(text)
         except cst.ParserSyntaxError as error:
             line = getattr(error, "raw_line", 0)
             python2 = _PRINT_STATEMENT.search(source.text) is not None
@@ -232,7 +234,7 @@ class Program:
         except (RecursionError, ValueError) as error:
             self.unreadable[source.path] = Unreadable(source.path, f"cannot be parsed: {type(error).__name__}")
             return None
-        if tree.code != source.text:
+        if tree.code != text:
             self.unreadable[source.path] = Unreadable(source.path, "cannot be written back exactly")
             return None
         try:

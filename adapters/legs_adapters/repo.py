@@ -74,10 +74,11 @@ def check_root(path: str | os.PathLike[str]) -> Path:
 
 
 def walk(root: Path, exclude: Sequence[str] = ()) -> Iterator[str]:
-    """Yield the paths of the checkout's own Python files, sorted, relative, posix separators.
+    """Yield the paths of the checkout's own Python files, relative, posix separators, a folder's own files first.
 
     Links are not followed, whether to files or to folders; left out are ``.git``, submodules, virtual environments,
-    vendored folders, tests, and what ``exclude`` (globs on the relative path, or on a folder above it) names.
+    vendored folders, tests, and what ``exclude`` names: globs on the relative path or, without a slash, on the name of
+    the file or of a folder above it.
     """
     submodules = set(_submodules(root))
     for folder, folders, files in os.walk(str(root), followlinks=False):

@@ -14,7 +14,7 @@ from typing import Any, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 import libcst as cst
 from libcst.metadata import ByteSpanPositionProvider, MetadataWrapper, PositionProvider
 
-from legs_adapters.program import Module, mention
+from legs_adapters.program import Module
 from legs_adapters.repo import Source, decode
 from legs_adapters.sites import Site
 from legs_adapters.syntax import code, dotted
@@ -109,6 +109,8 @@ class _Text:
             return [self.edit(*self.span(form.node, True), own)]
         if form.reduction == "callable":
             return [self.edit(*self.span(form.node, True), f"{name}.l1_loss")]
+        if form.reduction == "wrapped":
+            return self._wrapped(site, name)
         if form.callee is None:
             return self._absolute(site, name)
         return self._call(site, name)
@@ -181,14 +183,7 @@ class _Text:
         if not form.extras and not site.selection and not site.swapped:
             return callee
         extras = ", ".join(_flat(arg) for arg in form.extras)
-        used = set(re.findall(r"\w+", f"{callee} {extras} {site.selection}"))
-        a, b = (
-            ("a", "b")
-            if not used & {"a", "b"}
-            else ("prediction", "target")
-            if not used & {"prediction", "target"}
-            else ("_a", "_b")
-        )
+        a, b = _names_for_two(f"{callee} {extras} {site.selection}")
         index = " ".join(site.selection.split())
         first, second = (b, a) if site.swapped else (a, b)
         return f"lambda {a}, {b}: {callee}({first}{index}, {second}{index}{', ' + extras if extras else ''})"
@@ -216,6 +211,24 @@ class _Text:
             self.edit(right[0], right[1], texts[1]),
             self.edit(right[1], end, f"{settings}{after}){tail}"),
         ]
+
+    def _wrapped(self, site: Site, name: str) -> List[Edit]:
+        """``torch.abs((a - b) * mask)``: the expression stays, as a function of what is compared."""
+        form = site.form
+        difference = form.difference
+        assert difference is not None
+        start, end = self.span(form.node)
+        left, right = self.span(difference.left, True), self.span(difference.right, True)
+        pieces = [self.text(start, left[0]), self.text(left[1], right[0]), self.text(right[1], end)]
+        a, b = _names_for_two(" ".join(pieces))
+        own = " ".join(f"lambda {a}, {b}: {pieces[0]}{a}{pieces[1]}{b}{pieces[2]}".split())
+        texts = [self.text(*left), self.text(*right)]
+        if site.swapped:
+            texts.reverse()
+            own = own.replace(f"lambda {a}, {b}:", f"lambda {b}, {a}:", 1)
+        settings = self._settings(site, name, "", own)
+        residue = _residue(self.text(start, left[0]) + self.text(left[1], right[0]) + self.text(right[1], end))
+        return [self.edit(start, end, f"{name}.l1_loss({texts[0]}, {texts[1]}{settings}{residue})")]
 
     # -- the import
 
@@ -296,13 +309,15 @@ class _Text:
 
 def _package_name(module: Module) -> Tuple[str, bool]:
     """The name that legs_loss has, or will have, in a file; and whether the file imports it already."""
-    for definition in module.top.flow.definitions.get(PACKAGE, []):
-        alias = definition.node
-        if isinstance(alias, cst.ImportAlias) and isinstance(definition.value, cst.Import):
-            return PACKAGE, dotted(alias.name) == PACKAGE
-    if mention(PACKAGE).search(module.text):
-        return f"{PACKAGE}_", False  # the name is taken, by a variable say
-    return PACKAGE, False
+    imported = False
+    for function in module.everything():
+        for definition in function.flow.definitions.get(PACKAGE, []):
+            alias = definition.node
+            if isinstance(alias, cst.ImportAlias) and dotted(alias.name) == PACKAGE and alias.asname is None:
+                imported = imported or function is module.top
+            else:
+                return f"{PACKAGE}_", False  # the name is taken, by a variable say
+    return PACKAGE, imported
 
 
 def _is_future(node: cst.CSTNode) -> bool:
@@ -313,6 +328,13 @@ def _roots(node: cst.Import | cst.ImportFrom) -> List[str]:
     if isinstance(node, cst.ImportFrom):
         return [] if node.relative or node.module is None else [(dotted(node.module) or "").split(".")[0]]
     return [(dotted(alias.name) or "").split(".")[0] for alias in node.names]
+
+
+def _names_for_two(text: str) -> Tuple[str, str]:
+    """Two names for a lambda's parameters that a text does not use."""
+    used = set(re.findall(r"\w+", text))
+    pairs = [("a", "b"), ("prediction", "target"), ("prediction_", "target_")]
+    return next((pair for pair in pairs if not used & set(pair)), ("_prediction", "_target"))
 
 
 def _flat(arg: cst.Arg) -> str:

@@ -23,7 +23,6 @@ from legs_adapters.syntax import (
     call_name,
     code,
     constant,
-    dotted,
     same,
     walk_expressions,
     word_set,
@@ -193,11 +192,10 @@ class _Finder:
             for reference in self._referenced(module, function, lines, positions):
                 if not by_hand or reference.line in chosen:
                     entries.append(((reference.line, 0), reference))
+            for node in self._patched(function) if "legs_loss" in module.text else ():
+                start = positions[node].start
+                self.found.patched.append(Left(module.path, start.line, lines[start.line - 1].strip(), "patched"))
             for call in function.flow.calls:
-                if dotted(call.func) == "legs_loss.l1_loss":
-                    start = positions[call].start
-                    text = lines[start.line - 1].strip()
-                    self.found.patched.append(Left(module.path, start.line, text, "patched"))
                 callable_form = registered.form_of(self.program, function, call)
                 if callable_form is not None:
                     start = positions[callable_form.node].start
@@ -217,14 +215,25 @@ class _Finder:
                 self.found.left.append(entry)
         self.found.patched.sort(key=lambda entry: (entry.path, entry.line))
 
+    def _patched(self, function: Function) -> List[cst.CSTNode]:
+        """What refers to legs_loss.l1_loss already: calls, and names that it is given."""
+        nodes: List[cst.CSTNode] = [call.func for call in function.flow.calls]
+        for definitions in function.flow.definitions.values():
+            nodes.extend(d.value for d in definitions if d.kind == "assign" and isinstance(d.value, cst.Attribute))
+        return [
+            node
+            for node in nodes
+            if any(
+                r.kind == "external" and r.target == "legs_loss.l1_loss" for r in self.program.resolve(function, node)
+            )
+        ]
+
     # -- one form
 
     def _verdict(
         self, module: Module, function: Function, form: Form, where: Tuple[int, int], end: int, text: str, by_hand: bool
     ) -> Site | Left | Problem | None:
         line = where[0]
-        if isinstance(form.call.func, cst.Attribute) and dotted(form.call.func) == "legs_loss.l1_loss":
-            return None
         first, second, index = self._indexed(function, form)
         a, b = self.meanings.of(function, first), self.meanings.of(function, second)
         if not by_hand:
@@ -366,7 +375,7 @@ class _Finder:
         return self._forms[function]
 
     def _called_by_framework(self, function: Function) -> bool:
-        """Whether it makes the loss of a module's ``forward``, and who calls that is settled at run time (a registry)."""
+        """Whether it makes the loss of a module's ``forward``, whose caller is settled at run time (a registry)."""
         if "loss" not in words(function.name) and "losses" not in words(function.name):
             return False
         above = [function, *self._callers(function)]
@@ -427,7 +436,7 @@ class _Finder:
         return False
 
     def _rendered(self, module: Module, function: Function, form: Form) -> bool:
-        """Whether the rendering says so itself, in a codebase that is about splats and a file that is not about rays."""
+        """Whether the rendering says so itself, in a codebase about splats and a file that is not about rays."""
         sides: List[cst.CSTNode] = [*walk_expressions(form.first), *walk_expressions(form.second)]
         for part in list(sides):
             if isinstance(part, cst.Name):
@@ -493,7 +502,7 @@ def _is_noise(form: Form, left: Left) -> bool:
     """An absolute difference that is no loss: of angles, sizes, neighbouring pixels."""
     return (
         form.callee is None
-        and form.reduction == "none"
+        and form.reduction in ("none", "wrapped")
         and left.reason not in ("definition", "tracking", "distillation")
     )
 

@@ -13,11 +13,11 @@ from legs_adapters.syntax import arguments, call_name, children, constant, key_o
 
 __all__ = ["Training"]
 
-_BACKWARD = re.compile(r"\bbackward\s*\(")
+_BACKWARD = re.compile(r"backward\s*\(")
 # Methods whose result a framework trains on: Lightning, nerfstudio.
 _HOOKS = {"training_step", "get_loss_dict", "get_train_loss_dict"}
 _HOOK = re.compile(r"def\s+(training_step|get_loss_dict|get_train_loss_dict)\s*\(")
-_CUT = {"item", "detach", "tolist", "numpy", "backward"}
+_CUT = {"item", "detach", "tolist", "numpy", "backward", "manual_backward"}
 _ANY = object()
 
 
@@ -64,7 +64,7 @@ class Training:
 
     def _start(self, function: Function) -> None:
         for call in function.flow.calls:
-            if call_name(call) != "backward":
+            if call_name(call) not in ("backward", "manual_backward"):
                 continue
             self._root(function)
             values = [arg.value for arg in call.args if arg.keyword is None or arg.keyword.value in ("loss", "tensors")]

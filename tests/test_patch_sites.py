@@ -1,0 +1,82 @@
+"""Which L1 terms are chosen, what they become, and why the others are left: scripts in the shapes met in the wild."""
+
+from __future__ import annotations
+
+import pytest
+from legs_adapters.patch import plan
+from legs_adapters.repo import decode
+
+from tests.patching_support import NAMES, checkout, expected, files
+
+
+def changed_lines(found, path):
+    """Return the lines of a file after the patch, without the import: numbered as before."""
+    lines = decode(path, found.after[path]).text.splitlines()
+    return [line for line in lines if not line.startswith("import legs_loss")]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_term_gets_the_verdict_that_its_comment_asks_for(name, tmp_path):
+    texts = files(name)
+    found = plan(checkout(tmp_path, texts))
+    verdicts = {}
+    for site in found.findings.sites:
+        verdicts[site.path, site.line] = "weighted", changed_lines(found, site.path)[site.line - 1].strip()
+    for entry in found.findings.left:
+        verdicts.setdefault((entry.path, entry.line), ("left", entry.reason))
+    for entry in found.findings.problems:
+        verdicts[entry.path, entry.line] = "error", entry.reason
+    wanted = expected(texts)
+    assert {where: verdict for where, (verdict, _) in verdicts.items()} == {
+        where: verdict for where, (verdict, _) in wanted.items()
+    }
+    for where, (verdict, detail) in wanted.items():
+        if verdict == "error":
+            assert detail in verdicts[where][1]
+        else:
+            assert verdicts[where][1] == detail
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_patched_files_compile_and_a_second_patch_finds_nothing(name, tmp_path):
+    found = plan(checkout(tmp_path, files(name)))
+    for path, data in found.after.items():
+        compile(data, path, "exec")
+        (tmp_path / path).write_bytes(data)
+    assert plan(tmp_path).after == {}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_place_every_line_keeps_its_number(name, tmp_path):
+    root = checkout(tmp_path, files(name))
+    here, on_disk = plan(root, in_place=True), plan(root)
+    assert sorted(here.after) == sorted(on_disk.after)
+    for path, data in here.after.items():
+        before = (root / path).read_bytes()
+        if name != "taken":  # nothing to put the import on: its own line
+            assert data.count(b"\n") == before.count(b"\n")
+        edits = [edit for edit in here.edits[path] if b"import legs_loss" not in edit.after]
+        assert edits == [edit for edit in on_disk.edits[path] if b"import legs_loss" not in edit.after]
+
+
+def test_a_site_chosen_by_hand_is_the_only_one(tmp_path):
+    root = checkout(tmp_path, files("traps"))
+    lines = files("traps")["train.py"].splitlines()
+    line = lines.index("        Ll1 = l1_loss(rendered, target_image)") + 1
+    found = plan(root, by_hand=[("train.py", line)])
+    assert [(site.path, site.line) for site in found.findings.sites] == [("train.py", line)]
+
+
+def test_a_vendored_network_that_is_not_about_splats_is_left(tmp_path):
+    texts = files("inria")
+    texts["depth_network/train.py"] = (
+        "import torch\n\n\n"
+        "def step(network, batch):\n"
+        "    predicted_img = network(batch['input'])\n"
+        "    img = batch['image']\n"
+        "    loss = torch.nn.functional.l1_loss(predicted_img, img)\n"
+        "    loss.backward()\n"
+    )
+    found = plan(checkout(tmp_path, texts))
+    assert [site.path for site in found.findings.sites] == ["train.py"]
+    assert ("depth_network/train.py", "other") in [(entry.path, entry.reason) for entry in found.findings.left]

@@ -30,6 +30,8 @@ _COMMON = word_set(
     """
 )
 _DEPTH = 12
+_NOT_EXACT = "cannot be written back exactly"
+_BLANK = re.compile(r"^[ \t\f]+(?=[\r\n]|\Z)", re.M)
 
 
 class Function:
@@ -132,6 +134,7 @@ class Module:
     """A parsed file.
 
     Attributes:
+        text: what was parsed; ``removed`` says what it lacks of the file: (byte in text, bytes missing up to there).
         functions: every function in it, methods and nested functions too, in source order; ``top`` is its top level.
         classes: every class in it.
     """
@@ -140,6 +143,7 @@ class Module:
         self.path = path
         self.tree = tree
         self.text = text
+        self.removed: List[Tuple[int, int]] = []
         self.top = Function(self, tree)
         self.functions: List[Function] = []
         self.classes: List[Class] = []
@@ -221,8 +225,17 @@ class Program:
         return self._modules[path]
 
     def _parse(self, source: Source) -> Optional[Module]:
-        # A form feed is white space to Python, and LibCST may lose it: a space stands at the same place.
-        text = source.text.replace("\f", " ")
+        module = self._parse_text(source, source.text)
+        if module is None and self.unreadable[source.path].reason == _NOT_EXACT:
+            # LibCST loses some blank lines that have spaces in them, and form feeds.
+            text, removed = _without_blanks(source.text)
+            module = self._parse_text(source, text)
+            if module is not None:
+                module.removed = removed
+                del self.unreadable[source.path]
+        return module
+
+    def _parse_text(self, source: Source, text: str) -> Optional[Module]:
         try:
             tree = cst.parse_module(text)
         except cst.ParserSyntaxError as error:
@@ -235,10 +248,10 @@ class Program:
             self.unreadable[source.path] = Unreadable(source.path, f"cannot be parsed: {type(error).__name__}")
             return None
         if tree.code != text:
-            self.unreadable[source.path] = Unreadable(source.path, "cannot be written back exactly")
+            self.unreadable[source.path] = Unreadable(source.path, _NOT_EXACT)
             return None
         try:
-            return Module(source.path, tree, source.text)
+            return Module(source.path, tree, text)
         except RecursionError:
             self.unreadable[source.path] = Unreadable(source.path, "is nested too deeply")
             return None
@@ -539,6 +552,20 @@ class Program:
             for argument in arguments(value)[1].values():
                 references.extend(self.resolve(where, argument, depth))
         return references
+
+
+def _without_blanks(text: str) -> Tuple[str, List[Tuple[int, int]]]:
+    """Return text with its blank lines empty, and where bytes are missing now."""
+    removed: List[Tuple[int, int]] = []
+    parts, at, length, missing = [], 0, 0, 0
+    for match in _BLANK.finditer(text):
+        kept = text[at : match.start()]
+        parts.append(kept)
+        length += len(kept.encode("utf-8"))
+        missing += match.end() - match.start()
+        removed.append((length, missing))
+        at = match.end()
+    return "".join([*parts, text[at:]]), removed
 
 
 def _from(node: cst.ImportFrom) -> str:

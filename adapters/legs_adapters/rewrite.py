@@ -77,7 +77,7 @@ class _Text:
     def __init__(self, source: Source, module: Module) -> None:
         self.source = source
         self.module = module
-        self.bytes = source.text.encode("utf-8")
+        self.bytes = module.text.encode("utf-8")
         self.shift = len(source.bom)
         wrapper = MetadataWrapper(module.tree, unsafe_skip_copy=True)
         resolved = wrapper.resolve_many([ByteSpanPositionProvider, PositionProvider])
@@ -97,7 +97,11 @@ class _Text:
         return self.bytes[start:end].decode("utf-8")
 
     def edit(self, start: int, end: int, after: str) -> Edit:
-        return Edit(start + self.shift, end + self.shift, self.bytes[start:end], after.encode("utf-8"))
+        start, end = self._in_file(start), self._in_file(end)
+        return Edit(start, end, self.source.data[start:end], after.encode("utf-8"))
+
+    def _in_file(self, at: int) -> int:
+        return at + self.shift + max([missing for place, missing in self.module.removed if place <= at], default=0)
 
     # -- one site
 

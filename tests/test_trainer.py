@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 import torch
 
-from legs_loss import PRESETS, LegsError, WeightSpec, legs_loss, weight_map
+from legs_loss import PRESETS, LegsError, WeightSpec, legs_loss, ssim, weight_map
 from legs_loss.cli import main
+from legs_loss.cli import train as trainer_command
 from legs_loss.precompute import precompute
 from legs_loss.reference import trainer
 from legs_loss.reference.adam import COLOUR_RATE, FIELDS, RATES, Adam, position_rate
@@ -32,6 +33,13 @@ from legs_loss.reference.trainer import CHECKPOINT, TrainConfig, default_thresho
 from legs_loss.scenes import Scene, read_scene
 
 pytest.importorskip("numba")
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    """On a busy machine two threads can be many times slower than one."""
+    trainer_command.set_threads(1)
+
 
 SHORT = TrainConfig(iterations=60, seed=3)
 
@@ -183,6 +191,7 @@ def test_scores_are_those_of_the_libraries() -> None:
     assert psnr(prediction, target) == pytest.approx(float(kornia.metrics.psnr(prediction, target, 1.0)), abs=1e-4)
     ours = skimage.peak_signal_noise_ratio(target.numpy(), prediction.numpy(), data_range=1.0)
     assert score(prediction, target).psnr == pytest.approx(ours, abs=1e-4)
+    assert score(prediction, target).ssim == pytest.approx(float(ssim(prediction, target)), abs=1e-5)
     assert psnr(target, target) == math.inf
 
 
@@ -311,7 +320,8 @@ def test_training_learns_the_scene_and_repeats_bit_for_bit(scene: Scene, tmp_pat
     first = train(scene, config, out=tmp_path / "a")
     second = train(scene, config)
     assert_equal(first.gaussians, second.gaussians)
-    assert not torch.equal(train(scene, replace(config, seed=2)).gaussians.means[:9], first.gaussians.means[:9])
+    one, two = (train(scene, replace(config, iterations=5, seed=seed)).gaussians for seed in (1, 2))
+    assert not torch.equal(one.means, two.means)
     metrics = first.metrics
     before = train(scene, replace(config, iterations=1)).metrics
     assert metrics["train"]["psnr"] > before["train"]["psnr"] + 6
@@ -330,7 +340,7 @@ def test_the_loss_is_legs_loss(scene: Scene) -> None:
     prediction = torch.rand(3, 48, 64, requires_grad=True)
     ours = trainer._loss(prediction, view.image, view.weight, 0.2)
     expected = legs_loss(prediction, view.image, "legs")
-    assert float(ours.detach()) == pytest.approx(float(expected), rel=1e-5)
+    assert float(ours.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
 
 
 def test_l1_scale_is_a_weight_of_that_value_everywhere(scene: Scene) -> None:
@@ -367,11 +377,11 @@ def test_a_long_run_resets_opacities_and_prunes_wide_gaussians(scene: Scene, mon
     run = trainer._Run.begin(load_dataset(scene, PRESETS["3dgs"]), SHORT, scene)
     for _ in range(20):
         run.step()
-    assert float(run.adam.gaussians.opacities.max()) == pytest.approx(0.01)
+    assert float(run.adam.gaussians.opacities.detach().max()) == pytest.approx(0.01)
     for _ in range(30):
         run.step()
     assert seen == [20, 40]
-    assert float(run.adam.gaussians.scales.max()) <= 0.1 * run.extent * 1.2  # pruned at 50, and one step since
+    assert float(run.adam.gaussians.scales.detach().max()) <= 0.1 * run.extent * 1.2  # pruned at 50, and one step since
 
 
 # Interruptions
@@ -505,7 +515,7 @@ def wait_for(path: Path, process: subprocess.Popen[bytes], newer_than: Optional[
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 def test_ctrl_c_and_kill_9_lose_nothing_that_matters(tiny_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    flags = ("--iterations", 1000, "-r", 4, "--threads", 1, "--checkpoint_every", 20)
+    flags = ("--iterations", 400, "-r", 4, "--threads", 1, "--checkpoint_every", 20)
     whole = command("train", tiny_scene, "--out", tmp_path / "whole", *flags)
     assert whole.returncode == 0, whole.stderr
 
@@ -515,17 +525,18 @@ def test_ctrl_c_and_kill_9_lose_nothing_that_matters(tiny_scene: Path, tmp_path:
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 130
     interrupted = read_checkpoint(out / CHECKPOINT)[1]["iteration"]
-    assert 0 < interrupted < 1000
+    assert 0 < interrupted < 400
 
-    process = subprocess.Popen(arguments_of("train", tiny_scene, "--out", out, "--resume"), env=environment())
+    resume = ("train", tiny_scene, "--out", out, "--resume", "--threads", 1, "--checkpoint_every", 20)
+    process = subprocess.Popen(arguments_of(*resume), env=environment())
     wait_for(out / CHECKPOINT, process, (out / CHECKPOINT).stat().st_mtime_ns)
     process.kill()
     process.wait(60)
-    assert interrupted < read_checkpoint(out / CHECKPOINT)[1]["iteration"] < 1000
+    assert interrupted < read_checkpoint(out / CHECKPOINT)[1]["iteration"] < 400
 
-    resumed = command("train", tiny_scene, "--out", out, "--resume")
+    resumed = command(*resume)
     assert resumed.returncode == 0, resumed.stderr
-    files = [path / "point_cloud" / "iteration_1000" / "point_cloud.ply" for path in (tmp_path / "whole", out)]
+    files = [path / "point_cloud" / "iteration_400" / "point_cloud.ply" for path in (tmp_path / "whole", out)]
     assert files[0].read_bytes() == files[1].read_bytes()
 
 

@@ -129,7 +129,7 @@ def conclusion(metrics: Dict[str, Dict[str, Any]]) -> str:
     return (
         f"legs has {legs['gaussians'] / plain['gaussians']:.1f} times as many Gaussians as 3dgs: a larger L1 term "
         "makes larger gradients, and 3DGS's threshold for densifying is absolute. More Gaussians are part of the gain; "
-        "`legs train --max_gaussians` compares at equal numbers. Two seeds differ by about 0.2 dB."
+        "`legs train --max_gaussians` compares at equal numbers. Seeds differ by up to 0.2 dB."
     )
 
 

@@ -112,7 +112,7 @@ def set_threads(count: Optional[int]) -> None:
 
     if count is None:
         return
-    most = numba.config.NUMBA_NUM_THREADS
+    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     if not 1 <= count <= most:
         raise LegsError(f"--threads must be between 1 and {most}, the number of cores, got {count}")
     numba.set_num_threads(count)

@@ -19,7 +19,8 @@ def write_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], facts: Mappin
     """Write arrays, and facts that JSON can hold. A checkpoint that was there is replaced as a whole, or not at all."""
     part = path.with_name(path.name + ".part")
     with open(str(part), "wb") as file:
-        np.savez(file, __facts__=np.frombuffer(json.dumps(dict(facts)).encode(), np.uint8), **arrays)
+        all_arrays: Dict[str, Any] = dict(arrays, __facts__=np.frombuffer(json.dumps(dict(facts)).encode(), np.uint8))
+        np.savez(file, **all_arrays)
         file.flush()
         os.fsync(file.fileno())
     os.replace(str(part), str(path))

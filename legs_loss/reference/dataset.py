@@ -136,7 +136,8 @@ def _open_store(scene: Scene, store: Optional[Path]) -> Optional[WeightStore]:
 
 def _weight(store: Optional[WeightStore], view: TrainingView, spec: WeightSpec) -> Tensor:
     if store is not None:
-        entry = store.find(view.name, *view.image.shape[1:], spec)
+        height, width = view.image.shape[1:]
+        entry = store.find(view.name, height, width, spec)
         if entry is not None and entry.fingerprint in (fingerprint(view.image), fingerprint(view.image[:1])):
             return weight_from_response(torch.from_numpy(store.normalised_response(entry))[None], spec)
     return weight_map(view.image, spec)

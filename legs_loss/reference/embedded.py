@@ -177,8 +177,8 @@ def _still_life(random: np.random.RandomState) -> List:
         surfaces.append(Tube((-3.39, y0, z0), (3.39, y1, z1), 0.009, tone))
     for k in range(7):
         x = -0.62 + 0.13 * k
-        foot = (x, 0.35 - 0.02 * k, top)
-        surfaces.append(Tube(foot, (x + 0.05, 0.34 - 0.02 * k, top + 0.42), 0.004, steel))
+        below = (x, 0.35 - 0.02 * k, top)
+        surfaces.append(Tube(below, (x + 0.05, 0.34 - 0.02 * k, top + 0.42), 0.004, steel))
     shade = textures.stripes((1, 120), (10, 5), ((0.92, 0.66, 0.30), (0.80, 0.46, 0.20)))
     surfaces.append(Tube((0.55, 1.15, 2.02), (0.55, 1.15, 2.99), 0.008, black))
     surfaces.append(Sphere((0.55, 1.15, 1.84), 0.20, shade))

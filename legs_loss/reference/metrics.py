@@ -10,7 +10,6 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.response import response
-from legs_loss.ssim import ssim
 
 __all__ = ["Scores", "mean_scores", "psnr", "score", "strongest"]
 
@@ -58,11 +57,13 @@ def strongest(image: Tensor, fraction: float = 0.1) -> Tensor:
 
 def score(prediction: Tensor, target: Tensor) -> Scores:
     """Return the scores of one rendering [3, H, W] (clipped to [0, 1]) against its photograph."""
+    from legs_loss.kernels.numba_loss import fused_loss
+
     prediction = prediction.clamp(0.0, 1.0)
     mask = strongest(target)
     return Scores(
         psnr(prediction, target),
-        float(ssim(prediction, target)),
+        1.0 - float(fused_loss(prediction, target, None, 1.0)),  # SSIM alone, many times as fast as torch's
         psnr(prediction, target, mask),
         psnr(prediction, target, ~mask),
     )

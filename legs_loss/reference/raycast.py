@@ -7,9 +7,11 @@ scene, and keeps the result as a small light map.
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Optional, Sequence, Tuple
+from typing import List, NamedTuple, Optional, Sequence, Tuple, Union
 
 import numpy as np
+
+Vector = Union[Sequence[float], np.ndarray]  # three numbers
 
 AMBIENT, LAMP = 0.42, 0.68
 NEAR = 0.05
@@ -66,9 +68,9 @@ class Quad:
 
     def __init__(
         self,
-        corner: Sequence[float],
-        across: Sequence[float],
-        down: Sequence[float],
+        corner: Vector,
+        across: Vector,
+        down: Vector,
         texture: np.ndarray,
         round: bool = False,
         casts_shadow: bool = True,
@@ -133,7 +135,7 @@ class _Curved:
 class Sphere(_Curved):
     """A sphere; its texture is laid out by longitude and latitude."""
 
-    def __init__(self, centre: Sequence[float], radius: float, texture: np.ndarray, gloss: float = 0.0) -> None:
+    def __init__(self, centre: Vector, radius: float, texture: np.ndarray, gloss: float = 0.0) -> None:
         self.centre, self.radius = np.asarray(centre, float), radius
         self.texture, self.gloss, self.casts_shadow = texture, gloss, True
 
@@ -168,8 +170,8 @@ class Tube(_Curved):
 
     def __init__(
         self,
-        start: Sequence[float],
-        end: Sequence[float],
+        start: Vector,
+        end: Vector,
         radius: float,
         texture: np.ndarray,
         gloss: float = 0.0,

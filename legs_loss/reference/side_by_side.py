@@ -44,10 +44,11 @@ def train_side_by_side(
             while waiting and len(running) < processes:
                 process = _Process(waiting.pop())
                 running[process.connection] = process
-            for connection in wait(list(running)):
+            ready: List[Any] = wait(list(running))
+            for connection in ready:
                 name = running[connection].name
                 try:
-                    message = connection.recv()  # type: ignore[union-attr]
+                    message = connection.recv()
                 except (EOFError, OSError):
                     raise LegsError(f"{name}: its process was killed (out of memory?)") from None
                 if isinstance(message, Progress):

@@ -120,7 +120,7 @@ def checker(size: Tuple[int, int], cell: int, dark: Colour, light: Colour, rando
     return tint(odd.astype(np.float32), dark, light) * (shade * speckle)[..., None].astype("f4")
 
 
-def brick(size: Tuple[int, int], length: int, course: int, random: np.random.RandomState):
+def brick(size: Tuple[int, int], length: int, course: int, random: np.random.RandomState) -> np.ndarray:
     """A running bond of bricks, ``length`` x ``course`` texels each, with light mortar."""
     rows, columns = np.arange(size[0])[:, None], np.arange(size[1])[None, :]
     layer = rows // course

@@ -55,16 +55,29 @@ def ours(backend, camera, degree):
     return lambda *leaves: rasterize(*leaves, camera, BACKGROUND, degree, backend=backend).image
 
 
-def contributing_pairs(leaves, camera):
-    """Indices (Gaussian, pixel) where alpha reaches 1/255, sorted by pixel and depth; and the same of tiles."""
+def project(leaves, camera):
+    """Splats, and the bounds of their tiles; the camera stands in the origin."""
     from legs_loss.reference import oracle
-    from legs_loss.reference.conventions import MIN_ALPHA, View
+    from legs_loss.reference.conventions import View
 
     view = View.of(camera)
-    means, scales, quaternions, opacities, _ = (leaf.detach() for leaf in leaves)
-    splats = oracle.project(means, scales, quaternions, view)  # the camera stands in the origin
-    bounds = oracle.tile_bounds(splats.centres, splats.radii, view.tiles)
-    xs, ys = torch.arange(view.width, dtype=torch.float32), torch.arange(view.height, dtype=torch.float32)
+    splats = oracle.project(*(leaf.detach() for leaf in leaves[:3]), view)
+    return splats, oracle.tile_bounds(splats.centres, splats.radii, view.tiles)
+
+
+def describe(leaves, camera, threads):
+    _, bounds = project(leaves, camera)
+    tiles = int((bounds[:, 2:] - bounds[:, :2]).clamp_min(0).prod(1).sum())
+    return f"{camera.width}x{camera.height}, {len(leaves[0])} Gaussians, {tiles} tile entries, {threads} thread(s), ms"
+
+
+def contributing_pairs(leaves, camera):
+    """Indices (Gaussian, pixel) where alpha reaches 1/255, sorted by pixel and depth."""
+    from legs_loss.reference.conventions import MIN_ALPHA
+
+    splats, bounds = project(leaves, camera)
+    opacities = leaves[3].detach()
+    xs, ys = torch.arange(camera.width, dtype=torch.float32), torch.arange(camera.height, dtype=torch.float32)
     gaussians, pixels = [], []
     for i in torch.sort(splats.depths, stable=True).indices.tolist():
         left, top, right, bottom = (16 * bounds[i]).tolist()
@@ -72,12 +85,11 @@ def contributing_pairs(leaves, camera):
         a, b, c = splats.conics[i].tolist()
         alpha = opacities[i] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
         y, x = torch.nonzero(alpha >= MIN_ALPHA).unbind(1)
-        pixels.append((y + top) * view.width + x + left)
+        pixels.append((y + top) * camera.width + x + left)
         gaussians.append(torch.full_like(pixels[-1], i))
     gaussian_ids, pixel_ids = torch.cat(gaussians), torch.cat(pixels)
     order = torch.sort(pixel_ids, stable=True).indices
-    tiles = int((bounds[:, 2:] - bounds[:, :2]).clamp_min(0).prod(1).sum())
-    return gaussian_ids[order], pixel_ids[order], tiles
+    return gaussian_ids[order], pixel_ids[order]
 
 
 def nerfacc_stand_in():
@@ -193,8 +205,7 @@ def main():
 
     width, height = options.size
     leaves, camera, weights = make_scene(options.gaussians, width, height, options.degree)
-    *_, tiles = contributing_pairs(leaves, camera)
-    title = f"{width}x{height}, {options.gaussians} Gaussians, {tiles} tile entries, {options.threads} thread(s), ms"
+    title = describe(leaves, camera, options.threads)
     contestants = {"numba": ours("numba", camera, options.degree)}
     results["full"] = {"title": title, **report(title, *measure(contestants, leaves, weights, options.rounds))}
 
@@ -202,14 +213,14 @@ def main():
         root = options.peer_scale**0.5
         width, height, count = round(width / root), round(height / root), options.gaussians // options.peer_scale
         leaves, camera, weights = make_scene(count, width, height, options.degree)
-        gaussian_ids, pixel_ids, tiles = contributing_pairs(leaves, camera)
-        title = f"{width}x{height}, {count} Gaussians, {tiles} tile entries, {options.threads} thread(s), ms"
+        title = describe(leaves, camera, options.threads)
         contestants = {
             "numba": ours("numba", camera, options.degree),
             "torch oracle": ours("torch", camera, options.degree),
         }
         if options.gsplat:
-            contestants["gsplat torch"] = gsplat(options.gsplat, camera, options.degree, gaussian_ids, pixel_ids)
+            pairs = contributing_pairs(leaves, camera)
+            contestants["gsplat torch"] = gsplat(options.gsplat, camera, options.degree, *pairs)
         results["peers"] = {
             "title": title,
             **report(title, *measure(contestants, leaves, weights, options.peer_rounds)),

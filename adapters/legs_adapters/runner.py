@@ -15,7 +15,7 @@ import signal
 import sys
 import types
 from pathlib import Path
-from types import CodeType, TracebackType
+from types import CodeType
 from typing import Dict, Optional, Sequence
 
 from legs_adapters.patch import plan
@@ -56,21 +56,23 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str]) -> int:
     sources = {os.path.realpath(str(root / name)): data for name, data in found.after.items()}
     for site in found.findings.sites:
         print(f"legs-loss: {site.path}:{site.line} is weighted in this run", file=sys.stderr, flush=True)
+    name = str(script)
+    file = os.path.abspath(name) if sys.version_info >= (3, 9) else name
     sys.meta_path.insert(0, _Finder(sources))
-    main = _main_module(str(script))
-    sys.argv[:] = [str(script), *arguments]
-    sys.path[0] = os.path.dirname(os.path.realpath(str(script)))
+    main = _main_module(file)
+    sys.argv[:] = [name, *arguments]
+    sys.path[0] = os.path.dirname(os.path.realpath(name))
     sys.modules["__main__"] = main
-    loader = _Loader("__main__", str(script), sources.get(os.path.realpath(str(script))))
+    loader = _Loader("__main__", file, sources.get(os.path.realpath(name)))
     try:
         exec(loader.code(), main.__dict__)
     except SystemExit:
         raise
     except KeyboardInterrupt as error:
-        sys.excepthook(type(error), error, _from_script(error.__traceback__))
+        _show(error)
         return _interrupted()
     except BaseException as error:
-        sys.excepthook(type(error), error, _from_script(error.__traceback__))
+        _show(error)
         return 1
     return 0
 
@@ -133,9 +135,12 @@ def _main_module(script: str) -> types.ModuleType:
     return module
 
 
-def _from_script(traceback: Optional[TracebackType]) -> Optional[TracebackType]:
-    """Leave out our own frame: the traceback begins where the script does."""
-    return traceback.tb_next if traceback is not None and traceback.tb_next is not None else traceback
+def _show(error: BaseException) -> None:
+    """Print a traceback that begins where the script does, without our own frame."""
+    traceback = error.__traceback__
+    if traceback is not None and traceback.tb_next is not None:
+        traceback = traceback.tb_next
+    sys.excepthook(type(error), error.with_traceback(traceback), traceback)
 
 
 def _interrupted() -> int:

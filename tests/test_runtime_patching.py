@@ -1,0 +1,179 @@
+"""What the lines that legs-patch writes ask of l1_loss: unreduced maps, the codebase's own L1, both layouts."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from legs_loss import LegsError, configure, l1_loss, runtime, weight_map
+from legs_loss.runtime import active
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch, tmp_path):
+    """Each test is a run of its own, started in an empty folder."""
+    for name in [name for name in os.environ if name.startswith("LEGS_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(runtime, "_run", None)
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    monkeypatch.chdir(tmp_path)
+
+
+def pair(*shape):
+    prediction, target = torch.rand(shape), torch.rand(shape)
+    prediction.view(-1)[::5] = target.view(-1)[::5]  # where they are equal the gradient is 0
+    return prediction.requires_grad_(True), target
+
+
+def gradient(loss, prediction):
+    (found,) = torch.autograd.grad(loss, prediction)
+    return found
+
+
+def masked(network_output, gt, mask=None):
+    if mask is None:
+        return torch.abs(network_output - gt).mean()
+    return torch.abs((network_output - gt) * mask).sum() / mask.sum()
+
+
+def valid(network_output, gt):
+    error = torch.abs(network_output - gt)
+    error = torch.where(gt != 0, error, torch.zeros_like(error))
+    return error, error.mean()
+
+
+class TestUnreduced:
+    def test_is_the_weight_times_the_error(self):
+        prediction, target = pair(3, 6, 5)
+        expected = weight_map(target, "legs") * torch.abs(prediction - target)
+        assert torch.equal(l1_loss(prediction, target, reduction="none"), expected)
+        assert torch.equal(l1_loss(prediction, target, reduction="none").mean(), l1_loss(prediction, target))
+
+    def test_channels_last_and_a_mask_taken_afterwards(self):
+        prediction, target = pair(2, 6, 5, 3)
+        mask = torch.rand(2, 6, 5) > 0.5
+        weight = torch.stack([weight_map(image, "legs", channels_last=True) for image in target])
+        expected = (weight * torch.abs(prediction - target))[mask].mean()
+        found = l1_loss(prediction, target, channels_last=True, reduction="none")[mask].mean()
+        assert torch.equal(found, expected)
+
+    def test_a_mask_multiplies_it(self):
+        prediction, target = pair(3, 6, 5)
+        mask = torch.rand(6, 5)
+        expected = mask * (weight_map(target, "legs") * torch.abs(prediction - target))
+        assert torch.allclose(l1_loss(prediction, target, mask=mask, reduction="none"), expected)
+
+    def test_another_reduction_is_refused(self):
+        with pytest.raises(LegsError, match='reduction must be "mean" or "none"'):
+            l1_loss(*pair(3, 4, 4), reduction="sum")
+
+
+class TestOwn:
+    def test_a_mean_of_its_own_becomes_the_weighted_mean(self):
+        prediction, target = pair(3, 7, 6)
+        found = l1_loss(prediction, target, own=F.l1_loss)
+        assert torch.allclose(found, l1_loss(prediction, target), rtol=1e-5)
+        assert torch.allclose(gradient(found, prediction), gradient(l1_loss(prediction, target), prediction), rtol=1e-4)
+
+    def test_a_masked_mean_of_its_own(self):
+        prediction, target = pair(3, 7, 6)
+        mask = (torch.rand(1, 7, 6) > 0.5).float()
+        expected = (weight_map(target, "legs") * torch.abs(prediction - target) * mask).sum() / mask.sum()
+        found = l1_loss(prediction, target, own=lambda a, b: masked(a, b, mask))
+        assert torch.allclose(found, expected, rtol=1e-5)
+
+    def test_a_mask_that_it_makes_from_the_target_stays(self):
+        prediction, target = pair(3, 7, 6)
+        target[:, 2:4] = 0.0
+        error, mean = l1_loss(prediction, target, own=valid)
+        expected = weight_map(target, "legs") * torch.abs(prediction - target) * (target != 0)
+        assert torch.allclose(error, expected, atol=1e-6)
+        assert torch.allclose(mean, expected.mean(), rtol=1e-5)
+
+    def test_a_batch_reduced_by_image(self):
+        prediction, target = pair(4, 3, 7, 6)
+        found = l1_loss(prediction, target, own=lambda a, b: torch.abs(a - b).mean(dim=(1, 2, 3)))
+        expected = torch.stack([l1_loss(prediction[i], target[i]) for i in range(4)])
+        assert torch.allclose(found, expected, rtol=1e-5)
+
+    def test_takes_the_place_of_mask_and_reduction(self):
+        for settings in ({"mask": torch.ones(4, 4)}, {"reduction": "none"}):
+            with pytest.raises(LegsError, match="own= replaces"):
+                l1_loss(*pair(3, 4, 4), own=F.l1_loss, **settings)
+
+
+# The codebase's own line, and the line that the patch puts there.
+LINES = {
+    "own l1_loss": (lambda a, b: torch.abs(a - b).mean(), lambda a, b: l1_loss(a, b)),
+    "target first": (lambda a, b: torch.abs(b - a).mean(), lambda a, b: l1_loss(a, b)),
+    "F.l1_loss": (lambda a, b: F.l1_loss(a, b), lambda a, b: l1_loss(a, b, own=F.l1_loss)),
+    "F.l1_loss, target first": (
+        lambda a, b: F.l1_loss(b, a),
+        lambda a, b: l1_loss(a, b, own=lambda a, b: F.l1_loss(b, a)),
+    ),
+    "unreduced": (
+        lambda a, b: F.l1_loss(a, b, reduction="none").mean(),
+        lambda a, b: l1_loss(a, b, reduction="none").mean(),
+    ),
+    "a mask on both": (
+        lambda a, b: torch.abs(a[..., b[0, 0] > 0.5] - b[..., b[0, 0] > 0.5]).mean(),
+        lambda a, b: l1_loss(a, b, reduction="none")[..., b[0, 0] > 0.5].mean(),
+    ),
+    "masked": (
+        lambda a, b: masked(a, b, (b > 0.5).float()),
+        lambda a, b: l1_loss(a, b, own=lambda x, y: masked(x, y, (b > 0.5).float())),
+    ),
+    "a tuple": (lambda a, b: valid(a, b)[1], lambda a, b: l1_loss(a, b, own=valid)[1]),
+}
+
+
+@pytest.mark.parametrize("name", LINES)
+@pytest.mark.parametrize("off", ["LEGS_OFF", "LEGS_BETA"])
+def test_off_is_the_codebase_s_own_line_to_the_last_bit(name, off, monkeypatch):
+    monkeypatch.setenv(off, "1" if off == "LEGS_OFF" else "0")
+    own, patched = LINES[name]
+    for shape in ((3, 7, 5), (3, 33, 47), (1, 3, 50, 21), (3, 101, 103)):
+        for dtype in (torch.float32, torch.float64):
+            prediction, target = pair(*shape)
+            prediction = prediction.detach().to(dtype).requires_grad_(True)
+            target = target.to(dtype)
+            expected, found = own(prediction, target), patched(prediction, target)
+            assert torch.equal(found, expected)
+            share = torch.rand((), dtype=dtype)
+            assert torch.equal(gradient(share * found, prediction), gradient(share * expected, prediction))
+    assert not active()
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_evaluation_is_the_codebase_s_own_line_too(name):
+    own, patched = LINES[name]
+    prediction, target = pair(3, 9, 8)
+    with torch.no_grad():
+        assert torch.equal(patched(prediction, target), own(prediction, target))
+    assert torch.equal(patched(prediction.detach(), target), own(prediction.detach(), target))
+
+
+class TestLayout:
+    def test_images_the_other_way_around_are_refused_with_what_to_write(self):
+        with pytest.raises(LegsError, match=r"\[20, 30, 3\] has its channels last: .*channels_last=True"):
+            l1_loss(*pair(20, 30, 3))
+        with pytest.raises(LegsError, match=r"\[1, 3, 20, 30\] has its channels first: .*channels_last=False"):
+            l1_loss(*pair(1, 3, 20, 30), channels_last=True)
+
+    def test_small_and_feature_images_are_not_mistaken(self):
+        for shape, last in (((3, 4, 3), False), ((4, 3, 3), False), ((16, 20, 30), False), ((20, 30, 16), True)):
+            assert l1_loss(*pair(*shape), channels_last=last).requires_grad
+
+
+def test_active_says_whether_anything_is_weighted(monkeypatch):
+    assert active()
+    configure("3dgs")
+    assert not active()
+    configure("legs")
+    monkeypatch.setenv("LEGS_OFF", "1")
+    configure("legs")
+    assert not active()

@@ -144,7 +144,9 @@ def _show(error: BaseException) -> None:
 
 
 def _interrupted() -> int:
-    """End as Python does on Ctrl-C: by the signal, so that a shell's loop ends too."""
+    """End as Python does on Ctrl-C: by the signal, so that a shell's loop ends too; before 3.8 with exit code 1."""
+    if sys.version_info < (3, 8):
+        return 1
     if os.name == "posix":
         sys.stdout.flush()
         sys.stderr.flush()

@@ -68,6 +68,7 @@ class Flow:
         returns: the expressions that it returns or yields.
         functions, classes: what is defined in it, directly or inside of its branches.
         without_grad: ids of nodes under ``torch.no_grad()`` and its like.
+        reads: every name that is read, in source order.
         conditions: by a call's id, the names that must be true where it runs: ``if tracking:``.
     """
 
@@ -85,6 +86,7 @@ class Flow:
         self._made: Dict[Tuple[int, str, str], Definition] = {}
         self._seen: Set[int] = set()
         self.conditions: Dict[int, Tuple[str, ...]] = {}
+        self.reads: List[cst.Name] = []
         self._no_grad = 0
         self._conditions: Tuple[str, ...] = ()
         self._breaks: List[List[Env]] = []
@@ -362,6 +364,9 @@ class Flow:
             self.expressions.append(node)
             if isinstance(node, cst.Call):
                 self.calls.append(node)
+        if first and isinstance(node, cst.Name):
+            self._seen.add(id(node))
+            self.reads.append(node)
         if isinstance(node, (cst.Name, cst.Attribute, cst.Subscript)):
             place = path_of(node)
             if place is not None and place in env:

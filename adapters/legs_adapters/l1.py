@@ -31,7 +31,8 @@ class Form(NamedTuple):
         call: the call in it that has the two arguments, or that takes the absolute value.
         first, second: the two arguments, as written.
         reduction: "mean", "none" (an unreduced map), "own": what the codebase's function makes of it, "wrapped":
-            an expression around the difference, or "callable" and "registered" for a function handed over by name.
+            an expression around the difference, "again": a map with another use, of which ``node`` is the read that
+            is the loss, or "callable" and "registered" for a function handed over by name.
         callee: what is called, for a form that is a call of a function; None for ``abs``.
         extras: the call's further arguments.
         difference: the ``a - b``, for a form that is an absolute value.

@@ -113,6 +113,11 @@ class _Text:
             return [self.edit(*self.span(form.node, True), own)]
         if form.reduction == "callable":
             return [self.edit(*self.span(form.node, True), f"{name}.l1_loss")]
+        if form.reduction == "again":
+            first, second = (form.second, form.first) if site.swapped else (form.first, form.second)
+            texts = [" ".join(self.text(*self.span(node, True)).split()) for node in (first, second)]
+            settings = self._settings(site, name, "none", "")
+            return [self.edit(*self.span(form.node, True), f"{name}.l1_loss({texts[0]}, {texts[1]}{settings})")]
         if form.reduction == "wrapped":
             return self._wrapped(site, name)
         if form.callee is None:

@@ -36,7 +36,7 @@ __all__ = ["Findings", "Left", "Problem", "Site", "find"]
 
 _MAY_HAVE_L1 = re.compile(r"[lL]1|\babs\s*\(")
 _SPLATS = re.compile(r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_pkg|3dgs|surfel", re.I)
-_RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
+_RAYS = re.compile(r"\bmesh|rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
 _MASK_WORDS = {
     "mask",
     "masks",
@@ -183,6 +183,9 @@ class _Finder:
                 verdict = self._verdict(
                     module, function, form, where, end, text, any(start.line <= line <= end for line in chosen)
                 )
+                if isinstance(verdict, Site) and verdict.form.node is not form.node:
+                    span = positions[verdict.form.node]
+                    verdict = verdict._replace(line=span.start.line, column=span.start.column, last_line=span.end.line)
                 if by_hand and not isinstance(verdict, Left):
                     assert verdict is None or isinstance(verdict, (Site, Problem))
                     if not any(start.line <= line <= end for line in chosen):
@@ -249,10 +252,46 @@ class _Finder:
             swapped = False
         if not form.direct:
             return self._problem(module.path, line, text, form, swapped, "the difference has a name of its own")
+        shared = self._shared(function, form)
+        if shared is not None:
+            if not shared or not self._unchanged(function, first, second):
+                why = f"{_short(form.node)} serves more than the loss"
+                return self._problem(module.path, line, text, form, swapped, why)
+            form = form._replace(node=shared[0], reduction="again")
         prediction, target = (second, first) if swapped else (first, second)
         last = is_channels_last(self.program, function, prediction, target)
         view = self.views.of(function, target, form.call)
         return Site(module.path, *where, end, form, swapped, index, last, view, function.name)
+
+    def _shared(self, function: Function, form: Form) -> Optional[List[cst.Name]]:
+        """``error = torch.abs(image - gt)`` that also makes a mask, say: the reads of it that are the loss.
+
+        None where it is the loss alone (and what is logged of it).
+        """
+        made = [
+            definition
+            for definitions in function.flow.definitions.values()
+            for definition in definitions
+            if definition.kind == "assign" and definition.value is form.node and "." not in definition.place
+        ]
+        if form.reduction != "none" or not made:
+            return None
+        reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
+        trained = [read for read in reads if self.training.includes(read)]
+        if all(read in trained or id(read) in function.flow.without_grad for read in reads):
+            return None
+        return trained if len(trained) == 1 else []
+
+    @staticmethod
+    def _unchanged(function: Function, *images: cst.CSTNode) -> bool:
+        """Whether names mean the same all through a function, once they have been read here."""
+        for part in (part for image in images for part in walk_expressions(image)):
+            if isinstance(part, cst.Name):
+                known = function.flow.reaching(part)
+                everywhere = [d for d in function.flow.definitions.get(part.value, []) if d.kind != "store"]
+                if known and not set(everywhere) <= known:
+                    return False
+        return True
 
     def _indexed(self, function: Function, form: Form) -> Tuple[cst.BaseExpression, cst.BaseExpression, str]:
         """Take an index by one mask off both arguments: the weight map needs the whole image."""

@@ -107,7 +107,11 @@ class Training:
 
     def _visit(self, function: Function, node: cst.CSTNode, key: object) -> None:
         """Mark what ``node`` (or, with a key, ``node[key]``) gets its value from."""
-        if isinstance(key, int) and isinstance(node, (cst.Tuple, cst.List)) and -1 <= key < len(node.elements):
+        if (
+            isinstance(key, int)
+            and isinstance(node, (cst.Tuple, cst.List))
+            and -len(node.elements) <= key < len(node.elements)
+        ):
             self._push(function, node.elements[key].value)
             return
         if key is not _ANY and isinstance(node, cst.Dict):

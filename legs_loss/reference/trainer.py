@@ -132,7 +132,7 @@ def default_threshold(views: List[TrainingView]) -> float:
 
     3DGS's own 2e-4 is for photographs more than 1000 pixels wide. Its gradients are per half image, so that the
     gradient of a Gaussian that covers a given number of pixels grows as the image shrinks, and 2e-4 makes several
-    times as many Gaussians as a small image has use for. The rule gives 5e-4 at 180x321, and 2e-4 from 600x600 on.
+    times as many Gaussians as a small image has use for. The rule gives 5e-4 at 180x320, and 2e-4 from 600x600 on.
     """
     pixels = sum(view.image[0].numel() for view in views) / len(views)
     return max(2e-4, 0.12 / math.sqrt(pixels))

@@ -462,6 +462,7 @@ class TestCommandLine:
             (16, True),
             (19, True),
             (25, True),
+            (39, True),
         ]
         assert content["left"][0]["reason"] == "definition" or content["left"][0]["reason"] == "depth"
         assert content["would_change"] == ["simple_trainer.py"]

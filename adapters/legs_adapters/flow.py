@@ -31,9 +31,10 @@ class Definition:
         value: where the value comes from, if that is an expression.
         index: which element of the value, where it is unpacked and known.
         key: for a store under a literal key: the key.
+        order: which definition of its function it is, in the order of the source.
     """
 
-    __slots__ = ("index", "key", "kind", "node", "place", "value")
+    __slots__ = ("index", "key", "kind", "node", "order", "place", "value")
 
     def __init__(
         self,
@@ -50,6 +51,7 @@ class Definition:
         self.value = value
         self.index = index
         self.key = key
+        self.order = 0
 
 
 Env = Dict[str, FrozenSet[Definition]]
@@ -122,6 +124,7 @@ class Flow:
         known = (id(node), place, kind)
         if known not in self._made:
             self._made[known] = Definition(place, kind, node, value, index, key)
+            self._made[known].order = len(self._made)
             self.definitions.setdefault(place, []).append(self._made[known])
         return self._made[known]
 

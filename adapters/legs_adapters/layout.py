@@ -6,8 +6,9 @@ from typing import List, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.program import Function, Program
+from legs_adapters.program import Function
 from legs_adapters.syntax import arguments, call_name, constant
+from legs_adapters.training import Training
 
 __all__ = ["is_channels_last"]
 
@@ -16,13 +17,13 @@ _TO_FIRST = {(2, 0, 1), (0, 3, 1, 2)}
 _LAST_RENDERERS = {"rasterization", "rasterization_2dgs", "rasterize_gaussians", "rasterization_inria_wrapper"}
 
 
-def is_channels_last(program: Program, function: Function, *images: cst.CSTNode) -> bool:
+def is_channels_last(training: Training, function: Function, *images: cst.CSTNode) -> bool:
     """Return whether the images are [H, W, C] or [B, H, W, C]; without a sign of it they are not."""
-    votes = [vote for image in images for vote in _votes(function, image, set(), 0)]
+    votes = [vote for image in images for vote in _votes(training, function, image, set(), 0)]
     return sum(votes) > 0
 
 
-def _votes(function: Function, node: cst.CSTNode, seen: Set[int], depth: int) -> List[int]:
+def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[int], depth: int) -> List[int]:
     if depth > 10 or id(node) in seen:
         return []
     seen.add(id(node))
@@ -40,23 +41,25 @@ def _votes(function: Function, node: cst.CSTNode, seen: Set[int], depth: int) ->
             return [2]
         inner: List[cst.CSTNode] = [node.func.value] if isinstance(node.func, cst.Attribute) else []
         inner += arguments(node)[0][:1]
-        return [vote for part in inner for vote in _votes(function, part, seen, depth + 1)]
+        return [vote for part in inner for vote in _votes(training, function, part, seen, depth + 1)]
     votes: List[int] = []
     if isinstance(node, cst.Subscript):
         votes.extend(_slice_vote(node))
-        votes.extend(_votes(function, node.value, seen, depth + 1))
+        votes.extend(_votes(training, function, node.value, seen, depth + 1))
         return votes
     if isinstance(node, cst.BinaryOperation):
         for side in (node.left, node.right):
             if isinstance(side, cst.Subscript) and _is_spread(side):
                 votes.append(2)
             else:
-                votes.extend(_votes(function, side, seen, depth + 1))
+                votes.extend(_votes(training, function, side, seen, depth + 1))
         return votes
     if isinstance(node, (cst.Name, cst.Attribute)):
         for use in _uses(function, node):
             votes.extend(use)
-        for definition in function.flow.reaching(node):
+        for definition in sorted(function.flow.reaching(node), key=lambda d: d.order):
+            if definition.kind == "parameter":
+                votes.extend(_votes_of_callers(training, function, definition.place, seen, depth))
             if definition.value is None:
                 continue
             if definition.kind == "element" and isinstance(definition.value, cst.Call):
@@ -64,7 +67,21 @@ def _votes(function: Function, node: cst.CSTNode, seen: Set[int], depth: int) ->
                 if not definition.index and call_name(definition.value) in _LAST_RENDERERS:
                     votes.append(2)
             elif definition.kind in ("assign", "augment"):
-                votes.extend(_votes(function, definition.value, seen, depth + 1))
+                votes.extend(_votes(training, function, definition.value, seen, depth + 1))
+    return votes
+
+
+def _votes_of_callers(training: Training, function: Function, name: str, seen: Set[int], depth: int) -> List[int]:
+    """A parameter lies as what it is given where training calls the function."""
+    if name not in function.parameters:
+        return []
+    votes: List[int] = []
+    for caller, call in training.sites.get(function, [])[:4]:
+        positional, keywords, _ = arguments(call)
+        position = function.parameters.index(name)
+        value = keywords.get(name, positional[position] if position < len(positional) else None)
+        if value is not None:
+            votes.extend(_votes(training, caller, value, seen, depth + 1))
     return votes
 
 

@@ -13,7 +13,7 @@ import libcst as cst
 
 from legs_adapters.flow import Definition
 from legs_adapters.program import Function, Program
-from legs_adapters.syntax import arguments, call_name, constant, key_of, words
+from legs_adapters.syntax import arguments, call_name, constant, key_of, same, words
 from legs_adapters.training import Training
 from legs_adapters.vocabulary import DATA, KINDS, kind_of_words, role_of_words
 
@@ -36,6 +36,7 @@ _FIRST = {
 }  # fmt: skip
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _DEPTH = 24
+_BUDGET = 20000  # steps to answer one question: some code is one large knot
 
 
 class Meaning(NamedTuple):
@@ -57,6 +58,7 @@ class Meanings:
         self._known: Dict[int, Meaning] = {}
         self._here: Dict[int, Meaning] = {}
         self._open: Set[int] = set()
+        self._spent = 0
 
     def of(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Meaning:
         """Return what an expression stands for."""
@@ -64,9 +66,10 @@ class Meanings:
             return self._known[id(node)]
         if id(node) in self._here:
             return self._here[id(node)]
-        if id(node) in self._open or depth > _DEPTH:
+        if id(node) in self._open or depth > _DEPTH or self._spent > _BUDGET:
             return _UNKNOWN
         outermost = not self._open
+        self._spent = 0 if outermost else self._spent + 1
         self._open.add(id(node))
         try:
             meaning = self._of(function, node, depth + 1)
@@ -89,6 +92,8 @@ class Meanings:
         if isinstance(node, cst.Call):
             return self._call(function, node, depth)
         if isinstance(node, cst.BinaryOperation):
+            if isinstance(node.operator, cst.Subtract) and _neighbours(node.left, node.right):
+                return Meaning("gradient", self.of(function, node.left, depth).role)
             return _mix([self.of(function, node.left, depth), self.of(function, node.right, depth)])
         if isinstance(node, cst.Comparison):
             return Meaning("mask", None)
@@ -242,6 +247,8 @@ class Meanings:
             return Meaning(kind_of_words(key), role)
         if name == "where" and len(values) == 3:
             return _mix([self.of(function, value, depth) for value in values[1:]])
+        if name in ("conv2d", "filter2d", "spatial_gradient") and values:
+            return Meaning("gradient", self.of(function, values[0], depth).role)
         if name in _JOIN and values:
             return self.of(function, values[0], depth)
         if base is not None and not module and name in _SAME:
@@ -307,6 +314,11 @@ def _formatted_key(node: cst.Subscript) -> Optional[str]:
     if len(node.slice) != 1 or not isinstance(element, cst.Index) or not isinstance(element.value, cst.FormattedString):
         return None
     return "_".join(p.value for p in element.value.parts if isinstance(p, cst.FormattedStringText)) or None
+
+
+def _neighbours(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:
+    """``x[1:] - x[:-1]``: a picture's own slope."""
+    return isinstance(left, cst.Subscript) and isinstance(right, cst.Subscript) and same(left.value, right.value)
 
 
 def root_of(node: cst.Name | cst.Attribute) -> str:

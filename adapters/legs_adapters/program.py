@@ -305,7 +305,7 @@ class Program:
     def _definitions(self, function: Function, node: cst.CSTNode) -> Optional[List[Tuple[Function, Definition]]]:
         local = function.flow.reaching(node)
         if local:
-            return [(function, definition) for definition in sorted(local, key=lambda d: (d.place, d.kind))]
+            return [(function, definition) for definition in sorted(local, key=_order)]
         place = path_of(node)
         scope = function.parent
         while place is not None and scope is not None:
@@ -401,7 +401,7 @@ class Program:
         local = function.flow.reaching(node)
         if local:
             references: List[Reference] = []
-            for definition in local:
+            for definition in sorted(local, key=_order):
                 references.extend(self._of_definition(function, definition, depth))
             if references:
                 return _unique(references)
@@ -552,6 +552,10 @@ class Program:
             for argument in arguments(value)[1].values():
                 references.extend(self.resolve(where, argument, depth))
         return references
+
+
+def _order(definition: Definition) -> int:
+    return definition.order
 
 
 def _without_blanks(text: str) -> Tuple[str, List[Tuple[int, int]]]:

@@ -72,7 +72,7 @@ class Views:
             definitions = function.flow.reaching(node)
             if not definitions:
                 return f"{node.value} is not made in this function"
-            for definition in sorted(definitions, key=lambda d: d.kind):
+            for definition in sorted(definitions, key=lambda d: d.order):
                 problem = self._definition(function, definition, images, seen)
                 if problem is not None:
                     return problem

@@ -63,6 +63,7 @@ _SCORING = word_set(
     """
 )
 _NOT_TRAINING = {"render", "eval", "evaluate", "test", "validate", "validation", "inference"}
+_EVALUATING = {"eval", "evaluate", "evaluation", "metrics", "test", "benchmark", "benchmarks"}
 _POSE = {"tracking", "track", "tracker", "localize", "localization", "relocalize", "relocalization"}
 _WHY = {
     "depth": "depth", "normal": "normals", "feature": "features", "flow": "flow", "mask": "mask", "warp": "synthetic",
@@ -259,7 +260,7 @@ class _Finder:
                 return self._problem(module.path, line, text, form, swapped, why)
             form = form._replace(node=shared[0], reduction="again")
         prediction, target = (second, first) if swapped else (first, second)
-        last = is_channels_last(self.program, function, prediction, target)
+        last = is_channels_last(self.training, function, prediction, target)
         view = self.views.of(function, target, form.call)
         return Site(module.path, *where, end, form, swapped, index, last, view, function.name)
 
@@ -344,6 +345,9 @@ class _Finder:
         if (spoken | set(words(owner.name if owner is not None else ""))) & _POSE:
             return "tracking"
         if len(words(function.name)) > 1 and words(function.name)[0] in _NOT_TRAINING:
+            return "evaluation"
+        folders, _, file = module.path.rpartition("/")
+        if (words(file)[:1] and words(file)[0] in _EVALUATING) or set(folders.split("/")) & _EVALUATING:
             return "evaluation"
         if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
             return "evaluation"

@@ -26,7 +26,7 @@ _WORDS = {
         warp warped warping reproj reprojected reprojection pseudo virtual unseen sds diffusion inpaint inpainted edit
         edited
     """,
-    "gradient": "grad gradient gradients edge edges laplacian sobel curv curvature hessian canny",
+    "gradient": "grad gradient gradients edge edges laplacian sobel curv curvature hessian canny dx dy",
     "mask": """
         mask masks alpha alphas opacity opacities silhouette sil acc accumulation seg segmentation visibility
         transmittance occupancy sky

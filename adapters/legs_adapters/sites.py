@@ -161,7 +161,7 @@ class _Finder:
         self._hand_over()
         for module in modules:
             if (
-                any(self._forms[function] for function in module.everything())
+                any(self._forms[function] or function in self._references for function in module.everything())
                 or "legs_loss" in module.text
                 or registered.MENTIONED.search(module.text)
             ):
@@ -390,7 +390,8 @@ class _Finder:
                             if [r.target for r in references] != [function] or references[0].guess:
                                 continue
                             self._handed.add(function)
-                            self._references.setdefault(holder, []).append((value, shape, unknown))
+                            near = [(c, call) for c, call in unknown if c.module is module] or unknown
+                            self._references.setdefault(holder, []).append((value, shape, near))
 
     def _referenced(self, module: Module, holder: Function, lines: List[str], positions: object) -> List[Site | Left]:
         found: List[Site | Left] = []

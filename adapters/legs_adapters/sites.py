@@ -63,7 +63,7 @@ _SCORING = word_set(
     """
 )
 _NOT_TRAINING = {"render", "eval", "evaluate", "test", "validate", "validation", "inference"}
-_EVALUATING = {"eval", "evaluate", "evaluation", "metrics", "test", "benchmark", "benchmarks"}
+_EVALUATING = {"eval", "evaluate", "evaluation", "evaluator", "test"}
 _POSE = {"tracking", "track", "tracker", "localize", "localization", "relocalize", "relocalization"}
 _WHY = {
     "depth": "depth", "normal": "normals", "feature": "features", "flow": "flow", "mask": "mask", "warp": "synthetic",

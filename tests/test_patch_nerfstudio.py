@@ -116,6 +116,8 @@ def nerfstudio(tmp_path, monkeypatch):
     for name in list(sys.modules):
         if name.split(".")[0] == "nerfstudio" or name == "legs_adapters.upstreams.nerfstudio":
             del sys.modules[name]
+    # `from legs_adapters.upstreams import nerfstudio` asks the package before it asks sys.modules.
+    vars(importlib.import_module("legs_adapters.upstreams")).pop("nerfstudio", None)
 
 
 def models():

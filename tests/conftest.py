@@ -7,6 +7,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
+
+# The same examples in every run; how long a busy machine takes to draw one says nothing about the code.
+settings.register_profile(
+    "repeatable",
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
+)
+settings.load_profile("repeatable")
 
 FOX = Path(os.environ.get("LEGS_TEST_SCENE", Path(__file__).resolve().parents[2] / "shared" / "scenes" / "fox"))
 

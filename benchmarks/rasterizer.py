@@ -57,8 +57,8 @@ def ours(backend, camera, degree):
 
 def project(leaves, camera):
     """Splats, and the bounds of their tiles; the camera stands in the origin."""
-    from legs_loss.reference import oracle
     from legs_loss.reference.conventions import View
+    from legs_loss.reference.rasterizer import oracle
 
     view = View.of(camera)
     splats = oracle.project(*(leaf.detach() for leaf in leaves[:3]), view)

@@ -18,8 +18,8 @@ import torch
 from legs_loss import LegsError
 from legs_loss.cli.demo import METHODS, conclusion, table
 from legs_loss.reference.ply import read_ply
-from legs_loss.reference.side_by_side import Arm, train_side_by_side
-from legs_loss.reference.trainer import Progress, TrainConfig, train
+from legs_loss.reference.training.side_by_side import Arm, train_side_by_side
+from legs_loss.reference.training.trainer import Progress, TrainConfig, train
 from legs_loss.report.comparison import Compared, save_pictures
 from legs_loss.scenes import read_scene
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from legs_loss.reference.embedded import write_embedded_scene
-from legs_loss.reference.raycast import Lamp, Quad, Sphere, Tube, bake_light, render
-from legs_loss.reference.textures import text_mask
+from legs_loss.reference.embedded.raycast import Lamp, Quad, Sphere, Tube, bake_light, render
+from legs_loss.reference.embedded.textures import text_mask
 from legs_loss.scenes import load_training_image, read_scene
 
 WHITE = np.ones((1, 1, 3), np.float32)

@@ -11,7 +11,7 @@ import torch
 
 from legs_loss.reference import rasterize
 from legs_loss.reference.conventions import SH_C0, SH_C1
-from legs_loss.reference.oracle import colours
+from legs_loss.reference.rasterizer.oracle import colours
 
 BACKGROUND = (0.1, 0.2, 0.3)
 

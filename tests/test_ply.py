@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from legs_loss.errors import LegsError
-from legs_loss.reference.adam import FIELDS
 from legs_loss.reference.gaussians import Gaussians
 from legs_loss.reference.ply import read_ply, write_ply
+from legs_loss.reference.training.adam import FIELDS
 
 
 def some(count: int, degree: int) -> Gaussians:

@@ -371,7 +371,7 @@ class TestErrors:
 def test_without_a_place_for_the_cache(monkeypatch):
     import numba
 
-    from legs_loss.reference.compiling import compiled
+    from legs_loss.kernels.compiling import compiled
 
     njit = numba.njit
 
@@ -385,7 +385,7 @@ def test_without_a_place_for_the_cache(monkeypatch):
 
 
 def test_exp2():
-    from legs_loss.reference.strips import exp2
+    from legs_loss.reference.rasterizer.strips import exp2
 
     exponents = np.linspace(-30, 0, 3001, dtype=np.float32)
     got = np.array([exp2(exponent) for exponent in exponents], dtype=np.float64)

@@ -21,15 +21,15 @@ from legs_loss import PRESETS, LegsError, WeightSpec, legs_loss, ssim, weight_ma
 from legs_loss.cli import main
 from legs_loss.cli import train as trainer_command
 from legs_loss.precompute import precompute
-from legs_loss.reference import trainer
-from legs_loss.reference.adam import COLOUR_RATE, FIELDS, RATES, Adam, position_rate
-from legs_loss.reference.checkpoint import read_checkpoint, write_checkpoint
-from legs_loss.reference.dataset import extent, load_dataset, load_view, split_views
-from legs_loss.reference.densify import Schedule, densify, prunable
 from legs_loss.reference.gaussians import Gaussians
-from legs_loss.reference.metrics import psnr, score, strongest
 from legs_loss.reference.ply import read_ply
-from legs_loss.reference.trainer import CHECKPOINT, TrainConfig, default_threshold, train
+from legs_loss.reference.training import trainer
+from legs_loss.reference.training.adam import COLOUR_RATE, FIELDS, RATES, Adam, position_rate
+from legs_loss.reference.training.checkpoint import read_checkpoint, write_checkpoint
+from legs_loss.reference.training.dataset import extent, load_dataset, load_view, split_views
+from legs_loss.reference.training.densify import Schedule, densify, prunable
+from legs_loss.reference.training.metrics import psnr, score, strongest
+from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, default_threshold, train
 from legs_loss.scenes import Scene, read_scene
 
 pytest.importorskip("numba")

@@ -48,8 +48,8 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.errors import LegsError
     from legs_loss.precompute import precompute
     from legs_loss.reference.embedded import write_embedded_scene
-    from legs_loss.reference.side_by_side import Arm, train_side_by_side
-    from legs_loss.reference.trainer import TrainConfig
+    from legs_loss.reference.training.side_by_side import Arm, train_side_by_side
+    from legs_loss.reference.training.trainer import TrainConfig
     from legs_loss.report.comparison import check_matplotlib
     from legs_loss.scenes import read_scene
     from legs_loss.spec import PRESETS
@@ -134,9 +134,9 @@ def conclusion(metrics: Dict[str, Dict[str, Any]]) -> str:
 
 
 def _save_pictures(scene: Any, arms: List[Any], metrics: Dict[str, Dict[str, Any]], folder: Path) -> Any:
-    from legs_loss.reference.dataset import load_view, split_views
     from legs_loss.reference.ply import read_ply
-    from legs_loss.reference.trainer import draw, point_cloud
+    from legs_loss.reference.training.dataset import load_view, split_views
+    from legs_loss.reference.training.trainer import draw, point_cloud
     from legs_loss.report.comparison import Compared, save_pictures
     from legs_loss.weights import weight_map
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
 
 if TYPE_CHECKING:
-    from legs_loss.reference.trainer import Progress, TrainConfig
+    from legs_loss.reference.training.trainer import Progress, TrainConfig
 
 HELP = "train 3D Gaussians on a scene, on the CPU"
 
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Train, or go on training, and print the scores."""
     from legs_loss.errors import LegsError
-    from legs_loss.reference.trainer import CHECKPOINT, TrainConfig, point_cloud, train
+    from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, point_cloud, train
     from legs_loss.scenes import read_scene
 
     set_threads(args.threads)
@@ -140,8 +140,8 @@ def progress_bar(iterations: int, name: str, position: int = 0) -> Iterator[Call
 def _resumed(checkpoint: Path, given: Dict[str, Any]) -> TrainConfig:
     """The settings of the run in the output folder; the flags that were given must be the same."""
     from legs_loss.errors import LegsError
-    from legs_loss.reference.checkpoint import read_checkpoint
-    from legs_loss.reference.trainer import TrainConfig
+    from legs_loss.reference.training.checkpoint import read_checkpoint
+    from legs_loss.reference.training.trainer import TrainConfig
 
     stored = read_checkpoint(checkpoint)[1]["config"]
     wanted = TrainConfig.from_dict(dict(stored, **given))

@@ -4,6 +4,6 @@ from legs_loss.reference import Gaussians, rasterize
 """
 
 from legs_loss.reference.gaussians import Gaussians
-from legs_loss.reference.rasterize import Rendering, rasterize
+from legs_loss.reference.rasterizer import Rendering, rasterize
 
 __all__ = ["Gaussians", "Rendering", "rasterize"]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.reference.metrics import strongest
+from legs_loss.reference.training.metrics import strongest
 from legs_loss.response import normalise_response, response
 
 __all__ = ["Compared", "check_matplotlib", "save_pictures"]

@@ -58,7 +58,7 @@ class Adam:
 
     def step(self, position_rate: float) -> None:
         """Update every parameter from its gradient, and drop the gradients."""
-        from legs_loss.reference.adam_kernel import BETA1, BETA2, update
+        from legs_loss.reference.training.adam_kernel import BETA1, BETA2, update
 
         self.steps += 1
         correction1, correction2 = 1 - BETA1**self.steps, 1 - BETA2**self.steps

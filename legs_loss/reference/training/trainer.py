@@ -1,6 +1,6 @@
 """A small 3D Gaussian Splatting trainer on the CPU, with 3DGS's optimiser and density control.
 
-    from legs_loss.reference.trainer import TrainConfig, train
+    from legs_loss.reference.training import TrainConfig, train
     result = train(read_scene("my_scene"), TrainConfig(spec="legs"), out="output/my_scene")
 
 The same seed gives the same Gaussians to the last bit, whether or not the run was interrupted and resumed.
@@ -23,14 +23,14 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.reference.adam import Adam, position_rate
-from legs_loss.reference.checkpoint import read_checkpoint, write_checkpoint
-from legs_loss.reference.dataset import Dataset, TrainingView, extent, load_dataset
-from legs_loss.reference.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.reference.gaussians import Gaussians
-from legs_loss.reference.metrics import Scores, mean_scores, psnr, score
 from legs_loss.reference.ply import write_ply
-from legs_loss.reference.rasterize import Rendering, rasterize
+from legs_loss.reference.rasterizer import Rendering, rasterize
+from legs_loss.reference.training.adam import Adam, position_rate
+from legs_loss.reference.training.checkpoint import read_checkpoint, write_checkpoint
+from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, load_dataset
+from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
+from legs_loss.reference.training.metrics import Scores, mean_scores, psnr, score
 from legs_loss.scenes import Scene
 from legs_loss.spec import Spec, WeightSpec, as_spec
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence
 
 from legs_loss.errors import LegsError
-from legs_loss.reference.trainer import Progress, TrainConfig, train
+from legs_loss.reference.training.trainer import Progress, TrainConfig, train
 from legs_loss.scenes import read_scene
 
 __all__ = ["Arm", "train_side_by_side"]

@@ -25,9 +25,9 @@ from llvmlite import ir
 from numba import prange, types
 from numba.extending import intrinsic
 
-from legs_loss.reference.compiling import FAST, compiled
+from legs_loss.kernels.compiling import FAST, compiled
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from legs_loss.reference.projection import BLOCK, FAINTEST, TALL, WIDE, origin
+from legs_loss.reference.rasterizer.projection import BLOCK, FAINTEST, TALL, WIDE, origin
 
 PIXELS = WIDE * TALL
 CHECK = 16  # splats between two looks at whether a strip is finished

@@ -76,7 +76,7 @@ def rasterize(
         raise LegsError(f"background has shape {tuple(background.shape)}; pass 3 numbers, red, green and blue")
     _check_values(tensors, background)
     if backend == "torch":
-        from legs_loss.reference.oracle import render
+        from legs_loss.reference.rasterizer.oracle import render
     elif backend == "numba":
         render = _numba_renderer(means)
     else:
@@ -94,7 +94,7 @@ def _numba_renderer(means: Tensor) -> Any:
         raise LegsError(
             "the numba rasterizer needs numba: pip install legs-loss[cpu], or use backend='torch'"
         ) from error
-    from legs_loss.reference.compiled import render
+    from legs_loss.reference.rasterizer.compiled import render
 
     return render
 

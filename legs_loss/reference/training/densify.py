@@ -7,8 +7,8 @@ from typing import NamedTuple, Optional
 import torch
 from torch import Tensor
 
-from legs_loss.reference.adam import select, stack
 from legs_loss.reference.gaussians import Gaussians
+from legs_loss.reference.training.adam import select, stack
 
 __all__ = ["Change", "Schedule", "densify", "prunable"]
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from legs_loss.reference.compiling import compiled
+from legs_loss.kernels.compiling import compiled
 
 __all__ = ["update"]
 

@@ -12,11 +12,10 @@ from typing import List, Tuple, Union
 
 import numpy as np
 
+from legs_loss.reference.embedded import textures
+from legs_loss.reference.embedded.raycast import Lamp, Quad, Sphere, Tube, bake_light, render
 from legs_loss.scenes.colmap import write_colmap
 from legs_loss.scenes.model import Camera, PointCloud
-
-from . import textures
-from .raycast import Lamp, Quad, Sphere, Tube, bake_light, render
 
 LAMP = Lamp(np.array([-0.5, -0.6, 2.95]), 0.55)
 TARGET = np.array([0.0, 0.25, 0.98])

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import prange
 
-from legs_loss.reference.compiling import compiled
+from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import (
     DILATION,
     FARTHEST,

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from legs_loss.reference import projection, strips
 from legs_loss.reference.conventions import View
+from legs_loss.reference.rasterizer import projection, strips
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`compiled`: numba's njit with the settings that the rasterizer shares."""
+"""`compiled`: numba's njit with the settings that the reference shares."""
 
 from __future__ import annotations
 

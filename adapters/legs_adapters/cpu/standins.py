@@ -1,0 +1,103 @@
+"""Which module stands in for which: the table, and the import hook that puts them in.
+
+A file of this package that is named in the table has ``module(name)``, which returns the stand-in for that import
+name, complete with its submodules as attributes.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import sys
+import types
+from typing import Any, Dict, NamedTuple, Optional, Sequence
+
+__all__ = ["TABLE", "Finder", "StandIn", "build", "install"]
+
+
+class StandIn(NamedTuple):
+    """Which file builds a module, and whether a real one that is installed goes before it."""
+
+    file: str
+    real_first: bool = False
+
+
+TABLE: Dict[str, StandIn] = {
+    "diff_gaussian_rasterization": StandIn("inria"),
+    "diff_gaussian_rasterization_fastgs": StandIn("fastgs"),
+    "diff_surfel_rasterization": StandIn("surfels"),
+    "FasterGSCudaBackend._C": StandIn("fastergs"),
+    "MortonEncoding._C": StandIn("fastergs"),
+    "simple_knn": StandIn("simple_knn"),
+    "fused_ssim": StandIn("fused_ssim"),
+    "torchvision": StandIn("torchvision", real_first=True),
+    "lpipsPyTorch": StandIn("lpips"),
+    "lpips": StandIn("lpips"),
+}
+
+
+def build(name: str, file: str) -> types.ModuleType:
+    """Return the stand-in for ``name``, made by ``file`` of this package."""
+    return importlib.import_module(f"{__package__}.{file}").module(name)
+
+
+class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Finds the stand-ins of a table, and the submodules that hang on them, before Python looks for the real ones."""
+
+    def __init__(self, table: Dict[str, StandIn]) -> None:
+        self.table = table
+        self._asking = False
+
+    def find_spec(
+        self, fullname: str, path: Optional[Sequence[str]] = None, target: Optional[types.ModuleType] = None
+    ) -> Optional[importlib.machinery.ModuleSpec]:
+        """Return the stand-in's spec, or None where the name is not in the table."""
+        if self._asking:
+            return None
+        if fullname in self.table:
+            if self.table[fullname].real_first and self._is_installed(fullname):
+                return None
+            module = build(fullname, self.table[fullname].file)
+        else:
+            parent, _, child = fullname.rpartition(".")
+            found = getattr(sys.modules.get(parent), "__dict__", {}).get(child)
+            if not self._made(parent) or not isinstance(found, types.ModuleType):
+                return None
+            module = found
+        spec = importlib.machinery.ModuleSpec(fullname, self, is_package=True)
+        spec.loader_state = module
+        return spec
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> Any:
+        """Return the module that was built."""
+        return spec.loader_state
+
+    def exec_module(self, module: types.ModuleType) -> None:
+        """Nothing: it is complete."""
+
+    def without(self, name: str) -> None:
+        """Stop standing in for ``name``, whose real module may be imported next."""
+        self.table.pop(name, None)
+        for loaded in [key for key in sys.modules if key == name or key.startswith(name + ".")]:
+            del sys.modules[loaded]
+
+    def _made(self, name: str) -> bool:
+        return getattr(getattr(sys.modules.get(name), "__spec__", None), "loader", None) is self
+
+    def _is_installed(self, name: str) -> bool:
+        self._asking = True
+        try:
+            return importlib.util.find_spec(name) is not None
+        except (ImportError, ValueError):
+            return False
+        finally:
+            self._asking = False
+
+
+def install(table: Optional[Dict[str, StandIn]] = None) -> Finder:
+    """Put the import hook in front of Python's own, and return it."""
+    finder = Finder(dict(TABLE if table is None else table))
+    sys.meta_path.insert(0, finder)
+    return finder

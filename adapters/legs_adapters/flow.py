@@ -68,7 +68,6 @@ class Flow:
         definitions: every definition by place, in source order: what a nested function sees.
         calls: every call in the body, in source order, nested functions excepted.
         returns: the expressions that it returns or yields.
-        functions, classes: what is defined in it, directly or inside of its branches.
         without_grad: ids of nodes under ``torch.no_grad()`` and its like.
         reads: every name that is read, in source order.
         conditions: by a call's id, the names that must be true where it runs: ``if tracking:``.
@@ -79,8 +78,6 @@ class Flow:
         self.calls: List[cst.Call] = []
         self.expressions: List[cst.CSTNode] = []
         self.returns: List[cst.BaseExpression] = []
-        self.functions: List[cst.FunctionDef] = []
-        self.classes: List[cst.ClassDef] = []
         self.imports: List[cst.CSTNode] = []
         self.without_grad: Set[int] = set()
         self._reaching: Dict[int, Set[Definition]] = {}
@@ -239,17 +236,11 @@ class Flow:
         if isinstance(node, cst.FunctionDef):
             for decorator in node.decorators:
                 self._visit(decorator.decorator, env)
-            if id(node) not in self._seen:
-                self._seen.add(id(node))
-                self.functions.append(node)
-                if self._no_grad:
-                    self.without_grad.add(id(node))
+            if self._no_grad:
+                self.without_grad.add(id(node))
             self._bind(env, self._define(node.name.value, "function", node))
             return env
         if isinstance(node, cst.ClassDef):
-            if id(node) not in self._seen:
-                self._seen.add(id(node))
-                self.classes.append(node)
             self._bind(env, self._define(node.name.value, "class", node))
             return env
         if type(node).__name__ == "Match":

@@ -7,7 +7,8 @@ from typing import Dict, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.program import Function, Program, Reference
+from legs_adapters.module import Function
+from legs_adapters.program import Program, Reference
 from legs_adapters.syntax import arguments, call_name, code, constant, dotted, walk_expressions
 
 __all__ = ["Form", "forms", "is_l1_name", "own_shape"]

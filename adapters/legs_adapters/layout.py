@@ -6,7 +6,7 @@ from typing import List, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.program import Function
+from legs_adapters.module import Function
 from legs_adapters.syntax import arguments, call_name, constant
 from legs_adapters.training import Training
 

@@ -12,7 +12,8 @@ from typing import Dict, Iterable, NamedTuple, Optional, Set
 import libcst as cst
 
 from legs_adapters.flow import Definition
-from legs_adapters.program import Function, Program
+from legs_adapters.module import Function
+from legs_adapters.program import Program
 from legs_adapters.syntax import arguments, call_name, constant, key_of, same, words
 from legs_adapters.training import Training
 from legs_adapters.vocabulary import DATA, KINDS, kind_of_words, role_of_words

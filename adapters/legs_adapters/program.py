@@ -12,16 +12,14 @@ from typing import Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.flow import Definition, Flow
+from legs_adapters.flow import Definition
+from legs_adapters.module import Class, Function, Module, parse
 from legs_adapters.repo import Source, Unreadable
 from legs_adapters.syntax import arguments, call_name, dotted, path_of, word_set
 
-__all__ = ["Class", "Function", "Module", "Program", "Reference", "mention"]
+__all__ = ["Program", "Reference", "mention"]
 
 _DEFINED = re.compile(r"^[ \t]*(?:async[ \t]+)?(?:def|class)[ \t]+(\w+)", re.M)
-_PRINT_STATEMENT = re.compile(
-    r"^\s*(print\s+[\"'\w]|exec\s+[\"']|raise\s+\w+\s*,)|^\s*except\s+[\w.]+\s*,\s*\w+\s*:", re.M
-)
 _COMMON = word_set(
     """
     __init__ get items keys values copy to cuda cpu clone detach load save append update mean sum size step
@@ -30,161 +28,11 @@ _COMMON = word_set(
     """
 )
 _DEPTH = 12
-_NOT_EXACT = "cannot be written back exactly"
-_BLANK = re.compile(r"^[ \t\f]+(?=[\r\n]|\Z)", re.M)
-
-
-class Function:
-    """A function, a method, or a module's top level.
-
-    Attributes:
-        module, node, name: where it stands.
-        parent: the function around it; a module's top level for what is defined there; None for the top level itself.
-        owner: its class, for a method.
-    """
-
-    def __init__(
-        self,
-        module: Module,
-        node: cst.FunctionDef | cst.Module,
-        parent: Optional[Function] = None,
-        owner: Optional[Class] = None,
-    ) -> None:
-        self.module = module
-        self.node = node
-        self.parent = parent
-        self.owner = owner
-        self.name = node.name.value if isinstance(node, cst.FunctionDef) else ""
-        self._flow: Optional[Flow] = None
-
-    def __repr__(self) -> str:
-        return f"<{self.module.path}:{self.name or 'top level'}>"
-
-    @property
-    def flow(self) -> Flow:
-        """Its reaching definitions, computed once."""
-        if self._flow is None:
-            if isinstance(self.node, cst.FunctionDef):
-                self._flow = Flow(self.node.body, self.node.params)
-            else:
-                self._flow = Flow(self.node)
-        return self._flow
-
-    @property
-    def parameters(self) -> List[str]:
-        """Positional parameters' names, ``self`` and ``cls`` excepted."""
-        if not isinstance(self.node, cst.FunctionDef):
-            return []
-        names = [param.name.value for param in (*self.node.params.posonly_params, *self.node.params.params)]
-        return names[1:] if self.owner is not None and not self.static and names else names
-
-    @property
-    def static(self) -> bool:
-        """Whether it is a static method."""
-        return "staticmethod" in self.decorators
-
-    @property
-    def decorators(self) -> List[str]:
-        """The last names of its decorators."""
-        if not isinstance(self.node, cst.FunctionDef):
-            return []
-        names = []
-        for decorator in self.node.decorators:
-            node = decorator.decorator
-            names.append((dotted(node.func if isinstance(node, cst.Call) else node) or "").split(".")[-1])
-        return names
 
 
 def mention(name: str, called: bool = False) -> re.Pattern[str]:
     """Return a pattern for texts that mention a name, or call it."""
     return re.compile(r"\b" + re.escape(name) + (r"\s*\(" if called else r"\b"))
-
-
-class Class:
-    """A class: its methods, and what is stored in its attributes by any of them."""
-
-    def __init__(self, module: Module, node: cst.ClassDef, parent: Function) -> None:
-        self.module = module
-        self.node = node
-        self.parent = parent
-        self.name = node.name.value
-        self.methods: Dict[str, Function] = {}
-        self.fields: Dict[str, cst.BaseExpression] = {}
-        self._stores: Optional[Dict[str, List[Tuple[Function, Definition]]]] = None
-
-    @property
-    def bases(self) -> List[str]:
-        """The last names of its base classes."""
-        return [(dotted(arg.value) or "").split(".")[-1] for arg in self.node.bases]
-
-    def stores(self, attribute: str) -> List[Tuple[Function, Definition]]:
-        """Return what its methods assign to ``self.attribute``."""
-        if self._stores is None:
-            self._stores = {}
-            for method in self.methods.values():
-                for place, definitions in method.flow.definitions.items():
-                    if place.startswith("self.") and place.count(".") == 1 and "[" not in place:
-                        entries = self._stores.setdefault(place[5:], [])
-                        # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
-                        entries.extend((method, d) for d in definitions if not str(d.key).startswith("."))
-        return self._stores.get(attribute, [])
-
-
-class Module:
-    """A parsed file.
-
-    Attributes:
-        text: what was parsed; ``removed`` says what it lacks of the file: (byte in text, bytes missing up to there).
-        functions: every function in it, methods and nested functions too, in source order; ``top`` is its top level.
-        classes: every class in it.
-    """
-
-    def __init__(self, path: str, tree: cst.Module, text: str) -> None:
-        self.path = path
-        self.tree = tree
-        self.text = text
-        self.removed: List[Tuple[int, int]] = []
-        self.top = Function(self, tree)
-        self.functions: List[Function] = []
-        self.classes: List[Class] = []
-        self.by_node: Dict[int, Function | Class] = {}
-        self._collect(self.top)
-        self._names: Optional[Set[str]] = None
-
-    def _collect(self, function: Function) -> None:
-        for node in function.flow.functions:
-            self._add(Function(self, node, function))
-        for class_node in function.flow.classes:
-            self._add_class(class_node, function)
-
-    def _add(self, function: Function) -> None:
-        self.functions.append(function)
-        self.by_node[id(function.node)] = function
-        self._collect(function)
-
-    def _add_class(self, node: cst.ClassDef, parent: Function) -> None:
-        owner = Class(self, node, parent)
-        self.classes.append(owner)
-        self.by_node[id(node)] = owner
-        for statement in node.body.body:
-            if isinstance(statement, cst.FunctionDef):
-                method = Function(self, statement, parent, owner)
-                owner.methods.setdefault(method.name, method)
-                self._add(method)
-            elif isinstance(statement, cst.ClassDef):
-                self._add_class(statement, parent)
-            elif isinstance(statement, cst.SimpleStatementLine):
-                for small in statement.body:
-                    if isinstance(small, cst.Assign):
-                        for target in small.targets:
-                            if isinstance(target.target, cst.Name):
-                                owner.fields[target.target.value] = small.value
-                    elif isinstance(small, cst.AnnAssign) and isinstance(small.target, cst.Name) and small.value:
-                        owner.fields[small.target.value] = small.value
-
-    def everything(self) -> List[Function]:
-        """Every function and the top level."""
-        return [self.top, *self.functions]
 
 
 class Reference(NamedTuple):
@@ -221,40 +69,11 @@ class Program:
     def module(self, path: str) -> Optional[Module]:
         """Return a parsed file; None where it does not parse (it is then among ``unreadable``)."""
         if path not in self._modules:
-            self._modules[path] = self._parse(self.sources[path])
+            parsed = parse(self.sources[path])
+            if isinstance(parsed, Unreadable):
+                self.unreadable[path] = parsed
+            self._modules[path] = parsed if isinstance(parsed, Module) else None
         return self._modules[path]
-
-    def _parse(self, source: Source) -> Optional[Module]:
-        module = self._parse_text(source, source.text)
-        if module is None and self.unreadable[source.path].reason == _NOT_EXACT:
-            # LibCST loses some blank lines that have spaces in them, and form feeds.
-            text, removed = _without_blanks(source.text)
-            module = self._parse_text(source, text)
-            if module is not None:
-                module.removed = removed
-                del self.unreadable[source.path]
-        return module
-
-    def _parse_text(self, source: Source, text: str) -> Optional[Module]:
-        try:
-            tree = cst.parse_module(text)
-        except cst.ParserSyntaxError as error:
-            line = getattr(error, "raw_line", 0)
-            python2 = _PRINT_STATEMENT.search(source.text) is not None
-            reason = "Python 2" if python2 else f"does not parse (line {line})"
-            self.unreadable[source.path] = Unreadable(source.path, reason)
-            return None
-        except (RecursionError, ValueError) as error:
-            self.unreadable[source.path] = Unreadable(source.path, f"cannot be parsed: {type(error).__name__}")
-            return None
-        if tree.code != text:
-            self.unreadable[source.path] = Unreadable(source.path, _NOT_EXACT)
-            return None
-        try:
-            return Module(source.path, tree, text)
-        except RecursionError:
-            self.unreadable[source.path] = Unreadable(source.path, "is nested too deeply")
-            return None
 
     def matching(self, pattern: re.Pattern[str]) -> List[Module]:
         """Return the modules whose text matches."""
@@ -556,20 +375,6 @@ class Program:
 
 def _order(definition: Definition) -> int:
     return definition.order
-
-
-def _without_blanks(text: str) -> Tuple[str, List[Tuple[int, int]]]:
-    """Return text with its blank lines empty, and where bytes are missing now."""
-    removed: List[Tuple[int, int]] = []
-    parts, at, length, missing = [], 0, 0, 0
-    for match in _BLANK.finditer(text):
-        kept = text[at : match.start()]
-        parts.append(kept)
-        length += len(kept.encode("utf-8"))
-        missing += match.end() - match.start()
-        removed.append((length, missing))
-        at = match.end()
-    return "".join([*parts, text[at:]]), removed
 
 
 def _from(node: cst.ImportFrom) -> str:

@@ -13,7 +13,8 @@ from typing import List, NamedTuple, Optional, Set, Tuple
 import libcst as cst
 
 from legs_adapters.flow import Definition
-from legs_adapters.program import Class, Function, Program
+from legs_adapters.module import Class, Function
+from legs_adapters.program import Program
 from legs_adapters.syntax import arguments, call_name, code, constant, dotted, words
 
 __all__ = ["View", "Views"]

@@ -9,12 +9,11 @@ An edit never changes the number of lines of the expression it replaces: comment
 from __future__ import annotations
 
 import re
-from typing import Any, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
-from libcst.metadata import ByteSpanPositionProvider, MetadataWrapper, PositionProvider
 
-from legs_adapters.program import Module
+from legs_adapters.module import Module
 from legs_adapters.repo import Source, decode
 from legs_adapters.sites import Site
 from legs_adapters.syntax import code, dotted
@@ -77,31 +76,20 @@ class _Text:
     def __init__(self, source: Source, module: Module) -> None:
         self.source = source
         self.module = module
-        self.bytes = module.text.encode("utf-8")
+        self.bytes = module.places.bytes
         self.shift = len(source.bom)
-        wrapper = MetadataWrapper(module.tree, unsafe_skip_copy=True)
-        resolved = wrapper.resolve_many([ByteSpanPositionProvider, PositionProvider])
-        self.spans: Mapping[cst.CSTNode, Any] = resolved[ByteSpanPositionProvider]
-        self.positions: Mapping[cst.CSTNode, Any] = resolved[PositionProvider]
 
     def span(self, node: cst.CSTNode, brackets: bool = False) -> Tuple[int, int]:
         """Where a node begins and ends, on request with the brackets around it."""
-        found = self.spans[node]
-        start, end = found.start, found.start + found.length
-        if brackets and isinstance(node, cst.BaseExpression):
-            start -= sum(len(code(part).encode()) for part in node.lpar)
-            end += sum(len(code(part).encode()) for part in node.rpar)
-        return start, end
+        place = self.module.places.of(node, brackets)
+        return place.start, place.end
 
     def text(self, start: int, end: int) -> str:
         return self.bytes[start:end].decode("utf-8")
 
     def edit(self, start: int, end: int, after: str) -> Edit:
-        start, end = self._in_file(start), self._in_file(end)
+        start, end = start + self.shift, end + self.shift
         return Edit(start, end, self.source.data[start:end], after.encode("utf-8"))
-
-    def _in_file(self, at: int) -> int:
-        return at + self.shift + max([missing for place, missing in self.module.removed if place <= at], default=0)
 
     # -- one site
 
@@ -256,7 +244,7 @@ class _Text:
                 return self.edit(at, at, f"{line}; ")
             at = self.span(last)[1]
             return self.edit(at, at, f"; {line}")
-        at, newline = self._next_line(self.positions[anchor].end.line)
+        at, newline = self._next_line(self.module.places.of(anchor).last_line)
         if newline:
             return self.edit(at, at, line + newline)
         return self.edit(at, at, self._newline() + line)  # the last line of a file that does not end in one
@@ -293,27 +281,19 @@ class _Text:
         body = self.module.tree.body
         if not body:
             return len(self.bytes)
-        return self._line_start(self._first_line(body[0]))
-
-    def _first_line(self, statement: cst.CSTNode) -> int:
-        line = self.positions[statement].start.line
-        decorators = getattr(statement, "decorators", ())
-        return min([line, *(self.positions[decorator].start.line for decorator in decorators)])
+        places = self.module.places
+        decorators = getattr(body[0], "decorators", ())
+        return places.line_start(min(places.of(node).line for node in (body[0], *decorators)))
 
     def _newline(self) -> str:
         return self.module.tree.default_newline
 
-    def _line_start(self, line: int) -> int:
-        at = 0
-        for _ in range(line - 1):
-            match = re.compile(rb"\r\n|\r|\n").search(self.bytes, at)
-            assert match is not None
-            at = match.end()
-        return at
-
     def _next_line(self, line: int) -> Tuple[int, str]:
-        match = re.compile(rb"\r\n|\r|\n").search(self.bytes, self._line_start(line))
-        return (len(self.bytes), "") if match is None else (match.end(), match.group().decode())
+        """Return where the line after this one begins, and what ends this one; nothing where it is the last."""
+        at = self.module.places.line_start(line + 1)
+        ending = re.search(rb"(\r\n|\r|\n)?\Z", self.bytes[:at])
+        assert ending is not None
+        return at, ending.group().decode()
 
 
 def _package_name(module: Module) -> Tuple[str, bool]:

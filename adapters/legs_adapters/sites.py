@@ -10,12 +10,12 @@ import re
 from typing import Dict, Iterable, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import libcst as cst
-from libcst.metadata import MetadataWrapper, PositionProvider
 
 from legs_adapters.l1 import Form, forms, own_shape
 from legs_adapters.layout import is_channels_last
 from legs_adapters.meaning import Meaning, Meanings
-from legs_adapters.program import Function, Module, Program, mention
+from legs_adapters.module import Function, Module
+from legs_adapters.program import Program, mention
 from legs_adapters.provenance import View, Views
 from legs_adapters.repo import Source, Unreadable
 from legs_adapters.syntax import (
@@ -170,39 +170,43 @@ class _Finder:
         return self.found
 
     def _module(self, module: Module) -> None:
-        positions = MetadataWrapper(module.tree, unsafe_skip_copy=True).resolve(PositionProvider)
-        lines = module.text.splitlines()
+        try:
+            places = module.places
+        except ValueError:
+            self.program.unreadable[module.path] = Unreadable(module.path, "cannot be written back exactly")
+            return
+        lines = places.bytes.decode("utf-8").splitlines()
         entries: List[Tuple[Tuple[int, int], object]] = []
         by_hand = bool(self.by_hand)
         chosen = {line for path, line in self.by_hand if path == module.path}
         for function in module.everything():
             for form in self._forms[function]:
-                start = positions[form.node].start
+                start = places.of(form.node)
                 where = (start.line, start.column)
-                end = positions[form.node].end.line
+                end = start.last_line
                 text = lines[start.line - 1].strip()
                 verdict = self._verdict(
                     module, function, form, where, end, text, any(start.line <= line <= end for line in chosen)
                 )
                 if isinstance(verdict, Site) and verdict.form.node is not form.node:
-                    span = positions[verdict.form.node]
-                    verdict = verdict._replace(line=span.start.line, column=span.start.column, last_line=span.end.line)
+                    span = places.of(verdict.form.node)
+                    verdict = verdict._replace(line=span.line, column=span.column, last_line=span.last_line)
                 if by_hand and not isinstance(verdict, Left):
                     assert verdict is None or isinstance(verdict, (Site, Problem))
                     if not any(start.line <= line <= end for line in chosen):
                         verdict = Left(module.path, start.line, text, "not chosen")
                 if verdict is not None and not (isinstance(verdict, Left) and _is_noise(form, verdict)):
                     entries.append((where, verdict))
-            for reference in self._referenced(module, function, lines, positions):
+            for reference in self._referenced(module, function, lines):
                 if not by_hand or reference.line in chosen:
                     entries.append(((reference.line, 0), reference))
             for node in self._patched(function) if "legs_loss" in module.text else ():
-                start = positions[node].start
+                start = places.of(node)
                 self.found.patched.append(Left(module.path, start.line, lines[start.line - 1].strip(), "patched"))
             for call in function.flow.calls:
                 callable_form = registered.form_of(self.program, function, call)
                 if callable_form is not None:
-                    start = positions[callable_form.node].start
+                    start = places.of(callable_form.node)
                     where = (start.line, start.column)
                     if not by_hand or start.line in chosen:
                         view = View(None, "a registered callable has no view")
@@ -393,13 +397,13 @@ class _Finder:
                             near = [(c, call) for c, call in unknown if c.module is module] or unknown
                             self._references.setdefault(holder, []).append((value, shape, near))
 
-    def _referenced(self, module: Module, holder: Function, lines: List[str], positions: object) -> List[Site | Left]:
+    def _referenced(self, module: Module, holder: Function, lines: List[str]) -> List[Site | Left]:
         found: List[Site | Left] = []
         for value, shape, calls in self._references.get(holder, []):
             caller, call = calls[0]
             first, second = call.args[0].value, call.args[1].value
             a, b = self.meanings.of(caller, first), self.meanings.of(caller, second)
-            start = positions[value].start  # type: ignore[index]
+            start = module.places.of(value)
             form = Form(value, call, first, second, "callable" if shape == "mean" else "registered", value)
             reason = self._why_left(caller.module, caller, form, a, b)
             if reason is None and self._swapped(a, b) is not False:

@@ -8,7 +8,8 @@ from typing import Dict, List, Optional, Set, Tuple
 import libcst as cst
 
 from legs_adapters.flow import Definition
-from legs_adapters.program import Class, Function, Program, Reference, mention
+from legs_adapters.module import Class, Function
+from legs_adapters.program import Program, Reference, mention
 from legs_adapters.syntax import arguments, call_name, children, constant, key_of
 
 __all__ = ["Training"]

@@ -12,7 +12,8 @@ from typing import Optional
 import libcst as cst
 
 from legs_adapters.l1 import Form, is_l1_name
-from legs_adapters.program import Function, Program
+from legs_adapters.module import Function
+from legs_adapters.program import Program
 from legs_adapters.syntax import arguments, call_name, constant, dotted, words
 
 __all__ = ["MENTIONED", "form_of"]

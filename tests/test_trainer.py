@@ -29,7 +29,7 @@ from legs_loss.reference.training.checkpoint import read_checkpoint, write_check
 from legs_loss.reference.training.dataset import extent, load_dataset, load_view, split_views
 from legs_loss.reference.training.densify import Schedule, densify, prunable
 from legs_loss.reference.training.metrics import psnr, score, strongest
-from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, default_threshold, train
+from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, Weigh, default_threshold, train
 from legs_loss.scenes import Scene, read_scene
 
 pytest.importorskip("numba")
@@ -338,7 +338,7 @@ def test_the_loss_is_legs_loss(scene: Scene) -> None:
     """The trainer's compiled loss, on its own rendering, against the package's own."""
     view = load_dataset(scene, PRESETS["legs"]).train[0]
     prediction = torch.rand(3, 48, 64, requires_grad=True)
-    ours = trainer._loss(prediction, view.image, view.weight, 0.2)
+    ours = trainer.step_loss(prediction, view.image, view.weight, 0.2)
     expected = legs_loss(prediction, view.image, "legs")
     assert float(ours.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
 
@@ -359,6 +359,64 @@ def test_a_cap_holds_and_a_threshold_counts(scene: Scene) -> None:
     assert free > 1100
     assert train(scene, replace(config, max_gaussians=1000)).metrics["gaussians"] <= 1000
     assert train(scene, replace(config, densify_grad_threshold=1.0)).metrics["gaussians"] <= 900
+
+
+def test_the_numbers_of_another_run_can_be_taken(scene: Scene) -> None:
+    plain, legs = replace(SHORT, spec="3dgs"), replace(SHORT, spec="legs")
+    led = train(scene, plain)
+    caps = {iteration: count for iteration, count in led.metrics["growth"]}
+    # Its own numbers, met by a threshold that lets all through: the very same Gaussians.
+    assert_equal(train(scene, replace(plain, densify_grad_threshold=1e-9), caps=caps).gaussians, led.gaussians)
+    free = train(scene, legs).metrics["gaussians"]
+    followed = train(scene, replace(legs, densify_grad_threshold=1e-9), caps=caps).metrics
+    assert free > 1.2 * led.metrics["gaussians"]
+    assert followed["gaussians"] == pytest.approx(led.metrics["gaussians"], rel=0.01)
+    assert followed["growth"] == led.metrics["growth"]
+
+
+def rising(views: List[Any], config: TrainConfig) -> Weigh:
+    """A weight that depends on all that it may depend on."""
+    return lambda index, done, rendering: 1 + done * (views[index].weight - 1) * rendering.mean()
+
+
+def test_weights_may_change_during_a_run(scene: Scene, tmp_path: Path) -> None:
+    told: List[Any] = []
+
+    def constant(views: List[Any], config: TrainConfig) -> Weigh:
+        def weigh(index: int, done: float, rendering: torch.Tensor) -> torch.Tensor:
+            told.append((index, done, rendering.requires_grad))
+            return views[index].weight
+
+        return weigh
+
+    maps = train(scene, SHORT)
+    same = train(scene, SHORT, weighting=constant)
+    assert_equal(same.gaussians, maps.gaussians)
+    assert [done for _, done, _ in told] == [(i + 1) / 60 for i in range(60)]
+    assert {index for index, _, _ in told} == set(range(10))
+    assert not any(gradient for _, _, gradient in told)
+    assert same.metrics["mean_weight"] == pytest.approx(maps.metrics["mean_weight"], rel=1e-6)
+    whole = train(scene, SHORT, weighting=rising, evaluate_every=20)
+    assert not torch.equal(whole.gaussians.means, maps.gaussians.means)
+    assert 1.0 < whole.metrics["mean_weight"] < maps.metrics["mean_weight"]
+    run_until_killed(scene, tmp_path, SHORT, 30, weighting=rising, evaluate_every=20)
+    resumed = train(scene, SHORT, out=tmp_path, resume=True, weighting=rising, evaluate_every=20)
+    assert_equal(resumed.gaussians, whole.gaussians)
+    for metrics in (whole.metrics, resumed.metrics):
+        metrics.pop("seconds")
+    assert resumed.metrics == whole.metrics
+
+
+def test_a_run_keeps_its_history_and_each_views_scores(scene: Scene) -> None:
+    metrics = train(scene, SHORT, evaluate_every=20).metrics
+    assert [point["iteration"] for point in metrics["history"]] == [20, 40, 60]
+    last = metrics["history"][-1]
+    assert last["gaussians"] == metrics["gaussians"]
+    assert last["test_psnr"] == metrics["test"]["psnr"]
+    for split in ("train", "test"):
+        scores = [values["psnr"] for values in metrics["views"][split].values()]
+        assert sum(scores) / len(scores) == metrics[split]["psnr"]
+    assert list(metrics["views"]["test"]) == [view.name for view in split_views(scene)[1]]
 
 
 def test_harmonics_wait_for_their_degree(scene: Scene) -> None:
@@ -387,7 +445,7 @@ def test_a_long_run_resets_opacities_and_prunes_wide_gaussians(scene: Scene, mon
 # Interruptions
 
 
-def run_until_killed(scene: Scene, out: Path, config: TrainConfig, at: int) -> None:
+def run_until_killed(scene: Scene, out: Path, config: TrainConfig, at: int, **arguments: Any) -> None:
     class Killed(BaseException):
         pass
 
@@ -396,7 +454,7 @@ def run_until_killed(scene: Scene, out: Path, config: TrainConfig, at: int) -> N
             raise Killed
 
     with pytest.raises(Killed):
-        train(scene, config, out=out, checkpoint_every=20, on_progress=kill)
+        train(scene, config, out=out, checkpoint_every=20, on_progress=kill, **arguments)
 
 
 @pytest.mark.parametrize("at", [10, 30, 50])  # before the first periodic checkpoint, in and after densification

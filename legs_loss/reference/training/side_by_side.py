@@ -6,17 +6,20 @@ import multiprocessing
 import signal
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence
+from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence
 
 from legs_loss.errors import LegsError
-from legs_loss.reference.training.trainer import Progress, TrainConfig, train
+from legs_loss.reference.training.trainer import Progress, TrainConfig, Weighting, train
 from legs_loss.scenes import read_scene
 
-__all__ = ["Arm", "train_side_by_side"]
+__all__ = ["Arm", "train_arm", "train_side_by_side"]
 
 
 class Arm(NamedTuple):
-    """One training: its name, and what `train` needs. ``images`` is the folder that ``read_scene`` takes."""
+    """One training: its name, and what `train` needs. ``images`` is the folder that ``read_scene`` takes.
+
+    ``weighting`` is a function of a module, since it is sent to another process by its name.
+    """
 
     name: str
     scene: Path
@@ -24,12 +27,21 @@ class Arm(NamedTuple):
     out: Path
     images: Optional[str] = None
     store: Optional[Path] = None
+    weighting: Optional[Weighting] = None
+    caps: Optional[Mapping[int, int]] = None
+    evaluate_every: Optional[int] = None
+    resume: bool = False
 
 
 def train_side_by_side(
-    arms: Sequence[Arm], processes: int, on_progress: Callable[[str, Progress], None]
+    arms: Sequence[Arm],
+    processes: int,
+    on_progress: Callable[[str, Progress], None],
+    on_done: Optional[Callable[[str, Dict[str, Any]], None]] = None,
 ) -> Dict[str, Dict[str, Any]]:
     """Train all arms, in order, ``processes`` at a time; return their metrics by name.
+
+    ``on_done`` gets the name and the metrics of each as soon as it ends.
 
     Uses fresh processes, so a script that calls it needs its ``if __name__ == "__main__"``.
 
@@ -58,6 +70,8 @@ def train_side_by_side(
                     raise LegsError(f"{name}: {message}")
                 metrics[name] = message
                 running.pop(connection).end()
+                if on_done is not None:
+                    on_done(name, message)
     finally:
         for process in running.values():
             process.end()
@@ -83,15 +97,28 @@ class _Process:
         self.process.join()
 
 
-def _work(connection: Connection, arm: Arm) -> None:
+def train_arm(arm: Arm, on_progress: Callable[[Progress], None]) -> Dict[str, Any]:
+    """Train one arm in this process, with one thread from here on; return its metrics."""
     import numba
     import torch
 
     torch.set_num_threads(1)
     numba.set_num_threads(1)
+    return train(
+        read_scene(arm.scene, arm.images),
+        arm.config,
+        out=arm.out,
+        resume=arm.resume,
+        store=arm.store,
+        on_progress=on_progress,
+        weighting=arm.weighting,
+        caps=arm.caps,
+        evaluate_every=arm.evaluate_every,
+    ).metrics
+
+
+def _work(connection: Connection, arm: Arm) -> None:
     try:
-        scene = read_scene(arm.scene, arm.images)
-        result = train(scene, arm.config, out=arm.out, store=arm.store, on_progress=connection.send)
-        connection.send(result.metrics)
+        connection.send(train_arm(arm, connection.send))
     except LegsError as error:
         connection.send(str(error))

@@ -34,9 +34,24 @@ from legs_loss.reference.training.metrics import Scores, mean_scores, psnr, scor
 from legs_loss.scenes import Scene
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
-__all__ = ["Progress", "Result", "TrainConfig", "draw", "point_cloud", "train"]
+__all__ = [
+    "Progress",
+    "Result",
+    "TrainConfig",
+    "Weigh",
+    "Weighting",
+    "draw",
+    "point_cloud",
+    "step_loss",
+    "step_weight",
+    "train",
+]
 
 CHECKPOINT = "checkpoint.npz"
+
+# Weights that change during a run: of a training view's index, the share of the run that is done, and the view's
+# rendering [3, H, W], detached, the weight map [1, H, W] of this one iteration. It must depend on nothing else.
+Weigh = Callable[[int, float, Tensor], Optional[Tensor]]
 
 
 @dataclass(frozen=True)
@@ -110,6 +125,10 @@ class TrainConfig:
         return torch.full((3,), 1.0 if self.white_background else 0.0)
 
 
+# Makes a run's Weigh from its training views, each with its spec's weight map.
+Weighting = Callable[[List[TrainingView], TrainConfig], Weigh]
+
+
 class Progress(NamedTuple):
     """What a running training tells: smoothed loss and PSNR of the training views, and the number of Gaussians."""
 
@@ -158,6 +177,9 @@ def train(
     weights: Optional[Mapping[str, Tensor]] = None,
     checkpoint_every: int = 500,
     on_progress: Optional[Callable[[Progress], None]] = None,
+    weighting: Optional[Weighting] = None,
+    caps: Optional[Mapping[int, int]] = None,
+    evaluate_every: Optional[int] = None,
 ) -> Result:
     """Train 3D Gaussians on a scene.
 
@@ -171,6 +193,12 @@ def train(
         store, weights: where weight maps come from, see :func:`load_dataset`.
         checkpoint_every: iterations between checkpoints. Another one is written on Ctrl-C.
         on_progress: called every 10 iterations.
+        weighting: makes weights that change during the run, in place of the maps: for experiments.
+        caps: the most Gaussians that a densification may lead to, before it prunes, by its iteration; in place of
+            ``config.max_gaussians``. Another run's ``metrics["growth"]`` gives this one that run's numbers: for
+            experiments. A resumed run needs the same ``weighting`` and ``caps``.
+        evaluate_every: score the held-out views every so many iterations into ``metrics["history"]``, outside of the
+            run's time; None: only at the end.
 
     Raises:
         LegsError: the scene cannot be trained on, numba is missing, or the checkpoint does not fit.
@@ -184,6 +212,8 @@ def train(
         run = _Run.restore(data, config, folder / CHECKPOINT)
     else:
         run = _Run.begin(data, config, scene)
+    run.caps, run.evaluate_every = caps, evaluate_every
+    run.weigh = None if weighting is None else weighting(data.train, config)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         _write_json(folder / "cfg.json", config.as_dict())
@@ -212,8 +242,13 @@ class _Run:
         self.loss: Optional[float] = None
         self.psnr: Optional[float] = None
         self._forget_gradients()
-        # Photographs without a map of their own share one of 1 where the L1 term is scaled.
-        self.weights = [_scaled(view, config.l1_scale) for view in data.train]
+        self.weights = [step_weight(view.weight, view, config) for view in data.train]
+        self.weigh: Optional[Weigh] = None
+        self.weight_sum = 0.0  # of the mean weights of all iterations, where they change
+        self.caps: Optional[Mapping[int, int]] = None
+        self.growth: List[List[int]] = []  # [iteration of a densification, Gaussians before it pruned]
+        self.evaluate_every: Optional[int] = None
+        self.history: List[Dict[str, float]] = []
 
     @classmethod
     def begin(cls, data: Dataset, config: TrainConfig, scene: Scene) -> _Run:
@@ -234,6 +269,7 @@ class _Run:
         run = cls(data, config, Adam.restore(arrays))
         run.iteration, run.seconds, run.order = facts["iteration"], facts["seconds"], facts["order"]
         run.loss, run.psnr = facts["loss"], facts["psnr"]
+        run.weight_sum, run.growth, run.history = facts["weight_sum"], facts["growth"], facts["history"]
         run.gradient_sum = torch.from_numpy(arrays["gradient_sum"])
         run.times_seen = torch.from_numpy(arrays["times_seen"])
         run.generator.set_state(torch.from_numpy(arrays["generator"]))
@@ -254,6 +290,9 @@ class _Run:
             "order": self.order,
             "loss": self.loss,
             "psnr": self.psnr,
+            "weight_sum": self.weight_sum,
+            "growth": self.growth,
+            "history": self.history,
         }
         write_checkpoint(path, arrays, facts)
 
@@ -266,6 +305,9 @@ class _Run:
             while self.iteration < self.config.iterations:
                 self.step()
                 self.seconds = time.perf_counter() - started
+                if self.evaluate_every is not None and self.iteration % self.evaluate_every == 0:
+                    self._evaluate()
+                    started = time.perf_counter() - self.seconds
                 last = self.iteration == self.config.iterations
                 if on_progress is not None and (last or self.iteration % 10 == 0):
                     assert self.loss is not None and self.psnr is not None
@@ -284,7 +326,8 @@ class _Run:
         degree = min(self.config.sh_degree, self.iteration // self.schedule.sh_every)
         viewspace = torch.zeros(len(gaussians), 2, requires_grad=True)
         drawn = _rasterize(gaussians, view, self.config, degree, viewspace)
-        loss = _loss(drawn.image, view.image, self.weights[index], self.config.lambda_dssim)
+        weight = self._weight(index, drawn.image.detach())
+        loss = step_loss(drawn.image, view.image, weight, self.config.lambda_dssim)
         loss.backward()
         if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
             self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image))
@@ -300,22 +343,47 @@ class _Run:
 
     def metrics(self) -> Dict[str, Any]:
         """Scores over training and held-out views, and what they cost."""
-        maps = [1.0 if weight is None else float(weight.double().mean()) for weight in self.weights]
+        train, test = self._scores(self.data.train), self._scores(self.data.test)
         return {
-            "train": self._scores(self.data.train),
-            "test": self._scores(self.data.test),
+            "train": mean_scores(list(train.values()))._asdict(),
+            "test": mean_scores(list(test.values()))._asdict() if test else None,
             "gaussians": len(self.adam.gaussians),
             "densify_grad_threshold": self.threshold,
-            "mean_weight": sum(maps) / len(maps),
+            "mean_weight": self._mean_weight(),
             "iterations": self.iteration,
             "seconds": self.seconds,
+            "growth": self.growth,
+            "history": self.history,
+            "views": {
+                "train": {name: scores._asdict() for name, scores in train.items()},
+                "test": {name: scores._asdict() for name, scores in test.items()},
+            },
         }
 
-    def _scores(self, views: List[TrainingView]) -> Optional[Dict[str, float]]:
-        if not views:
-            return None
-        scores: List[Scores] = [score(draw(self.adam.gaussians, view, self.config), view.image) for view in views]
-        return mean_scores(scores)._asdict()
+    def _scores(self, views: List[TrainingView]) -> Dict[str, Scores]:
+        return {view.name: score(draw(self.adam.gaussians, view, self.config), view.image) for view in views}
+
+    def _mean_weight(self) -> float:
+        if self.weigh is not None:
+            return self.weight_sum / self.iteration
+        maps = [1.0 if weight is None else float(weight.double().mean()) for weight in self.weights]
+        return sum(maps) / len(maps)
+
+    def _evaluate(self) -> None:
+        point: Dict[str, float] = {"iteration": self.iteration, "gaussians": len(self.adam.gaussians)}
+        if self.psnr is not None:
+            point["train_psnr"] = self.psnr
+        if self.data.test:
+            point["test_psnr"] = mean_scores(list(self._scores(self.data.test).values())).psnr
+        self.history.append(point)
+
+    def _weight(self, index: int, rendering: Tensor) -> Optional[Tensor]:
+        if self.weigh is None:
+            return self.weights[index]
+        weight = self.weigh(index, self.iteration / self.config.iterations, rendering)
+        weight = step_weight(weight, self.data.train[index], self.config)
+        self.weight_sum += 1.0 if weight is None else float(weight.double().mean())
+        return weight
 
     def _next_view(self) -> int:
         if not self.order:
@@ -324,15 +392,16 @@ class _Run:
 
     def _densify(self) -> None:
         gradient = self.gradient_sum / self.times_seen.clamp(min=1)
-        config = self.config
+        cap = self.config.max_gaussians if self.caps is None else self.caps[self.iteration]
         change = densify(
             self.adam.gaussians,
             gradient,
             self.threshold,
             self.extent,
             self.generator,
-            config.max_gaussians,
+            cap,
         )
+        self.growth.append([self.iteration, len(change.kept) + len(change.new)])
         self.adam.replace(change.kept, change.new)
         remaining = ~prunable(self.adam.gaussians, self.extent, self.iteration > self.schedule.reset_every)
         self.adam.keep(torch.nonzero(remaining)[:, 0])
@@ -356,16 +425,18 @@ def _rasterize(
     )
 
 
-def _loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lambda_dssim: float) -> Tensor:
+def step_loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lambda_dssim: float) -> Tensor:
+    """Return the loss of one iteration: of a rendering [3, H, W], its photograph and its weight map [1, H, W]."""
     from legs_loss.kernels.numba_loss import fused_loss
 
     return fused_loss(prediction, target, weight, lambda_dssim)
 
 
-def _scaled(view: TrainingView, scale: float) -> Optional[Tensor]:
-    if scale == 1.0:
-        return view.weight
-    return scale * (torch.ones_like(view.image[:1]) if view.weight is None else view.weight)
+def step_weight(weight: Optional[Tensor], view: TrainingView, config: TrainConfig) -> Optional[Tensor]:
+    """Return what multiplies the L1 term of a view whose weight map is ``weight``; None where nothing does."""
+    if config.l1_scale == 1.0:
+        return weight
+    return config.l1_scale * (torch.ones_like(view.image[:1]) if weight is None else weight)
 
 
 @contextmanager

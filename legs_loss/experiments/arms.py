@@ -1,0 +1,148 @@
+"""An arm's name, and the training that it stands for.
+
+    LOSS[:CHANGE ...][@ARM]
+
+LOSS is a preset ("legs"), a curve with LEGS's other settings ("C4"), a beta with them ("beta=5"), or settings of a
+WeightSpec ("curve=C3,beta=4,percentile=99"). CHANGE is one of CHANGES: "legs:shuffled". @ARM gives it the number of
+Gaussians that another arm has, densification by densification: "legs@3dgs".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence, Tuple
+
+from legs_loss.curves import curve_names
+from legs_loss.errors import LegsError
+from legs_loss.reference.training.trainer import TrainConfig
+from legs_loss.spec import PRESETS, WeightSpec
+
+__all__ = ["CHANGES", "ArmSpec", "needed", "parse_arm", "parse_arms"]
+
+# What a change does, in the words of the help and of the tables.
+CHANGES: Mapping[str, str] = {
+    "scale": "no map: the L1 term times the loss's mean weight",
+    "shuffled": "each map's pixels in random order",
+    "mean1": "each map divided by its mean",
+    "threshold": "the densification threshold times the loss's mean weight",
+    "growing": "beta grows from 0 over the run",
+    "fading": "beta falls to 0 over the run",
+    "multiscale": "the mean of the responses at three sizes",
+    "error": "the response times the rendering's error nearby",
+}
+_WEIGHTINGS = ("shuffled", "growing", "fading", "multiscale", "error")  # one of them at most
+
+LOOSE = 0.25  # of the threshold: where another arm's numbers are the limit, they are to be met
+
+
+@dataclass(frozen=True)
+class ArmSpec:
+    """An arm as its name says it."""
+
+    name: str
+    spec: WeightSpec
+    changes: Tuple[str, ...] = ()
+    at: Optional[str] = None  # the arm whose numbers of Gaussians this one gets
+
+    @property
+    def folder(self) -> str:
+        """The name as a folder's, on any system."""
+        return self.name.replace(":", "-").replace("@", "-at-").replace("=", "-").replace(",", "-")
+
+    @property
+    def weighting(self) -> Optional[str]:
+        """The name of what makes its weights during the run, None where its spec does."""
+        return next((change for change in self.changes if change in _WEIGHTINGS), None)
+
+    @property
+    def needs_mean_weight(self) -> bool:
+        """Whether :meth:`config` needs the mean weight of the spec's maps."""
+        return "scale" in self.changes or "threshold" in self.changes
+
+    def config(self, base: TrainConfig, threshold: float, mean_weight: float) -> TrainConfig:
+        """Return the arm's settings.
+
+        Args:
+            base: what all arms share; its spec does not count.
+            threshold: the densification threshold that all arms share.
+            mean_weight: of the spec's maps over the training views.
+        """
+        if "threshold" in self.changes:
+            threshold *= mean_weight
+        if self.at is not None:
+            threshold *= LOOSE
+        if "scale" in self.changes:
+            return replace(base, spec="3dgs", l1_scale=base.l1_scale * mean_weight, densify_grad_threshold=threshold)
+        return replace(base, spec=self.spec, densify_grad_threshold=threshold)
+
+
+def parse_arm(name: str) -> ArmSpec:
+    """Return the arm of this name.
+
+    Raises:
+        LegsError: a part of the name is unknown.
+
+    >>> arm = parse_arm("legs:mean1@3dgs")
+    >>> arm.spec.normalise, arm.at
+    ('mean', '3dgs')
+    >>> parse_arm("beta=5").spec == parse_arm("curve=C3,beta=5.0").spec
+    True
+    """
+    own, at_sign, at = name.partition("@")
+    loss, *changes = own.split(":")
+    for change in changes:
+        if change not in CHANGES:
+            raise LegsError(f"{name}: no change is named {change!r}: choose one of {', '.join(CHANGES)}")
+    if len(set(changes)) < len(changes) or sum(change in _WEIGHTINGS for change in changes) > 1:
+        raise LegsError(f"{name}: give each change once, and one of {', '.join(_WEIGHTINGS)} at most")
+    if "scale" in changes and len(changes) > 1:
+        raise LegsError(f"{name}: scale leaves no map for another change")
+    if at_sign and "@" in at:
+        raise LegsError(f"{name}: the arm behind the @ has an @ of its own")
+    spec = _loss(name, loss)
+    if "mean1" in changes:
+        spec = replace(spec, normalise="mean")
+    arm = ArmSpec(name, spec, tuple(changes), at if at_sign else None)
+    if arm.at is not None:
+        parse_arm(arm.at)
+    if changes and spec.beta == 0:
+        raise LegsError(f"{name}: {loss} has no weights to change")
+    return arm
+
+
+def parse_arms(names: Sequence[str]) -> List[ArmSpec]:
+    """Return the arms of these names, each once, in order.
+
+    Raises:
+        LegsError: a name is wrong.
+    """
+    return [parse_arm(name) for name in dict.fromkeys(names)]
+
+
+def needed(arms: Sequence[ArmSpec]) -> List[ArmSpec]:
+    """Return the arms, and before them those whose numbers of Gaussians they take."""
+    return parse_arms([arm.at for arm in arms if arm.at is not None] + [arm.name for arm in arms])
+
+
+def _loss(name: str, loss: str) -> WeightSpec:
+    if loss in PRESETS:
+        return PRESETS[loss]
+    if loss in curve_names():
+        return WeightSpec(curve=loss)
+    settings: Dict[str, Any] = {}
+    for part in loss.split(","):
+        key, equals, value = part.partition("=")
+        if not equals or key not in _FIELDS:
+            raise LegsError(
+                f"{name}: {part!r} is no loss: give a preset ({', '.join(PRESETS)}), a curve "
+                f"({', '.join(curve_names())}) or settings of a spec such as beta=5 or curve=C3,percentile=99 "
+                f"({', '.join(_FIELDS)})"
+            )
+        try:
+            settings[key] = _FIELDS[key](value)
+        except ValueError:
+            raise LegsError(f"{name}: {key} must be a number, got {value!r}") from None
+    return WeightSpec(**settings)
+
+
+_FIELDS: Mapping[str, Callable[[str], Any]] = {field.name: type(field.default) for field in fields(WeightSpec)}

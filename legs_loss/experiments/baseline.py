@@ -1,0 +1,69 @@
+"""The proof that a comparison's baseline is 3DGS's own loss: a baseline that is weighted too makes all arms equal."""
+
+from __future__ import annotations
+
+from typing import Any, Dict, Sequence
+
+import torch
+
+from legs_loss.errors import LegsError
+from legs_loss.reference.training.dataset import TrainingView
+from legs_loss.reference.training.trainer import TrainConfig, step_loss, step_weight
+from legs_loss.ssim import d_ssim
+
+__all__ = ["prove_unweighted"]
+
+CLOSE = 1e-4  # relative: two implementations in float32
+
+
+def prove_unweighted(views: Sequence[TrainingView], config: TrainConfig) -> Dict[str, Any]:
+    """Take the loss of every training view as the trainer takes it, and 3DGS's own by its formula, and compare.
+
+    Args:
+        views: the baseline's training views, with the weight maps that its trainings would use.
+        config: the baseline's settings.
+
+    Returns:
+        What was compared, for the record: ``views``, their number; ``loss`` and ``loss_3dgs``, means over views;
+        ``gradient_error``, the largest difference of a gradient over the largest gradient.
+
+    Raises:
+        LegsError: a view has a weight map that is not 1 everywhere, or loss or gradient are not 3DGS's.
+    """
+    generator = torch.Generator().manual_seed(0)
+    ours_sum = theirs_sum = worst = 0.0
+    for view in views:
+        weight = step_weight(view.weight, view, config)
+        if weight is not None and not bool((weight == 1).all()):
+            raise LegsError(
+                f"the baseline is weighted: {view.name} has a weight map of mean {float(weight.mean()):.3f}: "
+                "differences from it would say nothing"
+            )
+        # Any rendering will do: the photograph with noise has errors of all sizes.
+        rendering = (view.image + 0.2 * torch.randn(view.image.shape, generator=generator)).clamp(0, 1)
+        ours, our_gradient = _with_gradient(
+            lambda image, view=view, weight=weight: step_loss(image, view.image, weight, config.lambda_dssim), rendering
+        )
+        theirs, their_gradient = _with_gradient(
+            lambda image, view=view: (
+                (1 - config.lambda_dssim) * (image - view.image).abs().mean()
+                + config.lambda_dssim * d_ssim(image, view.image)
+            ),
+            rendering,
+        )
+        difference = float((our_gradient - their_gradient).abs().max() / their_gradient.abs().max())
+        if abs(ours - theirs) > CLOSE * theirs or difference > CLOSE:
+            raise LegsError(
+                f"the baseline's loss is not 3DGS's: {ours:.6f} in place of {theirs:.6f} for {view.name} "
+                f"(gradients differ by {difference:.1e} of the largest)"
+            )
+        ours_sum, theirs_sum, worst = ours_sum + ours, theirs_sum + theirs, max(worst, difference)
+    count = len(views)
+    return {"views": count, "loss": ours_sum / count, "loss_3dgs": theirs_sum / count, "gradient_error": worst}
+
+
+def _with_gradient(loss: Any, rendering: torch.Tensor) -> Any:
+    image = rendering.clone().requires_grad_(True)
+    value = loss(image)
+    value.backward()
+    return float(value.detach()), image.grad

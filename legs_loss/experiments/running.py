@@ -1,0 +1,253 @@
+"""A comparison in a folder: its settings, and one row an arm and seed, each of which can be run again alone.
+
+OUT/comparison.json              the scene and the settings that all arms share, the proof of the baseline
+OUT/ARM/seed-N/plan.json         the row's own settings, complete
+OUT/ARM/seed-N/row.json          the same with the scores, once it is trained
+OUT/ARM/seed-N/point_cloud/...   its Gaussians
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Callable, Dict, Iterator, List, Mapping, Optional, Sequence, Tuple
+
+import numpy as np
+
+from legs_loss._version import __version__
+from legs_loss.errors import LegsError
+from legs_loss.experiments.arms import ArmSpec, needed, parse_arm
+from legs_loss.experiments.baseline import prove_unweighted
+from legs_loss.experiments.weighting import WEIGHTINGS
+from legs_loss.reference.training.dataset import Dataset, load_dataset
+from legs_loss.reference.training.side_by_side import Arm, train_arm, train_side_by_side
+from legs_loss.reference.training.trainer import CHECKPOINT, Progress, TrainConfig, default_threshold
+from legs_loss.scenes import Scene, read_scene
+from legs_loss.spec import WeightSpec
+from legs_loss.weights import weight_map
+
+__all__ = ["BASELINE", "Comparison", "Row", "read_rows", "versions"]
+
+BASELINE = "3dgs"
+EVALUATIONS = 10  # of the held-out views during a run, for the plots
+
+Row = Dict[str, Any]
+
+
+class Comparison:
+    """The comparison in a folder, new or begun.
+
+    Args:
+        scene: a COLMAP scene.
+        base: the settings that all arms share; its spec does not count, each row has its own seed.
+        out: the comparison's folder.
+        images: the folder of the photographs, as :func:`~legs_loss.scenes.read_scene` takes it.
+
+    Raises:
+        LegsError: the scene cannot be trained on, the baseline is weighted, or the folder holds another comparison.
+    """
+
+    def __init__(self, scene: Path, base: TrainConfig, out: Path, images: Optional[str] = None) -> None:
+        self.root, self.images, self.out = Path(scene), images, Path(out)
+        self.scene = read_scene(self.root, images)
+        self.base = replace(base, spec=BASELINE, seed=0)
+        self._data: Optional[Dataset] = None
+        self._mean_weights: Dict[WeightSpec, float] = {}
+        self.threshold = base.densify_grad_threshold or default_threshold(self.data.train)
+        self._begin()
+
+    @property
+    def data(self) -> Dataset:
+        """The baseline's views."""
+        if self._data is None:
+            self._data = load_dataset(self.scene, self.base.weights, self.base.resolution, self.base.white_background)
+        return self._data
+
+    def mean_weight(self, spec: WeightSpec) -> float:
+        """The mean weight of a spec's maps over the training views."""
+        if spec not in self._mean_weights:
+            means = [float(weight_map(view.image, spec).double().mean()) for view in self.data.train]
+            self._mean_weights[spec] = sum(means) / len(means)
+        return self._mean_weights[spec]
+
+    def folder(self, arm: ArmSpec, seed: int) -> Path:
+        """Where a row lies."""
+        return self.out / arm.folder / f"seed-{seed}"
+
+    def row(self, arm: ArmSpec, seed: int) -> Optional[Row]:
+        """The row of an arm and seed, None if it is not trained yet."""
+        path = self.folder(arm, seed) / "row.json"
+        return _read(path) if path.is_file() else None
+
+    def train(
+        self,
+        arms: Sequence[ArmSpec],
+        seeds: Sequence[int],
+        processes: int,
+        on_progress: Callable[[str, Progress], None],
+    ) -> List[Row]:
+        """Train the rows that are missing, each in a process of its own with one thread; return all, seed by seed.
+
+        Arms that others take their numbers of Gaussians from are trained too, and before them.
+
+        Raises:
+            LegsError: a training failed; rows that are done stay, and the next call goes on.
+        """
+        todo = [(arm, seed) for seed in seeds for arm in needed(arms)]
+        for late in (False, True):  # those with the numbers of another arm come after it
+            plans = {
+                f"{arm.name}, seed {seed}": (arm, seed)
+                for arm, seed in todo
+                if (arm.at is not None) == late and self.row(arm, seed) is None
+            }
+            trainings = [self._training(name, arm, seed) for name, (arm, seed) in plans.items()]
+
+            def done(name: str, metrics: Dict[str, Any], plans: Mapping[str, Tuple[ArmSpec, int]] = plans) -> None:
+                arm, seed = plans[name]
+                self._finish(arm, seed, metrics)
+
+            train_side_by_side(trainings, processes, on_progress, done)
+        rows = [self.row(arm, seed) for seed in seeds for arm in needed(arms)]
+        return [row for row in rows if row is not None]
+
+    def train_one(self, arm: ArmSpec, seed: int) -> Row:
+        """Train one row in this process, unless it is there already; what it takes its numbers from must be there."""
+        if self.row(arm, seed) is None:
+            training = self._training(arm.name, arm, seed)
+            self._finish(arm, seed, train_arm(training, lambda progress: None))
+        row = self.row(arm, seed)
+        assert row is not None
+        return row
+
+    def _training(self, name: str, arm: ArmSpec, seed: int) -> Arm:
+        config, caps = self._config(arm, seed)
+        folder = self.folder(arm, seed)
+        plan = {
+            "arm": arm.name,
+            "seed": seed,
+            "config": config.as_dict(),
+            "weighting": arm.weighting,
+            "caps": None if caps is None else sorted(caps.items()),
+        }
+        _keep(folder / "plan.json", json.loads(json.dumps(plan)), "row")
+        return Arm(
+            name,
+            self.root,
+            config,
+            folder,
+            self.images,
+            weighting=None if arm.weighting is None else WEIGHTINGS[arm.weighting],
+            caps=caps,
+            evaluate_every=max(1, config.iterations // EVALUATIONS),
+            resume=(folder / CHECKPOINT).is_file(),
+        )
+
+    def _config(self, arm: ArmSpec, seed: int) -> Tuple[TrainConfig, Optional[Dict[int, int]]]:
+        mean_weight = self.mean_weight(arm.spec) if arm.needs_mean_weight else 1.0
+        config = arm.config(replace(self.base, seed=seed), self.threshold, mean_weight)
+        if arm.at is None:
+            return config, None
+        leader = self.row(parse_arm(arm.at), seed)
+        if leader is None:
+            raise LegsError(f"{arm.name}, seed {seed}, takes its numbers from {arm.at}: train that first")
+        return config, {int(iteration): int(count) for iteration, count in leader["metrics"]["growth"]}
+
+    def _finish(self, arm: ArmSpec, seed: int, metrics: Dict[str, Any]) -> None:
+        folder = self.folder(arm, seed)
+        if arm.name == BASELINE and metrics["mean_weight"] != 1.0:
+            raise LegsError(f"the baseline was trained with weights of mean {metrics['mean_weight']}")
+        row = dict(_read(folder / "plan.json"), versions=versions(), metrics=metrics)
+        _write(folder / "row.json", row)
+        (folder / CHECKPOINT).unlink()
+
+    def _begin(self) -> None:
+        settings = {
+            "scene": _identity(self.scene),
+            "path": os.path.abspath(str(self.root)),
+            "images": self.images,
+            "base": replace(self.base, densify_grad_threshold=self.threshold).as_dict(),
+        }
+        _keep(self.out / "comparison.json", dict(settings, baseline=None), "comparison", ("path", "baseline"))
+        stored = _read(self.out / "comparison.json")
+        if stored["baseline"] is None:
+            proof = prove_unweighted(self.data.train, self.base)
+            _write(self.out / "comparison.json", dict(stored, baseline=proof))
+
+
+def read_rows(out: Path) -> Tuple[Dict[str, Any], List[Row]]:
+    """Return a comparison's settings and its rows, by arm and seed.
+
+    Raises:
+        LegsError: the folder holds no comparison, or none of its rows is trained.
+    """
+    if not (out / "comparison.json").is_file():
+        raise LegsError(f"{out}: there is no comparison here (comparison.json): `legs compare` makes one")
+    rows = [_read(path) for path in sorted(out.glob("*/seed-*/row.json"))]
+    if not rows:
+        raise LegsError(f"{out}: none of this comparison's rows is trained yet")
+    return _read(out / "comparison.json"), sorted(rows, key=lambda row: (row["arm"], row["seed"]))
+
+
+def versions() -> Dict[str, str]:
+    """What a result may depend on."""
+    import numba
+    import torch
+
+    return {
+        "legs_loss": __version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numba": numba.__version__,
+        "numpy": np.__version__,
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def _identity(scene: Scene) -> Dict[str, Any]:
+    """What tells this scene from others, wherever it lies."""
+    digest = hashlib.sha256("\n".join(view.name for view in scene.views).encode())
+    if scene.points is not None:
+        digest.update(np.ascontiguousarray(scene.points.xyz).tobytes())
+    return {"name": scene.root.resolve().name, "views": len(scene.views), "sha256": digest.hexdigest()[:16]}
+
+
+def _keep(path: Path, values: Dict[str, Any], what: str, free: Sequence[str] = ()) -> None:
+    """Write values, or find the same there already; those of the names in ``free`` may differ."""
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write(path, values)
+        return
+    there = _read(path)
+    different = [
+        name for name, text in _flat(values) if name.split(".")[0] not in free and dict(_flat(there)).get(name) != text
+    ]
+    if different:
+        raise LegsError(
+            f"{path}: this {what} was begun with another {', '.join(different)}: choose another folder (--out), "
+            "or give the settings that it has"
+        )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[Tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
+def _read(path: Path) -> Dict[str, Any]:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        raise LegsError(f"{path}: this file is damaged: delete it and run the comparison again") from None
+
+
+def _write(path: Path, values: Mapping[str, Any]) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    os.replace(str(part), str(path))

@@ -16,7 +16,7 @@ import sys
 import types
 from pathlib import Path
 from types import CodeType
-from typing import Dict, Optional, Sequence
+from typing import Dict, Optional, Sequence, Tuple, Type
 
 from legs_adapters.patch import plan
 from legs_adapters.repo import check_root
@@ -34,14 +34,20 @@ def checkout_of(script: Path) -> Path:
     return folder
 
 
-def run_script(script: str | os.PathLike[str], arguments: Sequence[str]) -> int:
+def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bool = False) -> int:
     """Run a script as ``python script arguments`` does, with the LEGS loss in it.
+
+    Args:
+        script: the script.
+        arguments: its arguments.
+        cpu: run it without a GPU: what it asks of CUDA is answered by the CPU, and its rasterizer by a stand-in.
 
     Returns:
         The exit code, where the script does not leave by ``sys.exit`` (which goes on as it is).
 
     Raises:
-        LegsError: there is no such script; or its codebase has a term that cannot be decided, or none.
+        LegsError: there is no such script; or its codebase has a term that cannot be decided, or, unless ``cpu``,
+            none; or, with ``cpu``, the script wants something of CUDA that has no stand-in.
     """
     path = Path(script)
     if not path.is_file():
@@ -52,13 +58,23 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str]) -> int:
         problem = found.findings.problems[0]
         raise LegsError(f"{problem.path}:{problem.line}: {problem.reason}; write there by hand: {problem.advice}")
     if not found.after and not found.findings.patched:
-        raise LegsError(f"no photometric L1 term was found in {root}")
+        if not cpu:
+            raise LegsError(f"no photometric L1 term was found in {root}")
+        print(
+            f"legs-loss: no photometric L1 term was found in {root}: nothing is weighted", file=sys.stderr, flush=True
+        )
     sources = {os.path.realpath(str(root / name)): data for name, data in found.after.items()}
     for site in found.findings.sites:
         print(f"legs-loss: {site.path}:{site.line} is weighted in this run", file=sys.stderr, flush=True)
     name = str(script)
     file = os.path.abspath(name) if sys.version_info >= (3, 9) else name
     sys.meta_path.insert(0, _Finder(sources))
+    refusals: Tuple[Type[BaseException], ...] = ()
+    if cpu:
+        from legs_adapters.cpu import MissingStandIn, start
+
+        start(root)
+        refusals = (MissingStandIn,)
     main = _main_module(file)
     sys.argv[:] = [name, *arguments]
     sys.path[0] = os.path.dirname(os.path.realpath(name))
@@ -71,6 +87,8 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str]) -> int:
     except KeyboardInterrupt as error:
         _show(error)
         return _interrupted()
+    except refusals:
+        raise
     except BaseException as error:
         _show(error)
         return 1

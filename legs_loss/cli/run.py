@@ -1,7 +1,8 @@
-"""Run a training script with the LEGS loss, its files untouched.
+"""Run a training script with the LEGS loss, its files untouched; with --cpu on a machine without a GPU.
 
 As `python SCRIPT ARGUMENTS`, with the photometric L1 term of its training step weighted: the same edits as legs-patch
-makes, in memory. Settings come from legs.toml and LEGS_* variables, as for a patched script.
+makes, in memory. Settings come from legs.toml and LEGS_* variables, as for a patched script. With --cpu, what the
+script asks of CUDA is answered by the CPU, and its rasterizer by a stand-in: slow, but it trains.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ HELP = "run a training script with the LEGS loss, its files untouched"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.add_argument("--cpu", action="store_true", help="run without a GPU, with stand-ins for CUDA modules")
     parser.add_argument("script", metavar="SCRIPT", help="the training script")
     parser.add_argument("arguments", metavar="...", nargs=argparse.REMAINDER, help="its own arguments")
 
@@ -27,4 +29,4 @@ def run(args: argparse.Namespace) -> int:
         if error.name not in ("libcst", "legs_adapters"):
             raise
         raise LegsError("legs run wants LibCST: pip install 'legs-loss[patch]'") from None
-    return run_script(args.script, args.arguments)
+    return run_script(args.script, args.arguments, args.cpu)

@@ -1,1 +1,17 @@
 """Running an upstream training script without a GPU: devices redirected, CUDA modules replaced by stand-ins."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from legs_adapters.cpu.missing import MissingStandIn
+
+__all__ = ["MissingStandIn", "start"]
+
+
+def start(root: Path) -> None:
+    """Answer for CUDA in this process, for the codebase in ``root``, until it ends."""
+    from legs_adapters.cpu import redirect, standins
+
+    redirect.redirect()
+    standins.install()

@@ -28,8 +28,8 @@ TABLE: Dict[str, StandIn] = {
     "diff_gaussian_rasterization": StandIn("inria"),
     "diff_gaussian_rasterization_fastgs": StandIn("fastgs"),
     "diff_surfel_rasterization": StandIn("surfels"),
-    "FasterGSCudaBackend._C": StandIn("fastergs"),
-    "MortonEncoding._C": StandIn("fastergs"),
+    "FasterGSCudaBackend": StandIn("fastergs"),
+    "MortonEncoding": StandIn("fastergs"),
     "simple_knn": StandIn("simple_knn"),
     "fused_ssim": StandIn("fused_ssim"),
     "torchvision": StandIn("torchvision", real_first=True),
@@ -76,12 +76,6 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def exec_module(self, module: types.ModuleType) -> None:
         """Nothing: it is complete."""
-
-    def without(self, name: str) -> None:
-        """Stop standing in for ``name``, whose real module may be imported next."""
-        self.table.pop(name, None)
-        for loaded in [key for key in sys.modules if key == name or key.startswith(name + ".")]:
-            del sys.modules[loaded]
 
     def _made(self, name: str) -> bool:
         return getattr(getattr(sys.modules.get(name), "__spec__", None), "loader", None) is self

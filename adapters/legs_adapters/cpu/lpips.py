@@ -1,0 +1,83 @@
+"""LPIPS, where the weights of its networks can be had; NaN and one warning where they cannot.
+
+Other metrics of an evaluation stay useful then. Under the names ``lpipsPyTorch``, which forks carry with them, and
+``lpips``, the package.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import types
+from typing import Any, Optional
+
+import torch
+from torch import Tensor, nn
+
+from legs_adapters.cpu import standins
+
+__all__ = ["module"]
+
+_said = False
+
+
+def _unavailable(error: BaseException) -> None:
+    global _said
+    if not _said:
+        _said = True
+        print(f"legs-loss: LPIPS is NaN: its networks cannot be had ({error})", file=sys.stderr, flush=True)
+
+
+def _real(name: str) -> Any:
+    """The real module, imported with the stand-in out of the way."""
+    finder = next(found for found in sys.meta_path if isinstance(found, standins.Finder))
+    kept = {key: sys.modules.pop(key) for key in list(sys.modules) if key.split(".")[0] == name}
+    entry = finder.table.pop(name)
+    try:
+        return importlib.import_module(name)
+    finally:
+        finder.table[name] = entry
+        for key in [key for key in sys.modules if key.split(".")[0] == name]:
+            del sys.modules[key]
+        sys.modules.update(kept)
+
+
+def module(name: str) -> types.ModuleType:
+    """Return ``lpipsPyTorch`` or ``lpips``."""
+    made = types.ModuleType(name, __doc__)
+
+    class LPIPS(nn.Module):
+        """The real network, or NaN."""
+
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__()
+            self.network: Optional[nn.Module] = None
+            try:
+                self.network = _real(name).LPIPS(*args, **kwargs)
+            except (KeyboardInterrupt, SystemExit):
+                raise
+            except BaseException as error:
+                _unavailable(error)
+
+        def forward(self, x: Tensor, y: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+            if self.network is not None:
+                return self.network(x, y, *args, **kwargs)
+            return torch.full((x.shape[0] if x.dim() == 4 else 1, 1, 1, 1), float("nan"))
+
+    criteria: Any = {}
+
+    def lpips(x: Tensor, y: Tensor, net_type: str = "alex", version: str = "0.1") -> Tensor:
+        """Return the distance of two images, or NaN."""
+        if (net_type, version) not in criteria:
+            criteria[net_type, version] = LPIPS(net_type, version)
+        return criteria[net_type, version](x, y)
+
+    made.LPIPS = LPIPS  # type: ignore[attr-defined]
+    if name == "lpips":
+        return made
+    made.lpips = lpips  # type: ignore[attr-defined]
+    modules, inner = types.ModuleType(f"{name}.modules"), types.ModuleType(f"{name}.modules.lpips")
+    inner.LPIPS, modules.lpips, made.modules = LPIPS, inner, modules  # type: ignore[attr-defined]
+    for part in (made, modules):
+        part.__path__ = []
+    return made

@@ -51,28 +51,28 @@ class _Rasterize(torch.autograd.Function):
         # A slot is a strip in a Gaussian's box of strips; an entry, one that it reaches, sorted by strip and depth.
         first_slots = np.cumsum(slots) - slots
         total = int(slots.sum())
-        slot_strips, slot_rows, places = (np.empty(total, kind) for kind in (np.int32, np.int32, np.int64))
+        slot_strips, slot_rows, places = (np.empty(total, np.int32) for _ in range(3))
         across, down = -(-view.width // strips.WIDE), -(-view.height // strips.TALL)
         strips.find_rows(splats, boxes, slots, first_slots, across, slot_strips, slot_rows)
         order = strips.order_by_depth(depths, slots)
         ranges = np.zeros(across * down + 1, np.int64)
-        strips.sort_slots(order, slots, first_slots, slot_strips, ranges, places)
-        entries = np.empty((int(ranges[-1]), strips.FIELDS), np.float32)
-        entry_slots = np.empty(len(entries), np.int64)
-        strips.expand(splats, boxes, slots, first_slots, slot_rows, places, entries, entry_slots)
+        owners, rows = np.empty(total, np.int32), np.empty(total, np.int32)
+        strips.sort_slots(order, slots, first_slots, slot_strips, slot_rows, ranges, places, owners, rows)
 
         image = torch.empty(3, view.height, view.width)
+        entries = np.empty((int(ranges[-1]), strips.FIELDS), np.float32)
         ends = np.empty(across * down, np.int64)
         strip_order = np.argsort(-np.diff(ranges), kind="stable")  # the fullest first, dealt out to the workers in turn
-        work = (strip_order, ranges, ends, entries)
-        strips.render(workers, *work, _array(background), across, image.numpy())
+        strips.render(
+            workers, strip_order, ranges, splats, owners, rows, entries, ends, _array(background), across, image.numpy()
+        )
 
         radii_tensor = torch.from_numpy(radii)
         ctx.mark_non_differentiable(radii_tensor)
         ctx.save_for_backward(means, scales, quaternions, opacities, sh, image)
         ctx.columns = 2 if viewspace is None else viewspace.shape[1]
-        splatted = (splats, clamped, boxes, slots, first_slots, slot_rows)
-        ctx.state = (degree, camera, splatted, across, (*work, entry_slots))
+        splatted = (splats, clamped, boxes, slots, first_slots, slot_rows, places)
+        ctx.state = (degree, camera, splatted, across, (strip_order, ranges, rows, entries, ends))
         return image, radii_tensor
 
     @staticmethod
@@ -80,9 +80,9 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, g_image: Tensor, _: Any) -> Tuple[Optional[Tensor], ...]:
         means, scales, quaternions, opacities, sh, image = ctx.saved_tensors
         degree, camera, splatted, across, work = ctx.state
-        slot_gradients = np.empty((len(splatted[-1]), strips.MOMENTS), np.float32)
+        entry_gradients = np.empty((len(work[3]), strips.MOMENTS), np.float32)
         strips.render_backward(
-            numba.get_num_threads(), *work, across, _array(image), _array(g_image), ctx.columns == 4, slot_gradients
+            numba.get_num_threads(), *work, across, _array(image), _array(g_image), ctx.columns == 4, entry_gradients
         )
         count = len(means)
         shapes = (means.shape, scales.shape, quaternions.shape, opacities.shape, sh.shape, (count, ctx.columns))
@@ -92,7 +92,7 @@ class _Rasterize(torch.autograd.Function):
             degree,
             *camera,
             *splatted,
-            slot_gradients,
+            entry_gradients,
             np.array([image.shape[2] / 2, image.shape[1] / 2]),
             *[gradient.numpy() for gradient in gradients],
         )

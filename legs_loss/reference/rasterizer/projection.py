@@ -27,8 +27,10 @@ from legs_loss.reference.conventions import (
     SH_C3,
     TILE,
 )
+from legs_loss.reference.rasterizer.intrinsics import prefetch
 
 BLOCK = 512  # Gaussians that one thread takes at a time
+AHEAD = 4  # how many Gaussians before their turn the gradients of their entries are asked for
 WIDE, TALL = 8, 32  # pixels: a strip of the image, see strips.py
 FAINTEST = math.log(MIN_ALPHA) - 1e-3  # what is left out is fainter than MIN_ALPHA by more than rounding
 
@@ -296,7 +298,15 @@ def origin(strip_x, strip_y, rows):
 
 
 @compiled()
-def _collect(splats, boxes, i, slot_rows, slot, gradients, sums):
+def _ask_for(first, count, slot_rows, places, gradients):
+    """Ask for the gradients of a Gaussian's slots, or of the first few of a giant's, ahead of `_collect`."""
+    for slot in range(first, first + min(count, 16)):
+        if slot_rows[slot] != 0:
+            prefetch(gradients, places[slot])
+
+
+@compiled()
+def _collect(splats, boxes, i, slot_rows, places, slot, gradients, sums):
     """Sum a Gaussian's gradients over its slots, from `slot` on, into `sums`, in a fixed order.
 
     A row of `gradients` holds the moments of h = dL/dpower about its origin: h, hx, hy, hxx, hxy, hyy; then red, green,
@@ -307,35 +317,34 @@ def _collect(splats, boxes, i, slot_rows, slot, gradients, sums):
     for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
         for strip_x in range(boxes[i, 0], boxes[i, 2]):
             if slot_rows[slot] != 0:
-                h, hx, hy = (
-                    np.float64(gradients[slot, 0]),
-                    np.float64(gradients[slot, 1]),
-                    np.float64(gradients[slot, 2]),
-                )
+                k = places[slot]
+                h, hx, hy = np.float64(gradients[k, 0]), np.float64(gradients[k, 1]), np.float64(gradients[k, 2])
                 x, y = origin(strip_x, strip_y, slot_rows[slot])
                 x -= u
                 y -= v
                 sums[0] += (a * x + b * y) * h + a * hx + b * hy
                 sums[1] += (b * x + c * y) * h + b * hx + c * hy
-                sums[2] -= 0.5 * (gradients[slot, 3] + x * (2 * hx + x * h))
-                sums[3] -= gradients[slot, 4] + x * hy + y * (hx + x * h)
-                sums[4] -= 0.5 * (gradients[slot, 5] + y * (2 * hy + y * h))
+                sums[2] -= 0.5 * (gradients[k, 3] + x * (2 * hx + x * h))
+                sums[3] -= gradients[k, 4] + x * hy + y * (hx + x * h)
+                sums[4] -= 0.5 * (gradients[k, 5] + y * (2 * hy + y * h))
                 sums[5] += h
                 for field in range(6, 11):
-                    sums[field] += gradients[slot, field]
+                    sums[field] += gradients[k, field]
             slot += 1
 
 
 @compiled()
 def _project_backward_block(
     first, end, means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position,
-    splats, clamped, boxes, slots, first_slots, slot_rows, slot_gradients, half,
+    splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients, half,
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
 ):  # fmt: skip
     fx, fy, _, _, limit_x, limit_y = intrinsics
     coefficients = (degree + 1) * (degree + 1)
     basis, g_basis, sums = np.empty(16, np.float32), np.empty(16, np.float32), np.empty(11, np.float64)
     for i in range(first, end):
+        if i + AHEAD < end:
+            _ask_for(first_slots[i + AHEAD], slots[i + AHEAD], slot_rows, places, entry_gradients)
         if slots[i] == 0:
             g_means[i] = 0
             g_scales[i] = 0
@@ -344,7 +353,7 @@ def _project_backward_block(
             g_sh[i] = 0
             g_view[i] = 0
             continue
-        _collect(splats, boxes, i, slot_rows, first_slots[i], slot_gradients, sums)
+        _collect(splats, boxes, i, slot_rows, places, first_slots[i], entry_gradients, sums)
         g_opacities[i, 0] = sums[5] / opacities[i, 0]
         g_view[i, 0], g_view[i, 1] = sums[0] * half[0], sums[1] * half[1]
         if g_view.shape[1] == 4:
@@ -428,15 +437,15 @@ def _project_backward_block(
 @compiled(parallel=True)
 def project_backward(
     means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position,
-    splats, clamped, boxes, slots, first_slots, slot_rows, slot_gradients, half,
+    splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients, half,
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
 ):  # fmt: skip
-    """Fill the gradients `g_...` of each Gaussian from those of its slots."""
+    """Fill the gradients `g_...` of each Gaussian from those of its entries."""
     count = len(means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
         _project_backward_block(
             first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, degree, intrinsics, pose,
-            position, splats, clamped, boxes, slots, first_slots, slot_rows, slot_gradients, half,
+            position, splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients, half,
             g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
         )  # fmt: skip

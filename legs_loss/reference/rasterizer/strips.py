@@ -18,21 +18,20 @@ whose coefficients are computed in float64: as precise for a needle a thousand p
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import prange, types
-from numba.extending import intrinsic
+from numba import prange
 
 from legs_loss.kernels.compiling import FAST, compiled
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from legs_loss.reference.rasterizer.intrinsics import as_float, prefetch
 from legs_loss.reference.rasterizer.projection import BLOCK, FAINTEST, TALL, WIDE, origin
 
 PIXELS = WIDE * TALL
+AHEAD = 16  # entries whose memory is asked for while another is worked on
 CHECK = 16  # splats between two looks at whether a strip is finished
-FIELDS = 11  # of an entry: e, gx, gy, a, b, c, red, green, blue, and the rows [first, end) that it reaches
-MOMENTS = 11  # of a slot's gradient: h, hx, hy, hxx, hxy, hyy, red, green, blue, |u|, |v|
+FIELDS = 9  # of an entry: e, gx, gy, a, b, c, red, green, blue
+MOMENTS = 11  # of an entry's gradient: h, hx, hy, hxx, hxy, hyy, red, green, blue, |u|, |v|
 
 # Planes of a strip's state. T: transmittance, its sign turned once the pixel is finished (or is outside the image).
 X, Y, T = 0, PIXELS, 2 * PIXELS
@@ -60,16 +59,6 @@ _UNDERFLOW = np.float32(-32)
 _BIAS, _MANTISSA = np.int32(127), np.int32(23)
 
 
-@intrinsic
-def _as_float(context: Any, bits: Any) -> Any:
-    """The float32 with the bits of an int32."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.FloatType())
-
-    return types.float32(types.int32), generate
-
-
 @compiled(fastmath={"contract", "nnan", "ninf", "nsz"})
 def exp2(x):
     """2^x for x <= 0, to 2e-7 relative; written out because a call to the library's would not vectorise."""
@@ -78,7 +67,7 @@ def exp2(x):
     f = x - np.float32(whole)
     ff = f * f
     fraction = (_P0 + _P1 * f) + ff * ((_P2 + _P3 * f) + ff * (_P4 + _P5 * f))  # in pairs: a shorter chain
-    return fraction * _as_float((whole + _BIAS) << _MANTISSA)
+    return fraction * as_float((whole + _BIAS) << _MANTISSA)
 
 
 # Which splats reach which strip
@@ -153,8 +142,11 @@ def find_rows(splats, boxes, slots, first_slots, across, slot_strips, slot_rows)
 
 
 @compiled()
-def sort_slots(order, slots, first_slots, slot_strips, ranges, places):
-    """Give each slot that reaches its strip a place: by strip, and in a strip by depth. Fills where strips begin."""
+def sort_slots(order, slots, first_slots, slot_strips, slot_rows, ranges, places, owners, rows):
+    """Give each slot that reaches its strip a place among the entries: by strip, and in a strip by depth.
+
+    Fills where each strip's entries begin, each slot's place, and each entry's Gaussian and rows.
+    """
     for strip in slot_strips:
         if strip >= 0:
             ranges[strip + 1] += 1
@@ -165,46 +157,25 @@ def sort_slots(order, slots, first_slots, slot_strips, ranges, places):
         for slot in range(first_slots[i], first_slots[i] + slots[i]):
             strip = slot_strips[slot]
             if strip >= 0:
-                places[slot] = cursors[strip]
+                place = cursors[strip]
                 cursors[strip] += 1
+                places[slot], owners[place], rows[place] = place, i, slot_rows[slot]
 
 
 @compiled()
-def _expand_block(first, end, splats, boxes, slots, first_slots, slot_rows, places, entries, entry_slots):
-    for i in range(first, end):
-        if slots[i] == 0:
-            continue
-        u, v, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
-        red, green, blue = splats[i, 6], splats[i, 7], splats[i, 8]
-        summit = splats[i, 5]
-        slot = first_slots[i]
-        for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
-            for strip_x in range(boxes[i, 0], boxes[i, 2]):
-                rows, p = slot_rows[slot], places[slot]
-                if rows == 0:
-                    slot += 1
-                    continue
-                x, y = origin(strip_x, strip_y, rows)
-                x -= u
-                y -= v
-                entries[p, 0] = _LOG2E * (summit - 0.5 * (a * x * x + c * y * y) - b * x * y)
-                entries[p, 1], entries[p, 2] = -_LOG2E * (a * x + b * y), -_LOG2E * (b * x + c * y)
-                entries[p, 3], entries[p, 4], entries[p, 5] = -0.5 * _LOG2E * a, -_LOG2E * b, -0.5 * _LOG2E * c
-                entries[p, 6], entries[p, 7], entries[p, 8] = red, green, blue
-                entries[p, 9], entries[p, 10] = rows & 255, rows >> 8
-                entry_slots[p] = slot
-                slot += 1
-
-
-@compiled(parallel=True)
-def expand(splats, boxes, slots, first_slots, slot_rows, places, entries, entry_slots):
-    """Write the polynomial of every entry to its place, and which slot it is."""
-    count = len(slots)
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        first = block * BLOCK
-        _expand_block(
-            first, min(first + BLOCK, count), splats, boxes, slots, first_slots, slot_rows, places, entries, entry_slots
-        )
+def _expand(begin, end, strip_x, strip_y, splats, owners, rows, entries):
+    """Write the polynomials of a strip's entries."""
+    for k in range(begin, end):
+        prefetch(splats, owners[min(k + AHEAD, len(owners) - 1)])
+        i = owners[k]
+        a, b, c = splats[i, 2], splats[i, 3], splats[i, 4]
+        x, y = origin(strip_x, strip_y, rows[k])
+        x -= splats[i, 0]
+        y -= splats[i, 1]
+        entries[k, 0] = _LOG2E * (splats[i, 5] - 0.5 * (a * x * x + c * y * y) - b * x * y)
+        entries[k, 1], entries[k, 2] = -_LOG2E * (a * x + b * y), -_LOG2E * (b * x + c * y)
+        entries[k, 3], entries[k, 4], entries[k, 5] = -0.5 * _LOG2E * a, -_LOG2E * b, -0.5 * _LOG2E * c
+        entries[k, 6], entries[k, 7], entries[k, 8] = splats[i, 6], splats[i, 7], splats[i, 8]
 
 
 # Blending
@@ -229,15 +200,19 @@ def _unfinished(state):
 
 
 @compiled()
-def _blend(state, begin, end, entries):
-    """Blend a strip's entries; returns the one after the last that mattered."""
+def _middle(first, last):
+    """The row about which an entry's polynomial is written."""
+    return (np.float32(first) + np.float32(last) - _ONE) * _HALF
+
+
+@compiled()
+def _blend(state, begin, end, rows, entries):
+    """Blend entries of a strip, in their order."""
     for k in range(begin, end):
-        if (k - begin) % CHECK == 0 and not _unfinished(state):
-            return k
         e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
         red, green, blue = entries[k, 6], entries[k, 7], entries[k, 8]
-        first, last = np.uint32(entries[k, 9]) & 63, np.uint32(entries[k, 10]) & 63
-        middle = (entries[k, 9] + entries[k, 10] - _ONE) * _HALF
+        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
+        middle = _middle(first, last)
         for i in range(first * WIDE, last * WIDE):
             x, y = state[X + i], state[Y + i] - middle
             state[WORK + i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
@@ -251,11 +226,12 @@ def _blend(state, begin, end, entries):
             state[RED + i] += weight * red
             state[GREEN + i] += weight * green
             state[BLUE + i] += weight * blue
-    return end
 
 
 @compiled()
-def _render_worker(worker, workers, strip_order, ranges, ends, entries, background, across, image):
+def _render_worker(
+    worker, workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image
+):
     state = np.empty(PLANES * PIXELS, np.float32)
     height, width = image.shape[1], image.shape[2]
     for turn in range(worker, len(strip_order), workers):
@@ -264,7 +240,12 @@ def _render_worker(worker, workers, strip_order, ranges, ends, entries, backgrou
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
         _place(state, wide, tall)
         state[RED : RED + 3 * PIXELS] = 0
-        ends[strip] = _blend(state, ranges[strip], ranges[strip + 1], entries)
+        end = ranges[strip]
+        while end < ranges[strip + 1] and _unfinished(state):
+            begin, end = end, min(end + CHECK, ranges[strip + 1])
+            _expand(begin, end, strip % across, strip // across, splats, owners, rows, entries)
+            _blend(state, begin, end, rows, entries)
+        ends[strip] = end
         for y in range(tall):
             for x in range(wide):
                 pixel = y * WIDE + x
@@ -275,15 +256,17 @@ def _render_worker(worker, workers, strip_order, ranges, ends, entries, backgrou
 
 
 @compiled(parallel=True)
-def render(workers, strip_order, ranges, ends, entries, background, across, image):
-    """Fill the image, and for each strip the end of the entries that mattered."""
+def render(workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image):
+    """Fill the image, and for each strip its entries, up to the end of those that mattered."""
     for worker in prange(workers):
-        _render_worker(worker, workers, strip_order, ranges, ends, entries, background, across, image)
+        _render_worker(
+            worker, workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image
+        )
 
 
 @compiled(fastmath=FAST | {"reassoc"})
-def _blend_backward(state, begin, end, entries, entry_slots, absolute, gradients):
-    """As `_blend`, front to back, filling the slots' gradients: moments of h = dL/dpower, and the colour's.
+def _blend_backward(state, begin, end, rows, entries, absolute, gradients):
+    """As `_blend`, front to back, filling the entries' gradients: moments of h = dL/dpower, and the colour's.
 
     dL/dalpha = T (g . colour) - rest / (1 - alpha), where rest = g . (all the colour behind this splat): what is left
     of g . (the pixel's colour) after what came before. Nothing is carried from back to front.
@@ -292,8 +275,8 @@ def _blend_backward(state, begin, end, entries, entry_slots, absolute, gradients
     for k in range(begin, end):
         e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
         red, green, blue = entries[k, 6], entries[k, 7], entries[k, 8]
-        first, last = np.uint32(entries[k, 9]) & 63, np.uint32(entries[k, 10]) & 63
-        middle = (entries[k, 9] + entries[k, 10] - _ONE) * _HALF
+        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
+        middle = _middle(first, last)
         a2, c2 = a + a, c + c
         m = mx = my = mxx = mxy = myy = r = g = bl = au = av = _ZERO
         for i in range(first * WIDE, last * WIDE):
@@ -330,16 +313,15 @@ def _blend_backward(state, begin, end, entries, entry_slots, absolute, gradients
                 x, y, h = state[X + i], state[Y + i] - middle, state[WORK + i]
                 au += abs(h * (a2 * x + (b * y + gx)))
                 av += abs(h * (c2 * y + (b * x + gy)))
-        slot = entry_slots[k]
-        gradients[slot, 0], gradients[slot, 1], gradients[slot, 2] = m, mx, my
-        gradients[slot, 3], gradients[slot, 4], gradients[slot, 5] = mxx, mxy, myy
-        gradients[slot, 6], gradients[slot, 7], gradients[slot, 8] = r, g, bl
-        gradients[slot, 9], gradients[slot, 10] = au * scale, av * scale
+        gradients[k, 0], gradients[k, 1], gradients[k, 2] = m, mx, my
+        gradients[k, 3], gradients[k, 4], gradients[k, 5] = mxx, mxy, myy
+        gradients[k, 6], gradients[k, 7], gradients[k, 8] = r, g, bl
+        gradients[k, 9], gradients[k, 10] = au * scale, av * scale
 
 
 @compiled()
 def _render_backward_worker(
-    worker, workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, absolute, gradients
+    worker, workers, strip_order, ranges, rows, entries, ends, across, image, g_image, absolute, gradients
 ):
     state = np.empty(PLANES * PIXELS, np.float32)
     height, width = image.shape[1], image.shape[2]
@@ -358,18 +340,14 @@ def _render_backward_worker(
                     state[RED + channel * PIXELS + pixel] = gradient
                     rest += gradient * image[channel, top + y, left + x]
                 state[REST + pixel] = rest
-        _blend_backward(state, ranges[strip], ends[strip], entries, entry_slots, absolute, gradients)
-        for k in range(ends[strip], ranges[strip + 1]):
-            gradients[entry_slots[k]] = 0
+        _blend_backward(state, ranges[strip], ends[strip], rows, entries, absolute, gradients)
+        gradients[ends[strip] : ranges[strip + 1]] = 0
 
 
 @compiled(parallel=True)
-def render_backward(
-    workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, absolute, gradients
-):
-    """Fill the gradient of every slot that reaches its strip; the absolute sums, if asked for."""
+def render_backward(workers, strip_order, ranges, rows, entries, ends, across, image, g_image, absolute, gradients):
+    """Fill the gradient of every entry; the absolute sums, if asked for."""
     for worker in prange(workers):
         _render_backward_worker(
-            worker, workers, strip_order, ranges, ends, entries, entry_slots, across, image, g_image, absolute,
-            gradients,
-        )  # fmt: skip
+            worker, workers, strip_order, ranges, rows, entries, ends, across, image, g_image, absolute, gradients
+        )

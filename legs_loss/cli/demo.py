@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         root = Path(args.scene)
     scene = read_scene(root, args.images)
-    resolution = args.resolution if args.resolution is not None else _default_resolution(scene)
+    resolution = args.resolution if args.resolution is not None else default_resolution(scene)
 
     store = out / "legs_weights"  # not in the scene folder, which is the user's
     for spec in {PRESETS[name].operator: PRESETS[name] for name in METHODS}.values():
@@ -156,7 +156,7 @@ def _save_pictures(scene: Any, arms: List[Any], metrics: Dict[str, Dict[str, Any
     return chosen.name, sheet
 
 
-def _default_resolution(scene: Any) -> int:
+def default_resolution(scene: Any) -> int:
     """The width that leaves AFFORDABLE pixels, or the photographs' own size (1) where that is less."""
     sizes = [(view.camera.width, view.camera.height) for view in scene.views if view.camera is not None]
     width, height = max(sizes, default=(1, 1))

@@ -10,12 +10,14 @@ Gaussians that another arm has, densification by densification: "legs@3dgs".
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence, Tuple
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.curves import curve_names
 from legs_loss.errors import LegsError
-from legs_loss.reference.training.trainer import TrainConfig
 from legs_loss.spec import PRESETS, WeightSpec
+
+if TYPE_CHECKING:
+    from legs_loss.reference.training.trainer import TrainConfig
 
 __all__ = ["CHANGES", "ArmSpec", "needed", "parse_arm", "parse_arms"]
 
@@ -77,7 +79,7 @@ class ArmSpec:
 
 
 def parse_arm(name: str) -> ArmSpec:
-    """Return the arm of this name.
+    """Return the arm of this name; one that a preset names too gets the preset's name.
 
     Raises:
         LegsError: a part of the name is unknown.
@@ -85,8 +87,8 @@ def parse_arm(name: str) -> ArmSpec:
     >>> arm = parse_arm("legs:mean1@3dgs")
     >>> arm.spec.normalise, arm.at
     ('mean', '3dgs')
-    >>> parse_arm("beta=5").spec == parse_arm("curve=C3,beta=5.0").spec
-    True
+    >>> parse_arm("C1").name, parse_arm("beta=0").name, parse_arm("beta=5").name
+    ('legs-l', '3dgs', 'beta=5')
     """
     own, at_sign, at = name.partition("@")
     loss, *changes = own.split(":")
@@ -100,14 +102,14 @@ def parse_arm(name: str) -> ArmSpec:
     if at_sign and "@" in at:
         raise LegsError(f"{name}: the arm behind the @ has an @ of its own")
     spec = _loss(name, loss)
-    if "mean1" in changes:
-        spec = replace(spec, normalise="mean")
-    arm = ArmSpec(name, spec, tuple(changes), at if at_sign else None)
-    if arm.at is not None:
-        parse_arm(arm.at)
     if changes and spec.beta == 0:
         raise LegsError(f"{name}: {loss} has no weights to change")
-    return arm
+    leader = parse_arm(at).name if at_sign else None
+    preset = next((preset for preset, known in PRESETS.items() if known == spec), loss)
+    own_name = ":".join([preset, *changes])
+    if "mean1" in changes:
+        spec = replace(spec, normalise="mean")
+    return ArmSpec(own_name if leader is None else f"{own_name}@{leader}", spec, tuple(changes), leader)
 
 
 def parse_arms(names: Sequence[str]) -> List[ArmSpec]:
@@ -116,12 +118,12 @@ def parse_arms(names: Sequence[str]) -> List[ArmSpec]:
     Raises:
         LegsError: a name is wrong.
     """
-    return [parse_arm(name) for name in dict.fromkeys(names)]
+    return list(dict.fromkeys(parse_arm(name) for name in names))
 
 
 def needed(arms: Sequence[ArmSpec]) -> List[ArmSpec]:
     """Return the arms, and before them those whose numbers of Gaussians they take."""
-    return parse_arms([arm.at for arm in arms if arm.at is not None] + [arm.name for arm in arms])
+    return list(dict.fromkeys([parse_arm(arm.at) for arm in arms if arm.at is not None] + list(arms)))
 
 
 def _loss(name: str, loss: str) -> WeightSpec:

@@ -171,11 +171,13 @@ class Comparison:
             "images": self.images,
             "base": replace(self.base, densify_grad_threshold=self.threshold).as_dict(),
         }
-        _keep(self.out / "comparison.json", dict(settings, baseline=None), "comparison", ("path", "baseline"))
-        stored = _read(self.out / "comparison.json")
+        path = self.out / "comparison.json"
+        _keep(path, dict(settings, baseline=None), "comparison", ("path", "baseline"))
+        stored = _read(path)
         if stored["baseline"] is None:
-            proof = prove_unweighted(self.data.train, self.base)
-            _write(self.out / "comparison.json", dict(stored, baseline=proof))
+            stored["baseline"] = prove_unweighted(self.data.train, self.base)
+            _write(path, stored)
+        self.proof: Dict[str, Any] = stored["baseline"]
 
 
 def read_rows(out: Path) -> Tuple[Dict[str, Any], List[Row]]:

@@ -1,0 +1,128 @@
+"""Train several losses on a scene, some seeds each, and say what their differences are worth.
+
+Each training runs in a process of its own with one thread. An arm is LOSS[:CHANGE ...][@ARM]. LOSS is a preset
+("legs"), a curve ("C4"), a beta ("beta=5") or settings of a spec ("curve=C5,beta=4"). CHANGE is one of: {changes}. @ARM
+gives it the number of Gaussians that another arm has, densification by densification ("legs@3dgs"). The baseline 3dgs
+is always among the arms, and is proven unweighted first. A comparison that was interrupted goes on when it is given
+again with the same --out; more arms and seeds are added in the same way. Without SCENE it takes a small version of the
+embedded scene, which it makes first.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Dict
+
+from legs_loss.cli.demo import cores, default_resolution
+
+HELP = "several losses on a scene, with seeds, controls and intervals"
+
+# Of the embedded scene: small enough that a laptop trains the arms of a study in some minutes.
+VIEWS, WIDTH, HEIGHT = 56, 144, 108
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    from legs_loss.experiments.arms import CHANGES
+    from legs_loss.experiments.studies import STUDIES
+
+    changes = ", ".join(f"{name} ({what})" for name, what in CHANGES.items())
+    parser.description = (__doc__ or "").format(changes=changes)
+    parser.add_argument("scene", metavar="SCENE", nargs="?", help="a COLMAP scene; default: the embedded scene")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--arms", nargs="+", metavar="ARM", help="default: those of --study")
+    what.add_argument(
+        "--study",
+        choices=STUDIES,
+        default="main",
+        help=f"a built-in list of arms, beside the paper's numbers; default: main. "
+        f"{'; '.join(f'{name}: {study.title}' for name, study in STUDIES.items())}",
+    )
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="of each arm; default: 3")
+    parser.add_argument(
+        "--first_seed", type=int, default=0, metavar="N", help="default: 0; with --seeds 1 a single row is run alone"
+    )
+    parser.add_argument(
+        "-m", "--out", type=Path, default=Path("legs_compare"), metavar="DIR", help="default: legs_compare"
+    )
+    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
+    parser.add_argument(
+        "-r",
+        "--resolution",
+        type=int,
+        metavar="1|2|4|8|WIDTH",
+        help="as in 3DGS; default: about 70,000 pixels, which a CPU trains in minutes",
+    )
+    parser.add_argument("--iterations", type=int, default=2000, metavar="N", help="of each training; default: 2000")
+    parser.add_argument(
+        "--densify_grad_threshold", type=float, metavar="X", help="of all arms; default: as for legs train"
+    )
+    parser.add_argument(
+        "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one a core"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train what is missing and print the tables."""
+    from tqdm import tqdm
+
+    from legs_loss.cli.train import set_threads
+    from legs_loss.errors import LegsError
+    from legs_loss.experiments.arms import needed, parse_arms
+    from legs_loss.experiments.running import BASELINE, Comparison, read_rows
+    from legs_loss.experiments.studies import STUDIES, Study
+    from legs_loss.experiments.tables import study_text
+    from legs_loss.reference.embedded import write_embedded_scene
+    from legs_loss.reference.training.trainer import Progress, TrainConfig
+    from legs_loss.scenes import read_scene
+
+    set_threads(None)  # without numba there is no training: say so now
+    for name in ("seeds", "processes"):
+        if getattr(args, name) < 1:
+            raise LegsError(f"--{name} must be at least 1, got {getattr(args, name)}")
+    study = STUDIES[args.study]
+    if args.arms is not None:
+        study = Study("These arms", tuple(args.arms), "The paper has no such table.")
+    arms = needed(parse_arms([BASELINE, *study.arms]))
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    root = Path(args.scene) if args.scene is not None else args.out / "scene"
+    if args.scene is None and not (root / "sparse").is_dir():
+        print(f"making the embedded scene in {root}", flush=True)
+        write_embedded_scene(root, VIEWS, WIDTH, HEIGHT)
+    resolution = args.resolution
+    if resolution is None:
+        resolution = default_resolution(read_scene(root, args.images))
+    base = TrainConfig(
+        iterations=args.iterations, resolution=resolution, densify_grad_threshold=args.densify_grad_threshold
+    )
+    comparison = Comparison(root, base, args.out, args.images)
+    proof = comparison.proof
+    print(
+        f"The baseline is unweighted: over {proof['views']} views its loss is {proof['loss']:.6f}, 3DGS's own "
+        f"{proof['loss_3dgs']:.6f}; gradients agree to {proof['gradient_error']:.0e} of the largest."
+    )
+    missing = sum(comparison.row(arm, seed) is None for arm in arms for seed in seeds)
+    print(f"{len(arms)} arms, {len(seeds)} seed(s); {missing} of {len(arms) * len(seeds)} trainings to do", flush=True)
+    reached: Dict[str, int] = {}
+    with tqdm(total=missing * args.iterations, desc="iterations", mininterval=0.5, disable=not missing) as bar:
+
+        def show(name: str, progress: Progress) -> None:
+            bar.update(progress.iteration - reached.get(name, 0))
+            reached[name] = progress.iteration
+            bar.set_postfix_str(f"{name}: {progress.psnr:.2f} dB, {progress.gaussians} Gaussians", refresh=False)
+
+        comparison.train(arms, seeds, args.processes, show)
+    rows = [row for row in read_rows(args.out)[1] if row["seed"] in seeds]
+    print(study_text(rows, study))
+    print()
+    print(READING)
+    print(f"Rows: {args.out}; as a page: legs report {args.out}")
+    return 0
+
+
+READING = """\
+Means ± standard deviations over seeds. "strongest 10%" and "the rest" split each held-out photograph's pixels by their
+Laplacian response, which favours the weighted losses. Differences are paired by view; brackets are 95% bootstrap
+intervals over views; ? marks a difference whose interval holds 0, or whose seeds differ in sign. Times are this
+machine's, as busy as it was."""

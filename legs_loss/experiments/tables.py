@@ -1,0 +1,137 @@
+"""The tables of a comparison, as Markdown that reads well in a terminal too."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+from typing import Any, List, Mapping, Optional, Sequence
+
+from legs_loss.experiments.arms import parse_arm
+from legs_loss.experiments.running import BASELINE
+from legs_loss.experiments.statistics import SCORES, Difference, difference, summarise_all
+from legs_loss.experiments.studies import Study
+
+__all__ = ["differences_table", "markdown", "paper_text", "score_cells", "scores_table", "study_text"]
+
+Rows = Sequence[Mapping[str, Any]]
+
+FORMATS: Mapping[str, str] = {
+    "train PSNR": ".2f",
+    "train SSIM": ".4f",
+    "held-out PSNR": ".2f",
+    "held-out SSIM": ".4f",
+    "strongest 10%": ".2f",
+    "the rest": ".2f",
+    "Gaussians": ",.0f",
+    "ms an iteration": ".0f",
+    "mean weight": ".2f",
+}
+SAME_NUMBER = 0.01  # of the Gaussians: the count control's promise
+
+
+def markdown(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table whose columns are as wide as their widest cell; numbers stand to the right.
+
+    >>> print(markdown(("arm", "PSNR"), (("a", "9.1"), ("legs", "10.2"))))
+    | arm  | PSNR |
+    | ---- | ---: |
+    | a    |  9.1 |
+    | legs | 10.2 |
+    """
+    widths = [max(3, *(len(line[column]) for line in (heads, *lines))) for column in range(len(heads))]
+    rule = ["-" * widths[0]] + ["-" * (width - 1) + ":" for width in widths[1:]]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = [cells[0].ljust(widths[0])] + [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:])]
+        return f"| {' | '.join(padded)} |"
+
+    return "\n".join([line(heads), f"| {' | '.join(rule)} |"] + [line(cells) for cells in lines])
+
+
+def label(arm: str) -> str:
+    """Return how a table names an arm: "C1" is the same training as "legs-l", and both names are told."""
+    name = parse_arm(arm).name
+    return name if name == arm else f"{arm} ({name})"
+
+
+def score_cells(mean: Mapping[str, float], spread: Mapping[str, float]) -> List[str]:
+    """Return the cells of :data:`SCORES`: mean ± standard deviation where there is one."""
+    cells = []
+    for name in SCORES:
+        spec = FORMATS[name]
+        cell = format(mean[name], spec)
+        with_spread = name not in ("mean weight", "ms an iteration") and not math.isnan(spread[name])
+        cells.append(f"{cell} ± {format(spread[name], spec)}" if with_spread else cell)
+    return cells
+
+
+def scores_table(rows: Rows, arms: Sequence[str]) -> str:
+    """Return every arm's scores, mean ± standard deviation over seeds."""
+    lines = []
+    for arm in arms:
+        for summary in summarise_all(rows, [parse_arm(arm).name]):
+            lines.append([label(arm), *score_cells(summary.mean, summary.spread), str(summary.seeds)])
+    return markdown(["arm", *SCORES, "seeds"], lines)
+
+
+def differences_table(rows: Rows, study: Study) -> str:
+    """Return each arm's differences from what it is measured against, with their intervals."""
+    lines = []
+    for arm in study.arms:
+        name, reference = parse_arm(arm).name, study.reference(parse_arm(arm).name)
+        if reference is None or name == reference:
+            continue
+        cells = [
+            _cell(difference(rows, name, reference, split, score), score)
+            for split, score in (("train", "psnr"), ("test", "psnr"), ("test", "ssim"), ("test", "psnr_strong"))
+        ]
+        numbers = {summary.arm: summary.mean["Gaussians"] for summary in summarise_all(rows, [name, reference])}
+        if name in numbers and reference in numbers:
+            lines.append([f"{label(arm)} − {reference}", *cells, _times(numbers[name] / numbers[reference])])
+    heads = ["difference", "train PSNR", "held-out PSNR", "held-out SSIM", "strongest 10%", "Gaussians"]
+    return markdown(heads, lines)
+
+
+def paper_text(rows: Rows, study: Study) -> str:
+    """Return what the paper says beside what was measured here."""
+    lines = [study.paper_says]
+    gains = {arm: difference(rows, parse_arm(arm).name, BASELINE, "train") for arm in study.paper or ()}
+    known = {arm: gain for arm, gain in gains.items() if gain is not None}
+    if len(known) > 1:
+        heads = ["curve", "paper, train PSNR", "here, train PSNR over 3dgs"]
+        table = [[label(arm), f"{study.paper[arm]:.2f}", _cell(known[arm], "psnr")] for arm in known]
+        lines += ["", markdown(heads, table), "", *_orders(rows, study, known)]
+    return "\n".join(lines)
+
+
+def study_text(rows: Rows, study: Study) -> str:
+    """Return a study's tables and what the paper says."""
+    parts = [f"## {study.title}", scores_table(rows, study.arms), differences_table(rows, study)]
+    return "\n\n".join([*parts, paper_text(rows, study)])
+
+
+def _orders(rows: Rows, study: Study, gains: Mapping[str, Difference]) -> List[str]:
+    theirs = sorted(gains, key=lambda arm: -study.paper[arm])
+    ours = sorted(gains, key=lambda arm: -gains[arm].mean)
+    lines = [f"Order in the paper: {' > '.join(theirs)}. Here: {' > '.join(ours)}."]
+    swapped = [(first, second) for first, second in combinations(theirs, 2) if ours.index(first) > ours.index(second)]
+    for first, second in swapped:
+        gap = difference(rows, parse_arm(first).name, parse_arm(second).name, "train")
+        assert gap is not None
+        weight = "more than the seeds and views explain" if gap.clear else "no more than seeds and views explain"
+        lines.append(f"{first} − {second} is {_cell(gap, 'psnr')} here: {weight}.")
+    return lines + ([] if swapped else ["The orders agree."])
+
+
+def _cell(value: Optional[Difference], score: str) -> str:
+    if value is None:
+        return "–"
+    digits = 4 if score == "ssim" else 2
+    text = f"{value.mean:+.{digits}f}"
+    if not math.isnan(value.low):
+        text += f" [{value.low:+.{digits}f}, {value.high:+.{digits}f}]"
+    return text + ("" if value.clear else " ?")
+
+
+def _times(ratio: float) -> str:
+    return "same" if abs(ratio - 1) <= SAME_NUMBER else f"{ratio:.2f}x"

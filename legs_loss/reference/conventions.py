@@ -10,6 +10,7 @@ TILE = 16  # pixels: the side of a tile
 NEAR = 0.2  # world units: a Gaussian whose centre is not beyond it is not drawn
 GUARD = 1.3  # times tan(fov / 2): where x/z and y/z are held when the projection is linearised
 FARTHEST = 1 << 20  # pixels: a larger radius reaches every tile of any image anyway
+SQUARE = 3.0  # standard deviations of a splat's longer axis: its radius, half the side of the square it is cut to
 DILATION = 0.3  # pixels^2: added to the diagonal of the 2D covariance
 # The three thresholds are float32 numbers there, and here in every type: in float64, 0.01 * 0.01 would not be below
 # 1e-4, and a pixel behind two opaque Gaussians would not be finished.

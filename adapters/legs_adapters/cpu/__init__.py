@@ -12,6 +12,7 @@ __all__ = ["MissingStandIn", "start"]
 def start(root: Path) -> None:
     """Answer for CUDA in this process, for the codebase in ``root``, until it ends."""
     from legs_adapters.cpu import redirect, standins
+    from legs_adapters.cpu.survey import survey
 
     redirect.redirect()
-    standins.install()
+    standins.install(standins.table_for(survey(root)))

@@ -1,24 +1,30 @@
-"""One way for every stand-in of Inria's family to draw: its inputs checked, its camera read, the reference called."""
+"""One way for every stand-in of Inria's family to draw: inputs checked, the camera read, the reference called."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Optional
+from typing import Any, Callable, NamedTuple, Optional, Tuple
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from legs_adapters.cpu.camera import pinhole
 from legs_adapters.cpu.missing import MissingStandIn
 from legs_loss import LegsError
-from legs_loss.reference.rasterizer import rasterize
+from legs_loss.reference.conventions import DILATION, NEAR, View
+from legs_loss.reference.rasterizer import compiled
+from legs_loss.reference.rasterizer.oracle import rotations
 
-__all__ = ["Drawn", "Gaussians", "draw"]
+__all__ = ["Contributions", "Drawn", "Gaussians", "Lens", "draw"]
+
+LEAST_RATIO = 0.000025  # of determinants, as in Inria's antialiasing
 
 
 class Gaussians(NamedTuple):
-    """What Inria's rasterizer is given: colours as harmonics or ready, shapes as scales and rotations or covariances.
+    """What Inria's rasterizer is given: colours as harmonics or ready, shapes as scales and rotations.
 
     means3D [N, 3]; means2D [N, 2 to 4], whose gradient is asked for; opacities [N, 1]; shs [N, K, 3];
-    colors_precomp [N, 3]; scales [N, 3]; rotations [N, 4], wxyz; cov3D_precomp [N, 6].
+    colors_precomp [N, 3]; scales [N, 3]; rotations [N, 4], wxyz; cov3D_precomp is not covered.
     """
 
     means3D: Tensor
@@ -31,42 +37,164 @@ class Gaussians(NamedTuple):
     cov3D_precomp: Any = None
 
 
-class Drawn(NamedTuple):
-    """The image [3, H, W] and the radii int32 [N]."""
+class Lens(NamedTuple):
+    """Where forks draw other than 3DGS.
 
-    image: Tensor
-    radii: Tensor
+    Attributes:
+        dilation: pixels^2, added to the diagonal of the splat's covariance.
+        compensated: whether the opacity is lowered by as much as the dilation widened the splat (Mip-Splatting).
+        square: standard deviations: half the side of the square in whose tiles a splat is drawn at all.
+        fade: view-space gradients of Gaussians nearer than this are scaled by (depth / fade)^2 (Pixel-GS); 0: none.
+    """
+
+    dilation: float = DILATION
+    compensated: bool = False
+    square: float = 3.0
+    fade: float = 0.0
 
 
-def draw(gaussians: Gaussians, settings: Any, module: str) -> Drawn:
-    """Draw, differentiable in everything but the view.
+class Contributions(NamedTuple):
+    """Sums over the pixels that each Gaussian is blended into, [N] each: see contributions.py."""
+
+    pixels: Tensor  # int32
+    blend: Tensor
+    value: Tensor
+    distance: Tensor
+    most: Tensor
+
+
+class Drawn:
+    """A rendering, and what else can be asked about it.
+
+    Attributes:
+        image: [3, H, W].
+        radii: int32 [N], pixels; 0 for what is not drawn.
+    """
+
+    def __init__(self, drawing: compiled.Drawing, tensors: compiled.Tensors, view: View) -> None:
+        self._drawing, self._tensors, self._view = drawing, tensors, view
+        self.image, self.radii = compiled.attach(drawing, tensors)
+        self._extras: Optional[Tensor] = None
+
+    def depth(self) -> Tensor:
+        """[1, H, W]: the sum of depth times transmittance times alpha; not divided by alpha."""
+        return self._extra(0)
+
+    def alpha(self) -> Tensor:
+        """[1, H, W]: one minus the transmittance that is left."""
+        return self._extra(1)
+
+    def inverse_depth(self) -> Tensor:
+        """[1, H, W]: as `depth`, of 1 / depth."""
+        return self._extra(2)
+
+    def centres(self) -> Tuple[Tensor, Tensor]:
+        """Pixels [N, 2] and depths [N] of what is drawn, 0 for what is not; no gradient."""
+        drawn = self.radii > 0
+        pixels = torch.from_numpy(self._drawing.splats[:, :2]).to(torch.float32)
+        depth = depths(self._tensors.means.detach(), self._view)
+        return torch.where(drawn[:, None], pixels, torch.zeros_like(pixels)), torch.where(
+            drawn, depth, torch.zeros_like(depth)
+        )
+
+    def features(self, values: Tensor) -> Tensor:
+        """[C, H, W]: any values [N, C] blended as colours are, on black."""
+        images = []
+        for group in torch.nn.functional.pad(values, (0, -values.shape[1] % 3)).split(3, 1):
+            tensors = self._tensors._replace(sh=None, colours=group, viewspace=None)
+            drawing = self._drawing.recoloured(group, np.zeros(3, np.float32))
+            images.append(compiled.attach(drawing, tensors)[0])
+        return torch.cat(images)[: values.shape[1]]
+
+    def contributions(self, values: Optional[Tensor] = None) -> Contributions:
+        """The sums; ``values`` [H, W] are summed too."""
+        from legs_adapters.cpu.contributions import FIELDS, contribute
+
+        view, drawing = self._view, self._drawing
+        plane = torch.zeros(view.height, view.width) if values is None else values.detach().to(torch.float32)
+        sums = np.empty((len(self.radii), FIELDS))
+        contribute(
+            drawing.across, drawing.ranges, drawing.ends, drawing.splats, drawing.owners, drawing.rows, drawing.entries,
+            plane.reshape(view.height, view.width).contiguous().numpy(), sums,
+        )  # fmt: skip
+        found = torch.from_numpy(sums).to(torch.float32)
+        return Contributions(found[:, 0].to(torch.int32), *found[:, 1:].unbind(1))
+
+    def _extra(self, channel: int) -> Tensor:
+        if self._extras is None:
+            depth = depths(self._tensors.means, self._view)
+            inverse = torch.where(depth > NEAR, 1 / depth.clamp_min(NEAR), torch.zeros_like(depth))
+            self._extras = self.features(torch.stack([depth, torch.ones_like(depth), inverse], 1))
+        return self._extras[channel : channel + 1]
+
+
+def depths(means: Tensor, view: View) -> Tensor:
+    """[N]: along the camera's axis."""
+    row = torch.from_numpy(view.world_to_camera[2]).to(means.dtype)
+    return means @ row[:3] + row[3]
+
+
+def compensation(means: Tensor, scales: Tensor, quaternions: Tensor, view: View, dilation: float) -> Tensor:
+    """[N, 1]: the square root of the splat's determinant before its dilation over that after, at least 0.005."""
+    to_camera = torch.from_numpy(view.world_to_camera).to(means.dtype)
+    points = means @ to_camera[:3, :3].T + to_camera[:3, 3]
+    x, y, z = points[:, 0], points[:, 1], points[:, 2].clamp_min(NEAR)
+    held = [value.clamp(-limit, limit) for value, limit in zip((x / z, y / z), view.limits)]
+    zero = torch.zeros_like(z)
+    rows = (view.fx / z, zero, -view.fx * held[0] / z), (zero, view.fy / z, -view.fy * held[1] / z)
+    jacobian = torch.stack([torch.stack(row, 1) for row in rows], 1)
+    axes = jacobian @ to_camera[:3, :3] @ rotations(quaternions) * scales[:, None]
+    covariance = axes @ axes.transpose(1, 2)
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    ratio = (a * c - b * b) / ((a + dilation) * (c + dilation) - b * b)
+    return ratio.clamp_min(LEAST_RATIO).sqrt()[:, None]
+
+
+def draw(
+    gaussians: Gaussians,
+    settings: Any,
+    module: str,
+    lens: Lens = Lens(),  # noqa: B008 (immutable)
+    clip: Optional[Callable[..., None]] = None,
+) -> Drawn:
+    """Draw, differentiable in everything but the view; ``clip`` as for `compiled.Drawing`.
 
     Raises:
-        LegsError: both or none of two ways to give colours or shapes.
+        LegsError: both or none of two ways to give colours or shapes; values that are not finite.
         MissingStandIn: a way of giving them, or a camera, that is not covered.
     """
     if _given(gaussians.shs) == _given(gaussians.colors_precomp):
         raise LegsError(f"{module}: give either shs or colors_precomp")
     if (_given(gaussians.scales) and _given(gaussians.rotations)) == _given(gaussians.cov3D_precomp):
         raise LegsError(f"{module}: give either scales and rotations or cov3D_precomp")
-    if not _given(gaussians.shs):
-        raise MissingStandIn(module, "GaussianRasterizer", "colors_precomp")
     if not _given(gaussians.scales):
-        raise MissingStandIn(module, "GaussianRasterizer", "cov3D_precomp")
+        raise MissingStandIn(module, "GaussianRasterizer.forward(cov3D_precomp=...)")
+    view = View.of(pinhole(settings, module))
     scales = gaussians.scales if settings.scale_modifier == 1 else gaussians.scales * settings.scale_modifier
-    columns = 4 if gaussians.means2D.shape[1] == 4 else 2
-    rendering = rasterize(
-        gaussians.means3D,
-        scales,
-        gaussians.rotations,
-        gaussians.opacities,
-        gaussians.shs,
-        pinhole(settings, module),
-        settings.bg,
-        int(settings.sh_degree),
-        viewspace=gaussians.means2D[:, :columns] if gaussians.means2D.requires_grad else None,
+    opacities = gaussians.opacities
+    if lens.compensated:
+        opacities = opacities * compensation(gaussians.means3D, scales, gaussians.rotations, view, lens.dilation)
+    viewspace = None
+    if gaussians.means2D.requires_grad:
+        viewspace = gaussians.means2D[:, : 4 if gaussians.means2D.shape[1] == 4 else 2]
+        if lens.fade > 0:
+            scale = (depths(gaussians.means3D, view).detach() / lens.fade).square().clamp_max(1)[:, None]
+            viewspace.register_hook(lambda gradient: gradient * scale)
+    tensors = compiled.Tensors(
+        gaussians.means3D, scales, gaussians.rotations, opacities, gaussians.shs, gaussians.colors_precomp, viewspace
     )
-    return Drawn(rendering.image, rendering.radii)
+    for name, tensor in tensors._asdict().items():
+        if tensor is not None and not bool(torch.isfinite(tensor.detach().sum())):
+            raise LegsError(f"{module}: {name} {list(tensor.shape)} holds NaN or infinity")
+    drawing = compiled.draw(
+        tensors,
+        view,
+        settings.bg.detach(),
+        int(settings.sh_degree),
+        compiled.Footprint(lens.dilation, lens.square),
+        clip,
+    )
+    return Drawn(drawing, tensors, view)
 
 
 def _given(tensor: Optional[Tensor]) -> bool:

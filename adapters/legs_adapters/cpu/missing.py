@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, List
 
 from legs_loss import LegsError
 
-__all__ = ["MissingStandIn", "attribute_guard"]
+__all__ = ["Absent", "MissingStandIn", "attribute_guard"]
 
 
 class MissingStandIn(LegsError, ImportError):
@@ -29,3 +29,36 @@ def attribute_guard(module: str) -> Any:
         raise MissingStandIn(module, name)
 
     return __getattr__
+
+
+class Absent:
+    """In the place of a result that is not known here: any use of it is an error that names it."""
+
+    def __init__(self, module: str, name: str) -> None:
+        self.__dict__["_error"] = (module, f"GaussianRasterizer.forward's result {name!r}")
+
+    def _refuse(self, *args: Any, **kwargs: Any) -> Any:
+        raise MissingStandIn(*self.__dict__["_error"])
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") and name.endswith("__"):
+            raise AttributeError(name)
+        return self._refuse()
+
+    __getitem__ = __iter__ = __len__ = __float__ = __add__ = __radd__ = __mul__ = __rmul__ = __sub__ = _refuse
+    __rsub__ = __truediv__ = __rtruediv__ = __gt__ = __lt__ = __ge__ = __le__ = __invert__ = __neg__ = _refuse
+    __torch_function__ = classmethod(lambda cls, *args, **kwargs: cls._refuse_any(args))
+
+    @classmethod
+    def _refuse_any(cls, args: Any) -> Any:
+        for value in _flat(args):
+            if isinstance(value, cls):
+                value._refuse()
+
+
+def _flat(values: Any) -> List[Any]:
+    if isinstance(values, dict):
+        return _flat(list(values.values()))
+    if isinstance(values, (list, tuple)):
+        return [inner for value in values for inner in _flat(value)]
+    return [values]

@@ -14,18 +14,23 @@ import sys
 import types
 from typing import Any, Dict, NamedTuple, Optional, Sequence
 
-__all__ = ["TABLE", "Finder", "StandIn", "build", "install"]
+from legs_adapters.cpu.survey import Interface
+
+__all__ = ["TABLE", "Finder", "StandIn", "build", "install", "table_for"]
+
+INRIA = "diff_gaussian_rasterization"
 
 
 class StandIn(NamedTuple):
-    """Which file builds a module, and whether a real one that is installed goes before it."""
+    """Which file builds a module, whether a real one that is installed goes before it, and what the code expects."""
 
     file: str
     real_first: bool = False
+    interface: Optional[Interface] = None
 
 
 TABLE: Dict[str, StandIn] = {
-    "diff_gaussian_rasterization": StandIn("inria"),
+    INRIA: StandIn("inria"),
     "diff_gaussian_rasterization_fastgs": StandIn("fastgs"),
     "diff_surfel_rasterization": StandIn("surfels"),
     "FasterGSCudaBackend": StandIn("fastergs"),
@@ -38,9 +43,33 @@ TABLE: Dict[str, StandIn] = {
 }
 
 
-def build(name: str, file: str) -> types.ModuleType:
-    """Return the stand-in for ``name``, made by ``file`` of this package."""
-    return importlib.import_module(f"{__package__}.{file}").module(name)
+def table_for(expected: Dict[str, Interface]) -> Dict[str, StandIn]:
+    """Return the table for a codebase whose rasterizers are expected to have these interfaces.
+
+    Inria's name is also that of many forks' own: it is Inria's rasterizer only where nothing more is expected of it.
+    """
+    table = dict(TABLE)
+    for name, interface in expected.items():
+        if name == INRIA and interface.is_like(inria_fields(), 2):
+            continue
+        if name == INRIA and "pixel_weights" in interface.fields:
+            table[name] = StandIn("taming")
+        elif name == INRIA or name not in table:
+            table[name] = StandIn("generic", interface=interface)
+    return table
+
+
+def inria_fields() -> Sequence[str]:
+    """Return the names of the settings of Inria's first rasterizer."""
+    from legs_adapters.cpu.inria import GaussianRasterizationSettings
+
+    return GaussianRasterizationSettings._fields
+
+
+def build(name: str, entry: StandIn) -> types.ModuleType:
+    """Return the stand-in for ``name``, made by its file of this package."""
+    module = importlib.import_module(f"{__package__}.{entry.file}").module
+    return module(name, entry.interface) if entry.interface is not None else module(name)
 
 
 class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -59,7 +88,7 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         if fullname in self.table:
             if self.table[fullname].real_first and self._is_installed(fullname):
                 return None
-            module = build(fullname, self.table[fullname].file)
+            module = build(fullname, self.table[fullname])
         else:
             parent, _, child = fullname.rpartition(".")
             found = getattr(sys.modules.get(parent), "__dict__", {}).get(child)

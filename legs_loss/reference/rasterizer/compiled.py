@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Optional, Tuple
+from typing import Any, Callable, NamedTuple, Optional, Tuple
 
 import numba
 import numpy as np
@@ -10,15 +10,160 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from legs_loss.reference.conventions import View
+from legs_loss.reference.conventions import DILATION, SQUARE, View
 from legs_loss.reference.rasterizer import projection, strips
+
+Clip = Callable[..., None]
+
+
+class Tensors(NamedTuple):
+    """What a drawing is differentiable in; ``colours`` [N, 3] in place of ``sh``."""
+
+    means: Tensor
+    scales: Tensor
+    quaternions: Tensor
+    opacities: Tensor
+    sh: Optional[Tensor]
+    colours: Optional[Tensor]
+    viewspace: Optional[Tensor]
+
+
+class Footprint(NamedTuple):
+    """How far a splat reaches; the defaults are 3DGS's. In pixels^2, and in standard deviations (conventions.py)."""
+
+    dilation: float = DILATION
+    square: float = SQUARE
+
+
+class Drawing(NamedTuple):
+    """All that drawing leaves behind: for the way back, and for who wants to know more of it.
+
+    A slot is a strip in a Gaussian's box of strips; an entry, one that it reaches, sorted by strip and depth.
+    """
+
+    parameters: Tuple[np.ndarray, ...]  # means, scales, quaternions, opacities, sh
+    degree: int
+    camera: Tuple[np.ndarray, np.ndarray, np.ndarray]  # intrinsics, world to camera, the camera's centre
+    splats: np.ndarray
+    radii: np.ndarray
+    clamped: np.ndarray
+    boxes: np.ndarray
+    slots: np.ndarray
+    first_slots: np.ndarray
+    slot_rows: np.ndarray
+    places: np.ndarray
+    across: int
+    strip_order: np.ndarray  # the fullest first, dealt out to the workers in turn
+    ranges: np.ndarray
+    owners: np.ndarray
+    rows: np.ndarray
+    entries: np.ndarray
+    ends: np.ndarray
+    image: np.ndarray
+
+    def recoloured(self, colours: Tensor, background: np.ndarray) -> Drawing:
+        """The same splats in other colours [N, 3], as they are: neither harmonics nor held at 0."""
+        splats = self.splats.copy()
+        splats[:, 6:9] = _array(colours)
+        return self._replace(
+            parameters=(*self.parameters[:4], np.zeros((len(splats), 1, 3), np.float32)),
+            degree=0,
+            splats=splats,
+            clamped=np.zeros_like(self.clamped),
+            entries=np.empty_like(self.entries),
+            ends=np.empty_like(self.ends),
+            image=np.empty_like(self.image),
+        ).blended(background)
+
+    def blended(self, background: np.ndarray) -> Drawing:
+        """Fill image, entries and ends."""
+        strips.render(
+            numba.get_num_threads(), self.strip_order, self.ranges, self.splats, self.owners, self.rows, self.entries,
+            self.ends, background, self.across, self.image,
+        )  # fmt: skip
+        return self
 
 
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-class _Rasterize(torch.autograd.Function):
+def draw(
+    tensors: Tensors,
+    view: View,
+    background: Tensor,
+    degree: int,
+    footprint: Footprint = Footprint(),  # noqa: B008 (immutable)
+    clip: Optional[Clip] = None,
+) -> Drawing:
+    """Draw; no gradient yet (see :func:`attach`).
+
+    ``clip`` may take rows away before they are sorted: it is called with the view's tiles across and down, and with
+    splats, boxes, slots, first_slots, slot_strips, slot_rows and radii.
+    """
+    count = len(tensors.means)
+    degree = degree if tensors.sh is not None else 0
+    sh = torch.zeros(count, 1, 3) if tensors.sh is None else tensors.sh
+    parameters = tuple(_array(tensor) for tensor in (*tensors[:4], sh))
+    size = np.array([view.width, view.height], np.int64)
+    camera = (
+        np.array([view.fx, view.fy, view.cx, view.cy, *view.limits]),
+        view.world_to_camera,
+        view.position,
+    )
+    splats = np.empty((count, 10))
+    depths = np.empty(count, np.float32)
+    radii = np.empty(count, np.int32)
+    clamped = np.empty((count, 3), np.bool_)
+    boxes = np.empty((count, 4), np.int32)
+    slots = np.empty(count, np.int64)
+    projection.project(*parameters, degree, *camera, size, *footprint, splats, depths, radii, clamped, boxes, slots)
+    if tensors.colours is not None:
+        splats[:, 6:9] = _array(tensors.colours)
+        clamped[:] = False
+
+    first_slots = np.cumsum(slots) - slots
+    total = int(slots.sum())
+    slot_strips, slot_rows, places = (np.empty(total, np.int32) for _ in range(3))
+    across, down = -(-view.width // strips.WIDE), -(-view.height // strips.TALL)
+    strips.find_rows(splats, boxes, slots, first_slots, across, slot_strips, slot_rows)
+    if clip is not None:
+        clip(np.array(view.tiles), splats, boxes, slots, first_slots, slot_strips, slot_rows, radii)
+    order = strips.order_by_depth(depths, slots)
+    ranges = np.zeros(across * down + 1, np.int64)
+    owners, rows = np.empty(total, np.int32), np.empty(total, np.int32)
+    strips.sort_slots(order, slots, first_slots, slot_strips, slot_rows, ranges, places, owners, rows)
+    return Drawing(
+        parameters=parameters,
+        degree=degree,
+        camera=camera,
+        splats=splats,
+        radii=radii,
+        clamped=clamped,
+        boxes=boxes,
+        slots=slots,
+        first_slots=first_slots,
+        slot_rows=slot_rows,
+        places=places,
+        across=across,
+        strip_order=np.argsort(-np.diff(ranges), kind="stable"),
+        ranges=ranges,
+        owners=owners,
+        rows=rows,
+        entries=np.empty((int(ranges[-1]), strips.FIELDS), np.float32),
+        ends=np.empty(across * down, np.int64),
+        image=np.empty((3, view.height, view.width), np.float32),
+    ).blended(_array(background))
+
+
+def attach(drawing: Drawing, tensors: Tensors) -> Tuple[Tensor, Tensor]:
+    """A drawing as image [3, H, W] and radii int32 [N], with the gradient to the tensors it was drawn from."""
+    # A colour is 1 / C0 of its constant harmonic, as the way back sees it.
+    sh = tensors.sh if tensors.colours is None else tensors.colours[:, None] / projection.SH_C0
+    return _Attach.apply(*tensors[:4], sh, tensors.viewspace, drawing)
+
+
+class _Attach(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
@@ -28,76 +173,36 @@ class _Rasterize(torch.autograd.Function):
         opacities: Tensor,
         sh: Tensor,
         viewspace: Optional[Tensor],
-        view: View,
-        background: Tensor,
-        degree: int,
+        drawing: Drawing,
     ) -> Tuple[Tensor, Tensor]:
-        count, workers = len(means), numba.get_num_threads()
-        size = np.array([view.width, view.height], np.int64)
-        camera = (
-            np.array([view.fx, view.fy, view.cx, view.cy, *view.limits]),
-            view.world_to_camera,
-            view.position,
-        )
-        splats = np.empty((count, 10))
-        depths = np.empty(count, np.float32)
-        radii = np.empty(count, np.int32)
-        clamped = np.empty((count, 3), np.bool_)
-        boxes = np.empty((count, 4), np.int32)
-        slots = np.empty(count, np.int64)
-        parameters = [_array(tensor) for tensor in (means, scales, quaternions, opacities, sh)]
-        projection.project(*parameters, degree, *camera, size, splats, depths, radii, clamped, boxes, slots)
-
-        # A slot is a strip in a Gaussian's box of strips; an entry, one that it reaches, sorted by strip and depth.
-        first_slots = np.cumsum(slots) - slots
-        total = int(slots.sum())
-        slot_strips, slot_rows, places = (np.empty(total, np.int32) for _ in range(3))
-        across, down = -(-view.width // strips.WIDE), -(-view.height // strips.TALL)
-        strips.find_rows(splats, boxes, slots, first_slots, across, slot_strips, slot_rows)
-        order = strips.order_by_depth(depths, slots)
-        ranges = np.zeros(across * down + 1, np.int64)
-        owners, rows = np.empty(total, np.int32), np.empty(total, np.int32)
-        strips.sort_slots(order, slots, first_slots, slot_strips, slot_rows, ranges, places, owners, rows)
-
-        image = torch.empty(3, view.height, view.width)
-        entries = np.empty((int(ranges[-1]), strips.FIELDS), np.float32)
-        ends = np.empty(across * down, np.int64)
-        strip_order = np.argsort(-np.diff(ranges), kind="stable")  # the fullest first, dealt out to the workers in turn
-        strips.render(
-            workers, strip_order, ranges, splats, owners, rows, entries, ends, _array(background), across, image.numpy()
-        )
-
-        radii_tensor = torch.from_numpy(radii)
-        ctx.mark_non_differentiable(radii_tensor)
-        ctx.save_for_backward(means, scales, quaternions, opacities, sh, image)
+        # The image that is handed out may be changed in place; the one of the way back may not.
+        image, radii = torch.from_numpy(drawing.image.copy()), torch.from_numpy(drawing.radii)
+        ctx.mark_non_differentiable(radii)
+        ctx.save_for_backward(means, scales, quaternions, opacities, sh)  # so that torch sees if one is changed
         ctx.columns = 2 if viewspace is None else viewspace.shape[1]
-        splatted = (splats, clamped, boxes, slots, first_slots, slot_rows, places)
-        ctx.state = (degree, camera, splatted, across, (strip_order, ranges, rows, entries, ends))
-        return image, radii_tensor
+        ctx.drawing = drawing
+        return image, radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor, _: Any) -> Tuple[Optional[Tensor], ...]:
-        means, scales, quaternions, opacities, sh, image = ctx.saved_tensors
-        degree, camera, splatted, across, work = ctx.state
-        entry_gradients = np.empty((len(work[3]), strips.MOMENTS), np.float32)
+        ctx.saved_tensors  # noqa: B018 (an error here is about a tensor that was changed)
+        it: Drawing = ctx.drawing
+        height, width = it.image.shape[1:]
+        entry_gradients = np.empty((len(it.entries), strips.MOMENTS), np.float32)
         strips.render_backward(
-            numba.get_num_threads(), *work, across, _array(image), _array(g_image), ctx.columns == 4, entry_gradients
-        )
-        count = len(means)
-        shapes = (means.shape, scales.shape, quaternions.shape, opacities.shape, sh.shape, (count, ctx.columns))
+            numba.get_num_threads(), it.strip_order, it.ranges, it.rows, it.entries, it.ends, it.across, it.image,
+            _array(g_image), ctx.columns == 4, entry_gradients,
+        )  # fmt: skip
+        shapes = [array.shape for array in it.parameters] + [(len(it.radii), ctx.columns)]
         gradients = [torch.empty(shape) for shape in shapes]
         projection.project_backward(
-            *[_array(tensor) for tensor in (means, scales, quaternions, opacities, sh)],
-            degree,
-            *camera,
-            *splatted,
-            entry_gradients,
-            np.array([image.shape[2] / 2, image.shape[1] / 2]),
+            *it.parameters, it.degree, *it.camera, it.splats, it.clamped, it.boxes, it.slots, it.first_slots,
+            it.slot_rows, it.places, entry_gradients, np.array([width / 2, height / 2]),
             *[gradient.numpy() for gradient in gradients],
-        )
+        )  # fmt: skip
         viewspace = gradients.pop() if ctx.needs_input_grad[5] else None
-        return (*gradients[:5], viewspace, None, None, None)
+        return (*gradients[:5], viewspace, None)
 
 
 def render(
@@ -112,4 +217,5 @@ def render(
     viewspace: Optional[Tensor],
 ) -> Tuple[Tensor, Tensor]:
     """Image [3, H, W] and radii int32 [N]; arguments as `rasterize` has checked them."""
-    return _Rasterize.apply(means, scales, quaternions, opacities, sh, viewspace, view, background, sh_degree)
+    tensors = Tensors(means, scales, quaternions, opacities, sh, None, viewspace)
+    return attach(draw(tensors, view, background, sh_degree), tensors)

@@ -22,6 +22,7 @@ from legs_loss.reference.conventions import (
     SH_C1,
     SH_C2,
     SH_C3,
+    SQUARE,
     TILE,
     View,
 )
@@ -73,7 +74,7 @@ def project(points: Tensor, scales: Tensor, quaternions: Tensor, view: View) -> 
 
     middle = (a + c) / 2
     largest = middle + (middle**2 - determinant).clamp_min(0.1).sqrt()
-    radii = (3 * largest.sqrt()).ceil().clamp_max(FARTHEST).detach()
+    radii = (SQUARE * largest.sqrt()).ceil().clamp_max(FARTHEST).detach()
     radii = torch.where(determinant > 0, radii, torch.zeros_like(radii))
     return Splats(centres, conics, z, radii.to(torch.int32))
 

@@ -17,7 +17,6 @@ from numba import prange
 
 from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import (
-    DILATION,
     FARTHEST,
     MIN_ALPHA,
     NEAR,
@@ -25,6 +24,7 @@ from legs_loss.reference.conventions import (
     SH_C1,
     SH_C2,
     SH_C3,
+    SQUARE,
     TILE,
 )
 from legs_loss.reference.rasterizer.intrinsics import prefetch
@@ -198,7 +198,7 @@ def _tile_range(centre, radius, tiles):
 @compiled()
 def _project_block(
     first, end, means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, size,
-    splats, depths, radii, clamped, boxes, slots,
+    dilation, square, splats, depths, radii, clamped, boxes, slots,
 ):  # fmt: skip
     fx, fy, cx, cy, limit_x, limit_y = intrinsics
     basis = np.empty(16, np.float32)
@@ -217,18 +217,19 @@ def _project_block(
         a = u[0] * u[0] * s0 + u[1] * u[1] * s1 + u[2] * u[2] * s2
         b = u[0] * u[3] * s0 + u[1] * u[4] * s1 + u[2] * u[5] * s2
         c = u[3] * u[3] * s0 + u[4] * u[4] * s1 + u[5] * u[5] * s2
-        determinant = DILATION * (a + c + DILATION)
+        determinant = dilation * (a + c + dilation)
         determinant += (u[0] * u[4] - u[1] * u[3]) ** 2 * s0 * s1
         determinant += (u[0] * u[5] - u[2] * u[3]) ** 2 * s0 * s2
         determinant += (u[1] * u[5] - u[2] * u[4]) ** 2 * s1 * s2
-        a += DILATION
-        c += DILATION
+        a += dilation
+        c += dilation
         middle = 0.5 * (a + c)
         largest = middle + math.sqrt(max(0.1, middle * middle - determinant))
-        radius = min(math.ceil(3 * math.sqrt(largest)), float(FARTHEST))
+        radius = min(math.ceil(SQUARE * math.sqrt(largest)), float(FARTHEST))
+        reach = radius if square == SQUARE else min(math.ceil(square * math.sqrt(largest)), float(FARTHEST))
         centre_x, centre_y = fx * x / z + cx - 0.5, fy * y / z + cy - 0.5
-        left, right = _tile_range(centre_x, radius, -(-size[0] // TILE))
-        top, bottom = _tile_range(centre_y, radius, -(-size[1] // TILE))
+        left, right = _tile_range(centre_x, reach, -(-size[0] // TILE))
+        top, bottom = _tile_range(centre_y, reach, -(-size[1] // TILE))
         if right <= left or bottom <= top:
             continue
         radii[i] = np.int32(radius)
@@ -266,7 +267,7 @@ def _project_block(
 @compiled(parallel=True)
 def project(
     means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, size,
-    splats, depths, radii, clamped, boxes, slots,
+    dilation, square, splats, depths, radii, clamped, boxes, slots,
 ):  # fmt: skip
     """Fill, for each Gaussian: splat, depth, radius, which channels are clamped, box of strips, how many they are."""
     count = len(means)
@@ -274,7 +275,7 @@ def project(
         first = block * BLOCK
         _project_block(
             first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, degree, intrinsics, pose,
-            position, size, splats, depths, radii, clamped, boxes, slots,
+            position, size, dilation, square, splats, depths, radii, clamped, boxes, slots,
         )  # fmt: skip
 
 

@@ -1,0 +1,80 @@
+"""What each Gaussian contributed to a rendering: the sums that forks score, prune and densify by."""
+
+# mypy: ignore-errors
+# (numba infers the types)
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from legs_loss.kernels.compiling import compiled
+from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from legs_loss.reference.rasterizer.projection import TALL, WIDE
+from legs_loss.reference.rasterizer.strips import exp2
+
+__all__ = ["COUNT", "DISTANCE", "FIELDS", "MOST", "VALUE", "WEIGHT", "contribute"]
+
+PIXELS = WIDE * TALL
+COUNT, WEIGHT, VALUE, DISTANCE, MOST, FIELDS = 0, 1, 2, 3, 4, 5
+_MAX, _MIN, _LAST = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
+_ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
+
+
+@compiled()
+def _strip(left, top, wide, tall, begin, end, splats, owners, rows, entries, values, sums):
+    """Sums of one strip's entries, [entries, FIELDS]."""
+    before, finished = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.bool_)
+    largest, whose = np.zeros(PIXELS, np.float32), np.full(PIXELS, -1, np.int64)
+    work = np.empty(PIXELS, np.float32)
+    for k in range(begin, end):
+        e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
+        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
+        middle = (np.float32(first) + np.float32(last) - _ONE) * _HALF
+        for i in range(first * WIDE, last * WIDE):
+            x, y = np.float32(i % WIDE) - np.float32((WIDE - 1) / 2), np.float32(i // WIDE) - middle
+            work[i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
+        u, v = splats[owners[k], 0] - left, splats[owners[k], 1] - top
+        count = weight = value = distance = 0.0
+        for row in range(first, min(last, tall)):
+            for column in range(wide):
+                i = row * WIDE + column
+                alpha = min(work[i], _MAX)
+                if finished[i] or alpha < _MIN:
+                    continue
+                after = before[i] - alpha * before[i]
+                if after < _LAST:
+                    finished[i] = True
+                    continue
+                drawn = alpha * before[i]
+                if drawn > largest[i]:
+                    largest[i], whose[i] = drawn, k
+                before[i] = after
+                count += 1
+                weight += drawn
+                value += values[top + row, left + column]
+                distance += np.sqrt((u - column) ** 2 + (v - row) ** 2)
+        sums[k, 0], sums[k, 1], sums[k, 2], sums[k, 3], sums[k, 4] = count, weight, value, distance, 0
+    for k in whose:
+        if k >= 0:
+            sums[k, 4] += 1
+
+
+@compiled(parallel=True)
+def contribute(across, ranges, ends, splats, owners, rows, entries, values, sums):
+    """Fill sums [N, FIELDS], over the pixels that each Gaussian is blended into.
+
+    COUNT: how many; WEIGHT: of transmittance times alpha; VALUE: of ``values`` [H, W] there; DISTANCE: from its centre,
+    in pixels; MOST: how many in which no other weighs more.
+    """
+    height, width = values.shape
+    parts = np.empty((len(entries), FIELDS))
+    for strip in prange(len(ends)):
+        left, top = strip % across * WIDE, strip // across * TALL
+        wide, tall = min(WIDE, width - left), min(TALL, height - top)
+        _strip(left, top, wide, tall, ranges[strip], ends[strip], splats, owners, rows, entries, values, parts)
+    sums[:] = 0
+    for strip in range(len(ends)):
+        for k in range(ranges[strip], ends[strip]):
+            for field in range(FIELDS):
+                sums[owners[k], field] += parts[k, field]

@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 TORCH ?= torch==2.13.0
 BIN = $(VENV)/bin
+SIDE_BY_SIDE = -n auto --maxprocesses 4 --dist worksteal
 
 .PHONY: demo test test-slow lint clean
 
@@ -11,10 +12,10 @@ demo: $(VENV)/.demo
 	$(BIN)/legs demo
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -q -m "not slow"
+	$(BIN)/python -m pytest -q -m "not slow" $(SIDE_BY_SIDE)
 
 test-slow: $(VENV)/.test
-	$(BIN)/python -m pytest -q -m slow
+	$(BIN)/python -m pytest -q -m slow $(SIDE_BY_SIDE)
 
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .

@@ -19,6 +19,10 @@ settings.register_profile(
 )
 settings.load_profile("repeatable")
 
+# Tests that run side by side share the processor's cores.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    torch.set_num_threads(1)
+
 # A suite that a shell started in the background ignores Ctrl-C, and would hand that on to every program that it tests.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

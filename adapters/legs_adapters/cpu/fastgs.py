@@ -21,7 +21,7 @@ from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
 
 NAME = "diff_gaussian_rasterization_fastgs"
-EVERYWHERE = float("inf")
+EVERYWHERE = 1e6  # standard deviations: no square cuts a splat off
 
 
 class GaussianRasterizationSettings(NamedTuple):

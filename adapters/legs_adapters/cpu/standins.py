@@ -35,6 +35,7 @@ TABLE: Dict[str, StandIn] = {
     "diff_surfel_rasterization": StandIn("surfels"),
     "FasterGSCudaBackend": StandIn("fastergs"),
     "MortonEncoding": StandIn("fastergs"),
+    "ppisp": StandIn("fastergs", real_first=True),
     "simple_knn": StandIn("simple_knn"),
     "fused_ssim": StandIn("fused_ssim"),
     "torchvision": StandIn("torchvision", real_first=True),

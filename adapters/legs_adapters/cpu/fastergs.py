@@ -1,0 +1,323 @@
+"""FasterGS (a method of NeRFICG): the compiled halves of its backend, and of the framework's Morton encoding.
+
+Only `FasterGSCudaBackend._C` and `MortonEncoding._C` are replaced; their own Python stays in use. `ppisp`, which
+FasterGS imports and by default does not use, can be imported and no more. Gaussians come as they are optimised:
+logarithms of scales, logits of opacities, quaternions of any length; pixel centres lie at +0.5. legs_loss's rasterizer
+draws them; docs/cpu.md says where the two differ.
+"""
+
+from __future__ import annotations
+
+import types
+from types import SimpleNamespace
+from typing import Any, NamedTuple, Sequence, Tuple
+
+import torch
+from torch import Tensor
+
+from legs_adapters.cpu.missing import MissingStandIn, attribute_guard
+from legs_loss.reference import rasterize
+from legs_loss.reference.conventions import DILATION, GUARD, MIN_ALPHA, NEAR
+
+BACKEND, MORTON, PPISP = "FasterGSCudaBackend", "MortonEncoding", "ppisp"
+MOST_SAMPLES = 50  # copies of one Gaussian that relocation reckons with
+MORTON_BITS = 21  # of each coordinate
+
+
+class _Settings(NamedTuple):
+    """The camera, in the order in which the backend's functions take it."""
+
+    w2c: Tensor
+    cam_position: Tensor
+    bg_color: Tensor
+    active_sh_bases: int
+    width: int
+    height: int
+    focal_x: float
+    focal_y: float
+    center_x: float
+    center_y: float
+    near_plane: float
+    far_plane: float
+    proper_antialiasing: bool
+
+
+class _Drawn(NamedTuple):
+    """What the backward pass needs; it hangs on the first of forward's buffers and goes when that goes."""
+
+    leaves: Tuple[Tensor, ...]
+    viewspace: Tensor
+    image: Tensor
+    visible: Tensor
+
+
+def _draw(function: str, raw: Sequence[Tensor], settings: _Settings, backend: str = "numba") -> _Drawn:
+    """Draw the six `raw` tensors, keeping the graph; `function` is named in errors."""
+    if settings.proper_antialiasing:
+        raise MissingStandIn(f"{BACKEND}._C", function, "with proper antialiasing")
+    means, _, rotations = raw[:3]
+    leaves = tuple(tensor.detach().requires_grad_() for tensor in raw)
+    viewspace = torch.zeros(len(means), 2, dtype=means.dtype, requires_grad=True)
+    degree = round(int(settings.active_sh_bases) ** 0.5) - 1
+    coefficients = (degree + 1) ** 2
+    to_camera = torch.eye(4, dtype=torch.float64)
+    to_camera[:3] = settings.w2c.detach().to(torch.float64)[:3]
+    depths = means.detach() @ to_camera[2, :3].to(means.dtype) + to_camera[2, 3].to(means.dtype)
+    inside = (depths >= settings.near_plane) & (depths <= settings.far_plane)
+
+    # The rasterizer's near plane is fixed. A world that is larger by the ratio of the two looks the same.
+    size = NEAR / float(settings.near_plane)
+    to_camera[:3, 3] *= size
+    camera = SimpleNamespace(
+        width=int(settings.width),
+        height=int(settings.height),
+        fx=float(settings.focal_x),
+        fy=float(settings.focal_y),
+        cx=float(settings.center_x),
+        cy=float(settings.center_y),
+        world_to_camera=to_camera.numpy(),
+    )
+    with torch.enable_grad():
+        centres, logs, quaternions, logits, first, rest = leaves
+        sizes = logs.exp()
+        alphas = torch.where(inside[:, None], torch.sigmoid(logits), torch.zeros_like(logits))
+        image, _ = rasterize(
+            centres * size if size != 1 else centres,
+            sizes * size if size != 1 else sizes,
+            quaternions,
+            alphas,
+            torch.cat([first, rest[:, : coefficients - 1]], 1) if degree else first,
+            camera,
+            settings.bg_color.detach().to(means.dtype),
+            degree,
+            viewspace,
+            backend=backend,
+        )
+    visible = inside & _reaches_image(means, sizes.detach(), rotations, alphas.detach(), settings)
+    return _Drawn(leaves, viewspace, image, visible)
+
+
+def _reaches_image(means: Tensor, scales: Tensor, rotations: Tensor, alphas: Tensor, settings: _Settings) -> Tensor:
+    """Which Gaussians' ellipse at the faintest alpha has its box in the image, bool [N]."""
+    with torch.no_grad():
+        w2c = settings.w2c.detach().to(means.dtype)
+        points = means.detach() @ w2c[:3, :3].T + w2c[:3, 3]
+        z = points[:, 2]
+        xy = points[:, :2] / z[:, None]
+        focal = means.new_tensor([settings.focal_x, settings.focal_y])
+        centre = means.new_tensor([settings.center_x, settings.center_y])
+        extent = means.new_tensor([settings.width, settings.height])
+        limit = GUARD * extent / (2 * focal)
+        held = torch.maximum(torch.minimum(xy, limit), -limit)
+        w, x, y, q = torch.nn.functional.normalize(rotations.detach(), dim=1).unbind(1)
+        rotation = torch.stack(
+            [
+                *(1 - 2 * (y * y + q * q), 2 * (x * y - w * q), 2 * (x * q + w * y)),
+                *(2 * (x * y + w * q), 1 - 2 * (x * x + q * q), 2 * (y * q - w * x)),
+                *(2 * (x * q - w * y), 2 * (y * q + w * x), 1 - 2 * (x * x + y * y)),
+            ],
+            1,
+        ).reshape(-1, 3, 3)
+        turned = w2c[:3, :3] @ (rotation * scales[:, None])  # [N, 3, 3]: the scaled axes in the camera's
+        axes = (turned[:, :2] - held[:, :, None] * turned[:, 2:]) * (focal / z[:, None])[:, :, None]
+        level = 2 * torch.log(alphas / MIN_ALPHA)  # [N, 1]; negative: too faint anywhere
+        reach = (level.clamp_min(0) * ((axes * axes).sum(2) + DILATION)).sqrt()
+        pixels = xy * focal + centre
+        meets = (pixels + reach > 0.5) & (pixels - reach < extent - 0.5)
+        return meets.all(1) & (level[:, 0] >= 0)
+
+
+def forward(*arguments: Any) -> Tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int, int, int]:
+    """Image [3, H, W], four buffers and three numbers for `backward`.
+
+    Args:
+        arguments: means [N, 3], logarithms of scales [N, 3], quaternions wxyz [N, 4], logits of opacities [N, 1], the
+            first spherical harmonic [N, 1, 3] and the rest [N, K, 3]; then the settings' thirteen fields.
+    """
+    drawn = _draw("forward", arguments[:6], _Settings(*arguments[6:]))
+    buffers = [torch.empty(0, dtype=torch.uint8) for _ in range(4)]
+    buffers[0].drawn = drawn  # type: ignore[attr-defined]
+    return (drawn.image.detach(), *buffers, int(drawn.visible.sum()), 0, 0)  # type: ignore[return-value]
+
+
+def backward(densification_info: Tensor, grad_image: Tensor, *arguments: Any) -> Tuple[Tensor, ...]:
+    """Gradients of forward's six tensors; `densification_info` [2, N], unless empty, is added to in place.
+
+    Its first row counts the views that show a Gaussian; its second sums the length of the gradient by the centre in
+    pixels times half the image's size.
+    """
+    drawn = arguments[6].drawn
+    gradients = torch.autograd.grad(drawn.image, [*drawn.leaves, drawn.viewspace], grad_image, allow_unused=True)
+    if len(densification_info):
+        densification_info[0] += drawn.visible.to(densification_info.dtype)
+        densification_info[1] += gradients[6].norm(dim=1)
+    return tuple(
+        torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in zip(drawn.leaves, gradients)
+    )
+
+
+def inference(*arguments: Any) -> Tensor:
+    """An image without gradients: as `forward`'s arguments, then whether [3, H, W] or [H, W, 3], whether clamped."""
+    to_chw, clamp_output = arguments[19:]
+    image = _draw("inference", arguments[:6], _Settings(*arguments[6:19])).image.detach()
+    image = image.clamp(0, 1) if clamp_output else image
+    return image if to_chw else image.permute(1, 2, 0).contiguous()
+
+
+def pruning_scores(*arguments: Any) -> None:
+    """Not provided: it sums squares of gradients over pixels, which the rasterizer does not keep apart."""
+    raise MissingStandIn(f"{BACKEND}._C", "pruning_scores", "train without Speedy-Splat's pruning")
+
+
+@torch.no_grad()
+def adam_step(
+    param_grad: Tensor,
+    param: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    step_count: int,
+    learning_rate: float,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+) -> None:
+    """One step of Adam, in place."""
+    exp_avg.lerp_(param_grad, 1 - beta1)
+    exp_avg_sq.mul_(beta2).addcmul_(param_grad, param_grad, value=1 - beta2)
+    scale = exp_avg_sq.sqrt().mul_((1 - beta2**step_count) ** -0.5).add_(epsilon)
+    param.addcdiv_(exp_avg, scale, value=-learning_rate / (1 - beta1**step_count))
+
+
+@torch.no_grad()
+def update_3d_filter(
+    positions: Tensor,
+    w2c: Tensor,
+    filter_3d: Tensor,
+    visibility_mask: Tensor,
+    width: int,
+    height: int,
+    focal_x: float,
+    focal_y: float,
+    center_x: float,
+    center_y: float,
+    near_plane: float,
+    clipping_tolerance: float,
+    distance2filter: float,
+) -> None:
+    """Lower `filter_3d` [N, 1] to a view's pixel size at each point that it shows, and set its `visibility_mask`."""
+    x, y, z = (positions @ w2c[:3, :3].T + w2c[:3, 3]).unbind(1)
+    wide, tall = (clipping_tolerance + 0.5) * width, (clipping_tolerance + 0.5) * height
+    shift_x, shift_y = center_x - 0.5 * width, center_y - 0.5 * height
+    shown = (z >= near_plane) & (x >= (-wide - shift_x) / focal_x * z) & (x <= (wide - shift_x) / focal_x * z)
+    shown &= (y >= (-tall - shift_y) / focal_y * z) & (y <= (tall - shift_y) / focal_y * z)
+    size = distance2filter * z
+    flat, mask = filter_3d.view(-1), visibility_mask.view(-1)
+    shown &= flat >= size
+    flat[shown] = size[shown]
+    mask[shown] = True
+
+
+@torch.no_grad()
+def relocation_adjustment(old_opacities: Tensor, old_scales: Tensor, counts: Tensor) -> Tuple[Tensor, Tensor]:
+    """Opacities [N, 1] and scales [N, 3] with which `counts` [N] copies look as one Gaussian did.
+
+    Source: 3DGS as Markov Chain Monte Carlo (Kheradmand et al. 2024), equation 9.
+    """
+    copies = counts.reshape(-1).clamp(1, MOST_SAMPLES)
+    old = old_opacities.reshape(-1)
+    new = (1 - (1 - old.double()) ** (1 / copies)).to(old.dtype)
+    denominator = torch.zeros_like(old, dtype=torch.float64)
+    for n in range(int(copies.max()) if len(copies) else 0):
+        term, binomial = torch.zeros_like(denominator), 1.0
+        for k in range(n + 1):
+            term += binomial * (-1) ** k * (k + 1) ** -0.5 * new.double() ** (k + 1)
+            binomial *= (n - k) / (k + 1)
+        denominator += torch.where(n < copies, term, torch.zeros_like(term))
+    ratio = (old / denominator).to(old.dtype)
+    return new[:, None], ratio[:, None] * old_scales
+
+
+@torch.no_grad()
+def add_noise(
+    raw_scales: Tensor,
+    raw_rotations: Tensor,
+    raw_opacities: Tensor,
+    random_samples: Tensor,
+    means: Tensor,
+    current_lr: float,
+) -> None:
+    """Move `means` [N, 3], in place, by samples [N, 3] shaped as each Gaussian, the more the fainter it is."""
+    from legs_loss.reference.rasterizer.oracle import rotations
+
+    axes = rotations(raw_rotations)
+    along = (axes.transpose(1, 2) @ random_samples[:, :, None]) * (2 * raw_scales).exp()[:, :, None]
+    moved = (axes @ along)[:, :, 0]
+    faint = torch.sigmoid(0.5 - 100 * torch.sigmoid(raw_opacities))
+    drawn = (raw_rotations * raw_rotations).sum(1, keepdim=True) >= 1e-8
+    means += torch.where(drawn, current_lr * faint * moved, torch.zeros_like(moved))
+
+
+@torch.no_grad()
+def morton_encode(positions: Tensor) -> Tensor:
+    """Place of each position [N, 3] along the Morton curve through their bounding cube, int64 [N]."""
+    least = positions.amin(0)
+    cube = (positions.amax(0) - least).amax()
+    most = float(2**MORTON_BITS - 1)
+    steps = (((positions - least) * (1 / cube)).nan_to_num(0).clamp(0, 1) * most).to(torch.int64)
+    codes = torch.zeros(len(positions), dtype=torch.int64)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            codes |= ((steps[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return codes
+
+
+CONTENTS = {
+    BACKEND: (
+        forward,
+        backward,
+        inference,
+        pruning_scores,
+        adam_step,
+        update_3d_filter,
+        relocation_adjustment,
+        add_noise,
+    ),
+    MORTON: (morton_encode,),
+}
+
+
+def _refusal(package: str, name: str) -> type:
+    """A class that can be imported and not be made."""
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise MissingStandIn(package, name)
+
+    return type(name, (), {"__init__": refuse})
+
+
+def _ppisp() -> types.ModuleType:
+    package, report = types.ModuleType(PPISP), types.ModuleType(f"{PPISP}.report")
+    for name in ("PPISP", "PPISPConfig"):
+        setattr(package, name, _refusal(PPISP, name))
+    report.export_ppisp_report = _refusal(report.__name__, "export_ppisp_report")  # type: ignore[attr-defined]
+    package.report = report  # type: ignore[attr-defined]
+    return package
+
+
+def module(name: str) -> types.ModuleType:
+    """The stand-in to be imported as `name`: a package of CONTENTS with its `_C`, that `_C`, or `ppisp`."""
+    if name == PPISP:
+        made = _ppisp()
+    else:
+        package, _, child = name.partition(".")
+        extension = types.ModuleType(f"{package}._C")
+        for function in CONTENTS[package]:
+            setattr(extension, function.__name__, function)
+        extension.__getattr__ = attribute_guard(extension.__name__)  # type: ignore[method-assign]
+        if child:
+            return extension
+        made = types.ModuleType(name)
+        made._C = extension  # type: ignore[attr-defined]
+    made.__path__ = []
+    made.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
+    return made

@@ -11,7 +11,15 @@ from legs_loss.experiments.running import BASELINE
 from legs_loss.experiments.statistics import SCORES, Difference, difference, summarise_all
 from legs_loss.experiments.studies import Study
 
-__all__ = ["differences_table", "markdown", "paper_text", "score_cells", "scores_table", "study_text"]
+__all__ = [
+    "difference_cell",
+    "differences_table",
+    "markdown",
+    "paper_text",
+    "score_cells",
+    "scores_table",
+    "study_text",
+]
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -82,7 +90,7 @@ def differences_table(rows: Rows, study: Study) -> str:
         if reference is None or name == reference:
             continue
         cells = [
-            _cell(difference(rows, name, reference, split, score), score)
+            difference_cell(difference(rows, name, reference, split, score), score)
             for split, score in (("train", "psnr"), ("test", "psnr"), ("test", "ssim"), ("test", "psnr_strong"))
         ]
         numbers = {summary.arm: summary.mean["Gaussians"] for summary in summarise_all(rows, [name, reference])}
@@ -99,7 +107,7 @@ def paper_text(rows: Rows, study: Study) -> str:
     known = {arm: gain for arm, gain in gains.items() if gain is not None}
     if len(known) > 1:
         heads = ["curve", "paper, train PSNR", "here, train PSNR over 3dgs"]
-        table = [[label(arm), f"{study.paper[arm]:.2f}", _cell(known[arm], "psnr")] for arm in known]
+        table = [[label(arm), f"{study.paper[arm]:.2f}", difference_cell(known[arm], "psnr")] for arm in known]
         lines += ["", markdown(heads, table), "", *_orders(rows, study, known)]
     return "\n".join(lines)
 
@@ -119,11 +127,12 @@ def _orders(rows: Rows, study: Study, gains: Mapping[str, Difference]) -> List[s
         gap = difference(rows, parse_arm(first).name, parse_arm(second).name, "train")
         assert gap is not None
         weight = "more than the seeds and views explain" if gap.clear else "no more than seeds and views explain"
-        lines.append(f"{first} − {second} is {_cell(gap, 'psnr')} here: {weight}.")
+        lines.append(f"{first} − {second} is {difference_cell(gap, 'psnr')} here: {weight}.")
     return lines + ([] if swapped else ["The orders agree."])
 
 
-def _cell(value: Optional[Difference], score: str) -> str:
+def difference_cell(value: Optional[Difference], score: str) -> str:
+    """Return a difference as a cell: its interval in brackets, and a ? where it is not clear."""
     if value is None:
         return "–"
     digits = 4 if score == "ssim" else 2

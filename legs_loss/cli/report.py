@@ -1,0 +1,34 @@
+"""Make a page of a comparison: one HTML file that needs neither a network nor anything else beside it.
+
+It holds the table of scores, which sorts; PSNR by iterations and by Gaussians; for some views a slider that wipes
+between two methods, error and weight maps, and the places where two methods differ most; and all settings.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+HELP = "a comparison as one HTML page"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("folder", metavar="RUN", type=Path, help="the folder that legs compare wrote")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: RUN/report.html")
+    parser.add_argument("--views", nargs="+", metavar="NAME", help="or parts of names; default: three held-out views")
+    parser.add_argument("--arms", nargs="+", metavar="ARM", help="default: all that are trained")
+    parser.add_argument("--scene", type=Path, metavar="DIR", help="where the scene lies, if it was moved")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the page and print where it is."""
+    from legs_loss.cli.train import set_threads
+    from legs_loss.report.comparison import check_matplotlib
+    from legs_loss.report.html import write_report
+
+    set_threads(None)  # it draws with the CPU rasterizer: without numba, say so now
+    check_matplotlib()
+    path = write_report(args.folder, args.output or args.folder / "report.html", args.views, args.arms, args.scene)
+    print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
+    return 0

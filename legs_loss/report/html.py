@@ -1,0 +1,265 @@
+"""A comparison as one HTML page that needs nothing else: tables that sort, plots, a slider between methods, crops."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import shlex
+from pathlib import Path
+from string import Template
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
+
+from legs_loss.errors import LegsError
+from legs_loss.experiments.arms import parse_arm
+from legs_loss.experiments.running import BASELINE, read_rows
+from legs_loss.experiments.statistics import SCORES, difference, summarise_all
+from legs_loss.experiments.tables import difference_cell, score_cells
+from legs_loss.reference.training.dataset import load_view, split_views
+from legs_loss.reference.training.trainer import TrainConfig
+from legs_loss.report.html_pictures import FORMATS as IMAGE_FORMATS
+from legs_loss.report.html_pictures import Pictures, draw_row, encode
+from legs_loss.report.html_plots import by_gaussians, by_iterations
+from legs_loss.scenes import Scene, View, read_scene
+
+__all__ = ["LIMIT", "write_report"]
+
+LIMIT = 10_000_000  # bytes of a page
+VIEWS = 3  # shown unless others are asked for
+
+Row = Mapping[str, Any]
+
+
+def write_report(
+    run: Path,
+    path: Path,
+    views: Optional[Sequence[str]] = None,
+    arms: Optional[Sequence[str]] = None,
+    scene: Optional[Path] = None,
+) -> Path:
+    """Write the page of a comparison.
+
+    Args:
+        run: the folder that ``legs compare`` wrote.
+        path: of the page.
+        views: names of the views to show, or parts of names; default: three of those held out.
+        arms: default: all that have rows.
+        scene: where the scene lies now, if it was moved.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        LegsError: there is no comparison, the scene or a view is not found, or the page would pass :data:`LIMIT`.
+    """
+    settings, rows = read_rows(run)
+    names = _arms(rows, arms)
+    rows = [row for row in rows if row["arm"] in names]
+    read = _scene(settings, scene)
+    shown = _views(read, views)
+    first: Dict[str, Row] = {}
+    for row in sorted(rows, key=lambda row: row["seed"]):
+        first.setdefault(row["arm"], row)
+    drawn = []
+    for view in shown:
+        loaded = load_view(read, view, TrainConfig.from_dict(settings["base"]).resolution)
+        drawn.append(
+            (
+                loaded,
+                {
+                    arm: draw_row(first[arm], run / parse_arm(arm).folder / f"seed-{first[arm]['seed']}", loaded)
+                    for arm in names
+                },
+            )
+        )
+    for form in IMAGE_FORMATS:
+        page = _page(settings, rows, names, [encode(view, each, form) for view, each in drawn], first, run)
+        data = page.encode("utf-8")
+        if len(data) < LIMIT:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            return path
+    raise LegsError(
+        f"the page would have {len(data) / 1e6:.0f} MB, above {LIMIT / 1e6:.0f}: choose fewer --views or --arms"
+    )
+
+
+def _page(
+    settings: Mapping[str, Any],
+    rows: Sequence[Row],
+    arms: Sequence[str],
+    views: Sequence[Pictures],
+    first: Mapping[str, Row],
+    run: Path,
+) -> str:
+    template = Template(Path(__file__).with_name("html_page.html").read_text(encoding="utf-8"))
+    base = settings["base"]
+    seeds = sorted({row["seed"] for row in rows})
+    others = [arm for arm in arms if arm != BASELINE]
+    preferred = "legs" if "legs" in others else others[-1] if others else arms[0]
+    data = {
+        "views": [view._asdict() for view in views],
+        "arms": list(arms),
+        "left": BASELINE if BASELINE in arms else arms[0],
+        "right": preferred,
+    }
+    scene = settings["scene"]
+    return template.substitute(
+        title=html.escape(f"Losses compared on {scene['name']}"),
+        subtitle=html.escape(
+            f"{len(arms)} arms, {len(seeds)} seed(s), {base['iterations']:,} iterations of 3D Gaussian Splatting each, "
+            f"on {views[0].width}x{views[0].height} photographs."
+        ),
+        scores=_scores(rows, arms),
+        differences=_differences(rows, others) if BASELINE in arms and others else "<p>There is no second arm.</p>",
+        by_iterations=by_iterations(rows, arms),
+        by_gaussians=by_gaussians(rows, arms),
+        seed=first[arms[0]]["seed"],
+        settings=_settings(settings, rows),
+        arms=_own_settings(arms, first),
+        command=html.escape(_command(settings, arms, seeds, run)),
+        # "</script>" in a name must not end the element.
+        data=json.dumps(data).replace("<", "\\u003c"),
+    )
+
+
+def _scores(rows: Sequence[Row], arms: Sequence[str]) -> str:
+    body = []
+    for summary in summarise_all(rows, arms):
+        cells = score_cells(summary.mean, summary.spread)
+        values = [summary.mean[name] for name in SCORES]
+        body.append(
+            [(summary.arm, summary.arm), *zip(cells, map(_sortable, values)), (str(summary.seeds), str(summary.seeds))]
+        )
+    return _table(
+        "Mean ± standard deviation over seeds. PSNR in dB. “strongest 10%” and “the rest” split each held-out "
+        "photograph's pixels by their Laplacian response, which favours the weighted losses.",
+        ["arm", *SCORES, "seeds"],
+        body,
+    )
+
+
+def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
+    columns = (("train", "psnr"), ("train", "ssim"), ("test", "psnr"), ("test", "ssim"), ("test", "psnr_strong"))
+    numbers = {summary.arm: summary.mean["Gaussians"] for summary in summarise_all(rows, [BASELINE, *arms])}
+    body = []
+    for arm in arms:
+        found = [difference(rows, arm, BASELINE, split, score) for split, score in columns]
+        cells = [
+            (difference_cell(one, score), _sortable(one.mean if one is not None else math.nan))
+            for one, (_, score) in zip(found, columns)
+        ]
+        ratio = numbers[arm] / numbers[BASELINE]
+        body.append([(arm, arm), *cells, (f"{ratio:.2f}x", _sortable(ratio))])
+    return _table(
+        f"Each arm minus {BASELINE}, paired by view. Brackets: 95% bootstrap interval over views. ? where it holds 0, "
+        "or where seeds differ in sign.",
+        ["arm", "train PSNR", "train SSIM", "held-out PSNR", "held-out SSIM", "strongest 10%", "Gaussians"],
+        body,
+    )
+
+
+def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> str:
+    heads = [
+        "arm",
+        "operator",
+        "p",
+        "curve",
+        "beta",
+        "percentile",
+        "normalise",
+        "L1 scale",
+        "threshold",
+        "weights",
+        "numbers of",
+    ]
+    body = []
+    for arm in arms:
+        row = first[arm]
+        config, spec = row["config"], row["config"]["spec"]
+        values = [spec[name] for name in ("operator", "p", "curve", "beta", "percentile", "normalise")]
+        values += [f"{config['l1_scale']:.4g}", f"{config['densify_grad_threshold']:.4g}"]
+        values += [row["weighting"] or "the spec's", parse_arm(arm).at or "its own"]
+        body.append([(arm, arm)] + [(str(value), "") for value in values])
+    return _table("", heads, body, sortable=False)
+
+
+def _table(caption: str, heads: Sequence[str], body: Sequence[Sequence[Tuple[str, str]]], sortable: bool = True) -> str:
+    """A table; each cell is its text and the value that it sorts by."""
+    if sortable:
+        head = "".join(f'<th scope="col"><button type="button">{html.escape(name)}</button></th>' for name in heads)
+    else:
+        head = "".join(f'<th scope="col" class="plain">{html.escape(name)}</th>' for name in heads)
+    lines = []
+    for (text, value), *cells in body:
+        first = f'<th scope="row" data-value="{html.escape(value)}">{html.escape(text)}</th>'
+        others = "".join(f'<td data-value="{html.escape(value)}">{html.escape(text)}</td>' for text, value in cells)
+        lines.append(f"<tr>{first}{others}</tr>")
+    kind = ' class="sortable"' if sortable else ""
+    described = f"<caption><span>{html.escape(caption)}</span></caption>" if caption else ""
+    return f"<table{kind}>{described}<thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+
+
+def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> str:
+    base, proof, scene = settings["base"], settings["baseline"], settings["scene"]
+    shared = {
+        "scene": f"{scene['name']}: {scene['views']} views, sha256 {scene['sha256']}",
+        "proof of the baseline": (
+            f"over {proof['views']} views its loss is {proof['loss']:.6f}, 3DGS's own {proof['loss_3dgs']:.6f}; "
+            f"gradients agree to {proof['gradient_error']:.0e} of the largest"
+        ),
+    }
+    shared.update({name: str(base[name]) for name in base if name not in ("spec", "seed", "max_gaussians")})
+    versions = {name: sorted({row["versions"][name] for row in rows}) for name in rows[0]["versions"]}
+    shared.update(
+        {f"version of {name}" if name != "machine" else name: ", ".join(each) for name, each in versions.items()}
+    )
+    return "".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd>" for name, value in shared.items())
+
+
+def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[int], run: Path) -> str:
+    base = settings["base"]
+    words = ["legs", "compare", settings["scene"]["name"], "--arms", *(arm for arm in arms if arm != BASELINE)]
+    if seeds[0] != 0:
+        words += ["--first_seed", str(seeds[0])]
+    words += ["--seeds", str(len(seeds)), "-r", str(base["resolution"]), "--iterations", str(base["iterations"])]
+    words += ["--densify_grad_threshold", f"{base['densify_grad_threshold']!r}", "--out", run.name]
+    return " ".join(shlex.quote(word) for word in words)
+
+
+def _arms(rows: Sequence[Row], asked: Optional[Sequence[str]]) -> List[str]:
+    there = list(dict.fromkeys(row["arm"] for row in rows))
+    order = [BASELINE, "eggs", "legs-l", "legs"]
+    if asked is None:
+        return sorted(there, key=lambda arm: (order.index(arm) if arm in order else len(order), arm))
+    names = list(dict.fromkeys(parse_arm(arm).name for arm in asked))
+    for name in names:
+        if name not in there:
+            raise LegsError(f"no row of the arm {name} is trained: there are {', '.join(there)}")
+    return names
+
+
+def _scene(settings: Mapping[str, Any], moved: Optional[Path]) -> Scene:
+    root = Path(settings["path"]) if moved is None else moved
+    if not root.is_dir():
+        raise LegsError(f"{root}: the scene is not there: say where it lies now (--scene)")
+    return read_scene(root, settings["images"])
+
+
+def _views(scene: Scene, asked: Optional[Sequence[str]]) -> List[View]:
+    train, test = split_views(scene)
+    if asked is None:
+        candidates = test or train
+        count = min(VIEWS, len(candidates))
+        return [candidates[(2 * index + 1) * len(candidates) // (2 * count)] for index in range(count)]
+    chosen = []
+    for part in asked:
+        found = [view for view in [*test, *train] if part in view.name]
+        if not found:
+            raise LegsError(f"{scene.root}: no view has {part!r} in its name")
+        chosen.append(found[0])
+    return chosen
+
+
+def _sortable(value: float) -> str:
+    return "-1e99" if math.isnan(value) else repr(float(value))

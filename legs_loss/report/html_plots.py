@@ -1,0 +1,127 @@
+"""The plots of a comparison as SVG that takes the page's own colour of text: PSNR by iterations and by Gaussians."""
+
+from __future__ import annotations
+
+import io
+from typing import Any, Dict, List, Mapping, Sequence, Tuple
+
+import numpy as np
+
+from legs_loss.errors import LegsError
+
+__all__ = ["by_gaussians", "by_iterations", "colours"]
+
+Rows = Sequence[Mapping[str, Any]]
+
+_INK = "#222222"  # replaced by currentColor, so no colour of an arm may be the same
+# Tableau's, in the order that keeps neighbours apart; a tenth and more arms differ by their markers.
+_COLOURS = (
+    "#7f7f7f",
+    "#1f77b4",
+    "#ff7f0e",
+    "#2ca02c",
+    "#d62728",
+    "#9467bd",
+    "#8c564b",
+    "#e377c2",
+    "#17becf",
+    "#bcbd22",
+)
+_MARKERS = "osD^vPX*<>"
+
+
+def colours(arms: Sequence[str]) -> Dict[str, Tuple[str, str]]:
+    """Return the colour and the marker of each arm.
+
+    >>> colours(["3dgs", "legs"])["legs"]
+    ('#1f77b4', 'o')
+    """
+    count = len(_COLOURS)
+    return {arm: (_COLOURS[i % count], _MARKERS[i // count % len(_MARKERS)]) for i, arm in enumerate(arms)}
+
+
+def by_iterations(rows: Rows, arms: Sequence[str]) -> str:
+    """Held-out PSNR during the runs, the mean over seeds, the band from the lowest to the highest."""
+    figure, axes = _figure(1)
+    style = colours(arms)
+    for arm in arms:
+        histories = [row["metrics"]["history"] for row in rows if row["arm"] == arm]
+        length = min(len(history) for history in histories)
+        x = [point["iteration"] for point in histories[0][:length]]
+        y = np.array([[point.get("test_psnr", np.nan) for point in history[:length]] for history in histories])
+        axes[0].plot(x, y.mean(0), color=style[arm][0], marker=style[arm][1], markersize=4, linewidth=1.6, label=arm)
+        axes[0].fill_between(x, y.min(0), y.max(0), color=style[arm][0], alpha=0.12, linewidth=0)
+    axes[0].set(xlabel="iterations", ylabel="held-out PSNR, dB")
+    _legend(axes[0], len(arms))
+    return _svg(figure, "iterations", "Held-out PSNR by iterations, a line an arm; the last values are in the table")
+
+
+def by_gaussians(rows: Rows, arms: Sequence[str]) -> str:
+    """Training and held-out PSNR against the number of Gaussians at the end: each seed, and their mean, larger."""
+    figure, axes = _figure(2)
+    style = colours(arms)
+    for panel, split, title in ((axes[0], "train", "training views"), (axes[1], "test", "held-out views")):
+        for arm in arms:
+            points = [
+                (row["metrics"]["gaussians"], row["metrics"][split]["psnr"])
+                for row in rows
+                if row["arm"] == arm and row["metrics"][split] is not None
+            ]
+            if not points:
+                continue
+            x, y = np.array(points, float).T
+            colour, marker = style[arm]
+            panel.plot(x, y, marker, color=colour, markersize=4, alpha=0.45)
+            panel.plot(x.mean(), y.mean(), marker, color=colour, markersize=9, label=arm)
+        panel.set(xlabel="Gaussians", ylabel="PSNR, dB")
+        panel.set_title(title, fontsize=11, color=_INK)
+        panel.locator_params(axis="x", nbins=5)
+        panel.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+    _legend(axes[1], len(arms))
+    return _svg(figure, "gaussians", "PSNR by number of Gaussians, a point an arm; the values are in the table")
+
+
+def _figure(panels: int) -> Tuple[Any, List[Any]]:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise LegsError("plots need matplotlib: pip install 'legs-loss[report]'") from None
+    figure: Any = Figure(figsize=(9.5, 4.2), constrained_layout=True)
+    axes = list(np.atleast_1d(figure.subplots(1, panels)))
+    for panel in axes:
+        panel.set_facecolor("none")
+        panel.grid(alpha=0.25, linewidth=0.6, color=_INK)
+        panel.tick_params(colors=_INK, labelsize=9)
+        panel.xaxis.label.set_color(_INK)
+        panel.yaxis.label.set_color(_INK)
+        for name, spine in panel.spines.items():
+            spine.set_visible(name in ("left", "bottom"))
+            spine.set_color(_INK)
+    return figure, axes
+
+
+def _legend(axes: Any, count: int) -> None:
+    axes.legend(
+        loc="center left",
+        bbox_to_anchor=(1.02, 0.5),
+        frameon=False,
+        labelcolor=_INK,
+        fontsize=9 if count < 12 else 7,
+    )
+
+
+def _svg(figure: Any, salt: str, says: str) -> str:
+    """Return the figure as an <svg> element.
+
+    ``says`` is what a screen reader calls it; ``salt`` keeps its ids apart from those of the page's other figures.
+    """
+    from matplotlib import rc_context
+
+    text = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": salt, "font.family": "sans-serif"}):
+        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    svg = text.getvalue()
+    svg = svg[svg.index("<svg") :].replace(_INK, "currentColor")
+    svg = svg.replace("<svg ", f'<svg role="img" aria-label="{says}" ', 1)
+    # Groups are numbered alike in every figure; nothing refers to them.
+    return svg.replace('<g id="', f'<g id="{salt}-').replace("DejaVu Sans", "system-ui")

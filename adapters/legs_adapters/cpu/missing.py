@@ -6,7 +6,7 @@ from typing import Any, List
 
 from legs_loss import LegsError
 
-__all__ = ["Absent", "MissingStandIn", "attribute_guard"]
+__all__ = ["Absent", "Deferred", "MissingStandIn", "attribute_guard", "deferred_guard"]
 
 
 class MissingStandIn(LegsError, ImportError):
@@ -29,6 +29,33 @@ def attribute_guard(module: str) -> Any:
         raise MissingStandIn(module, name)
 
     return __getattr__
+
+
+def deferred_guard(module: str) -> Any:
+    """As `attribute_guard`, for what scripts import more of than they use: the error comes with the use."""
+
+    def __getattr__(name: str) -> Any:
+        if name.startswith("__") and name.endswith("__"):
+            raise AttributeError(name)
+        return Deferred(module, name)
+
+    return __getattr__
+
+
+class Deferred:
+    """In the place of a function or class that has no stand-in: calling it, or asking for its parts, is the error."""
+
+    def __init__(self, module: str, name: str) -> None:
+        self.__dict__["_error"] = (module, name)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Raise the error."""
+        raise MissingStandIn(*self.__dict__["_error"])
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") and name.endswith("__"):
+            raise AttributeError(name)
+        raise MissingStandIn(*self.__dict__["_error"])
 
 
 class Absent:

@@ -87,7 +87,7 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         if self._asking:
             return None
         if fullname in self.table:
-            if self.table[fullname].real_first and self._is_installed(fullname):
+            if self.table[fullname].real_first and (_is_for_a_library() or self._is_installed(fullname)):
                 return None
             module = build(fullname, self.table[fullname])
         else:
@@ -118,6 +118,15 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
             return False
         finally:
             self._asking = False
+
+
+def _is_for_a_library() -> bool:
+    """Whether an installed package asks: one that does without torchvision should not take a part of it for all."""
+    frame = sys._getframe(2)
+    while frame is not None and "importlib" in frame.f_code.co_filename:
+        frame = frame.f_back  # type: ignore[assignment]
+    parts = frame.f_code.co_filename.replace("\\", "/").split("/") if frame is not None else []
+    return "site-packages" in parts or "dist-packages" in parts
 
 
 def install(table: Optional[Dict[str, StandIn]] = None) -> Finder:

@@ -1,20 +1,23 @@
 """The few helpers of torchvision that training scripts use, for machines without it.
 
-ToTensor, ToPILImage, Compose, Resize; save_image, make_grid. Everything else is a clear error.
+ToTensor, ToPILImage, Compose, Resize; save_image, make_grid; reading and writing pictures. Everything else can be
+imported, and is a clear error where it is used.
 """
 
 from __future__ import annotations
 
+import enum
+import io
 import math
 import types
-from typing import Any, List, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
-from legs_adapters.cpu.missing import attribute_guard
+from legs_adapters.cpu.missing import deferred_guard
 
 __all__ = ["module"]
 
@@ -90,6 +93,39 @@ def save_image(tensor: Union[Tensor, List[Tensor]], fp: Any, format: Optional[st
     Image.fromarray(pixels).save(fp, format=format)
 
 
+class ImageReadMode(enum.Enum):
+    """Which channels are wanted of a picture."""
+
+    UNCHANGED = None
+    GRAY = "L"
+    GRAY_ALPHA = "LA"
+    RGB = "RGB"
+    RGB_ALPHA = "RGBA"
+
+
+def read_image(path: Any, mode: ImageReadMode = ImageReadMode.UNCHANGED, **_: Any) -> Tensor:
+    """[C, H, W] of a file, in its own type."""
+    with Image.open(path) as image:
+        array = np.array(image if mode.value is None else image.convert(mode.value))
+    array = array[:, :, None] if array.ndim == 2 else array
+    return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
+
+
+def decode_image(input: Any, mode: ImageReadMode = ImageReadMode.UNCHANGED, **_: Any) -> Tensor:
+    """As `read_image`, of a file, or of its bytes as a tensor."""
+    return read_image(io.BytesIO(input.numpy().tobytes()) if isinstance(input, Tensor) else input, mode)
+
+
+def write_png(input: Tensor, filename: Any, compression_level: int = 6) -> None:
+    """Write a picture, uint8 [C, H, W]."""
+    to_pil_image(input).save(filename, format="PNG", compress_level=compression_level)
+
+
+def write_jpeg(input: Tensor, filename: Any, quality: int = 75) -> None:
+    """Write a picture, uint8 [C, H, W]."""
+    to_pil_image(input).save(filename, format="JPEG", quality=quality)
+
+
 class ToTensor:
     """`to_tensor` as a transform."""
 
@@ -130,11 +166,12 @@ class Compose:
 
 
 def module(name: str) -> types.ModuleType:
-    """Return ``torchvision`` with ``transforms``, ``transforms.functional``, ``utils`` and ``models``."""
-    parts = {
+    """Return ``torchvision`` with ``transforms``, ``transforms.functional``, ``utils``, ``io`` and ``models``."""
+    parts: Dict[str, Tuple[Any, ...]] = {
         "transforms": (ToTensor, ToPILImage, Resize, Compose),
         "transforms.functional": (to_tensor, to_pil_image, resize),
         "utils": (make_grid, save_image),
+        "io": (ImageReadMode, read_image, decode_image, write_png, write_jpeg),
         "models": (),
     }
     made = {"": types.ModuleType(name, __doc__)}
@@ -146,5 +183,5 @@ def module(name: str) -> types.ModuleType:
             setattr(made[path], part.__name__, part)
     for part_of in made.values():
         part_of.__path__ = []
-        part_of.__getattr__ = attribute_guard(part_of.__name__)  # type: ignore[method-assign]
+        part_of.__getattr__ = deferred_guard(part_of.__name__)  # type: ignore[method-assign]
     return made[""]

@@ -145,7 +145,7 @@ def rasterize(
     if rgb is None:
         assert sh is not None
         basis = harmonics(means - settings.campos.detach().to(means.dtype), settings.sh_degree)
-        rgb = (torch.bmm(basis[:, None], sh[:, : basis.shape[1]])[:, 0] + 0.5).clamp_min(0)
+        rgb = ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
     if backend == "torch":
         from legs_adapters.cpu.surfels_oracle import render
     else:

@@ -539,16 +539,14 @@ def spread_gradients(
         gb = sums[3] * scale, sums[4] * scale, sums[5] * scale
         gc = sums[6] * scale, sums[7] * scale, sums[8] * scale
         gd = sums[G_DEPTH] * scale  # to det T
-        gx, gy, gw = np.zeros(3), np.zeros(3), np.zeros(3)
         one, two = _cross(centred_y, ga), _cross(gc, w)
         three, four = _cross(ga, centred_x), _cross(w, gb)
         five, six = _cross(gb, centred_y), _cross(centred_x, gc)
         for k in range(3):
-            gx[k] = one[k] + two[k] + gd * along[k]
-            gy[k] = three[k] + four[k] + gd * down[k]
-            gw[k] = five[k] + six[k] + gd * constant[k] + sums[G_DIRECT + k]
-            gw[k] -= u * gx[k] + v * gy[k]
-            g_homographies[i, 0, k], g_homographies[i, 1, k], g_homographies[i, 2, k] = gx[k], gy[k], gw[k]
+            gx = one[k] + two[k] + gd * along[k]
+            gy = three[k] + four[k] + gd * down[k]
+            gw = five[k] + six[k] + gd * constant[k] + sums[G_DIRECT + k] - u * gx - v * gy
+            g_homographies[i, 0, k], g_homographies[i, 1, k], g_homographies[i, 2, k] = gx, gy, gw
             g_normals[i, k], g_rgb[i, k] = sums[G_NORMAL + k], sums[G_COLOUR + k]
         g_opacities[i, 0] = sums[G_OPACITY] / opacities[i, 0]
         from_x, from_y, from_w = _box_gradient(x, y, w, sums[G_CENTRE], sums[G_CENTRE + 1])

@@ -17,7 +17,8 @@ from legs_loss import LegsError, __version__
 __all__ = ["main"]
 
 EXIT_CODES = (
-    "exit codes: 0 done, or nothing to do; 1 --check: something would change, or --partial: a term was left to you; "
+    "exit codes: 0 done, or nothing to do; 1 --check: something would change, or --partial: a term was left to you, "
+    "or --verify: something did not hold; "
     "2 nothing was changed: bad usage, a term that cannot be decided, no term found, uncommitted changes; "
     "130 interrupted"
 )
@@ -27,6 +28,8 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
     args = _parser().parse_args(argv)
     try:
+        if args.verify:
+            return _patch(args) or _verify(args)
         return _undo(args) if args.undo else _patch(args)
     except LegsError as error:
         print(f"legs-patch: error: {error}", file=sys.stderr)
@@ -52,6 +55,12 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument("--diff", action="store_true", help="show what would change as a unified diff; write nothing")
     what.add_argument("--check", action="store_true", help="exit with 1 if something would change; write nothing")
     what.add_argument("--undo", action="store_true", help="take the patch back, byte for byte")
+    what.add_argument(
+        "--verify",
+        action="store_true",
+        help="patch, then prove on the CPU that it took: train copies with and without it for a few dozen steps, and "
+        "compare",
+    )
     parser.add_argument(
         "--force",
         action="store_true",
@@ -66,6 +75,15 @@ def _parser() -> argparse.ArgumentParser:
         "--exclude", action="append", default=[], metavar="GLOB", help="files or folders not to look at; repeatable"
     )
     parser.add_argument("--json", action="store_true", help="report as JSON")
+    proof = parser.add_argument_group("with --verify")
+    proof.add_argument("--script", metavar="FILE", help="the training script; default: where the term is")
+    proof.add_argument("--iterations", type=int, default=40, metavar="N", help="steps to compare; default: 40")
+    proof.add_argument(
+        "--arguments",
+        metavar="TEXT",
+        help="the script's arguments, with {scene}, {output}, {iterations}, {port} filled in; default: those of "
+        "Inria's train.py that it knows",
+    )
     settings = parser.add_argument_group("settings, written to legs.toml")
     settings.add_argument("--preset", metavar="NAME", help="3dgs, eggs, legs-l or legs; default: legs")
     settings.add_argument("--beta", type=float, metavar="X", help="how far the strongest response lifts the weight")
@@ -129,6 +147,21 @@ def _patch(args: argparse.Namespace) -> int:
     for problem in problems:
         print(_advice(problem), file=sys.stderr)
     return 1 if problems else 0
+
+
+def _verify(args: argparse.Namespace) -> int:
+    import json
+
+    from legs_adapters.verify import verify
+
+    verdict = verify(args.folder, args.script, args.arguments, args.iterations)
+    if args.json:
+        print(
+            json.dumps({"holds": verdict.claims, "runs": {name: run._asdict() for name, run in verdict.runs.items()}})
+        )
+    else:
+        print("\n" + verdict.text(), end="")
+    return 0 if verdict.holds else 1
 
 
 def _undo(args: argparse.Namespace) -> int:

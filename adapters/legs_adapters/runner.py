@@ -22,7 +22,7 @@ from legs_adapters.patch import plan
 from legs_adapters.repo import check_root
 from legs_loss import LegsError
 
-__all__ = ["checkout_of", "run_script"]
+__all__ = ["checkout_of", "execute", "run_script"]
 
 
 def checkout_of(script: Path) -> Path:
@@ -66,14 +66,28 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
     sources = {os.path.realpath(str(root / name)): data for name, data in found.after.items()}
     for site in found.findings.sites:
         print(f"legs-loss: {site.path}:{site.line} is weighted in this run", file=sys.stderr, flush=True)
-    name = str(script)
+    return execute(str(script), arguments, sources, root if cpu else None)
+
+
+def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[Path] = None) -> int:
+    """Run a script as the main program of this process, with other text for the files that ``sources`` names.
+
+    Args:
+        name: the script, as it would be given to python.
+        arguments: its arguments.
+        sources: by real path, what to run in place of what is on disk.
+        cpu_root: the codebase, if what it asks of CUDA is to be answered by the CPU.
+
+    Returns:
+        The exit code, where the script does not leave by ``sys.exit``.
+    """
     file = os.path.abspath(name) if sys.version_info >= (3, 9) else name
     sys.meta_path.insert(0, _Finder(sources))
     refusals: Tuple[Type[BaseException], ...] = ()
-    if cpu:
+    if cpu_root is not None:
         from legs_adapters.cpu import MissingStandIn, start
 
-        start(root)
+        start(cpu_root)
         refusals = (MissingStandIn,)
     main = _main_module(file)
     sys.argv[:] = [name, *arguments]

@@ -1,0 +1,328 @@
+"""Proof on the CPU that a patch took: the patched and the unpatched script are trained, and what they did compared.
+
+Three runs of copies of the checkout, on the embedded scene, from the same seed: unpatched, patched, and patched with
+LEGS_OFF=1. Each is a process of its own, which is watched (see :func:`watch`) and otherwise runs the script as it is.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shlex
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence
+
+from legs_adapters.journal import JOURNAL
+from legs_adapters.patch import plan, undo
+from legs_adapters.repo import check_root
+from legs_loss import LegsError
+
+__all__ = ["ITERATIONS", "Run", "Verdict", "verify", "watch"]
+
+ITERATIONS = 40
+VIEWS, WIDTH, HEIGHT, POINTS = 12, 96, 64, 800  # of the embedded scene
+SECONDS = 1800  # that a run may take
+# What a script that takes arguments in the way of Inria's is given, as far as its source knows them.
+ARGUMENTS = (
+    ("--source_path", "-s {scene}"),
+    ("--model_path", "-m {output}"),
+    ("--port", "--port {port}"),
+    ("--test_iterations", "--test_iterations {iterations}"),
+)
+
+
+class Run(NamedTuple):
+    """What one run did.
+
+    Attributes:
+        code: its exit code.
+        losses: the value of every loss that was trained on, as float.hex has it.
+        seconds: from each step to the next.
+        weighted, weighted_without_gradient, plain: calls of legs_loss.l1_loss.
+        stored, computed, remembered: where weight maps came from.
+        error: the last lines of its stderr.
+    """
+
+    code: int
+    losses: List[str]
+    seconds: List[float]
+    weighted: int
+    weighted_without_gradient: int
+    plain: int
+    stored: int
+    computed: int
+    remembered: int
+    error: str
+
+
+class Verdict(NamedTuple):
+    """The runs, and what was to hold: each claim with whether it does."""
+
+    runs: Dict[str, Run]
+    claims: Dict[str, bool]
+
+    @property
+    def holds(self) -> bool:
+        """Whether all of it does."""
+        return all(self.claims.values())
+
+    def text(self) -> str:
+        """Return the report."""
+        lines = []
+        for name, run in self.runs.items():
+            step = f"{1000 * statistics.median(run.seconds):.0f} ms a step" if run.seconds else "no step"
+            ended = "" if run.code == 0 else f", exit code {run.code}"
+            lines.append(f"{name:<10} {len(run.losses)} steps, {step}{ended}")
+        patched = self.runs["patched"]
+        lines.append(
+            f"{'l1_loss':<10} {patched.weighted} calls weighted in training, {patched.weighted_without_gradient} in "
+            f"no-grad code; {patched.plain} plain"
+        )
+        lines.append(
+            f"{'maps':<10} {patched.stored} from the store, {patched.computed} computed; {patched.remembered} times "
+            "one of these again"
+        )
+        lines += [f"{'holds' if held else 'FAILS':<10} {claim}" for claim, held in self.claims.items()]
+        for name, run in self.runs.items():
+            if run.code != 0 and run.error:
+                lines += [f"{name} ended with:", *(f"    {line}" for line in run.error.splitlines())]
+        return "\n".join(lines) + "\n"
+
+
+def verify(
+    folder: str | os.PathLike[str],
+    script: Optional[str] = None,
+    arguments: Optional[str] = None,
+    iterations: int = ITERATIONS,
+) -> Verdict:
+    """Train a patched checkout and its unpatched self on the CPU, and compare.
+
+    Args:
+        folder: the patched checkout; nothing is written there.
+        script: the training script in it; default: the file of its one weighted term, or its train.py.
+        arguments: the script's arguments, with {scene}, {output}, {iterations} and {port} filled in; default: those of
+            Inria's train.py that its source knows.
+        iterations: how many steps are looked at; a script that goes on is ended then.
+
+    Raises:
+        LegsError: the folder is not patched; or which script trains cannot be told.
+    """
+    from legs_loss.precompute import precompute
+    from legs_loss.reference.embedded import write_embedded_scene
+    from legs_loss.scenes import read_scene
+
+    root = check_root(folder)
+    if not (root / JOURNAL).is_file():
+        raise LegsError(f"{root} is not patched: nothing to verify")
+    script = script or _script(root)
+    if not (root / script).is_file():
+        raise LegsError(f"there is no {script} in {root}")
+    with tempfile.TemporaryDirectory(prefix="legs-verify-") as work:
+        scene = write_embedded_scene(
+            Path(work) / "scene", views=VIEWS, width=WIDTH, height=HEIGHT, points=POINTS, samples=1
+        )
+        precompute(read_scene(scene), scene / "legs_weights")
+        patched, unpatched = (Path(work) / name / root.name for name in ("patched", "unpatched"))
+        for copy in (patched, unpatched):
+            shutil.copytree(str(root), str(copy), symlinks=True, ignore=_unneeded)
+        undo(unpatched, force=True)
+        runs = {}
+        for name, copy, off in (("unpatched", unpatched, ""), ("patched", patched, ""), ("LEGS_OFF", patched, "1")):
+            output = Path(work) / f"output-{name}"
+            given = _arguments(copy / script, arguments, iterations, scene=scene, output=output)
+            runs[name] = _run(copy, script, given, iterations, Path(work) / f"{name}.json", off)
+    return Verdict(runs, _claims(runs))
+
+
+def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
+    unpatched, patched, off = runs["unpatched"], runs["patched"], runs["LEGS_OFF"]
+    steps = len(unpatched.losses)
+    return {
+        "all three trained": all(run.code == 0 and run.losses for run in runs.values()),
+        "as many steps each": steps == len(patched.losses) == len(off.losses),
+        "with LEGS_OFF=1 every loss is the unpatched one, to the last bit": steps > 0
+        and off.losses == unpatched.losses,
+        "with LEGS every loss is another": steps > 0
+        and all(first != second for first, second in zip(unpatched.losses, patched.losses)),
+        "every step was weighted": patched.weighted >= len(patched.losses) > 0,
+        "nothing was weighted in no-grad code": patched.weighted_without_gradient == 0,
+        "nothing was weighted with LEGS_OFF=1": off.weighted == 0,
+    }
+
+
+def _script(root: Path) -> str:
+    found = plan(root).findings
+    files = sorted({site.path for site in found.sites} | {site.path for site in found.patched})
+    trains = [name for name in files if "__main__" in (root / name).read_text(encoding="utf-8", errors="replace")]
+    if len(trains) == 1:
+        return trains[0]
+    if "train.py" in trains or (not trains and (root / "train.py").is_file()):
+        return "train.py"
+    raise LegsError(f"which script trains? Name it with --script; weighted are {', '.join(files) or 'none'}")
+
+
+def _arguments(script: Path, given: Optional[str], iterations: int, **places: Path) -> List[str]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    if given is None:
+        source = "\n".join(
+            path.read_text(encoding="utf-8", errors="replace")
+            for path in (script, *script.parent.glob("arguments/*.py"))
+        )
+        known = [words for option, words in ARGUMENTS if option in source or option[2:] in source]
+        given = " ".join([*known, *(["--iterations {iterations}"] if "iterations" in source else [])])
+    values = {"iterations": iterations, "port": port, **places}
+    try:
+        return [word.format(**values) for word in shlex.split(given)]
+    except (KeyError, IndexError, ValueError) as error:
+        raise LegsError(
+            f"--arguments {given!r}: only {{scene}}, {{output}}, {{iterations}}, {{port}}: {error}"
+        ) from None
+
+
+def _unneeded(folder: str, names: List[str]) -> List[str]:
+    """What a copy can do without: histories, caches, and anything large."""
+    left = {".git", "__pycache__", "node_modules", "output", "outputs"} & set(names)
+    for name in names:
+        path = os.path.join(folder, name)
+        if os.path.isfile(path) and os.path.getsize(path) > 64 << 20:
+            left.add(name)
+    return sorted(left)
+
+
+def _run(root: Path, script: str, arguments: Sequence[str], iterations: int, report: Path, off: str) -> Run:
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
+    environment.update(
+        {
+            "CUDA_VISIBLE_DEVICES": "",
+            "PYTHONHASHSEED": "0",
+            "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+        }
+    )
+    if off:
+        environment["LEGS_OFF"] = off
+    command = [
+        sys.executable,
+        "-m",
+        "legs_adapters.verify",
+        str(report),
+        str(iterations),
+        str(root),
+        script,
+        *arguments,
+    ]
+    with tempfile.TemporaryFile() as said:
+        try:
+            code = subprocess.run(
+                command, cwd=str(root), env=environment, stdout=subprocess.DEVNULL, stderr=said,
+                stdin=subprocess.DEVNULL, timeout=SECONDS,
+            ).returncode  # fmt: skip
+        except subprocess.TimeoutExpired:
+            code = -1
+        said.seek(0)
+        error = said.read().decode("utf-8", "replace")
+    try:
+        found = json.loads(report.read_text())
+    except (OSError, ValueError):
+        found = {field: [] if field in ("losses", "seconds") else 0 for field in Run._fields[1:-1]}
+    return Run(code=code, error="\n".join(error.replace("\r", "\n").strip().splitlines()[-12:]), **found)
+
+
+class _Enough(BaseException):
+    """As many steps as were asked for."""
+
+
+class watch:
+    """Watch this process train: every backward pass from one number, and every call of ``legs_loss.l1_loss``."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.losses: List[str] = []
+        self.times: List[float] = []
+        self.without_gradient = 0
+
+    def __enter__(self) -> watch:
+        import torch
+
+        import legs_loss
+        from legs_loss.runtime import counts
+
+        self._backward, self._l1_loss = torch.Tensor.backward, legs_loss.l1_loss
+
+        def backward(tensor: Any, *args: Any, **kwargs: Any) -> Any:
+            if tensor.numel() == 1:
+                if len(self.losses) >= self.limit:
+                    raise _Enough
+                self.losses.append(float(tensor.detach()).hex())
+                self.times.append(time.perf_counter())
+            return self._backward(tensor, *args, **kwargs)
+
+        def l1_loss(*args: Any, **kwargs: Any) -> Any:
+            before = counts().weighted
+            result = self._l1_loss(*args, **kwargs)
+            self.without_gradient += counts().weighted - before if not torch.is_grad_enabled() else 0
+            return result
+
+        torch.Tensor.backward = backward  # type: ignore
+        legs_loss.l1_loss = l1_loss
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        import torch
+
+        import legs_loss
+
+        torch.Tensor.backward = self._backward  # type: ignore[method-assign]
+        legs_loss.l1_loss = self._l1_loss
+
+    def report(self) -> Dict[str, Any]:
+        """Return all fields of a `Run` that the process itself knows."""
+        from legs_loss.runtime import counts
+
+        found = counts()
+        return {
+            "losses": self.losses,
+            "seconds": [after - before for before, after in zip(self.times, self.times[1:])],
+            "weighted": found.weighted,
+            "weighted_without_gradient": self.without_gradient,
+            "plain": found.plain,
+            "stored": found.stored,
+            "computed": found.computed,
+            "remembered": found.remembered,
+        }
+
+
+def _main(report: str, limit: str, root: str, script: str, *arguments: str) -> int:
+    """Run a script, watched; what was seen goes to a file, whatever happens."""
+    import numpy as np
+    import torch
+
+    from legs_adapters.runner import execute
+
+    random.seed(0)
+    np.random.seed(0)
+    torch.manual_seed(0)
+    with watch(int(limit)) as seen:
+        try:
+            return execute(script, arguments, {}, Path(root))
+        except _Enough:
+            return 0
+        finally:
+            Path(report).write_text(json.dumps(seen.report()))
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(_main(*sys.argv[1:]))
+    except LegsError as error:
+        print(f"legs: error: {error}", file=sys.stderr)
+        sys.exit(2)

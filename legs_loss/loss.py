@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from legs_loss.errors import LegsError
 from legs_loss.images import as_map, check_pair
+from legs_loss.kernels.backends import fused_or_none
 from legs_loss.spec import Spec, as_spec
 from legs_loss.ssim import d_ssim
 from legs_loss.weights import weight_map
@@ -91,7 +92,8 @@ def legs_loss(
         channels_last: where the channel stands.
 
     Returns:
-        A scalar, differentiable in the prediction.
+        A scalar, differentiable in the prediction. With a weight it is computed by numba or Triton where they are
+        installed and take the images (docs/performance.md): equal up to rounding, differentiable once.
 
     Raises:
         LegsError: shapes, ranges or names that do not fit, or a target with NaN or infinity (on the CPU).
@@ -109,6 +111,18 @@ def legs_loss(
     if not 0.0 <= lambda_dssim <= 1.0:
         raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
     check_pair(prediction, target)
+    fused = fused_or_none(
+        prediction,
+        target,
+        spec if weight is None else weight,
+        mask,
+        lambda_dssim,
+        padding,
+        renormalise,
+        channels_last,
+    )
+    if fused is not None:
+        return fused
     if weight is None and spec.beta > 0.0:
         weight = weight_map(target, spec, channels_last)
     photometric = weighted_l1(prediction, target, weight, mask, renormalise, channels_last)

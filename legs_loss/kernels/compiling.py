@@ -1,7 +1,8 @@
-"""`compiled`: numba's njit with the settings that the reference shares."""
+"""`compiled`: numba's njit with the settings that the reference shares; the lock that parallel calls take."""
 
 from __future__ import annotations
 
+import threading
 from typing import Any, Callable
 
 import numba
@@ -22,3 +23,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             return numba.njit(**options)(function)
 
     return decorate
+
+
+# Of numba's three ways to run threads, one ends the process when two of Python's threads use it at a time.
+ONE_AT_A_TIME = threading.Lock()

@@ -1,0 +1,72 @@
+"""Say what was found on this machine, for a bug report: versions, devices, and which backend computes the loss."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import platform
+from typing import TYPE_CHECKING, Iterator, Tuple
+
+from legs_loss._version import __version__
+
+if TYPE_CHECKING:
+    import torch
+
+HELP = "say what was found on this machine, for a bug report"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this command's arguments to its parser: it has none."""
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what was found, a line each, and return the exit code."""
+    for name, value in _lines():
+        print(f"{name:<16} {value}", flush=True)
+    return 0
+
+
+def _lines() -> Iterator[Tuple[str, str]]:
+    import torch
+
+    yield "legs-loss", __version__
+    yield "python", f"{platform.python_version()}, {platform.platform()}"
+    yield "torch", f"{torch.__version__}, {torch.get_num_threads()} threads"
+    yield "CUDA", _cuda()
+    for name, package in (("numba", "numba"), ("triton", "triton"), ("fused-ssim", "fused_ssim")):
+        yield name, _version(package)
+    yield "LEGS_BACKEND", os.environ.get("LEGS_BACKEND") or "not set"
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    for device in devices:
+        yield f"loss on {device}", _backend(torch.device(device))
+
+
+def _cuda() -> str:
+    import torch
+
+    if torch.version.cuda is None:
+        return "this torch is built without it"
+    if not torch.cuda.is_available():
+        return f"{torch.version.cuda}, no device"
+    names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return f"{torch.version.cuda}, {', '.join(names)}"
+
+
+def _version(package: str) -> str:
+    try:
+        module = importlib.import_module(package)
+    except ImportError as error:
+        return "not installed" if getattr(error, "name", None) == package else f"broken: {error}"
+    except Exception as error:  # whatever a broken install raises
+        return f"broken: {type(error).__name__}: {error}"
+    return str(getattr(module, "__version__", "installed"))
+
+
+def _backend(device: torch.device) -> str:
+    from legs_loss.kernels.backends import BACKENDS, backend_for, finding, runs_on
+
+    chosen = backend_for(device)
+    tried = [name for name in BACKENDS if name != "torch" and runs_on(name, device)]
+    reasons = [f"{name}: {finding(name, device).reason}" for name in tried]
+    return "; ".join([chosen, *reasons])

@@ -1,0 +1,41 @@
+"""What the tests of the fused losses share: images, the comparison with the reference, and who computed a loss."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from legs_loss import WeightSpec, legs_loss
+
+
+def images(shape, offset=0.1):
+    target = torch.rand(shape)
+    return (0.8 * target + offset * torch.rand(shape)).requires_grad_(), target
+
+
+def compare(fused, prediction, target, weight, lambda_dssim=0.2):
+    """Compare with the reference in float64, which makes its own weights from the float64 target."""
+    loss = fused(prediction, target, weight, lambda_dssim)
+    (gradient,) = torch.autograd.grad(loss, prediction)
+    exact = prediction.detach().double().requires_grad_()
+    spec = weight if isinstance(weight, WeightSpec) else "3dgs"
+    stored = weight.double() if isinstance(weight, torch.Tensor) else None
+    expected = legs_loss(exact, target.double(), spec, stored, lambda_dssim=lambda_dssim)
+    expected.backward()
+    assert loss.dtype == torch.float32 and loss.shape == ()
+    # float32 keeps 7 digits; SSIM's variances, differences of near-equal numbers, keep about 5.
+    assert loss.item() == pytest.approx(expected.item(), rel=2e-5, abs=1e-6)
+    # A pixel whose response is the least but for rounding has sqrt(rounding) of weight: hence the wider bound.
+    bound = 2e-4 if isinstance(weight, WeightSpec) else 2e-5
+    assert float((gradient.double() - exact.grad).norm() / exact.grad.norm()) < bound
+
+
+def used(loss):
+    """Say which code made a loss, from its graph."""
+    names, nodes = set(), [loss.grad_fn]
+    while nodes:
+        node = nodes.pop()
+        if node is not None:
+            names.add(type(node).__name__)
+            nodes += [parent for parent, _ in node.next_functions]
+    return "fused" if "_FusedLossBackward" in names else "torch"

@@ -98,6 +98,9 @@ def test_the_settings_of_controls() -> None:
     assert (scale.weights, scale.l1_scale, scale.densify_grad_threshold) == (PRESETS["3dgs"], 2.5, 1e-3)
     threshold = parse_arm("legs:threshold").config(base, 1e-3, 2.5)
     assert (threshold.weights, threshold.l1_scale, threshold.densify_grad_threshold) == (PRESETS["legs"], 1, 2.5e-3)
+    half = parse_arm("legs:mean1:half").config(base, 1e-3, 2.5)
+    assert (half.weights.normalise, half.l1_scale, half.densify_grad_threshold) == ("mean", 0.5, 1e-3)
+    assert parse_arm("3dgs:half@3dgs").config(base, 1e-3, 2.5).l1_scale == 0.5
     counted = parse_arm("legs@3dgs").config(base, 1e-3, 2.5)
     assert (counted.weights, counted.densify_grad_threshold, counted.seed) == (PRESETS["legs"], LOOSE * 1e-3, 4)
 

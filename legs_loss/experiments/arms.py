@@ -26,6 +26,7 @@ CHANGES: Mapping[str, str] = {
     "scale": "no map: the L1 term times the loss's mean weight",
     "shuffled": "each map's pixels in random order",
     "mean1": "each map divided by its mean",
+    "half": "half the L1 term, weighted or not, so that SSIM counts for more",
     "threshold": "the densification threshold times the loss's mean weight",
     "growing": "beta grows from 0 over the run",
     "fading": "beta falls to 0 over the run",
@@ -75,7 +76,8 @@ class ArmSpec:
             threshold *= LOOSE
         if "scale" in self.changes:
             return replace(base, spec="3dgs", l1_scale=base.l1_scale * mean_weight, densify_grad_threshold=threshold)
-        return replace(base, spec=self.spec, densify_grad_threshold=threshold)
+        scale = base.l1_scale * (0.5 if "half" in self.changes else 1.0)
+        return replace(base, spec=self.spec, l1_scale=scale, densify_grad_threshold=threshold)
 
 
 def parse_arm(name: str) -> ArmSpec:
@@ -102,7 +104,7 @@ def parse_arm(name: str) -> ArmSpec:
     if at_sign and "@" in at:
         raise LegsError(f"{name}: the arm behind the @ has an @ of its own")
     spec = _loss(name, loss)
-    if changes and spec.beta == 0:
+    if spec.beta == 0 and set(changes) - {"half"}:
         raise LegsError(f"{name}: {loss} has no weights to change")
     leader = parse_arm(at).name if at_sign else None
     preset = next((preset for preset, known in PRESETS.items() if known == spec), loss)

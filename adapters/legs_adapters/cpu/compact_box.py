@@ -20,7 +20,7 @@ from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import TILE
 from legs_loss.reference.rasterizer.projection import BLOCK, TALL, WIDE
 
-__all__ = ["clip"]
+__all__ = ["clip", "touches"]
 
 
 @compiled()
@@ -68,30 +68,46 @@ def _slices(a, b, c, t, u0, v0, least, most, u_tiles, v_tiles, spans):
 
 
 @compiled()
+def _reach(x, y, a, b, c, opacity, mult, tiles, spans):
+    """Which tiles a splat is drawn in: whether ``spans`` go by rows, the first and past the last of them, how many."""
+    t = mult * 2 * math.log(opacity * 255)
+    disc = b * b - a * c
+    if not (t > 0 and disc < 0):
+        return False, 0, 0, 0
+    reach_x, reach_y = math.sqrt(t * c / -disc), math.sqrt(t * a / -disc)
+    # Where the ellipse is highest and lowest, x is off the centre by this, and likewise y at its sides.
+    at_x, at_y = -b / a * reach_y, -b / c * reach_x
+    across = _tile((x + reach_x) / TILE + 1, tiles[0]) - _tile((x - reach_x) / TILE, tiles[0])
+    down = _tile((y + reach_y) / TILE + 1, tiles[1]) - _tile((y - reach_y) / TILE, tiles[1])
+    first = end = count = 0
+    if across * down > 0 and down < across:
+        least, most = (y - reach_y, x - reach_x, y - at_y), (y + reach_y, x + reach_x, y + at_y)
+        first, end, count = _slices(c, b, a, t, y, x, least, most, tiles[1], tiles[0], spans)
+    elif across * down > 0:
+        least, most = (x - reach_x, y - reach_y, x - at_x), (x + reach_x, y + reach_y, x + at_x)
+        first, end, count = _slices(a, b, c, t, x, y, least, most, tiles[0], tiles[1], spans)
+    return down < across, first, end, count
+
+
+@compiled()
+def touches(splats, opacities, mult, tiles):
+    """Whether splats [N, 5], rows of u, v and the conic, are drawn in any tile, be it between its pixels."""
+    spans = np.empty((max(tiles[0], tiles[1]), 2), np.int64)
+    found = np.zeros(len(splats), np.bool_)
+    for i in range(len(splats)):
+        x, y, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
+        found[i] = _reach(x, y, a, b, c, opacities[i], mult, tiles, spans)[3] > 0
+    return found
+
+
+@compiled()
 def _clip_block(start, stop, splats, opacities, mult, tiles, boxes, slots, first_slots, slot_strips, slot_rows, radii):
     spans = np.empty((max(tiles[0], tiles[1]), 2), np.int64)
     for i in range(start, stop):
         if slots[i] == 0:
-            radii[i] = 0
             continue
         x, y, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
-        t = mult * 2 * math.log(np.float64(opacities[i, 0]) * 255)
-        disc = b * b - a * c
-        first = end = count = 0
-        by_rows = False
-        if t > 0 and disc < 0:
-            reach_x, reach_y = math.sqrt(t * c / -disc), math.sqrt(t * a / -disc)
-            # Where the ellipse is highest and lowest, x is off the centre by this, and likewise y at its sides.
-            at_x, at_y = -b / a * reach_y, -b / c * reach_x
-            across = _tile((x + reach_x) / TILE + 1, tiles[0]) - _tile((x - reach_x) / TILE, tiles[0])
-            down = _tile((y + reach_y) / TILE + 1, tiles[1]) - _tile((y - reach_y) / TILE, tiles[1])
-            by_rows = down < across
-            if across * down > 0 and by_rows:
-                least, most = (y - reach_y, x - reach_x, y - at_y), (y + reach_y, x + reach_x, y + at_y)
-                first, end, count = _slices(c, b, a, t, y, x, least, most, tiles[1], tiles[0], spans)
-            elif across * down > 0:
-                least, most = (x - reach_x, y - reach_y, x - at_x), (x + reach_x, y + reach_y, x + at_x)
-                first, end, count = _slices(a, b, c, t, x, y, least, most, tiles[0], tiles[1], spans)
+        by_rows, first, end, count = _reach(x, y, a, b, c, np.float64(opacities[i, 0]), mult, tiles, spans)
         if count == 0:
             radii[i] = 0
         slot = first_slots[i]
@@ -120,7 +136,7 @@ def _clip_block(start, stop, splats, opacities, mult, tiles, boxes, slots, first
 
 @compiled(parallel=True)
 def clip(splats, opacities, mult, tiles, boxes, slots, first_slots, slot_strips, slot_rows, radii):
-    """Take from every slot the rows outside the compact box; the radius of a Gaussian in no tile becomes 0.
+    """Take from every slot the rows outside the compact box; a Gaussian with slots and no tile gets radius 0.
 
     Args:
         splats, boxes, slots, first_slots, slot_strips, slot_rows, radii: as the reference rasterizer has them after

@@ -10,13 +10,17 @@ from __future__ import annotations
 import types
 from typing import Any, NamedTuple, Optional, Tuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from legs_adapters.cpu import inria
+from legs_adapters.cpu.camera import pinhole
 from legs_adapters.cpu.drawing import Gaussians, Lens, draw
-from legs_adapters.cpu.missing import attribute_guard
+from legs_adapters.cpu.missing import attribute_guard, refuse_unknown
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
+from legs_loss.reference.conventions import TILE, View
+from legs_loss.reference.rasterizer import oracle
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
 
@@ -58,12 +62,14 @@ class GaussianRasterizer(inria.GaussianRasterizer):
         scales: Optional[Tensor] = None,
         rotations: Optional[Tensor] = None,
         cov3D_precomp: Optional[Tensor] = None,
+        **unknown: Any,
     ) -> Tuple[Tensor, Tensor, Tensor]:
         """Return image [3, H, W], radii int32 [N], counts int32 [N]; dc is [N, 1, 3], shs the harmonics that remain."""
+        refuse_unknown(NAME, unknown)
         shs = shs if dc is None or shs is None else torch.cat([dc, shs], 1)
         gaussians = Gaussians(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
         settings = self.raster_settings
-        drawn = draw(gaussians, settings, NAME, Lens(square=EVERYWHERE), _CompactBox(opacities, settings))
+        drawn = draw(gaussians, settings, NAME, Lens(square=EVERYWHERE), _CompactBox(gaussians, settings))
         counts = torch.empty(0, dtype=torch.int32)
         if settings.get_flag:
             marked = (settings.metric_map == 1).reshape(int(settings.image_height), int(settings.image_width))
@@ -72,14 +78,41 @@ class GaussianRasterizer(inria.GaussianRasterizer):
 
 
 class _CompactBox:
-    def __init__(self, opacities: Tensor, settings: Any) -> None:
-        self.opacities = opacities.detach().contiguous().numpy()
-        self.mult = float(settings.mult)
+    """What `compiled.draw` calls to have splats clipped."""
 
-    def __call__(self, tiles: Any, splats: Any, *arrays: Any) -> None:
+    def __init__(self, gaussians: Gaussians, settings: Any) -> None:
+        self.gaussians, self.settings = gaussians, settings
+
+    def __call__(self, tiles: Any, splats: Any, boxes: Any, slots: Any, *arrays: Any) -> None:
         from legs_adapters.cpu.compact_box import clip
 
-        clip(splats, self.opacities, self.mult, tiles, *arrays)
+        opacities = self.gaussians.opacities.detach().contiguous().numpy()
+        clip(splats, opacities, float(self.settings.mult), tiles, boxes, slots, *arrays)
+        radii = arrays[-1]
+        # A Gaussian that reaches no pixel's centre is visible, to FastGS, if it enters a tile all the same.
+        faint = np.nonzero((slots == 0) & (radii > 0))[0]
+        radii[faint[~self._enters(torch.from_numpy(faint), tiles, radii[faint])]] = 0
+
+    def _enters(self, rows: Tensor, tiles: Any, radii: Any) -> Any:
+        from legs_adapters.cpu.compact_box import touches
+
+        view = View.of(pinhole(self.settings, NAME))
+        to_camera = torch.from_numpy(view.world_to_camera)
+        points = self.gaussians.means3D.detach()[rows].double() @ to_camera[:3, :3].T + to_camera[:3, 3]
+        centres = points[:, :2] / points[:, 2:] * torch.tensor([view.fx, view.fy])
+        centres = centres + torch.tensor([view.cx - 0.5, view.cy - 0.5])
+        reach, size = torch.from_numpy(radii)[:, None].double() + 1, TILE * torch.from_numpy(tiles)
+        near = torch.nonzero(((centres + reach > 0) & (centres - reach < size)).all(1))[:, 0]
+        chosen = rows[near]
+        scales = self.gaussians.scales.detach()[chosen].double() * self.settings.scale_modifier
+        shapes = oracle.project(points[near], scales, self.gaussians.rotations.detach()[chosen].double(), view)
+        opacities = self.gaussians.opacities.detach()[chosen, 0].double()
+        found = np.zeros(len(rows), np.bool_)
+        found[near.numpy()] = touches(
+            torch.cat([shapes.centres, shapes.conics], 1).contiguous().numpy(),
+            opacities.numpy(), float(self.settings.mult), tiles,
+        )  # fmt: skip
+        return found
 
 
 def module(name: str) -> types.ModuleType:

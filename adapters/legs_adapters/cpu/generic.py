@@ -17,7 +17,7 @@ from torch import Tensor
 
 from legs_adapters.cpu import inria
 from legs_adapters.cpu.drawing import Drawn, Gaussians, Lens, draw
-from legs_adapters.cpu.missing import Absent, MissingStandIn, attribute_guard
+from legs_adapters.cpu.missing import Absent, MissingStandIn, attribute_guard, refuse_unknown
 from legs_adapters.cpu.relocation import compute_relocation
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 from legs_adapters.cpu.survey import Interface
@@ -72,9 +72,7 @@ def module(name: str, interface: Optional[Interface] = None) -> types.ModuleType
                 known["shs"] = torch.cat([dc, known["shs"]], 1)
             elif dc is not None and dc.numel():
                 known["shs"] = dc
-            for key, value in inputs.items():
-                if value is not None:
-                    raise MissingStandIn(name, f"GaussianRasterizer.forward({key}=...)")
+            refuse_unknown(name, inputs)
             names = _names_at_call(found) or ("image", "radii")
             gaussians = Gaussians(means3D, means2D, opacities, **known)
             drawn = draw(gaussians, self.raster_settings, name, _lens(self.raster_settings, name))

@@ -14,10 +14,12 @@ from torch import Tensor, nn
 
 from legs_adapters.cpu.camera import visible
 from legs_adapters.cpu.drawing import Gaussians, draw
-from legs_adapters.cpu.missing import attribute_guard
+from legs_adapters.cpu.missing import attribute_guard, refuse_unknown
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
+
+NAME = "diff_gaussian_rasterization"
 
 
 class GaussianRasterizationSettings(NamedTuple):
@@ -59,10 +61,12 @@ class GaussianRasterizer(nn.Module):
         scales: Optional[Tensor] = None,
         rotations: Optional[Tensor] = None,
         cov3D_precomp: Optional[Tensor] = None,
+        **unknown: Any,
     ) -> Tuple[Tensor, Tensor]:
         """Return the image [3, H, W] and the radii int32 [N], 0 for what is not drawn."""
+        refuse_unknown(NAME, unknown)
         gaussians = Gaussians(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
-        drawn = draw(gaussians, self.raster_settings, __name__.rpartition(".")[2])
+        drawn = draw(gaussians, self.raster_settings, NAME)
         return drawn.image, drawn.radii
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, List
+from typing import Any, Dict, List
 
 from legs_loss import LegsError
 
-__all__ = ["Absent", "Deferred", "MissingStandIn", "attribute_guard", "deferred_guard"]
+__all__ = ["Absent", "Deferred", "MissingStandIn", "attribute_guard", "deferred_guard", "refuse_unknown"]
 
 
 class MissingStandIn(LegsError, ImportError):
@@ -29,6 +29,13 @@ def attribute_guard(module: str) -> Any:
         raise MissingStandIn(module, name)
 
     return __getattr__
+
+
+def refuse_unknown(module: str, inputs: Dict[str, Any]) -> None:
+    """Raise for the first input of a rasterizer's ``forward`` that is given and has no meaning here."""
+    for name, value in inputs.items():
+        if value is not None:
+            raise MissingStandIn(module, f"GaussianRasterizer.forward({name}=...)")
 
 
 def deferred_guard(module: str) -> Any:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from legs_adapters.cpu import inria
 from legs_adapters.cpu.drawing import Gaussians, draw
-from legs_adapters.cpu.missing import Absent, attribute_guard
+from legs_adapters.cpu.missing import Absent, attribute_guard, refuse_unknown
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
@@ -54,12 +54,14 @@ class GaussianRasterizer(inria.GaussianRasterizer):
         scales: Optional[Tensor] = None,
         rotations: Optional[Tensor] = None,
         cov3D_precomp: Optional[Tensor] = None,
+        **unknown: Any,
     ) -> Tuple[Any, ...]:
         """Return image, radii; counts, lists, listsRender, listsDistance; centres, depths, radii; and four sums.
 
         The sums, [N] each: of the pixels' weights, of pixels (int32), of transmittance times alpha, and of the
         distance from the centre in pixels.
         """
+        refuse_unknown(NAME, unknown)
         shs = shs if dc is None or shs is None else torch.cat([dc, shs], 1)
         gaussians = Gaussians(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
         settings = self.raster_settings

@@ -21,6 +21,7 @@ _L1_NAME = re.compile(
 )
 _SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)
 _SHAPE_ONLY = {"shape", "device", "dtype", "dim", "ndim", "size", "numel", "is_cuda"}
+_TRANSFORMS = {"pow", "square", "log", "log1p", "log2", "log10", "exp", "sqrt", "tanh", "sigmoid"}
 _NOT_L1 = {"pow", "square", "sqrt", "log", "exp", "mse_loss", "norm", "smooth_l1_loss", "huber_loss"}
 
 
@@ -59,7 +60,7 @@ def is_l1_name(name: str) -> bool:
 def forms(program: Program, function: Function) -> List[Form]:
     """Return the L1 expressions in a function's own body, in source order; the widest where they nest."""
     found: List[Form] = []
-    inside: Set[int] = set()
+    inside = _transformed(function)
     for node in function.flow.expressions:
         if id(node) in inside or not isinstance(node, cst.Call):
             continue
@@ -69,6 +70,20 @@ def forms(program: Program, function: Function) -> List[Form]:
             inside.add(id(form.call))
             if form.difference is None or form.callee is None:
                 inside.update(id(n) for n in walk_expressions(form.node) if isinstance(n, cst.Call) and _is_abs(n))
+    return found
+
+
+def _transformed(function: Function) -> Set[int]:
+    """The ids of the calls whose values are squared, or go through a logarithm and its like: no L1 any more."""
+    found: Set[int] = set()
+    for node in function.flow.expressions:
+        parts: List[cst.CSTNode] = []
+        if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Power):
+            parts = [node.left]
+        elif isinstance(node, cst.Call) and call_name(node) in _TRANSFORMS:
+            parts = [node.func, *node.args]
+        for part in parts:
+            found.update(id(n) for n in walk_expressions(part) if isinstance(n, cst.Call) and n is not node)
     return found
 
 
@@ -85,8 +100,8 @@ def _absolute(function: Function, node: cst.Call) -> Optional[Form]:
         return None
     if isinstance(argument, cst.BinaryOperation) and isinstance(argument.operator, cst.Subtract):
         return Form(node, inner, argument.left, argument.right, reduction, difference=argument)
-    if isinstance(argument, cst.BinaryOperation) and isinstance(argument.operator, cst.Multiply):
-        for side in (argument.left, argument.right):
+    if isinstance(argument, cst.BinaryOperation) and isinstance(argument.operator, (cst.Multiply, cst.Divide)):
+        for side in (argument.left, argument.right)[: 1 if isinstance(argument.operator, cst.Divide) else 2]:
             if isinstance(side, cst.BinaryOperation) and isinstance(side.operator, cst.Subtract):
                 return Form(inner, inner, side.left, side.right, "wrapped", difference=side)
     if isinstance(argument, cst.Name):
@@ -408,9 +423,13 @@ def _only_differences(program: Program, function: Function, a: str, b: str, dept
             if name in _NOT_L1:
                 return False
             absolute = absolute or _is_abs(node)
-            positional, _, starred = arguments(node)
-            pair = len(positional) >= 2 and not starred and _mirrored(positional[0], positional[1], a, b)
-            if pair and any(_l1_reference(program, r, node, depth) for r in program.resolve(function, node.func)):
+            positional = arguments(node)[0]
+            spread = any(arg.star == "*" for arg in node.args)
+            pair = len(positional) >= 2 and not spread and _mirrored(positional[0], positional[1], a, b)
+            if pair and (
+                any(_l1_reference(program, r, node, depth) for r in program.resolve(function, node.func))
+                or any(_is_l1_function(program, function, value, depth) for value in positional[2:])
+            ):
                 allowed.update(id(n) for value in positional[:2] for n in walk_expressions(value))
                 absolute = True
         elif isinstance(node, cst.Comparison):
@@ -441,6 +460,16 @@ def _l1_reference(program: Program, reference: Reference, node: cst.Call, depth:
     if reference.kind == "function" and isinstance(reference.target, Function):
         return own_shape(program, reference.target, node, depth + 1) is not None
     return reference.kind == "external" and _reference_shape(program, reference, node) is not None
+
+
+def _is_l1_function(program: Program, function: Function, node: cst.BaseExpression, depth: int) -> bool:
+    """Whether an argument is an L1 function itself, as in ``masked_loss(pred, gt, l1, mask=mask)``."""
+    if not isinstance(node, cst.Name):
+        return False
+    references = program.resolve(function, node)
+    return bool(references) and all(
+        isinstance(r.target, Function) and own_shape(program, r.target, None, depth + 1) is not None for r in references
+    )
 
 
 def _mirrored(left: cst.BaseExpression, right: cst.BaseExpression, a: str, b: str) -> bool:

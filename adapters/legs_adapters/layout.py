@@ -102,6 +102,8 @@ def _uses(function: Function, node: cst.CSTNode) -> List[List[int]]:
             found.append([3])
         elif order in _TO_LAST:
             found.append([-3])
+        elif call_name(call) in ("mean", "sum") and _reduced(call) is not None:  # a grey image, a norm of the channels
+            found.append([1 if _reduced(call) == -1 else -1])
         elif pattern is not None:
             found.append([3] if pattern.split("->")[0].split()[-1:] == ["c"] else [-3])
     return found
@@ -120,6 +122,20 @@ def _permutation(node: cst.Call) -> Optional[Tuple[int, ...]]:
         order = tuple(value for value in values if isinstance(value, int))
     rank = len(order)
     return tuple(i % rank for i in order) if rank in (3, 4) and all(isinstance(i, int) for i in order) else None
+
+
+def _reduced(node: cst.Call) -> Optional[int]:
+    """The one axis that ``x.mean(dim=-1)`` goes over, if it can only be the channels: the last, or the first."""
+    positional, keywords, _ = arguments(node)
+    values = [keywords[key] for key in ("dim", "axis") if key in keywords]
+    if isinstance(node.func, cst.Attribute) and not (
+        isinstance(node.func.value, cst.Name) and node.func.value.value == "torch"
+    ):
+        values += positional[:1]
+    else:
+        values += positional[1:2]
+    axis = constant(values[0]) if values else None
+    return axis if axis in (-1, 0, -3) and not isinstance(axis, bool) else None
 
 
 def _subject(node: cst.Call) -> Optional[cst.CSTNode]:

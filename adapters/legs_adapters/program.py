@@ -104,7 +104,7 @@ class Program:
             made = self.resolve(function, node.func, depth + 1)
             instances = [Reference("instance", ref.target) for ref in made if ref.kind == "class"]
             instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
-            return instances
+            return _unique(instances + self._returned(made, None, depth + 1))
         if isinstance(node, cst.Subscript):
             return self._subscript(function, node, depth + 1)
         if isinstance(node, cst.IfExp):
@@ -147,7 +147,29 @@ class Program:
             return self.resolve(where, definition.value, depth)
         if definition.kind == "parameter" and definition.value is not None:
             return self.resolve(where, definition.value, depth)
+        if definition.kind == "element" and definition.index is not None and isinstance(definition.value, cst.Call):
+            return self._returned(self.resolve(where, definition.value.func, depth), definition.index, depth)
         return []
+
+    def _returned(self, made: List[Reference], index: Optional[int], depth: int) -> List[Reference]:
+        """``render = get_renderer(kind)``: the functions that functions return, or one of those in a tuple."""
+        found: List[Reference] = []
+        for ref in made:
+            if ref.kind != "function" or ref.guess or not isinstance(ref.target, Function) or depth > _DEPTH:
+                continue
+            for value in ref.target.flow.returns:
+                part: cst.CSTNode = value
+                if index is not None:
+                    if not isinstance(value, cst.Tuple) or index >= len(value.elements):
+                        continue
+                    part = value.elements[index].value
+                if isinstance(part, (cst.Name, cst.Attribute, cst.Subscript, cst.Lambda)):
+                    found.extend(
+                        r
+                        for r in self.resolve(ref.target, part, depth + 1)
+                        if r.kind in ("function", "lambda") and not r.guess
+                    )
+        return _unique(found)
 
     def _global(self, module: Module, name: str, depth: int) -> List[Reference]:
         if depth > _DEPTH:

@@ -94,6 +94,10 @@ class _Text:
     # -- one site
 
     def edits_for(self, site: Site, name: str) -> List[Edit]:
+        plain = " ".join(self.text(*self.span(site.form.node, True)).split())
+        return [*self._edits_for(site, name), *(self.edit(*self.span(read, True), plain) for read in site.aside)]
+
+    def _edits_for(self, site: Site, name: str) -> List[Edit]:
         form = site.form
         if form.reduction == "registered":
             assert form.callee is not None

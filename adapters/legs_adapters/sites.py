@@ -18,11 +18,13 @@ from legs_adapters.module import Function, Module
 from legs_adapters.program import Program, mention
 from legs_adapters.provenance import View, Views
 from legs_adapters.repo import Source, Unreadable
+from legs_adapters.steps import Steps
 from legs_adapters.syntax import (
     attribute_chain,
     call_name,
     code,
     constant,
+    key_of,
     same,
     walk_expressions,
     word_set,
@@ -30,13 +32,14 @@ from legs_adapters.syntax import (
 )
 from legs_adapters.training import Training
 from legs_adapters.upstreams import registered
-from legs_adapters.vocabulary import kind_of_words
+from legs_adapters.vocabulary import kind_of_words, role_of_words
 
 __all__ = ["Findings", "Left", "Problem", "Site", "find"]
 
 _MAY_HAVE_L1 = re.compile(r"[lL]1|\babs\s*\(")
 _SPLATS = re.compile(r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_pkg|3dgs|surfel", re.I)
 _RAYS = re.compile(r"\bmesh|rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
+_RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
 _MASK_WORDS = {
     "mask",
     "masks",
@@ -50,6 +53,8 @@ _MASK_WORDS = {
     "inside",
     "foreground",
     "sel",
+    "robust",
+    "inliers",
 }
 _EVALUATION = word_set(
     """
@@ -83,6 +88,7 @@ class Site(NamedTuple):
         channels_last: the images are [H, W, C].
         view: the verdict on ``view=``.
         function: the name of the function that it stands in.
+        aside: other reads of the same error map, which are not the loss and keep the plain one.
     """
 
     path: str
@@ -95,6 +101,7 @@ class Site(NamedTuple):
     channels_last: bool
     view: View
     function: str
+    aside: Tuple[cst.Name, ...] = ()
 
     def named_by(self, line: int) -> bool:
         """Whether a line that a person names is one of its lines."""
@@ -141,6 +148,13 @@ def find(sources: Iterable[Source], by_hand: Sequence[Tuple[str, int]] = ()) -> 
     return _Finder(Program(sources), by_hand).run()
 
 
+class _Shared(NamedTuple):
+    """The reads of an error map: the one to be weighted in its place; and those that are to keep the plain map."""
+
+    loss: List[cst.Name]
+    aside: List[cst.Name]
+
+
 class _Finder:
     def __init__(self, program: Program, by_hand: Sequence[Tuple[str, int]]) -> None:
         self.program = program
@@ -148,6 +162,7 @@ class _Finder:
         self.training = Training(program)
         self.meanings = Meanings(program, self.training)
         self.views = Views(program)
+        self.steps = Steps(program, self.training)
         self.found = Findings([], [], [], [], [], program)
         self._forms: Dict[Function, List[Form]] = {}
         self._handed: Set[Function] = set()
@@ -258,18 +273,21 @@ class _Finder:
         if not form.direct:
             return self._problem(module.path, line, text, form, swapped, "the difference has a name of its own")
         shared = self._shared(function, form)
-        if shared is not None:
-            if not shared or not self._unchanged(function, first, second):
-                why = f"{_short(form.node)} serves more than the loss"
-                return self._problem(module.path, line, text, form, swapped, why)
-            form = form._replace(node=shared[0], reduction="again")
+        aside: Tuple[cst.Name, ...] = ()
+        if shared is not None and shared.loss:
+            form = form._replace(node=shared.loss[0], reduction="again")
+        elif shared is not None and shared.aside:
+            aside = tuple(shared.aside)
+        elif shared is not None:
+            why = f"{_short(form.node)} serves more than the loss"
+            return self._problem(module.path, line, text, form, swapped, why)
         prediction, target = (second, first) if swapped else (first, second)
         last = is_channels_last(self.training, function, prediction, target)
         view = self.views.of(function, target, form.call)
-        return Site(module.path, *where, end, form, swapped, index, last, view, function.name)
+        return Site(module.path, *where, end, form, swapped, index, last, view, function.name, aside)
 
-    def _shared(self, function: Function, form: Form) -> Optional[List[cst.Name]]:
-        """``error = torch.abs(image - gt)`` that also makes a mask, say: the reads of it that are the loss.
+    def _shared(self, function: Function, form: Form) -> Optional[_Shared]:
+        """``error = torch.abs(image - gt)`` that also makes a mask, say: which reads of it are the loss, which are not.
 
         None where it is the loss alone (and what is logged of it).
         """
@@ -282,10 +300,27 @@ class _Finder:
         if form.reduction != "none" or not made:
             return None
         reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
-        trained = [read for read in reads if self.training.includes(read)]
-        if all(read in trained or id(read) in function.flow.without_grad for read in reads):
+        callers = {id(arg.value): call for call in function.flow.calls for arg in call.args}
+        masks = [read for read in reads if id(read) in callers and _makes_mask(callers[id(read)])]
+        loss = [read for read in reads if self.training.includes(read) and read not in masks]
+        logged = {
+            id(part)
+            for call in function.flow.calls
+            if call_name(call) in ("item", "tolist", "numpy")
+            for part in attribute_chain(call)
+        } | function.flow.without_grad
+        aside = [read for read in reads if read not in loss and id(read) not in logged]
+        if not aside:
             return None
-        return trained if len(trained) == 1 else []
+        again = loss if len(loss) == 1 and self._unchanged(function, form.first, form.second) else []
+        known = all(
+            function.flow.names_at(callers[id(read)], part.value) == function.flow.reaching(part)
+            for read in aside
+            for image in (form.first, form.second)
+            for part in walk_expressions(image)
+            if id(read) in callers and isinstance(part, cst.Name) and function.flow.reaching(part)
+        )
+        return _Shared(again, aside if known and all(id(read) in callers for read in aside) else [])
 
     @staticmethod
     def _unchanged(function: Function, *images: cst.CSTNode) -> bool:
@@ -335,13 +370,15 @@ class _Finder:
         trained = trained or self._called_by_framework(function)
         if not trained or self._without_grad(function, form):
             return self._why_untrained(function, form)
-        if "image" not in (a.kind, b.kind):
+        if "image" not in (a.kind, b.kind) and not _counterparts(form):
             return "unknown"
         if _same_root(form):
             return "regulariser"
         if a.role == b.role == "render":
             return "distillation"
-        if _detached(form.second if self._swapped(a, b) else form.first):
+        if _detached(form.second if self._swapped(a, b) else form.first) or any(
+            _makes_mask(call) and any(arg.value is form.node for arg in call.args) for call in function.flow.calls
+        ):
             return "weighting"
         owner = self.program.owner_of(function)
         names = (function.name, *function.flow.conditions.get(id(form.call), ()))
@@ -355,9 +392,11 @@ class _Finder:
             return "evaluation"
         if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
             return "evaluation"
-        if not (self._about_splats(function) or self._rendered(module, function, form)):
+        if not (self._about_splats(function) or self._rendered(module, function, form)) or (
+            "eikonal" in module.text and _RAY_COLOURS.search(_short(form.node))
+        ):
             return "other"
-        return None
+        return self.steps.purpose(function, form.call)
 
     def _is_definition(self, function: Function, form: Form) -> bool:
         """Whether this is the body of the codebase's own L1 function, whose calls are what counts."""
@@ -484,7 +523,7 @@ class _Finder:
         return False
 
     def _rendered(self, module: Module, function: Function, form: Form) -> bool:
-        """Whether the rendering says so itself, in a codebase about splats and a file that is not about rays."""
+        """Whether the rendering says so itself, or files beside it do, where the file is not about rays."""
         sides: List[cst.CSTNode] = [*walk_expressions(form.first), *walk_expressions(form.second)]
         for part in list(sides):
             if isinstance(part, cst.Name):
@@ -492,11 +531,12 @@ class _Finder:
                     if definition.value is not None:
                         sides.extend(walk_expressions(definition.value))
         names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
-        return (
-            any(word.startswith(("render", "raster")) for word in names)
-            and not _RAYS.search(module.text)
-            and bool(self.program.matching(_SPLATS))
-        )
+        if _RAYS.search(module.text):
+            return False
+        rendered = any(word.startswith(("render", "raster")) for word in names)
+        folder = module.path.rpartition("/")[0]
+        near = (s for path, s in self.program.sources.items() if not folder or path.startswith(folder + "/"))
+        return any(_SPLATS.search(s.text) for s in (self.program.sources.values() if rendered else near))
 
     @staticmethod
     def _swapped(a: Meaning, b: Meaning) -> Optional[bool]:
@@ -508,6 +548,11 @@ class _Finder:
         if a.role == "render" and b.role is None:
             return False
         if b.role == "render" and a.role is None:
+            return True
+        # of a composite of both and one of them, the composite is the other
+        if (a.role == "render" and b.role == "both") or (a.role == "both" and b.role == "target"):
+            return False
+        if (a.role == "both" and b.role == "render") or (a.role == "target" and b.role == "both"):
             return True
         return None
 
@@ -526,6 +571,10 @@ class _Finder:
         return Problem(path, line, text, reason, advice)
 
 
+def _makes_mask(call: cst.Call) -> bool:
+    return bool(set(words(call_name(call))) & _MASK_WORDS) or call_name(call) == "quantile"
+
+
 def _speaks_of_images(node: cst.CSTNode) -> bool:
     return any(
         kind_of_words(part.value) == "image" for part in walk_expressions(node) if isinstance(part, cst.Name)
@@ -539,7 +588,22 @@ def _speaks_of_images(node: cst.CSTNode) -> bool:
 def _same_root(form: Form) -> bool:
     """``x[1:] - x[:-1]``: a picture against itself."""
     a, b = form.first, form.second
-    return isinstance(a, cst.Subscript) and isinstance(b, cst.Subscript) and same(a.value, b.value) and not same(a, b)
+    if not (isinstance(a, cst.Subscript) and isinstance(b, cst.Subscript)) or isinstance(key_of(a), str):
+        return False
+    return same(a.value, b.value) and not same(a, b)
+
+
+def _counterparts(form: Form) -> bool:
+    """``rendered_lips`` and ``gt_lips``: the same thing, once rendered and once photographed."""
+    names = []
+    for node in (form.first, form.second):
+        key = key_of(node)
+        text = node.value if isinstance(node, cst.Name) else key if isinstance(key, str) else ""
+        names.append((role_of_words(text), [w for w in words(text) if role_of_words(w) is None], words(text)))
+    (a, rest_a, _), (b, rest_b, _) = names
+    spoken = {word for _, _, each in names for word in each}
+    rendered = any(word.startswith("render") for word in spoken)
+    return {a, b} == {"render", "target"} and bool(rest_a) and rest_a == rest_b and rendered
 
 
 def _detached(node: cst.CSTNode) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import dataclasses
 import re
-from functools import lru_cache
 from typing import Any, Dict, FrozenSet, Iterator, List, Optional, Tuple
 
 import libcst as cst
@@ -18,6 +17,8 @@ __all__ = [
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _EMPTY = cst.Module(body=[])
 _MISSING = object()
+_NODES: Dict[type, bool] = {}
+_FIELDS: Dict[type, Tuple[str, ...]] = {}
 
 
 def code(node: cst.CSTNode) -> str:
@@ -79,13 +80,14 @@ def key_of(node: cst.CSTNode) -> Any:
 
 def path_of(node: cst.CSTNode) -> Optional[str]:
     """Return one spelling for a place that can be assigned: ``x``, ``self.x``, ``losses['im']``; else None."""
-    if isinstance(node, cst.Name):
-        return node.value
-    if isinstance(node, cst.Attribute):
-        base = path_of(node.value)
-        return None if base is None else f"{base}.{node.attr.value}"
-    if isinstance(node, cst.Subscript):
-        base, key = path_of(node.value), key_of(node)
+    kind = type(node)
+    if kind is cst.Name:
+        return node.value  # type: ignore[attr-defined]
+    if kind is cst.Attribute:
+        base = path_of(node.value)  # type: ignore[attr-defined]
+        return None if base is None else f"{base}.{node.attr.value}"  # type: ignore[attr-defined]
+    if kind is cst.Subscript:
+        base, key = path_of(node.value), key_of(node)  # type: ignore[attr-defined]
         return None if base is None or key is None else f"{base}[{key!r}]"
     return None
 
@@ -143,12 +145,13 @@ def children(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
     """Yield a node's direct children in source order, without white space and punctuation."""
     for name in _fields(type(node)):
         value = getattr(node, name)
-        if isinstance(value, cst.CSTNode):
-            yield value
-        elif isinstance(value, (list, tuple)):
+        kind = type(value)
+        if kind is list or kind is tuple:
             for item in value:
-                if isinstance(item, cst.CSTNode):
+                if _is_node(type(item)):
                     yield item
+        elif _is_node(kind):
+            yield value
 
 
 def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
@@ -157,19 +160,29 @@ def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
     while stack:
         node = stack.pop()
         yield node
-        below = [child for child in children(node) if not isinstance(child, (cst.FunctionDef, cst.ClassDef))]
+        below = [
+            child for child in children(node) if type(child) is not cst.FunctionDef and type(child) is not cst.ClassDef
+        ]
         stack.extend(reversed(below))
 
 
-@lru_cache(maxsize=None)
+def _is_node(kind: type) -> bool:
+    """Whether a class is one of LibCST's nodes: to ask isinstance of every node costs more than all the rest."""
+    if kind not in _NODES:
+        _NODES[kind] = issubclass(kind, cst.CSTNode)
+    return _NODES[kind]
+
+
 def _fields(kind: type) -> Tuple[str, ...]:
-    return tuple(
-        field.name
-        for field in dataclasses.fields(kind)
-        if not field.name.startswith(("whitespace", "lpar", "rpar", "lbrac", "rbrac"))
-        and field.name
-        not in ("leading_lines", "trailing_whitespace", "header", "footer", "comma", "equal", "semicolon")
-    )
+    if kind not in _FIELDS:
+        _FIELDS[kind] = tuple(
+            field.name
+            for field in dataclasses.fields(kind)
+            if not field.name.startswith(("whitespace", "lpar", "rpar", "lbrac", "rbrac"))
+            and field.name
+            not in ("leading_lines", "trailing_whitespace", "header", "footer", "comma", "equal", "semicolon")
+        )
+    return _FIELDS[kind]
 
 
 def same(a: cst.CSTNode, b: cst.CSTNode) -> bool:

@@ -57,6 +57,7 @@ _RENDER = word_set(
     network student recon reconstructed reconstruction est estimated
     """
 )
+_LAID_OVER = word_set("mask masks valid weight weights diff error errors")
 DATA = word_set(
     """
     data batch sample item items datum cam camera cameras cams view views viewpoint viewpoints info infos
@@ -68,13 +69,11 @@ DATA = word_set(
 def kind_of_words(name: str) -> Optional[str]:
     """Return the kind that a name speaks of; the more special where it has several."""
     spoken = words(name)
-    if [word for word in spoken if not word.isdigit()][-1:] in (
-        ["mask"],
-        ["masks"],
-        ["valid"],
-        ["weight"],
-        ["weights"],
-    ):
+    if "no" in spoken[1:]:  # image_no_sh
+        spoken = spoken[: spoken.index("no", 1)]
+    if [word for word in spoken if not word.isdigit()][-1:] and [w for w in spoken if not w.isdigit()][
+        -1
+    ] in _LAID_OVER:
         return "mask"  # of whatever: laid over an image, it leaves an image
     kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF}
     return min(kinds, key=KINDS.index) if kinds else None

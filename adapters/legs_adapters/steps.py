@@ -1,0 +1,141 @@
+"""What a backward pass is for, going by the optimisers that step after it: the Gaussians, a camera's pose, or nothing.
+
+An L1 whose gradients move a pose alone is tracking; one that moves an embedding alone fits a view for evaluation; one
+whose gradients are read and thrown away scores Gaussians. Only where something else moves is it training.
+"""
+
+from __future__ import annotations
+
+from typing import Dict, Iterator, List, Optional, Set, Tuple
+
+import libcst as cst
+
+from legs_adapters.module import Function
+from legs_adapters.program import Program
+from legs_adapters.syntax import call_name, children, constant, word_set, words
+from legs_adapters.training import Training
+
+__all__ = ["Steps"]
+
+_POSE = word_set("pose poses cam cams camera cameras c2w w2c extrinsic extrinsics camtoworld camtoworlds tracking se3")
+_EMBEDDING = word_set("embedding embeddings embed emb appearance exposure")
+_MODEL = word_set(
+    """
+    gaussian gaussians gs splat splats xyz means opacity opacities scaling scalings scales features sh0 shn model models
+    net network mlp scene deform anchor anchors primitives points parameters params variables
+    """
+)
+_SCHEDULES = word_set("sched scheduler schedulers lr strategy profiler progress")
+_PLUMBING = word_set("torch optim adam params lr name eps self")
+_DEPTH = 3
+
+
+class Steps:
+    """Answers for one program."""
+
+    def __init__(self, program: Program, training: Training) -> None:
+        self.program = program
+        self.training = training
+
+    def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[str]:
+        """Return "tracking", "evaluation" or "scoring" for an expression that does not train; None where it may."""
+        calls = {id(call): call for call in function.flow.calls}
+        if not any(_is_backward(call) for call in calls.values()):
+            return self._of_callers(function, depth)
+        scopes = [*_loops_around(function.node, node), function.node]
+        stepped = False
+        for scope in scopes:
+            inside = list(_calls(scope, node, calls))
+            stepped = stepped or any(_is_step(call) for call, _ in inside)
+            if not any(_is_backward(call) for call, _ in inside):
+                continue
+            optimisers = [call for call, elsewhere in inside if _is_step(call) and not elsewhere]
+            if optimisers:
+                spoken = [self._words(function, call) for call in optimisers]
+                if all(some & _POSE and not some & _MODEL for some in spoken):
+                    return "tracking"
+                if all(some & _EMBEDDING and not some & _MODEL for some in spoken):
+                    return "evaluation"
+                return None
+        return "scoring" if stepped else None
+
+    def _of_callers(self, function: Function, depth: int) -> Optional[str]:
+        sites = self.training.sites.get(function, [])
+        if not sites or depth >= _DEPTH:
+            return None
+        purposes = {self.purpose(caller, call, depth + 1) for caller, call in sites}
+        return purposes.pop() if len(purposes) == 1 else None
+
+    def _words(self, function: Function, step: cst.Call) -> Set[str]:
+        """The words in an optimiser's name, and in what it was made of."""
+        assert isinstance(step.func, cst.Attribute)
+        parts: List[cst.CSTNode] = [step.func.value, *(arg.value for arg in step.args)]
+        found: Set[str] = set()
+        for part in parts:
+            found |= _spoken(part)
+            for where, definition in self.program.lookup(function, part) or []:
+                if definition.kind != "assign" or not isinstance(definition.value, cst.Call):
+                    continue
+                for arg in definition.value.args:
+                    found |= _spoken(arg.value)
+                    if isinstance(arg.value, cst.Name):  # opt_params = [], then opt_params.append(...)
+                        for other in where.flow.definitions.get(arg.value.value, []):
+                            if other.value is not None and other.kind in ("assign", "mutate"):
+                                found |= _spoken(other.value)
+        return found - _PLUMBING
+
+
+def _is_backward(call: cst.Call) -> bool:
+    return call_name(call) in ("backward", "manual_backward")
+
+
+def _is_step(call: cst.Call) -> bool:
+    if call_name(call) != "step" or not isinstance(call.func, cst.Attribute):
+        return False
+    return not _spoken(call.func.value) & _SCHEDULES
+
+
+def _spoken(node: cst.CSTNode) -> Set[str]:
+    found: Set[str] = set()
+    stack = [node]
+    while stack:
+        part = stack.pop()
+        stack.extend(children(part))
+        if isinstance(part, cst.Name):
+            found.update(words(part.value))
+        elif isinstance(part, cst.SimpleString) and isinstance(constant(part), str):
+            found.update(words(constant(part)))
+    return found
+
+
+def _loops_around(root: cst.CSTNode, node: cst.CSTNode) -> List[cst.CSTNode]:
+    """Return the loops that an expression stands in, the innermost first."""
+    stack: List[Tuple[cst.CSTNode, Tuple[cst.CSTNode, ...]]] = [(root, ())]
+    while stack:
+        part, loops = stack.pop()
+        if part is node:
+            return list(reversed(loops))
+        inner = (*loops, part) if isinstance(part, (cst.For, cst.While)) else loops
+        stack.extend((child, inner) for child in children(part))
+    return []
+
+
+def _calls(scope: cst.CSTNode, node: cst.CSTNode, calls: Dict[int, cst.Call]) -> Iterator[Tuple[cst.Call, bool]]:
+    """Yield the calls in a scope; each with whether it belongs to another training loop in it."""
+    stack: List[Tuple[cst.CSTNode, bool]] = [(scope, False)]
+    while stack:
+        part, elsewhere = stack.pop()
+        if id(part) in calls:
+            yield calls[id(part)], elsewhere
+        if part is not scope and isinstance(part, (cst.For, cst.While)) and not elsewhere:
+            below = list(_walk(part))
+            elsewhere = node not in below and any(isinstance(p, cst.Call) and _is_backward(p) for p in below)
+        stack.extend((child, elsewhere) for child in children(part))
+
+
+def _walk(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    stack = [node]
+    while stack:
+        part = stack.pop()
+        yield part
+        stack.extend(children(part))

@@ -203,7 +203,7 @@ def _project_block(
     fx, fy, cx, cy, limit_x, limit_y = intrinsics
     basis = np.empty(16, np.float32)
     coefficients = (degree + 1) * (degree + 1)
-    for i in range(first, end):
+    for i in range(np.uint64(first), np.uint64(end)):
         radii[i] = 0
         slots[i] = 0
         x, y, z = _to_camera(means, i, pose)
@@ -227,7 +227,8 @@ def _project_block(
         largest = middle + math.sqrt(max(0.1, middle * middle - determinant))
         radius = min(math.ceil(SQUARE * math.sqrt(largest)), float(FARTHEST))
         reach = radius if square == SQUARE else min(math.ceil(square * math.sqrt(largest)), float(FARTHEST))
-        centre_x, centre_y = fx * x / z + cx - 0.5, fy * y / z + cy - 0.5
+        nearness = 1 / z
+        centre_x, centre_y = fx * x * nearness + cx - 0.5, fy * y * nearness + cy - 0.5
         left, right = _tile_range(centre_x, reach, -(-size[0] // TILE))
         top, bottom = _tile_range(centre_y, reach, -(-size[1] // TILE))
         if right <= left or bottom <= top:

@@ -10,6 +10,8 @@ Within a strip a splat is the polynomial
     log2(alpha) = e + gx x + gy y + a x^2 + b x y + c y^2        x, y in pixels from `origin`
 
 whose coefficients are computed in float64: as precise for a needle a thousand pixels long as for a dot.
+
+Indices are unsigned where it counts: of any other, Python's rules for negative ones are looked after at every access.
 """
 
 # mypy: ignore-errors
@@ -100,7 +102,7 @@ def order_by_depth(depths, slots):
 
 @compiled()
 def _find_rows_block(first, end, splats, boxes, slots, first_slots, across, slot_strips, slot_rows):
-    for i in range(first, end):
+    for i in range(np.uint64(first), np.uint64(end)):
         if slots[i] == 0:
             continue
         u, v, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
@@ -112,7 +114,7 @@ def _find_rows_block(first, end, splats, boxes, slots, first_slots, across, slot
         wide = math.sqrt(level * c / determinant)
         summit = -b * math.sqrt(level / (a * determinant))
         tall, slope, bend = level / c, -b / c, determinant / (c * c)
-        slot = first_slots[i]
+        slot = np.uint64(first_slots[i])
         for strip_y in range(y0 // TALL, (y1 - 1) // TALL + 1):
             top = strip_y * TALL
             first_row, last_row = float(max(top, y0)), float(min(top + TALL, y1) - 1)
@@ -127,7 +129,7 @@ def _find_rows_block(first, end, splats, boxes, slots, first_slots, across, slot
                     if row < end_row:
                         slot_strips[slot] = strip_y * across + strip_x
                         slot_rows[slot] = np.int32(row - top) | np.int32(end_row - top) << 8
-                slot += 1
+                slot += np.uint64(1)
 
 
 @compiled(parallel=True)
@@ -153,21 +155,25 @@ def sort_slots(order, slots, first_slots, slot_strips, slot_rows, ranges, places
     for strip in range(1, len(ranges)):
         ranges[strip] += ranges[strip - 1]
     cursors = ranges.copy()
-    for i in order:
-        for slot in range(first_slots[i], first_slots[i] + slots[i]):
+    for turn in range(len(order)):
+        prefetch(slot_strips, first_slots[order[min(turn + AHEAD, len(order) - 1)]])
+        owner = order[turn]
+        i = np.uint64(owner)
+        for slot in range(np.uint64(first_slots[i]), np.uint64(first_slots[i] + slots[i])):
             strip = slot_strips[slot]
             if strip >= 0:
-                place = cursors[strip]
-                cursors[strip] += 1
-                places[slot], owners[place], rows[place] = place, i, slot_rows[slot]
+                at = np.uint64(strip)
+                place = np.uint64(cursors[at])
+                cursors[at] += 1
+                places[slot], owners[place], rows[place] = place, owner, slot_rows[slot]
 
 
 @compiled()
 def _expand(begin, end, strip_x, strip_y, splats, owners, rows, entries):
     """Write the polynomials of a strip's entries."""
-    for k in range(begin, end):
-        prefetch(splats, owners[min(k + AHEAD, len(owners) - 1)])
-        i = owners[k]
+    for k in range(np.uint64(begin), np.uint64(end)):
+        prefetch(splats, owners[min(np.int64(k) + AHEAD, len(owners) - 1)])
+        i = np.uint64(owners[k])
         a, b, c = splats[i, 2], splats[i, 3], splats[i, 4]
         x, y = origin(strip_x, strip_y, rows[k])
         x -= splats[i, 0]

@@ -14,6 +14,7 @@ import sys
 import types
 from typing import Any, Dict, NamedTuple, Optional, Sequence
 
+from legs_adapters.cpu.missing import attribute_guard
 from legs_adapters.cpu.survey import Interface
 
 __all__ = ["TABLE", "Finder", "StandIn", "build", "install", "table_for"]
@@ -92,10 +93,11 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
             module = build(fullname, self.table[fullname])
         else:
             parent, _, child = fullname.rpartition(".")
-            found = getattr(sys.modules.get(parent), "__dict__", {}).get(child)
-            if not self._made(parent) or not isinstance(found, types.ModuleType):
+            if not self._made(parent):
                 return None
-            module = found
+            found = vars(sys.modules[parent]).get(child)
+            # Whatever else is imported from below a stand-in is missed by its whole name.
+            module = found if isinstance(found, types.ModuleType) else _empty(fullname)
         spec = importlib.machinery.ModuleSpec(fullname, self, is_package=True)
         spec.loader_state = module
         return spec
@@ -118,6 +120,12 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
             return False
         finally:
             self._asking = False
+
+
+def _empty(name: str) -> types.ModuleType:
+    module = types.ModuleType(name)
+    module.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
+    return module
 
 
 def _is_for_a_library() -> bool:

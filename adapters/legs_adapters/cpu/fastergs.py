@@ -8,18 +8,22 @@ draws them; docs/cpu.md says where the two differ.
 
 from __future__ import annotations
 
+import math
 import types
 from types import SimpleNamespace
 from typing import Any, NamedTuple, Sequence, Tuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from legs_adapters.cpu.missing import MissingStandIn, attribute_guard
-from legs_loss.reference import rasterize
-from legs_loss.reference.conventions import DILATION, GUARD, MIN_ALPHA, NEAR
+from legs_adapters.cpu.missing import MissingStandIn, attribute_guard, deferred_guard
+from legs_loss import LegsError
+from legs_loss.reference.conventions import MIN_ALPHA, NEAR, View
+from legs_loss.reference.rasterizer import compiled
 
 BACKEND, MORTON, PPISP = "FasterGSCudaBackend", "MortonEncoding", "ppisp"
+SQUARE = math.sqrt(-2 * math.log(MIN_ALPHA)) + 0.01  # standard deviations: past them even opaque ones are not drawn
 MOST_SAMPLES = 50  # copies of one Gaussian that relocation reckons with
 MORTON_BITS = 21  # of each coordinate
 
@@ -45,86 +49,59 @@ class _Settings(NamedTuple):
 class _Drawn(NamedTuple):
     """What the backward pass needs; it hangs on the first of forward's buffers and goes when that goes."""
 
-    leaves: Tuple[Tensor, ...]
-    viewspace: Tensor
-    image: Tensor
-    visible: Tensor
+    image: Tensor  # with its graph to `tensors`
+    tensors: compiled.Tensors  # activated, and scaled by `size`
+    size: float
+    visible: Tensor  # bool [N]
 
 
-def _draw(function: str, raw: Sequence[Tensor], settings: _Settings, backend: str = "numba") -> _Drawn:
-    """Draw the six `raw` tensors, keeping the graph; `function` is named in errors."""
+def _draw(function: str, raw: Sequence[Tensor], settings: _Settings) -> _Drawn:
+    """Draw the six `raw` tensors; `function` is named in errors."""
     if settings.proper_antialiasing:
         raise MissingStandIn(f"{BACKEND}._C", function, "with proper antialiasing")
-    means, _, rotations = raw[:3]
-    leaves = tuple(tensor.detach().requires_grad_() for tensor in raw)
-    viewspace = torch.zeros(len(means), 2, dtype=means.dtype, requires_grad=True)
+    means, scales, rotations, opacities, first, rest = (tensor.detach() for tensor in raw)
+    for name, given in zip(("means", "scales", "rotations", "opacities", "sh_coefficients_0"), raw):
+        if not bool(torch.isfinite(given.detach().sum())):
+            raise LegsError(f"{BACKEND}._C.{function}: {name} {list(given.shape)} holds NaN or infinity")
     degree = round(int(settings.active_sh_bases) ** 0.5) - 1
-    coefficients = (degree + 1) ** 2
-    to_camera = torch.eye(4, dtype=torch.float64)
-    to_camera[:3] = settings.w2c.detach().to(torch.float64)[:3]
-    depths = means.detach() @ to_camera[2, :3].to(means.dtype) + to_camera[2, 3].to(means.dtype)
+    world_to_camera = np.eye(4)
+    world_to_camera[:3] = settings.w2c.detach().to(torch.float64)[:3].numpy()
+    axis = torch.from_numpy(world_to_camera[2]).to(means.dtype)
+    depths = means @ axis[:3] + axis[3]
     inside = (depths >= settings.near_plane) & (depths <= settings.far_plane)
 
     # The rasterizer's near plane is fixed. A world that is larger by the ratio of the two looks the same.
     size = NEAR / float(settings.near_plane)
-    to_camera[:3, 3] *= size
-    camera = SimpleNamespace(
-        width=int(settings.width),
-        height=int(settings.height),
-        fx=float(settings.focal_x),
-        fy=float(settings.focal_y),
-        cx=float(settings.center_x),
-        cy=float(settings.center_y),
-        world_to_camera=to_camera.numpy(),
-    )
-    with torch.enable_grad():
-        centres, logs, quaternions, logits, first, rest = leaves
-        sizes = logs.exp()
-        alphas = torch.where(inside[:, None], torch.sigmoid(logits), torch.zeros_like(logits))
-        image, _ = rasterize(
-            centres * size if size != 1 else centres,
-            sizes * size if size != 1 else sizes,
-            quaternions,
-            alphas,
-            torch.cat([first, rest[:, : coefficients - 1]], 1) if degree else first,
-            camera,
-            settings.bg_color.detach().to(means.dtype),
-            degree,
-            viewspace,
-            backend=backend,
+    world_to_camera[:3, 3] *= size
+    view = View.of(
+        SimpleNamespace(
+            width=settings.width,
+            height=settings.height,
+            fx=settings.focal_x,
+            fy=settings.focal_y,
+            cx=settings.center_x,
+            cy=settings.center_y,
+            world_to_camera=world_to_camera,
         )
-    visible = inside & _reaches_image(means, sizes.detach(), rotations, alphas.detach(), settings)
-    return _Drawn(leaves, viewspace, image, visible)
-
-
-def _reaches_image(means: Tensor, scales: Tensor, rotations: Tensor, alphas: Tensor, settings: _Settings) -> Tensor:
-    """Which Gaussians' ellipse at the faintest alpha has its box in the image, bool [N]."""
-    with torch.no_grad():
-        w2c = settings.w2c.detach().to(means.dtype)
-        points = means.detach() @ w2c[:3, :3].T + w2c[:3, 3]
-        z = points[:, 2]
-        xy = points[:, :2] / z[:, None]
-        focal = means.new_tensor([settings.focal_x, settings.focal_y])
-        centre = means.new_tensor([settings.center_x, settings.center_y])
-        extent = means.new_tensor([settings.width, settings.height])
-        limit = GUARD * extent / (2 * focal)
-        held = torch.maximum(torch.minimum(xy, limit), -limit)
-        w, x, y, q = torch.nn.functional.normalize(rotations.detach(), dim=1).unbind(1)
-        rotation = torch.stack(
-            [
-                *(1 - 2 * (y * y + q * q), 2 * (x * y - w * q), 2 * (x * q + w * y)),
-                *(2 * (x * y + w * q), 1 - 2 * (x * x + q * q), 2 * (y * q - w * x)),
-                *(2 * (x * q - w * y), 2 * (y * q + w * x), 1 - 2 * (x * x + y * y)),
-            ],
-            1,
-        ).reshape(-1, 3, 3)
-        turned = w2c[:3, :3] @ (rotation * scales[:, None])  # [N, 3, 3]: the scaled axes in the camera's
-        axes = (turned[:, :2] - held[:, :, None] * turned[:, 2:]) * (focal / z[:, None])[:, :, None]
-        level = 2 * torch.log(alphas / MIN_ALPHA)  # [N, 1]; negative: too faint anywhere
-        reach = (level.clamp_min(0) * ((axes * axes).sum(2) + DILATION)).sqrt()
-        pixels = xy * focal + centre
-        meets = (pixels + reach > 0.5) & (pixels - reach < extent - 0.5)
-        return meets.all(1) & (level[:, 0] >= 0)
+    )
+    tensors = compiled.Tensors(
+        means=means * size if size != 1 else means.clone(),
+        scales=scales.exp() * size,
+        quaternions=rotations,
+        opacities=torch.sigmoid(opacities) * inside[:, None],
+        sh=torch.cat([first, rest[:, : (degree + 1) ** 2 - 1]], 1),
+        colours=None,
+        viewspace=torch.zeros(len(means), 2),
+    )
+    for tensor in tensors:
+        if tensor is not None:
+            tensor.requires_grad_()
+    drawing = compiled.draw(tensors, view, settings.bg_color.detach(), degree, compiled.Footprint(square=SQUARE))
+    visible = np.zeros(len(means), np.bool_)
+    visible[drawing.owners[: len(drawing.entries)]] = True
+    with torch.enable_grad():
+        image, _ = compiled.attach(drawing, tensors)
+    return _Drawn(image, tensors, size, torch.from_numpy(visible))
 
 
 def forward(*arguments: Any) -> Tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int, int, int]:
@@ -146,13 +123,24 @@ def backward(densification_info: Tensor, grad_image: Tensor, *arguments: Any) ->
     Its first row counts the views that show a Gaussian; its second sums the length of the gradient by the centre in
     pixels times half the image's size.
     """
-    drawn = arguments[6].drawn
-    gradients = torch.autograd.grad(drawn.image, [*drawn.leaves, drawn.viewspace], grad_image, allow_unused=True)
+    drawn: _Drawn = arguments[6].drawn
+    tensors = drawn.tensors
+    inputs = [tensor for tensor in tensors if tensor is not None]
+    means, scales, rotations, opacities, sh, viewspace = torch.autograd.grad(drawn.image, inputs, grad_image)
     if len(densification_info):
         densification_info[0] += drawn.visible.to(densification_info.dtype)
-        densification_info[1] += gradients[6].norm(dim=1)
-    return tuple(
-        torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in zip(drawn.leaves, gradients)
+        densification_info[1] += viewspace.norm(dim=1)
+    rest = sh[:, 1:].contiguous()
+    if rest.shape != arguments[5].shape:  # harmonics that are not in use yet
+        rest = torch.nn.functional.pad(rest, (0, 0, 0, arguments[5].shape[1] - rest.shape[1]))
+    alphas = tensors.opacities.detach()
+    return (
+        means * drawn.size,
+        scales * tensors.scales.detach(),
+        rotations,
+        opacities * alphas * (1 - alphas),
+        sh[:, :1].contiguous(),
+        rest,
     )
 
 
@@ -286,28 +274,13 @@ CONTENTS = {
 }
 
 
-def _refusal(package: str, name: str) -> type:
-    """A class that can be imported and not be made."""
-
-    def refuse(*_: Any, **__: Any) -> None:
-        raise MissingStandIn(package, name)
-
-    return type(name, (), {"__init__": refuse})
-
-
-def _ppisp() -> types.ModuleType:
-    package, report = types.ModuleType(PPISP), types.ModuleType(f"{PPISP}.report")
-    for name in ("PPISP", "PPISPConfig"):
-        setattr(package, name, _refusal(PPISP, name))
-    report.export_ppisp_report = _refusal(report.__name__, "export_ppisp_report")  # type: ignore[attr-defined]
-    package.report = report  # type: ignore[attr-defined]
-    return package
-
-
 def module(name: str) -> types.ModuleType:
     """The stand-in to be imported as `name`: a package of CONTENTS with its `_C`, that `_C`, or `ppisp`."""
     if name == PPISP:
-        made = _ppisp()
+        made, report = types.ModuleType(name), types.ModuleType(f"{name}.report")
+        made.report = report  # type: ignore[attr-defined]
+        for part in (made, report):
+            part.__getattr__ = deferred_guard(part.__name__)  # type: ignore[method-assign]
     else:
         package, _, child = name.partition(".")
         extension = types.ModuleType(f"{package}._C")
@@ -318,6 +291,6 @@ def module(name: str) -> types.ModuleType:
             return extension
         made = types.ModuleType(name)
         made._C = extension  # type: ignore[attr-defined]
+        made.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
     made.__path__ = []
-    made.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
     return made

@@ -104,9 +104,13 @@ class TestTensors:
 
     def test_what_leaves_the_gpu_is_a_copy(self):
         x = torch.ones(2)
-        for kept in (x.cpu(), x.to("cpu"), x.to(torch.device("cpu"))):
+        for kept in (x.cpu(), x.to("cpu"), x.to(device="cpu")):
             x += 1
             assert kept[0] != x[0]
+
+    def test_what_stays_beside_another_tensor_is_none(self):
+        x, y = torch.ones(2, device="cuda"), torch.ones(2, device="cuda")
+        assert x.to(y.device) is x
 
     def test_parameters_stay_leaves(self):
         parameter = torch.nn.Parameter(torch.ones(2).cuda())
@@ -278,6 +282,8 @@ class TestProcesses:
             assert list(pool.map(lambda x: (x * x, os.getpid()), [3])) == [(9, os.getpid())]
         with multiprocessing.Pool(2) as pool:
             assert pool.map(square, [1, 2, 3]) == [1, 4, 9]
+        with multiprocessing.get_context("spawn").Pool(2) as pool:
+            assert pool.map(lambda x: x + 1, [1]) == [2]
         with torch.multiprocessing.Pool(2) as pool:
             assert pool.map(square, [4]) == [16]
 

@@ -11,6 +11,7 @@ import concurrent.futures
 import functools
 import importlib
 import inspect
+import multiprocessing.context
 import multiprocessing.pool
 import sys
 import time
@@ -209,8 +210,8 @@ def _to(old: Any) -> Any:
         elif args and not isinstance(target, (torch.dtype, Tensor)):
             args = (on_cpu(target), *args[1:])
         result: Tensor = old(self, *args, **kwargs)
-        leaves = isinstance(target, (str, torch.device)) and torch.device(target).type == "cpu"
-        return _own_copy(result) if leaves and result is self else result
+        # By name: `x.to(y.device)` stays where it is if y is on the GPU too, and says the same here.
+        return _own_copy(result) if isinstance(target, str) and target == "cpu" and result is self else result
 
     return to
 
@@ -517,6 +518,11 @@ def _workers(redirection: Redirection) -> None:
     redirection.replace(concurrent.futures, "ProcessPoolExecutor", Executor)
     redirection.replace(concurrent.futures.process, "ProcessPoolExecutor", Executor)
     redirection.wrap(multiprocessing, "Pool", lambda old: pool)
+    redirection.wrap(
+        multiprocessing.context.BaseContext,
+        "Pool",
+        lambda old: lambda self, *args, **kwargs: pool(*args, **kwargs),
+    )
     redirection.wrap(torch.multiprocessing, "Pool", lambda old: pool)
 
     def loader(old: Any) -> Any:

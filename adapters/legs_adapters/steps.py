@@ -6,6 +6,7 @@ whose gradients are read and thrown away scores Gaussians. Only where something 
 
 from __future__ import annotations
 
+import re
 from typing import Dict, Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
@@ -27,6 +28,7 @@ _MODEL = word_set(
 )
 _SCHEDULES = word_set("sched scheduler schedulers lr strategy profiler progress")
 _PLUMBING = word_set("torch optim adam params lr name eps self")
+_OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 _DEPTH = 3
 
 
@@ -74,13 +76,19 @@ class Steps:
         for part in parts:
             found |= _spoken(part)
             for where, definition in self.program.lookup(function, part) or []:
-                if definition.kind != "assign" or not isinstance(definition.value, cst.Call):
+                made = definition.value
+                if (
+                    definition.kind != "assign"
+                    or not isinstance(made, cst.Call)
+                    or not _OPTIMISER.search(call_name(made))
+                ):
                     continue
-                for arg in definition.value.args:
+                for arg in made.args:
                     found |= _spoken(arg.value)
                     if isinstance(arg.value, cst.Name):  # opt_params = [], then opt_params.append(...)
                         for other in where.flow.definitions.get(arg.value.value, []):
-                            if other.value is not None and other.kind in ("assign", "mutate"):
+                            if other.kind == "mutate" or isinstance(other.value, cst.List):
+                                assert other.value is not None
                                 found |= _spoken(other.value)
         return found - _PLUMBING
 

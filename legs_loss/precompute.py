@@ -24,7 +24,8 @@ import torch
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
-from legs_loss.response import normalise_response, response
+from legs_loss.kernels.backends import backend_for
+from legs_loss.response import response
 from legs_loss.scenes import Scene, View, image_size, image_tensor, load_training_image, training_size
 from legs_loss.scenes.images import row_strips
 from legs_loss.spec import Spec, WeightSpec, as_spec
@@ -33,6 +34,7 @@ from legs_loss.store import Entry, StoreWriter, fingerprint, is_intact, stage
 __all__ = ["Report", "normalised_map", "precompute"]
 
 _COMMIT_SECONDS = 1.0
+_WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 
 
 @dataclass
@@ -108,13 +110,28 @@ def precompute(
 def normalised_map(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
     """Return E^ of a photograph uint8 or uint16 [H, W, C] as float16 [H, W], with one strip's temporaries at a time."""
     height, width = image.shape[:2]
-    strength = torch.empty(1, height, width)
+    strength = _strength(image, spec)
+    low, high = strength.amin(), strength.amax()
+    normalised = np.empty((height, width), np.float16)  # numpy asks for large pages; torch does not
+    for rows in row_strips(height, width):  # in place: what is allocated anew has to be mapped anew
+        torch.from_numpy(normalised[rows]).copy_(strength[rows].sub_(low).div_(high - low + spec.eps))
+    return normalised
+
+
+def _strength(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
+    """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
+    if image.size >= _WORTH_COMPILING and backend_for(torch.device("cpu")) == "numba":
+        from legs_loss.kernels.numba_response import photograph_response
+
+        return torch.from_numpy(photograph_response(image, spec))
+    height, width = image.shape[:2]
+    strength = torch.from_numpy(np.empty((height, width), np.float32))
     for rows in row_strips(height, width):
         # Every operator reaches one row up and one down; at the photograph's own border it reflects.
         above, below = max(rows.start - 1, 0), min(rows.stop + 1, height)
         strip = response(image_tensor(image[above:below]), spec.operator, spec.p)
-        strength[:, rows] = strip[:, rows.start - above : rows.stop - above]
-    return normalise_response(strength, spec.eps)[0].half().numpy()
+        strength[rows] = strip[0, rows.start - above : rows.stop - above]
+    return strength
 
 
 class _Job(NamedTuple):

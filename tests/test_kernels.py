@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -15,7 +16,9 @@ from hypothesis import strategies as st
 
 from legs_loss import LegsError, LEGSLoss, WeightSpec, legs_loss, weight_map
 from legs_loss.kernels import backends
+from legs_loss.precompute import normalised_map
 from legs_loss.response import operator_names, response
+from legs_loss.scenes.images import image_tensor
 from legs_loss.spec import PRESETS
 from tests.kernels_support import compare, images, used
 from tests.support import legs_environment
@@ -23,7 +26,7 @@ from tests.support import legs_environment
 pytest.importorskip("numba")
 
 from legs_loss.kernels.numba_loss import fused_loss
-from legs_loss.kernels.numba_response import extremes, map_of_responses
+from legs_loss.kernels.numba_response import extremes, map_of_responses, photograph_response
 
 SHAPES = [(3, 1, 1), (1, 5, 7), (3, 40, 300), (2, 3, 30, 17), (3, 150, 530), (4, 11, 257), (2, 1, 8, 9), (3, 129, 8)]
 
@@ -135,6 +138,23 @@ class TestResponse:
             assert found[:, 1].tolist() == strength.max((1, 2)).tolist()
             assert found[:, 2].tolist() == image.abs().amax((1, 2, 3)).tolist()
             assert (extremes(image.numpy(), spec) == found).all()
+
+    @pytest.mark.parametrize(("dtype", "channels"), [(np.uint8, 3), (np.uint16, 1)])
+    @pytest.mark.parametrize("size", [(1, 1), (2, 900), (700, 523)])
+    def test_a_photograph_is_done_in_strips(self, size, dtype, channels):
+        photograph = np.random.RandomState(0).randint(0, np.iinfo(dtype).max, (*size, channels)).astype(dtype)
+        strength = photograph_response(photograph, PRESETS["legs"])
+        expected = response(image_tensor(photograph))[0]
+        torch.testing.assert_close(torch.from_numpy(strength), expected, rtol=3e-7, atol=0.0)
+
+    def test_precompute_uses_it_for_photographs_that_are_large(self, monkeypatch):
+        photograph = np.random.RandomState(0).randint(0, 255, (600, 700, 3)).astype(np.uint8)
+        maps = []
+        for backend in ("numba", "torch"):
+            monkeypatch.setenv("LEGS_BACKEND", backend)
+            maps.append(normalised_map(photograph, PRESETS["legs"]).astype(np.float32))
+        assert 0.0 == maps[0].min() < maps[0].max() == 1.0
+        assert np.abs(maps[0] - maps[1]).max() <= 2.0**-11  # at most the next number of float16
 
     @pytest.mark.parametrize("value", [0.1, 0.7, 0.9999])
     @pytest.mark.parametrize("operator", operator_names())

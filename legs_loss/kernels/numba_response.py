@@ -67,7 +67,7 @@ def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
 
 
 def photograph_response(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
-    """Return the response of a photograph uint8 or uint16 [H, W, C], scaled to [0, 1], as float32 [H, W]; one thread."""
+    """Return the response of a photograph uint8 or uint16 [H, W, C], scaled to [0, 1], as float32 [H, W]."""
     height, width, channels = image.shape
     out = np.empty((height, width), np.float32)
     rows = max(1, min(height, (1 << 18) // (width * channels)))  # their floats stay in the cache

@@ -76,9 +76,9 @@ def load_training_image(view: View, resolution: int = -1, white_background: bool
         if view.composited:
             prepared = _on_background(image.convert("RGBA"), 255 if white_background else 0)
         else:
-            prepared = image.convert(_colour_mode(image))
-        pixels = np.array(prepared.resize(size))
-    return pixels[:, :, :3] if pixels.ndim == 3 else pixels[:, :, None]
+            mode = _colour_mode(image)
+            prepared = image if image.mode == mode else image.convert(mode)
+        return _pixels(prepared if prepared.size == size else prepared.resize(size))
 
 
 def image_size(path: Path) -> Tuple[int, int]:
@@ -126,6 +126,16 @@ def _opened(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
         raise LegsError(f"{path}: not an image that Pillow can read ({error})") from None
+
+
+def _pixels(image: Any) -> np.ndarray:
+    """The values of an image without its alpha, [H, W, C]; in strips, since Pillow copies what it hands over thrice."""
+    width, height = image.size
+    pixels = np.empty((height, width, 1 if image.mode == "L" else 3), np.uint8)
+    for rows in row_strips(height, width):
+        strip = np.asarray(image.crop((0, rows.start, width, rows.stop)))
+        pixels[rows] = strip[:, :, :3] if strip.ndim == 3 else strip[:, :, None]
+    return pixels
 
 
 def _colour_mode(image: Any) -> str:

@@ -1,0 +1,275 @@
+"""The loss beside what people run today: time, memory, the weights alone, and how the cost grows. Writes JSON.
+
+    python benchmarks/loss.py --threads 1 --size 1297x840
+    python benchmarks/loss.py --parts growth
+
+The contenders take turns in every round, on the same tensors and threads; a ratio is taken within a round, and the
+table shows the median and the least and greatest of them. kornia, pytorch-msssim and torchmetrics are measured where
+they are installed. "3DGS" is Inria's l1_loss + ssim: |a - b|.mean() and legs_loss.ssim, which tests/test_ssim.py holds
+equal to theirs to the last bit. Contenders of more than two seconds get three rounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from typing import Any, Callable, Dict, List, Tuple
+
+import torch
+from torch import Tensor
+
+from legs_loss import legs_loss, ssim, weight_map
+from legs_loss.kernels.backends import finding
+from legs_loss.spec import PRESETS
+
+LAMBDA = 0.2
+LEGS = PRESETS["legs"]
+GROWTH = ((400, 266), (800, 533), (1297, 840), (1600, 1066), (3840, 2160), (7680, 4320))
+SLOW_ROUNDS = 3
+
+Contenders = Dict[str, Callable[[], Any]]
+
+
+def main() -> None:
+    args = parse()
+    if args.memory_of:  # a child: one contender in a process of its own
+        print(json.dumps(peak_memory(args.memory_of, args.size)))
+        return
+    result: Dict[str, Any] = {"machine": machine(), "threads": args.threads, "size": f"{args.size[0]}x{args.size[1]}"}
+    for part in args.parts:
+        result[part] = {"loss": loss, "weights": weights, "memory": memory, "growth": growth}[part](args)
+    if args.json:
+        with open(args.json, "w", encoding="utf-8") as file:
+            json.dump(result, file, indent=1)
+            file.write("\n")
+
+
+def loss(args: argparse.Namespace) -> Any:
+    print(f"\nforward and backward, {args.size[0]}x{args.size[1]} RGB, threads: {args.threads}")
+    prediction, target = images(args.size)
+    return side_by_side(losses(prediction, target), args.rounds, "LEGS, weights in the kernel")
+
+
+def weights(args: argparse.Namespace) -> Any:
+    print(f"\nthe weights alone, {args.size[0]}x{args.size[1]} RGB, threads: {args.threads}")
+    _, target = images(args.size)
+    return side_by_side(weightings(target), args.rounds, "weight_map")
+
+
+def memory(args: argparse.Namespace) -> Any:
+    print(f"\npeak memory beyond the images, forward and backward, {args.size[0]}x{args.size[1]} RGB")
+    found = {}
+    for name in losses(*images((32, 32))):
+        command = [sys.executable, __file__, "--memory-of", name, "--threads", str(args.threads)]
+        command += ["--size", f"{args.size[0]}x{args.size[1]}"]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+        found[name] = json.loads(done.stdout)
+        print(f"{name:<34} {found[name] / 1e6:9.0f} MB", flush=True)
+    return found
+
+
+def growth(args: argparse.Namespace) -> Any:
+    print("\nhow the cost grows: LEGS, weights in the kernel, forward and backward")
+    found = []
+    for size in GROWTH:
+        prediction, target = images(size)
+        step = losses(prediction, target)["LEGS, weights in the kernel"]
+        row: Dict[str, Any] = {"size": f"{size[0]}x{size[1]}", "megapixels": size[0] * size[1] / 1e6}
+        for threads in sorted({1, os.cpu_count() or 1}):
+            set_threads(threads)
+            step()
+            seconds = statistics.median(timed(step) for _ in range(args.rounds))
+            row[f"ms on {threads}"] = 1e3 * seconds
+            row[f"ns a pixel on {threads}"] = 1e9 * seconds / (size[0] * size[1])
+        found.append(row)
+        print("  ".join(f"{key} {value:.4g}" if isinstance(value, float) else value for key, value in row.items()))
+    set_threads(args.threads)
+    return found
+
+
+def losses(prediction: Tensor, target: Tensor) -> Contenders:
+    """Return each loss as a function that computes it and its gradient."""
+    stored = weight_map(target, LEGS)
+    batched = target.unsqueeze(0)
+
+    def l1(image: Tensor) -> Tensor:
+        return torch.abs(image - target).mean()
+
+    def mixed(similarity: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+        return lambda image: (1.0 - LAMBDA) * l1(image) + LAMBDA * (1.0 - similarity(image))
+
+    contenders: Dict[str, Callable[[Tensor], Tensor]] = {}
+    kernel = finding("numba", torch.device("cpu")).fused
+    if kernel is not None:
+        contenders["LEGS, weights in the kernel"] = lambda image: legs_loss(image, target, LEGS)
+        contenders["LEGS, stored map"] = lambda image: legs_loss(image, target, weight=stored)
+        contenders["3DGS by the kernel"] = lambda image: kernel(image, target, None, LAMBDA)
+    contenders["LEGS by torch"] = lambda image: (
+        (1.0 - LAMBDA) * (weight_map(target, LEGS) * torch.abs(image - target)).mean()
+        + LAMBDA * (1.0 - ssim(image, target))
+    )
+    contenders["3DGS (torch)"] = mixed(lambda image: ssim(image, target))
+    contenders["3DGS (torch, oneDNN off)"] = contenders["3DGS (torch)"]
+    try:
+        import kornia
+
+        # kornia's value is (1 - SSIM) / 2
+        contenders["kornia SSIM + L1"] = mixed(
+            lambda image: 1.0 - 2.0 * kornia.losses.ssim_loss(image.unsqueeze(0), batched, 11)
+        )
+    except ImportError:
+        pass
+    try:
+        import pytorch_msssim
+
+        contenders["pytorch-msssim SSIM + L1"] = mixed(
+            lambda image: pytorch_msssim.ssim(image.unsqueeze(0), batched, data_range=1.0)
+        )
+    except ImportError:
+        pass
+    try:
+        from torchmetrics.functional.image import structural_similarity_index_measure
+
+        contenders["torchmetrics SSIM + L1"] = mixed(
+            lambda image: structural_similarity_index_measure(image.unsqueeze(0), batched, data_range=1.0)
+        )
+    except ImportError:
+        pass
+
+    def step(name: str, function: Callable[[Tensor], Tensor]) -> Callable[[], None]:
+        def run() -> None:
+            prediction.grad = None
+            torch.backends.mkldnn.enabled = name != "3DGS (torch, oneDNN off)"  # type: ignore[assignment]
+            function(prediction).backward()
+
+        return run
+
+    return {name: step(name, function) for name, function in contenders.items()}
+
+
+def weightings(target: Tensor) -> Contenders:
+    """Return each way to the weights of a photograph as a function."""
+    found: Contenders = {"weight_map": lambda: weight_map(target, LEGS)}
+    if finding("numba", torch.device("cpu")).fused is not None:
+        from legs_loss.kernels.numba_response import extremes
+
+        batch = target.unsqueeze(0).numpy()
+        found["its extremes by numba (all the kernel keeps)"] = lambda: extremes(batch, LEGS)
+    try:
+        import kornia
+
+        def by_kornia() -> Tensor:
+            values = kornia.filters.laplacian(target.unsqueeze(0), 3, border_type="reflect", normalized=False)
+            strength = values.norm(dim=1, keepdim=True)
+            low, high = strength.amin(), strength.amax()
+            return 1.0 + LEGS.beta * torch.sqrt((strength - low) / (high - low + LEGS.eps))
+
+        found["kornia.filters.laplacian + the same"] = by_kornia
+    except ImportError:
+        pass
+    return found
+
+
+def side_by_side(contenders: Contenders, rounds: int, against: str) -> Any:
+    """Time all contenders in turns; print and return medians and the ratios to one of them."""
+    first = {name: timed(step) for name, step in contenders.items()}  # compilation, and memory's first touch
+    times: Dict[str, List[float]] = {name: [] for name in contenders}
+    for i in range(rounds):
+        for name, step in contenders.items():
+            if i < SLOW_ROUNDS or first[name] < 2.0:
+                times[name].append(timed(step))
+    table = {}
+    against = against if against in times else next(iter(times))
+    for name, seconds in times.items():
+        ratios = [ours / theirs for ours, theirs in zip(times[against], seconds)]
+        table[name] = {
+            "ms": [1e3 * value for value in seconds],
+            "median ms": 1e3 * statistics.median(seconds),
+            f"ratio of {against!r} to it": [statistics.median(ratios), min(ratios), max(ratios)],
+        }
+        spread = f"{statistics.median(ratios):7.4f}  ({min(ratios):.4f} to {max(ratios):.4f})"
+        print(f"{name:<46} {1e3 * statistics.median(seconds):10.2f} ms   ours / it {spread}", flush=True)
+    return table
+
+
+def peak_memory(name: str, size: Tuple[int, int]) -> int:
+    """Return by how many bytes one step raises this process's peak (on Linux); a small one came first, to load all."""
+    losses(*images((64, 64)))[name]()
+    prediction, target = images(size)
+    step = losses(prediction, target)[name]
+    with open("/proc/self/clear_refs", "w", encoding="ascii") as file:
+        file.write("5")  # the peak counts from here
+    before = peak()
+    step()
+    return peak() - before
+
+
+def peak() -> int:
+    with open("/proc/self/status", encoding="ascii") as file:
+        return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmHWM"))
+
+
+def images(size: Tuple[int, int]) -> Tuple[Tensor, Tensor]:
+    """Return a prediction that learns and a target: a picture of waves with noise, 8 bits deep as photographs are."""
+    width, height = size
+    generator = torch.Generator().manual_seed(0)
+    x, y = torch.arange(float(width)) / 37.0, torch.arange(float(height))[:, None] / 23.0
+    waves = torch.stack([0.5 + 0.3 * torch.sin((k + 1) * x + torch.cos(y * (k + 1))) for k in range(3)])
+    target = (waves + 0.05 * torch.randn(3, height, width, generator=generator)).clamp(0.0, 1.0)
+    target = (255.0 * target).round() / 255.0
+    prediction = (0.9 * target + 0.05 * torch.rand(3, height, width, generator=generator)).requires_grad_()
+    return prediction, target
+
+
+def timed(step: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    step()
+    return time.perf_counter() - start
+
+
+def set_threads(threads: int) -> None:
+    torch.set_num_threads(threads)
+    try:
+        import numba
+
+        numba.set_num_threads(threads)
+    except ImportError:
+        pass
+
+
+def machine() -> Dict[str, str]:
+    """Return what the numbers depend on."""
+    name = platform.processor() or platform.machine()
+    if os.path.exists("/proc/cpuinfo"):
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            name = next((line.split(":")[1].strip() for line in file if line.startswith("model name")), name)
+    versions = {"python": platform.python_version(), "torch": torch.__version__}
+    for package in ("numba", "kornia", "pytorch_msssim", "torchmetrics"):
+        try:
+            versions[package] = str(getattr(__import__(package), "__version__", "installed"))
+        except ImportError:
+            versions[package] = "not installed"
+    return {"processor": name, "cores": str(os.cpu_count()), **versions}
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="+", default=["loss", "weights", "memory", "growth"])
+    parser.add_argument("--size", default="1297x840", type=lambda text: tuple(int(side) for side in text.split("x")))
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--json", help="write everything to this file")
+    parser.add_argument("--memory-of", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    set_threads(args.threads)
+    return args
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""`legs precompute` beside decoding the same JPEGs with Pillow alone, on as many processes. Writes JSON.
+
+    python benchmarks/precompute.py --workers 2 --resolution -1
+
+Photographs of 12 megapixels are drawn into a temporary folder. Both sides take turns, and each run starts its processes
+anew: whole runs with two numbers of photographs are timed, and the difference is what the additional ones cost. The
+memory is a worker's peak, all of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, List
+
+import numpy as np
+from PIL import Image
+
+from legs_loss.precompute import precompute
+from legs_loss.scenes import read_scene
+
+WIDTH, HEIGHT = 4000, 3000
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--resolution", type=int, default=-1, help="3DGS's -r")
+    parser.add_argument("--photographs", type=int, default=24)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json")
+    args = parser.parse_args()
+    few = args.workers
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        scenes = {count: draw(root / str(count), count) for count in (few, few + args.photographs)}
+        precomputing: List[float] = []
+        decoding: List[float] = []
+        for i in range(args.rounds + 1):
+            costs = []
+            for run in (compute, decode):
+                costs.append((run(scenes[few + args.photographs], args) - run(scenes[few], args)) / args.photographs)
+            if i > 0:  # the first compiles, and fills the file cache
+                precomputing.append(costs[0])
+                decoding.append(costs[1])
+        peak = worker_peak(scenes[few], args)
+    ratios = [ours / theirs for ours, theirs in zip(precomputing, decoding)]
+    result = {
+        "workers": args.workers,
+        "resolution": args.resolution,
+        "photographs": args.photographs,
+        "precompute ms a photograph": [1e3 * value for value in precomputing],
+        "decode ms a photograph": [1e3 * value for value in decoding],
+        "ratio": [statistics.median(ratios), min(ratios), max(ratios)],
+        "worker peak MB": peak / 1e6,
+    }
+    print(json.dumps(result, indent=1))
+    if args.json:
+        Path(args.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+def compute(scene: Path, args: argparse.Namespace) -> float:
+    """Return the seconds that the package takes for a folder of photographs, with its processes' start and end."""
+    with tempfile.TemporaryDirectory() as out:
+        start = time.perf_counter()
+        report = precompute(read_scene(scene), out=out, resolution=args.resolution, workers=args.workers)
+        assert not report.skipped and not report.kept
+        return time.perf_counter() - start
+
+
+def decode(scene: Path, args: argparse.Namespace) -> float:
+    """Return the seconds that Pillow takes to decode it, with as many processes."""
+    start = time.perf_counter()
+    with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
+        pool.map(load, sorted(scene.glob("*.jpg")), chunksize=1)
+    return time.perf_counter() - start
+
+
+def load(path: Path) -> None:
+    with Image.open(str(path)) as image:
+        image.load()
+
+
+def worker_peak(scene: Path, args: argparse.Namespace) -> int:
+    """Return the peak memory in bytes of a process that makes one map."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_alone, (scene, args.resolution))
+
+
+def _alone(scene: Path, resolution: int) -> int:
+    with tempfile.TemporaryDirectory() as out:
+        precompute(read_scene(scene), out=out, resolution=resolution, workers=1)
+    with open("/proc/self/status", encoding="ascii") as file:
+        return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmHWM"))
+
+
+def draw(folder: Path, count: int) -> Path:
+    """Write photographs: smooth shapes under the noise of a sensor, about 5 MB each."""
+    folder.mkdir(parents=True)
+    generator = np.random.RandomState(0)
+    coarse = Image.fromarray(generator.randint(0, 255, (HEIGHT // 10, WIDTH // 10, 3)).astype(np.uint8))
+    smooth: Any = np.asarray(coarse.resize((WIDTH, HEIGHT))).astype(np.int16)
+    noise = generator.randint(-12, 12, smooth.shape).astype(np.int16)
+    data = Image.fromarray((smooth + noise).clip(0, 255).astype(np.uint8))
+    data.save(str(folder / "0000.jpg"), quality=92)
+    for i in range(1, count):
+        (folder / f"{i:04}.jpg").write_bytes((folder / "0000.jpg").read_bytes())
+    return folder
+
+
+if __name__ == "__main__":
+    main()

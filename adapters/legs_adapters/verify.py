@@ -30,12 +30,14 @@ __all__ = ["ITERATIONS", "Run", "Verdict", "verify", "watch"]
 ITERATIONS = 40
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 96, 64, 800  # of the embedded scene
 SECONDS = 1800  # that a run may take
-# What a script that takes arguments in the way of Inria's is given, as far as its source knows them.
+# What a script that takes arguments in the way of Inria's is given, where its source has these words. (Inria's options
+# are made of attributes' names, but for those that its train.py adds itself.)
 ARGUMENTS = (
-    ("--source_path", "-s {scene}"),
-    ("--model_path", "-m {output}"),
-    ("--port", "--port {port}"),
+    ("source_path", "-s {scene}"),
+    ("model_path", "-m {output}"),
+    ("iterations", "--iterations {iterations}"),
     ("--test_iterations", "--test_iterations {iterations}"),
+    ("--port", "--port {port}"),
 )
 
 
@@ -178,8 +180,7 @@ def _arguments(script: Path, given: Optional[str], iterations: int, **places: Pa
             path.read_text(encoding="utf-8", errors="replace")
             for path in (script, *script.parent.glob("arguments/*.py"))
         )
-        known = [words for option, words in ARGUMENTS if option in source or option[2:] in source]
-        given = " ".join([*known, *(["--iterations {iterations}"] if "iterations" in source else [])])
+        given = " ".join(words for word, words in ARGUMENTS if word in source)
     values = {"iterations": iterations, "port": port, **places}
     try:
         return [word.format(**values) for word in shlex.split(given)]

@@ -17,7 +17,7 @@ from torch import Tensor
 from legs_adapters.cpu import inria
 from legs_adapters.cpu.camera import pinhole
 from legs_adapters.cpu.drawing import Gaussians, Lens, draw
-from legs_adapters.cpu.missing import attribute_guard, refuse_unknown
+from legs_adapters.cpu.missing import complete, refuse_unknown
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 from legs_loss.reference.conventions import TILE, View
 from legs_loss.reference.rasterizer import oracle
@@ -117,8 +117,4 @@ class _CompactBox:
 
 def module(name: str) -> types.ModuleType:
     """Return ``diff_gaussian_rasterization_fastgs``."""
-    made = types.ModuleType(name, __doc__)
-    for part in (GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam):
-        setattr(made, part.__name__, part)
-    made.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
-    return made
+    return complete(name, __doc__, GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam)

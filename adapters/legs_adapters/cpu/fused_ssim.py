@@ -7,7 +7,7 @@ import types
 import torch
 from torch import Tensor
 
-from legs_adapters.cpu.missing import attribute_guard
+from legs_adapters.cpu.missing import complete
 from legs_loss import LegsError, ssim
 
 __all__ = ["fused_ssim", "module"]
@@ -30,7 +30,4 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
 
 def module(name: str) -> types.ModuleType:
     """Return ``fused_ssim``."""
-    made = types.ModuleType(name, __doc__)
-    made.fused_ssim = fused_ssim  # type: ignore[attr-defined]
-    made.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
-    return made
+    return complete(name, __doc__, fused_ssim)

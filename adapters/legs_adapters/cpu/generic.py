@@ -17,7 +17,7 @@ from torch import Tensor
 
 from legs_adapters.cpu import inria
 from legs_adapters.cpu.drawing import Drawn, Gaussians, Lens, draw
-from legs_adapters.cpu.missing import Absent, MissingStandIn, attribute_guard, refuse_unknown
+from legs_adapters.cpu.missing import Absent, MissingStandIn, complete, refuse_unknown
 from legs_adapters.cpu.relocation import compute_relocation
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 from legs_adapters.cpu.survey import Interface
@@ -79,12 +79,8 @@ def module(name: str, interface: Optional[Interface] = None) -> types.ModuleType
             results = [_result(drawn, result, self.raster_settings, name) for result in names]
             return results[0] if len(results) == 1 else tuple(results)
 
-    made = types.ModuleType(name, __doc__)
     settings.__module__ = GaussianRasterizer.__module__ = name
-    made.GaussianRasterizationSettings, made.GaussianRasterizer = settings, GaussianRasterizer  # type: ignore[attr-defined]
-    made.SparseGaussianAdam, made.compute_relocation = SparseGaussianAdam, compute_relocation  # type: ignore[attr-defined]
-    made.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
-    return made
+    return complete(name, __doc__, settings, GaussianRasterizer, SparseGaussianAdam, compute_relocation)
 
 
 def _names_at_call(interface: Interface) -> Optional[Tuple[str, ...]]:

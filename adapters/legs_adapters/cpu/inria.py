@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from legs_adapters.cpu.camera import visible
 from legs_adapters.cpu.drawing import Gaussians, draw
-from legs_adapters.cpu.missing import attribute_guard, refuse_unknown
+from legs_adapters.cpu.missing import complete, refuse_unknown
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
@@ -72,8 +72,4 @@ class GaussianRasterizer(nn.Module):
 
 def module(name: str) -> types.ModuleType:
     """Return ``diff_gaussian_rasterization``."""
-    made = types.ModuleType(name, __doc__)
-    for part in (GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam):
-        setattr(made, part.__name__, part)
-    made.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
-    return made
+    return complete(name, __doc__, GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam)

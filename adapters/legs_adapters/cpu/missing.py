@@ -1,12 +1,13 @@
-"""The one error for what has no stand-in on the CPU."""
+"""The one error for what has no stand-in on the CPU, and modules that raise it for what they lack."""
 
 from __future__ import annotations
 
-from typing import Any, Dict, List
+import types
+from typing import Any, Dict, List, Optional
 
 from legs_loss import LegsError
 
-__all__ = ["Absent", "Deferred", "MissingStandIn", "attribute_guard", "deferred_guard", "refuse_unknown"]
+__all__ = ["Absent", "Deferred", "MissingStandIn", "attribute_guard", "complete", "deferred_guard", "refuse_unknown"]
 
 
 class MissingStandIn(LegsError, ImportError):
@@ -36,6 +37,15 @@ def refuse_unknown(module: str, inputs: Dict[str, Any]) -> None:
     for name, value in inputs.items():
         if value is not None:
             raise MissingStandIn(module, f"GaussianRasterizer.forward({name}=...)")
+
+
+def complete(name: str, doc: Optional[str], *parts: Any) -> types.ModuleType:
+    """Return a module of these functions and classes, by their names; what else is asked of it is missing."""
+    made = types.ModuleType(name, doc)
+    for part in parts:
+        setattr(made, part.__name__, part)
+    made.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
+    return made
 
 
 def deferred_guard(module: str) -> Any:

@@ -7,7 +7,7 @@ import types
 import torch
 from torch import Tensor
 
-from legs_adapters.cpu.missing import attribute_guard
+from legs_adapters.cpu.missing import complete
 
 __all__ = ["distCUDA2", "module"]
 
@@ -33,10 +33,6 @@ def distCUDA2(points: Tensor) -> Tensor:
 
 def module(name: str) -> types.ModuleType:
     """Return ``simple_knn`` with its ``_C``."""
-    package, extension = types.ModuleType(name), types.ModuleType(f"{name}._C")
-    extension.distCUDA2 = distCUDA2  # type: ignore[attr-defined]
-    package._C = extension  # type: ignore[attr-defined]
-    for made in (package, extension):
-        made.__getattr__ = attribute_guard(made.__name__)  # type: ignore[method-assign]
-    package.__path__ = []
+    package, extension = complete(name, __doc__), complete(f"{name}._C", None, distCUDA2)
+    package._C, package.__path__ = extension, []  # type: ignore[attr-defined]
     return package

@@ -14,7 +14,7 @@ import sys
 import types
 from typing import Any, Dict, NamedTuple, Optional, Sequence
 
-from legs_adapters.cpu.missing import attribute_guard
+from legs_adapters.cpu.missing import complete
 from legs_adapters.cpu.survey import Interface
 
 __all__ = ["TABLE", "Finder", "StandIn", "build", "install", "table_for"]
@@ -97,7 +97,7 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
                 return None
             found = vars(sys.modules[parent]).get(child)
             # Whatever else is imported from below a stand-in is missed by its whole name.
-            module = found if isinstance(found, types.ModuleType) else _empty(fullname)
+            module = found if isinstance(found, types.ModuleType) else complete(fullname, None)
         spec = importlib.machinery.ModuleSpec(fullname, self, is_package=True)
         spec.loader_state = module
         return spec
@@ -120,12 +120,6 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
             return False
         finally:
             self._asking = False
-
-
-def _empty(name: str) -> types.ModuleType:
-    module = types.ModuleType(name)
-    module.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
-    return module
 
 
 def _is_for_a_library() -> bool:

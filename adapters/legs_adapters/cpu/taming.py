@@ -14,7 +14,7 @@ from torch import Tensor
 
 from legs_adapters.cpu import inria
 from legs_adapters.cpu.drawing import Gaussians, draw
-from legs_adapters.cpu.missing import Absent, attribute_guard, refuse_unknown
+from legs_adapters.cpu.missing import Absent, complete, refuse_unknown
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
@@ -78,8 +78,4 @@ class GaussianRasterizer(inria.GaussianRasterizer):
 
 def module(name: str) -> types.ModuleType:
     """Return ``diff_gaussian_rasterization`` as Taming 3DGS has it."""
-    made = types.ModuleType(name, __doc__)
-    for part in (GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam):
-        setattr(made, part.__name__, part)
-    made.__getattr__ = attribute_guard(name)  # type: ignore[method-assign]
-    return made
+    return complete(name, __doc__, GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam)

@@ -1,0 +1,108 @@
+"""Rebuild docs/evidence.md's tables and plots from the rows beside this file.
+
+    python docs/evidence/rebuild.py                           # tables and plots, from fox.json and embedded.json
+    python docs/evidence/rebuild.py --take OUT docs/evidence/NAME.json    # first: the rows of a `legs compare` folder
+
+A table stands in the text between `<!-- SCENE STUDY -->` and `<!-- end -->`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any, List, Tuple
+
+from legs_loss.experiments.arms import parse_arm
+from legs_loss.experiments.running import read_rows
+from legs_loss.experiments.statistics import summarise_all
+from legs_loss.experiments.studies import STUDIES
+from legs_loss.experiments.tables import differences_table, paper_text, scores_table
+
+HERE = Path(__file__).resolve().parent
+TEXT = HERE.parent / "evidence.md"
+PICTURES = HERE.parent / "pictures"
+SCENES = ("fox", "embedded")
+DIGITS = 6
+
+
+def take(out: Path, path: Path) -> None:
+    """Write a comparison's settings and rows as one compact file."""
+    settings, rows = read_rows(out)
+    settings.pop("path")
+    for row in rows:
+        for scores in row["metrics"]["views"]["train"].values():
+            for name in ("psnr_strong", "psnr_rest"):  # no table has them of training views
+                scores.pop(name)
+    lines = ",\n".join(json.dumps(_rounded(row), separators=(",", ":")) for row in rows)
+    path.write_text(f'{{"settings":{json.dumps(settings)},"rows":[\n{lines}\n]}}\n', encoding="utf-8")
+
+
+def tables(text: str) -> str:
+    """Return the text with every table made anew."""
+
+    def table(match: re.Match[str]) -> str:
+        scene, study = match.group(1), STUDIES[match.group(2)]
+        rows = _rows(scene)
+        parts = [scores_table(rows, study.arms), differences_table(rows, study)]
+        if study.paper:
+            parts.append(paper_text(rows, study).partition("\n\n")[2])
+        return f"<!-- {scene} {match.group(2)} -->\n\n" + "\n\n".join(parts) + "\n\n<!-- end -->"
+
+    return re.sub(r"<!-- (\w+) ([\w-]+) -->.*?<!-- end -->", table, text, flags=re.DOTALL)
+
+
+def plots() -> None:
+    """Draw PSNR by Gaussians of each scene, with the arms' names at their points."""
+    from matplotlib.figure import Figure
+
+    figure: Any = Figure(figsize=(11, 8.4), constrained_layout=True)
+    grid = figure.subplots(len(SCENES), 2)
+    arms = list(dict.fromkeys(parse_arm(arm).name for name in ("main", "controls") for arm in STUDIES[name].arms))
+    for panels, scene in zip(grid, SCENES):
+        found = summarise_all(_rows(scene), arms)
+        for panel, score in zip(panels, ("train PSNR", "held-out PSNR")):
+            values = [summary.mean[score] for summary in found]
+            line = 0.045 * (max(values) - min(values))  # a label's height, in dB
+            labels: List[Tuple[float, float]] = []  # places of those that are written
+            for summary in sorted(found, key=lambda one: one.mean[score]):
+                x, y = summary.mean["Gaussians"] / 1000, summary.mean[score]
+                plain = parse_arm(summary.arm).spec.beta == 0
+                colour = "#555555" if plain else "#d62728" if summary.arm == "legs" else "#1f77b4"
+                panel.errorbar(x, y, summary.spread[score], fmt="s" if plain else "o", color=colour, markersize=6)
+                at = max([y] + [below + line for beside, below in labels if abs(beside - x) < 10])
+                labels.append((x, at))
+                panel.annotate(f"  {summary.arm}", (x, at), fontsize=9, color=colour, va="center")
+            panel.set(xlabel="thousand Gaussians", ylabel=f"{score}, dB", title=scene, xlim=(11, 56))
+            panel.margins(y=0.12)
+            panel.grid(alpha=0.3)
+    figure.savefig(str(PICTURES / "evidence_gaussians.png"), dpi=110, facecolor="white")
+
+
+def _rows(scene: str) -> List[Any]:
+    return json.loads((HERE / f"{scene}.json").read_text(encoding="utf-8"))["rows"]
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}")
+    if isinstance(value, dict):
+        return {name: _rounded(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_rounded(one) for one in value]
+    return value
+
+
+def main(words: List[str]) -> None:
+    """Take what is asked to be taken, then rebuild."""
+    while words[:1] == ["--take"]:
+        taken: Tuple[str, ...] = tuple(words[1:3])
+        take(Path(taken[0]), Path(taken[1]))
+        words = words[3:]
+    TEXT.write_text(tables(TEXT.read_text(encoding="utf-8")), encoding="utf-8")
+    plots()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

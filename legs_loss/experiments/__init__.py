@@ -1,5 +1,6 @@
 """Experiments: arms that differ in one thing, trained side by side over several seeds, and what their differences say.
 
-arms.py names an arm; weighting.py holds the weights that no stored map can give; running.py trains and keeps one row an
-arm and seed; baseline.py proves that the baseline is unweighted; statistics.py and studies.py make the tables.
+arms.py names an arm; weighting.py holds the weights that no spec describes; baseline.py proves that the baseline is
+unweighted; running.py trains and keeps one row an arm and seed; statistics.py compares rows; studies.py lists the built-in
+questions; tables.py prints them.
 """

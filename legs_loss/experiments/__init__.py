@@ -1,6 +1,6 @@
 """Experiments: arms that differ in one thing, trained side by side over several seeds, and what their differences say.
 
 arms.py names an arm; weighting.py holds the weights that no spec describes; baseline.py proves that the baseline is
-unweighted; running.py trains and keeps one row an arm and seed; statistics.py compares rows; studies.py lists the built-in
-questions; tables.py prints them.
+unweighted; running.py trains and keeps one row an arm and seed; statistics.py compares rows; studies.py lists the
+built-in questions; tables.py prints them.
 """

@@ -149,10 +149,14 @@ def find(sources: Iterable[Source], by_hand: Sequence[Tuple[str, int]] = ()) -> 
 
 
 class _Shared(NamedTuple):
-    """The reads of an error map: the one to be weighted in its place; and those that are to keep the plain map."""
+    """The reads of an error map: the one to be weighted in its place; and those that are to keep the plain map.
+
+    ``trains`` is False where none of the reads is the loss.
+    """
 
     loss: List[cst.Name]
     aside: List[cst.Name]
+    trains: bool = True
 
 
 class _Finder:
@@ -274,6 +278,8 @@ class _Finder:
             return self._problem(module.path, line, text, form, swapped, "the difference has a name of its own")
         shared = self._shared(function, form)
         aside: Tuple[cst.Name, ...] = ()
+        if shared is not None and not shared.trains:
+            return Left(module.path, line, text, "weighting")
         if shared is not None and shared.loss:
             form = form._replace(node=shared.loss[0], reduction="again")
         elif shared is not None and shared.aside:
@@ -312,6 +318,8 @@ class _Finder:
         aside = [read for read in reads if read not in loss and id(read) not in logged]
         if not aside:
             return None
+        if not loss:
+            return _Shared([], [], False)
         again = loss if len(loss) == 1 and self._unchanged(function, form.first, form.second) else []
         known = all(
             function.flow.names_at(callers[id(read)], part.value) == function.flow.reaching(part)

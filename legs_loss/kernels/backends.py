@@ -162,6 +162,8 @@ def _try(name: str, device: torch.device) -> Finding:
     try:
         if importlib.util.find_spec(name) is None:
             return Finding(None, False, "it is not installed")
+        if name == "numba" and sys.version_info < (3, 8):
+            return Finding(None, False, "the last numba for Python 3.7 takes minutes to compile the weights")
         fused = importlib.import_module(_MODULES[name]).fused_loss
         problem = _difference_from_torch(fused, device)
     except Exception as error:  # whatever a broken install, compiler or driver raises

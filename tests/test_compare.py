@@ -21,7 +21,7 @@ from legs_loss import PRESETS, LegsError, WeightSpec, weight_map
 from legs_loss.cli import main
 from legs_loss.experiments.arms import CHANGES, LOOSE, needed, parse_arm, parse_arms
 from legs_loss.experiments.baseline import prove_unweighted
-from legs_loss.experiments.statistics import difference, summarise
+from legs_loss.experiments.statistics import difference, summarise, times_gaussians
 from legs_loss.experiments.studies import STUDIES
 from legs_loss.experiments.tables import differences_table, markdown, paper_text, scores_table
 
@@ -346,6 +346,9 @@ def test_tables_by_hand() -> None:
     assert "| C3 (legs) | 26.00 ± 0.00 |" in scores
     assert "250 ± 71" in scores
     differences = differences_table(rows, STUDIES["main"])
+    # Only over the seeds that both have.
+    assert times_gaussians([*rows, row_of("3dgs", 2, plain, 900)], "legs", "3dgs") == 2.5
+    assert times_gaussians(rows, "legs", "eggs") is None
     assert "legs − 3dgs" in differences and "+1.00 [+1.00, +1.00]" in differences and "2.50x" in differences
     assert len({len(line) for line in markdown(("a", "b"), (("x", "1"), ("long", "22"))).splitlines()}) == 1
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from legs_loss.errors import LegsError
 
-__all__ = ["SCORES", "Difference", "Summary", "difference", "summarise", "summarise_all"]
+__all__ = ["SCORES", "Difference", "Summary", "difference", "summarise", "summarise_all", "times_gaussians"]
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -103,6 +103,13 @@ def difference(rows: Rows, arm: str, reference: str, split: str = "test", score:
     table = np.array([[ours[seed][view] - theirs[seed][view] for view in views] for seed in seeds])
     low, high = _interval(table.mean(0))
     return Difference(float(table.mean()), low, high, tuple(table.mean(1).tolist()))
+
+
+def times_gaussians(rows: Rows, arm: str, reference: str) -> Optional[float]:
+    """Return how many times as many Gaussians ``arm`` has, over the seeds that both have; None if they share none."""
+    ours, theirs = ({row["seed"]: row["metrics"]["gaussians"] for row in _of(rows, name)} for name in (arm, reference))
+    seeds = set(ours) & set(theirs)
+    return sum(ours[seed] for seed in seeds) / sum(theirs[seed] for seed in seeds) if seeds else None
 
 
 def _interval(values: np.ndarray) -> Tuple[float, float]:

@@ -8,7 +8,7 @@ from typing import Any, List, Mapping, Optional, Sequence
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE
-from legs_loss.experiments.statistics import SCORES, Difference, difference, summarise_all
+from legs_loss.experiments.statistics import SCORES, Difference, difference, summarise_all, times_gaussians
 from legs_loss.experiments.studies import Study
 
 __all__ = [
@@ -93,9 +93,9 @@ def differences_table(rows: Rows, study: Study) -> str:
             difference_cell(difference(rows, name, reference, split, score), score)
             for split, score in (("train", "psnr"), ("test", "psnr"), ("test", "ssim"), ("test", "psnr_strong"))
         ]
-        numbers = {summary.arm: summary.mean["Gaussians"] for summary in summarise_all(rows, [name, reference])}
-        if name in numbers and reference in numbers:
-            lines.append([f"{label(arm)} − {reference}", *cells, _times(numbers[name] / numbers[reference])])
+        ratio = times_gaussians(rows, name, reference)
+        if ratio is not None:
+            lines.append([f"{label(arm)} − {reference}", *cells, _times(ratio)])
     heads = ["difference", "train PSNR", "held-out PSNR", "held-out SSIM", "strongest 10%", "Gaussians"]
     return markdown(heads, lines)
 

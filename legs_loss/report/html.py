@@ -13,7 +13,7 @@ from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE, read_rows
-from legs_loss.experiments.statistics import SCORES, difference, summarise_all
+from legs_loss.experiments.statistics import SCORES, difference, summarise_all, times_gaussians
 from legs_loss.experiments.tables import difference_cell, score_cells
 from legs_loss.reference.training.dataset import load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
@@ -141,7 +141,6 @@ def _scores(rows: Sequence[Row], arms: Sequence[str]) -> str:
 
 def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
     columns = (("train", "psnr"), ("train", "ssim"), ("test", "psnr"), ("test", "ssim"), ("test", "psnr_strong"))
-    numbers = {summary.arm: summary.mean["Gaussians"] for summary in summarise_all(rows, [BASELINE, *arms])}
     body = []
     for arm in arms:
         found = [difference(rows, arm, BASELINE, split, score) for split, score in columns]
@@ -149,8 +148,9 @@ def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
             (difference_cell(one, score), _sortable(one.mean if one is not None else math.nan))
             for one, (_, score) in zip(found, columns)
         ]
-        ratio = numbers[arm] / numbers[BASELINE]
-        body.append([(arm, arm), *cells, (f"{ratio:.2f}x", _sortable(ratio))])
+        ratio = times_gaussians(rows, arm, BASELINE)
+        times = ("–", _sortable(math.nan)) if ratio is None else (f"{ratio:.2f}x", _sortable(ratio))
+        body.append([(arm, arm), *cells, times])
     return _table(
         f"Each arm minus {BASELINE}, paired by view. Brackets: 95% bootstrap interval over views. ? where it holds 0, "
         "or where seeds differ in sign.",

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from legs_loss import LegsError, LEGSLoss, WeightSpec, legs_loss, weight_map
@@ -57,6 +57,8 @@ class TestFusedLoss:
     @given(st.integers(1, 140), st.integers(1, 300), st.integers(1, 4), st.floats(0, 1), st.integers(0, 2))
     def test_any_size_and_share(self, height, width, channels, lambda_dssim, kind):
         prediction, target = images((channels, height, width))
+        spread = response(target).max() - response(target).min()
+        assume(kind != 2 or spread > 1e-3)  # two pixels respond alike but for rounding, which the weights then magnify
         compare(fused_loss, prediction, target, [None, weight_map(target), PRESETS["legs-l"]][kind], lambda_dssim)
 
     def test_one_map_for_a_batch(self):
@@ -298,6 +300,7 @@ class TestSelection:
             "import os, torch\nfrom legs_loss import legs_loss\ntorch.set_num_threads(1)\n"
             "x, y = torch.rand(3, 90, 700, requires_grad=True), torch.rand(3, 90, 700)\n"
             "legs_loss(x, y).backward()\n"
+            "assert torch.get_num_threads() == 1\n"
             "child = os.fork()\n"
             "if child == 0:\n    legs_loss(x, y).backward()\n    os._exit(0)\n"
             "assert os.waitpid(child, 0)[1] == 0\n"

@@ -165,7 +165,9 @@ def _try(name: str, device: torch.device) -> Finding:
         if name == "numba" and sys.version_info < (3, 8):
             return Finding(None, False, "the last numba for Python 3.7 takes minutes to compile the weights")
         fused = importlib.import_module(_MODULES[name]).fused_loss
+        threads = torch.get_num_threads()
         problem = _difference_from_torch(fused, device)
+        torch.set_num_threads(threads)  # numba's first parallel loop sets OpenMP's number, which is torch's too
     except Exception as error:  # whatever a broken install, compiler or driver raises
         return Finding(None, True, f"{type(error).__name__}: {str(error).strip() or 'no message'}".splitlines()[0])
     return Finding(None if problem else fused, True, problem or "its trial agreed with torch")

@@ -62,7 +62,7 @@ def summarise(rows: Rows) -> Summary:
     """Return the summary of one arm's rows.
 
     >>> metrics = {"train": {"psnr": 30.0, "ssim": 0.9}, "test": None, "gaussians": 5, "mean_weight": 1.0,
-    ...            "seconds": 2.0, "iterations": 100}
+    ...            "processor_seconds": 2.0, "iterations": 100}
     >>> other = dict(metrics, gaussians=7)
     >>> summary = summarise([{"arm": "a", "metrics": metrics}, {"arm": "a", "metrics": other}])
     >>> summary.mean["Gaussians"], round(summary.spread["Gaussians"], 3), summary.mean["ms an iteration"]
@@ -139,7 +139,7 @@ def _scores(rows: Rows, arm: str, split: str, score: str) -> Dict[int, Dict[str,
 
 def _value(metrics: Mapping[str, Any], name: str) -> float:
     if name == "ms an iteration":
-        return 1000.0 * metrics["seconds"] / metrics["iterations"]
+        return 1000.0 * metrics.get("processor_seconds", math.nan) / metrics["iterations"]
     value: Any = metrics
     for key in SCORES[name]:
         if value is None:  # no view is held out

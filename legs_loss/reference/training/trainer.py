@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Union
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -236,7 +237,7 @@ class _Run:
         self.schedule = Schedule.of(config.iterations)
         self.threshold = config.densify_grad_threshold or default_threshold(data.train)
         self.iteration = 0
-        self.seconds = 0.0
+        self.clocks = np.zeros(2)  # seconds: on the wall, and of the processor
         self.generator = torch.Generator().manual_seed(config.seed)
         self.order: List[int] = []  # the views that this round through all of them has still to show
         self.loss: Optional[float] = None
@@ -267,7 +268,7 @@ class _Run:
         if facts["config"] != config.as_dict():
             raise LegsError(f"{path}: this run was made with other settings")
         run = cls(data, config, Adam.restore(arrays))
-        run.iteration, run.seconds, run.order = facts["iteration"], facts["seconds"], facts["order"]
+        run.iteration, run.clocks, run.order = facts["iteration"], np.array(facts["clocks"]), facts["order"]
         run.loss, run.psnr = facts["loss"], facts["psnr"]
         run.weight_sum, run.growth, run.history = facts["weight_sum"], facts["growth"], facts["history"]
         run.gradient_sum = torch.from_numpy(arrays["gradient_sum"])
@@ -286,7 +287,7 @@ class _Run:
             "config": self.config.as_dict(),
             "views": [view.name for view in self.data.train],
             "iteration": self.iteration,
-            "seconds": self.seconds,
+            "clocks": self.clocks.tolist(),
             "order": self.order,
             "loss": self.loss,
             "psnr": self.psnr,
@@ -300,14 +301,14 @@ class _Run:
         self, folder: Optional[Path], checkpoint_every: int, on_progress: Optional[Callable[[Progress], None]]
     ) -> None:
         """Run to the last iteration."""
-        started = time.perf_counter() - self.seconds
+        started = _clocks() - self.clocks
         with _ctrl_c_between_iterations() as interrupted:
             while self.iteration < self.config.iterations:
                 self.step()
-                self.seconds = time.perf_counter() - started
+                self.clocks = _clocks() - started
                 if self.evaluate_every is not None and self.iteration % self.evaluate_every == 0:
                     self._evaluate()
-                    started = time.perf_counter() - self.seconds
+                    started = _clocks() - self.clocks
                 last = self.iteration == self.config.iterations
                 if on_progress is not None and (last or self.iteration % 10 == 0):
                     assert self.loss is not None and self.psnr is not None
@@ -351,7 +352,8 @@ class _Run:
             "densify_grad_threshold": self.threshold,
             "mean_weight": self._mean_weight(),
             "iterations": self.iteration,
-            "seconds": self.seconds,
+            "seconds": float(self.clocks[0]),
+            "processor_seconds": float(self.clocks[1]),
             "growth": self.growth,
             "history": self.history,
             "views": {
@@ -437,6 +439,10 @@ def step_weight(weight: Optional[Tensor], view: TrainingView, config: TrainConfi
     if config.l1_scale == 1.0:
         return weight
     return config.l1_scale * (torch.ones_like(view.image[:1]) if weight is None else weight)
+
+
+def _clocks() -> np.ndarray:
+    return np.array([time.perf_counter(), time.process_time()])
 
 
 @contextmanager

@@ -44,12 +44,20 @@ def ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_la
         >>> round(float(ssim(image, image)), 5)
         1.0
     """
+    return ssim_map(prediction, target, padding, channels_last).mean()
+
+
+def ssim_map(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: bool = False) -> Tensor:
+    """Return the SSIM of every pixel and channel, channels first, whose mean :func:`ssim` is; arguments as there.
+
+    Padding "valid" leaves out the pixels whose window is not inside the image.
+    """
     check_pair(prediction, target)
     first = channels_first(prediction, channels_last)
     second = channels_first(target, channels_last)
     dtype = torch.promote_types(torch.promote_types(first.dtype, second.dtype), torch.float32)
     with _no_autocast(first):
-        return _ssim_map(first.to(dtype), second.to(dtype), padding).mean()
+        return _ssim_map(first.to(dtype), second.to(dtype), padding)
 
 
 def d_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: bool = False) -> Tensor:

@@ -28,6 +28,9 @@ from legs_loss.experiments.tables import differences_table, markdown, paper_text
 pytest.importorskip("numba")
 pytest.importorskip("scipy")
 
+from skimage.metrics import structural_similarity
+
+from legs_loss.experiments.losses import LOSSES
 from legs_loss.experiments.running import Comparison, read_rows
 from legs_loss.experiments.weighting import WEIGHTINGS, fading, growing, multiscale, shuffled
 from legs_loss.reference.training import trainer
@@ -89,7 +92,7 @@ def test_every_study_and_change_can_be_named() -> None:
             assert arm in study.arms
     for change in CHANGES:
         assert parse_arm(f"legs:{change}").changes == (change,)
-    assert set(WEIGHTINGS) <= set(CHANGES)
+    assert set(WEIGHTINGS) | set(LOSSES) <= set(CHANGES)
 
 
 def test_the_settings_of_controls() -> None:
@@ -157,6 +160,21 @@ def test_several_scales_see_what_one_does_not() -> None:
 
     assert share(weight_map(image, spec)) < 0.1
     assert share(weight) > 0.3
+
+
+def test_weights_inside_ssim() -> None:
+    image, rendering = torch.rand(3, 24, 20), torch.rand(3, 24, 20, requires_grad=True)
+    weight = weight_map(image, WeightSpec())
+    same = LOSSES["ssim"](rendering, image, torch.full_like(weight, 2.5), 0.2)
+    torch.testing.assert_close(same, 2.5 * trainer.step_loss(rendering, image, None, 0.2))
+    _, of_each = structural_similarity(  # skimage's map, an independent one; its border is another
+        image.numpy(), rendering.detach().numpy(), channel_axis=0, data_range=1.0, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, full=True,
+    )  # fmt: skip
+    inside = torch.zeros_like(weight)
+    inside[:, 5:-5, 5:-5] = weight[:, 5:-5, 5:-5]
+    expected = float((inside * (1 - torch.from_numpy(of_each))).mean())
+    assert float(LOSSES["ssim"](rendering.detach(), image, inside, 1.0)) == pytest.approx(expected, rel=1e-4)
 
 
 def test_weight_goes_where_the_rendering_errs() -> None:

@@ -32,6 +32,7 @@ CHANGES: Mapping[str, str] = {
     "fading": "beta falls to 0 over the run",
     "multiscale": "the mean of the responses at three sizes",
     "error": "the response times the rendering's error nearby",
+    "ssim": "the weights also inside the mean of SSIM's map",
 }
 _WEIGHTINGS = ("shuffled", "growing", "fading", "multiscale", "error")  # one of them at most
 
@@ -56,6 +57,11 @@ class ArmSpec:
     def weighting(self) -> Optional[str]:
         """The name of what makes its weights during the run, None where its spec does."""
         return next((change for change in self.changes if change in _WEIGHTINGS), None)
+
+    @property
+    def loss(self) -> Optional[str]:
+        """The name of its iterations' loss, None for 3DGS's with weights."""
+        return "ssim" if "ssim" in self.changes else None
 
     @property
     def needs_mean_weight(self) -> bool:

@@ -22,10 +22,11 @@ from legs_loss._version import __version__
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import ArmSpec, needed, parse_arm
 from legs_loss.experiments.baseline import prove_unweighted
+from legs_loss.experiments.losses import LOSSES
 from legs_loss.experiments.weighting import WEIGHTINGS
 from legs_loss.reference.training.dataset import Dataset, load_dataset
 from legs_loss.reference.training.side_by_side import Arm, train_arm, train_side_by_side
-from legs_loss.reference.training.trainer import CHECKPOINT, Progress, TrainConfig, default_threshold
+from legs_loss.reference.training.trainer import CHECKPOINT, Progress, TrainConfig, default_threshold, step_loss
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
@@ -131,6 +132,7 @@ class Comparison:
             "seed": seed,
             "config": config.as_dict(),
             "weighting": arm.weighting,
+            "loss": arm.loss,
             "caps": None if caps is None else sorted(caps.items()),
         }
         _keep(folder / "plan.json", json.loads(json.dumps(plan)), "row")
@@ -141,6 +143,7 @@ class Comparison:
             folder,
             self.images,
             weighting=None if arm.weighting is None else WEIGHTINGS[arm.weighting],
+            loss=step_loss if arm.loss is None else LOSSES[arm.loss],
             caps=caps,
             evaluate_every=max(1, config.iterations // EVALUATIONS),
             resume=(folder / CHECKPOINT).is_file(),

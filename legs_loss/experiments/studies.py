@@ -78,6 +78,8 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
                 "legs:mean1:growing@3dgs",
                 "legs:mean1:multiscale@3dgs",
                 "percentile=99:mean1:error@3dgs",
+                "legs-l:mean1:ssim@3dgs",
+                "legs:mean1:ssim@3dgs",
                 "3dgs:half@3dgs",
                 "legs:mean1:half@3dgs",
                 "percentile=99:mean1:error:half@3dgs",

@@ -171,6 +171,7 @@ def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> str:
         "L1 scale",
         "threshold",
         "weights",
+        "loss",
         "numbers of",
     ]
     body = []
@@ -179,7 +180,7 @@ def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> str:
         config, spec = row["config"], row["config"]["spec"]
         values = [spec[name] for name in ("operator", "p", "curve", "beta", "percentile", "normalise")]
         values += [f"{config['l1_scale']:.4g}", f"{config['densify_grad_threshold']:.4g}"]
-        values += [row["weighting"] or "the spec's", parse_arm(arm).at or "its own"]
+        values += [row["weighting"] or "the spec's", parse_arm(arm).loss or "3DGS's", parse_arm(arm).at or "its own"]
         body.append([(arm, arm)] + [(str(value), "") for value in values])
     return _table("", heads, body, sortable=False)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence
 
 from legs_loss.errors import LegsError
-from legs_loss.reference.training.trainer import Progress, TrainConfig, Weighting, train
+from legs_loss.reference.training.trainer import Loss, Progress, TrainConfig, Weighting, step_loss, train
 from legs_loss.scenes import read_scene
 
 __all__ = ["Arm", "train_arm", "train_side_by_side"]
@@ -18,7 +18,7 @@ __all__ = ["Arm", "train_arm", "train_side_by_side"]
 class Arm(NamedTuple):
     """One training: its name, and what `train` needs. ``images`` is the folder that ``read_scene`` takes.
 
-    ``weighting`` is a function of a module, since it is sent to another process by its name.
+    ``weighting`` and ``loss`` are functions of a module, since they are sent to another process by their names.
     """
 
     name: str
@@ -28,6 +28,7 @@ class Arm(NamedTuple):
     images: Optional[str] = None
     store: Optional[Path] = None
     weighting: Optional[Weighting] = None
+    loss: Loss = step_loss
     caps: Optional[Mapping[int, int]] = None
     evaluate_every: Optional[int] = None
     resume: bool = False
@@ -112,6 +113,7 @@ def train_arm(arm: Arm, on_progress: Callable[[Progress], None]) -> Dict[str, An
         store=arm.store,
         on_progress=on_progress,
         weighting=arm.weighting,
+        loss=arm.loss,
         caps=arm.caps,
         evaluate_every=arm.evaluate_every,
     ).metrics

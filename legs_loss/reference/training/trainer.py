@@ -36,6 +36,7 @@ from legs_loss.scenes import Scene
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
 __all__ = [
+    "Loss",
     "Progress",
     "Result",
     "TrainConfig",
@@ -129,6 +130,9 @@ class TrainConfig:
 # Makes a run's Weigh from its training views, each with its spec's weight map.
 Weighting = Callable[[List[TrainingView], TrainConfig], Weigh]
 
+# An iteration's loss, as `step_loss`: of rendering, photograph, weight map (None: 1 everywhere) and lambda.
+Loss = Callable[[Tensor, Tensor, Optional[Tensor], float], Tensor]
+
 
 class Progress(NamedTuple):
     """What a running training tells: smoothed loss and PSNR of the training views, and the number of Gaussians."""
@@ -158,6 +162,13 @@ def default_threshold(views: List[TrainingView]) -> float:
     return max(2e-4, 0.12 / math.sqrt(pixels))
 
 
+def step_loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lambda_dssim: float) -> Tensor:
+    """Return the loss of one iteration: of a rendering [3, H, W], its photograph and its weight map [1, H, W]."""
+    from legs_loss.kernels.numba_loss import fused_loss
+
+    return fused_loss(prediction, target, weight, lambda_dssim)
+
+
 def draw(gaussians: Gaussians, view: TrainingView, config: TrainConfig) -> Tensor:
     """Return a finished scene's rendering of a view, [3, H, W], not clipped."""
     with torch.no_grad():
@@ -179,6 +190,7 @@ def train(
     checkpoint_every: int = 500,
     on_progress: Optional[Callable[[Progress], None]] = None,
     weighting: Optional[Weighting] = None,
+    loss: Loss = step_loss,
     caps: Optional[Mapping[int, int]] = None,
     evaluate_every: Optional[int] = None,
 ) -> Result:
@@ -195,9 +207,10 @@ def train(
         checkpoint_every: iterations between checkpoints. Another one is written on Ctrl-C.
         on_progress: called every 10 iterations.
         weighting: makes weights that change during the run, in place of the maps: for experiments.
+        loss: in place of 3DGS's with weights: for experiments.
         caps: the most Gaussians that a densification may lead to, before it prunes, by its iteration; in place of
             ``config.max_gaussians``. Another run's ``metrics["growth"]`` gives this one that run's numbers: for
-            experiments. A resumed run needs the same ``weighting`` and ``caps``.
+            experiments. A resumed run needs the same ``weighting``, ``loss`` and ``caps``.
         evaluate_every: score the held-out views every so many iterations into ``metrics["history"]``, outside of the
             run's time; None: only at the end.
 
@@ -213,7 +226,7 @@ def train(
         run = _Run.restore(data, config, folder / CHECKPOINT)
     else:
         run = _Run.begin(data, config, scene)
-    run.caps, run.evaluate_every = caps, evaluate_every
+    run.step_loss, run.caps, run.evaluate_every = loss, caps, evaluate_every
     run.weigh = None if weighting is None else weighting(data.train, config)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -245,6 +258,7 @@ class _Run:
         self._forget_gradients()
         self.weights = [step_weight(view.weight, view, config) for view in data.train]
         self.weigh: Optional[Weigh] = None
+        self.step_loss: Loss = step_loss
         self.weight_sum = 0.0  # of the mean weights of all iterations, where they change
         self.caps: Optional[Mapping[int, int]] = None
         self.growth: List[List[int]] = []  # [iteration of a densification, Gaussians before it pruned]
@@ -328,7 +342,7 @@ class _Run:
         viewspace = torch.zeros(len(gaussians), 2, requires_grad=True)
         drawn = _rasterize(gaussians, view, self.config, degree, viewspace)
         weight = self._weight(index, drawn.image.detach())
-        loss = step_loss(drawn.image, view.image, weight, self.config.lambda_dssim)
+        loss = self.step_loss(drawn.image, view.image, weight, self.config.lambda_dssim)
         loss.backward()
         if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
             self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image))
@@ -425,13 +439,6 @@ def _rasterize(
     return rasterize(
         g.means, g.scales, g.quaternions, g.opacities, g.sh, view.camera, config.background, degree, viewspace
     )
-
-
-def step_loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lambda_dssim: float) -> Tensor:
-    """Return the loss of one iteration: of a rendering [3, H, W], its photograph and its weight map [1, H, W]."""
-    from legs_loss.kernels.numba_loss import fused_loss
-
-    return fused_loss(prediction, target, weight, lambda_dssim)
 
 
 def step_weight(weight: Optional[Tensor], view: TrainingView, config: TrainConfig) -> Optional[Tensor]:

@@ -3,17 +3,43 @@
     from legs_loss import l1_loss       # in place of the codebase's own
 
 See README.md for the three ways in, docs/method.md for the mathematics.
+
+A name is imported when it is first asked for: legs-patch, which needs none of those that compute, need not wait for
+torch.
 """
 
-from legs_loss._version import __version__
-from legs_loss.curves import register_curve
-from legs_loss.errors import LegsError
-from legs_loss.loss import LEGSLoss, legs_loss, weighted_l1
-from legs_loss.response import response
-from legs_loss.runtime import configure, l1_loss
-from legs_loss.spec import PRESETS, WeightSpec
-from legs_loss.ssim import d_ssim, ssim
-from legs_loss.weights import weight_map
+import importlib
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, List
+
+if TYPE_CHECKING:
+    from legs_loss._version import __version__
+    from legs_loss.curves import register_curve
+    from legs_loss.errors import LegsError
+    from legs_loss.loss import LEGSLoss, legs_loss, weighted_l1
+    from legs_loss.response import response
+    from legs_loss.runtime import configure, l1_loss
+    from legs_loss.spec import PRESETS, WeightSpec
+    from legs_loss.ssim import d_ssim, ssim
+    from legs_loss.weights import weight_map
+
+_HOMES = {
+    "PRESETS": "spec",
+    "LEGSLoss": "loss",
+    "LegsError": "errors",
+    "WeightSpec": "spec",
+    "__version__": "_version",
+    "configure": "runtime",
+    "d_ssim": "ssim",
+    "l1_loss": "runtime",
+    "legs_loss": "loss",
+    "register_curve": "curves",
+    "response": "response",
+    "ssim": "ssim",
+    "weight_map": "weights",
+    "weighted_l1": "loss",
+}
 
 __all__ = [
     "PRESETS",
@@ -31,3 +57,23 @@ __all__ = [
     "weight_map",
     "weighted_l1",
 ]
+
+
+class _Package(ModuleType):
+    def __getattr__(self, name: str) -> object:
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+        setattr(self, name, value)
+        return value
+
+    def __setattr__(self, name: str, value: object) -> None:
+        # Python binds a module that was imported to its name here; ssim and response are functions first.
+        if name not in _HOMES or not isinstance(value, ModuleType):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> List[str]:
+        return sorted({*super().__dir__(), *__all__})
+
+
+sys.modules[__name__].__class__ = _Package

@@ -6,16 +6,16 @@ this project's identification of that picture, not the paper's text; docs/method
 
 from __future__ import annotations
 
-from typing import Callable, Dict, Tuple
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Callable, Dict, Tuple
 
 from legs_loss.errors import LegsError
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 __all__ = ["Curve", "curve", "curve_names", "register_curve"]
 
-Curve = Callable[[Tensor], Tensor]
+Curve = Callable[["Tensor"], "Tensor"]
 
 
 def _linear(x: Tensor) -> Tensor:
@@ -27,7 +27,7 @@ def _square(x: Tensor) -> Tensor:
 
 
 def _square_root(x: Tensor) -> Tensor:
-    return torch.sqrt(x)
+    return x.sqrt()
 
 
 def _smoothstep(x: Tensor) -> Tensor:
@@ -36,7 +36,7 @@ def _smoothstep(x: Tensor) -> Tensor:
 
 def _inverse_smoothstep(x: Tensor) -> Tensor:
     # Rounding can leave the unit interval by one ulp at its ends.
-    return (0.5 - torch.sin(torch.asin(1.0 - 2.0 * x) / 3.0)).clamp(0.0, 1.0)
+    return (0.5 - ((1.0 - 2.0 * x).asin() / 3.0).sin()).clamp(0.0, 1.0)
 
 
 _CURVES: Dict[str, Curve] = {
@@ -55,6 +55,7 @@ def curve(name: str) -> Curve:
         LegsError: no curve has that name.
 
     Example:
+        >>> import torch
         >>> curve("C3")(torch.tensor([0.0, 0.25, 1.0]))
         tensor([0.0000, 0.5000, 1.0000])
     """
@@ -83,6 +84,7 @@ def register_curve(name: str, function: Curve) -> None:
         LegsError: the name is taken, or the function leaves [0, 1] or changes the shape.
 
     Example:
+        >>> import torch
         >>> register_curve("cube-root", lambda x: x ** (1 / 3))
         >>> curve("cube-root")(torch.tensor([0.125]))
         tensor([0.5000])
@@ -91,9 +93,11 @@ def register_curve(name: str, function: Curve) -> None:
         raise LegsError(f"a curve's name is a non-empty string, got {name!r}")
     if name in _CURVES:
         raise LegsError(f"a curve named {name!r} exists already: choose another name")
+    import torch
+
     x = torch.linspace(0.0, 1.0, 257)
     y = function(x.clone())
-    if not isinstance(y, Tensor) or y.shape != x.shape:
+    if not isinstance(y, torch.Tensor) or y.shape != x.shape:
         raise LegsError(f"curve {name!r} must return a tensor of its input's shape")
     if not bool(((y >= 0.0) & (y <= 1.0)).all()):
         raise LegsError(

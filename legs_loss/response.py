@@ -7,77 +7,16 @@ Source: the LEGS paper, its weight's definition (op = Laplacian); EGGS, arXiv 24
 
 from __future__ import annotations
 
-from typing import Callable, Dict, List, Tuple
+from typing import List
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from legs_loss.errors import LegsError
 from legs_loss.images import channels_first, check_image
+from legs_loss.operators import OPERATORS, check_operator
 
-__all__ = ["normalise_response", "operator_names", "response"]
-
-# An operator takes the image with a border of one pixel, [B, C, H+2, W+2], and returns its components,
-# each [B, C, H, W]. Differences are taken in an order that is exactly zero on a constant image.
-_Operator = Callable[[Tensor], List[Tensor]]
-
-
-def _neighbour(padded: Tensor, row: int, column: int) -> Tensor:
-    height, width = padded.shape[-2] - 2, padded.shape[-1] - 2
-    return padded[..., 1 + row : 1 + row + height, 1 + column : 1 + column + width]
-
-
-def _cross(padded: Tensor) -> Tensor:
-    return (_neighbour(padded, -1, 0) + _neighbour(padded, 1, 0)) + (
-        _neighbour(padded, 0, -1) + _neighbour(padded, 0, 1)
-    )
-
-
-def _laplacian(padded: Tensor) -> List[Tensor]:
-    return [_cross(padded) - 4.0 * _neighbour(padded, 0, 0)]
-
-
-def _laplacian8(padded: Tensor) -> List[Tensor]:
-    diagonal = (_neighbour(padded, -1, -1) + _neighbour(padded, 1, 1)) + (
-        _neighbour(padded, -1, 1) + _neighbour(padded, 1, -1)
-    )
-    return [(_cross(padded) + diagonal) - 8.0 * _neighbour(padded, 0, 0)]
-
-
-def _central(padded: Tensor) -> List[Tensor]:
-    return [
-        0.5 * (_neighbour(padded, 0, 1) - _neighbour(padded, 0, -1)),
-        0.5 * (_neighbour(padded, 1, 0) - _neighbour(padded, -1, 0)),
-    ]
-
-
-def _smoothed_difference(side: float, middle: float) -> _Operator:
-    def operator(padded: Tensor) -> List[Tensor]:
-        across = padded[..., :, 2:] - padded[..., :, :-2]
-        down = padded[..., 2:, :] - padded[..., :-2, :]
-        return [
-            side * (across[..., :-2, :] + across[..., 2:, :]) + middle * across[..., 1:-1, :],
-            side * (down[..., :, :-2] + down[..., :, 2:]) + middle * down[..., :, 1:-1],
-        ]
-
-    return operator
-
-
-_OPERATORS: Dict[str, _Operator] = {
-    "laplacian": _laplacian,
-    "laplacian8": _laplacian8,
-    "sobel": _smoothed_difference(1.0, 2.0),
-    "scharr": _smoothed_difference(3.0, 10.0),
-    "central": _central,
-}
-
-NORMS = (1.0, 2.0, float("inf"))
-
-
-def operator_names() -> Tuple[str, ...]:
-    """Return the names that ``operator`` may take."""
-    return tuple(_OPERATORS)
+__all__ = ["normalise_response", "response"]
 
 
 def response(image: Tensor, operator: str = "laplacian", p: float = 2.0, channels_last: bool = False) -> Tensor:
@@ -111,7 +50,7 @@ def response(image: Tensor, operator: str = "laplacian", p: float = 2.0, channel
     flat = channels_first(image.detach(), channels_last)
     flat = flat.to(torch.promote_types(flat.dtype, torch.float32))
     single = flat.dim() == 3
-    parts = _OPERATORS[operator](_with_border(flat.unsqueeze(0) if single else flat))
+    parts = OPERATORS[operator](_with_border(flat.unsqueeze(0) if single else flat))
     strength = _norm(parts, p)
     strength = strength[0] if single else strength
     return strength.movedim(-3, -1) if channels_last else strength
@@ -135,18 +74,6 @@ def normalise_response(response: Tensor, eps: float = 1e-8) -> Tensor:
     low = response.amin(over, keepdim=True)
     high = response.amax(over, keepdim=True)
     return (response - low) / (high - low + eps)
-
-
-def check_operator(operator: str, p: float) -> None:
-    """Check the two settings of a response.
-
-    Raises:
-        LegsError: one of them is unknown; the message lists what there is.
-    """
-    if operator not in _OPERATORS:
-        raise LegsError(f"no operator is named {operator!r}: choose one of {', '.join(_OPERATORS)}")
-    if p not in NORMS:
-        raise LegsError(f"p must be 1, 2 or inf, got {p!r}")
 
 
 def _with_border(image: Tensor) -> Tensor:

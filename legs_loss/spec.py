@@ -8,7 +8,7 @@ from typing import Mapping, Union
 
 from legs_loss.curves import curve
 from legs_loss.errors import LegsError
-from legs_loss.response import check_operator
+from legs_loss.operators import check_operator
 
 __all__ = ["PRESETS", "Spec", "WeightSpec", "as_spec"]
 

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 
 from legs_loss import LegsError, LEGSLoss, WeightSpec, legs_loss, weight_map
 from legs_loss.kernels import backends
+from legs_loss.operators import operator_names
 from legs_loss.precompute import normalised_map
-from legs_loss.response import operator_names, response
+from legs_loss.response import response
 from legs_loss.scenes.images import image_tensor
 from legs_loss.spec import PRESETS
 from tests.kernels_support import compare, images, used

@@ -15,7 +15,7 @@ pytest.importorskip("triton")
 from legs_loss import LegsError, WeightSpec, legs_loss, weight_map
 from legs_loss.kernels import backends
 from legs_loss.kernels.triton_loss import fused_loss
-from legs_loss.response import operator_names
+from legs_loss.operators import operator_names
 from legs_loss.spec import PRESETS
 from tests.kernels_support import compare, images, used
 

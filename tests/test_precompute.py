@@ -15,8 +15,9 @@ import torch
 from PIL import Image
 
 from legs_loss.errors import LegsError
+from legs_loss.operators import operator_names
 from legs_loss.precompute import normalised_map, precompute
-from legs_loss.response import normalise_response, operator_names, response
+from legs_loss.response import normalise_response, response
 from legs_loss.scenes import image_tensor, images, load_training_image, read_scene
 from legs_loss.spec import PRESETS, WeightSpec
 from legs_loss.store import WeightStore, fingerprint

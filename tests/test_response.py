@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from legs_loss import LegsError, response
-from legs_loss.response import normalise_response, operator_names
+from legs_loss.operators import operator_names
+from legs_loss.response import normalise_response
 from tests.strategies import images
 
 ndimage_mode = "mirror"  # what torch calls reflect: the edge pixel is not repeated

@@ -244,13 +244,13 @@ def own_shape(program: Program, function: Function, call: Optional[cst.Call] = N
         nothing but the difference (and on further arguments); None for what is not.
     """
     names = function.parameters
-    if len(names) < 2 or depth > 4 or not isinstance(function.node, cst.FunctionDef):
+    if len(names) < 2 or depth > 4 or not program.prospects.of(function.text):
         return None
     a, b = names[:2]
     if not _only_differences(program, function, a, b, depth):
         return None
     known = _known_arguments(function, call)
-    returned = _follow(function.node.body.body, {}, known)
+    returned = _follow(function.body.body, {}, known)
     if returned is not None:
         shape = _shape_of(program, function, returned, a, b, depth)
         if shape is not None:
@@ -405,7 +405,7 @@ def _only_differences(program: Program, function: Function, a: str, b: str, dept
     """Return whether a function is an L1 of its first two parameters: they meet in differences, and in no other way."""
     assert isinstance(function.node, cst.FunctionDef)
     nodes: List[cst.CSTNode] = []
-    for statement in function.node.body.body:
+    for statement in function.body.body:
         nodes.extend(walk_expressions(statement))
     allowed: Set[int] = set()
     absolute = False

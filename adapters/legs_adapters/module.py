@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-import bisect
 import re
-from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Callable, Dict, Iterator, List, Optional, Sequence, Tuple
 
 import libcst as cst
-from libcst.metadata import ByteSpanPositionProvider, MetadataWrapper
 
 from legs_adapters.flow import Definition, Flow
+from legs_adapters.parts import Cut, Lines, Part, Place, body_part, outline_part
 from legs_adapters.repo import Source, Unreadable
-from legs_adapters.syntax import code, dotted
+from legs_adapters.syntax import dotted
 
-__all__ = ["Class", "Function", "Module", "Place", "parse"]
+__all__ = ["Class", "Function", "Module", "parse"]
 
 _PRINT_STATEMENT = re.compile(
     r"^\s*(print\s+[\"'\w]|exec\s+[\"']|raise\s+\w+\s*,)|^\s*except\s+[\w.]+\s*,\s*\w+\s*:", re.M
 )
-_FORM_FEED = re.compile(r"^[ \t\f]*\f", re.M)  # LibCST loses these
-_NEWLINE = re.compile(rb"\r\n|\r|\n")
+_DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
 class Function:
     """A function, a method, or a module's top level.
 
     Attributes:
-        module, node, name: where it stands.
+        module, name: where it stands.
+        node: its header; its body is ``body``.
         parent: the function around it; a module's top level for what is defined there; None for the top level itself.
         owner: its class, for a method.
+        text: what it is written in: its own body, or (where that is not known by itself) what is around it. What a
+            function says is said there: a cheap question before the dear ones.
     """
 
     def __init__(
@@ -37,25 +38,66 @@ class Function:
         node: cst.FunctionDef | cst.Module,
         parent: Optional[Function] = None,
         owner: Optional[Class] = None,
+        cut: Optional[Cut] = None,
     ) -> None:
         self.module = module
         self.node = node
         self.parent = parent
         self.owner = owner
         self.name = node.name.value if isinstance(node, cst.FunctionDef) else ""
+        self._cut = cut
+        self._part: Optional[Part] = None
+        self._body: Optional[cst.BaseSuite | cst.Module] = None
+        self._inner: List[Function] = []
         self._flow: Optional[Flow] = None
+        if cut is not None:
+            self.text = module.lines.data[cut.start : cut.end].decode("utf-8")
+        else:
+            self.text = parent.text if parent is not None and parent.parent is not None else module.outline_text
 
     def __repr__(self) -> str:
         return f"<{self.module.path}:{self.name or 'top level'}>"
 
     @property
+    def body(self) -> cst.BaseSuite | cst.Module:
+        """Its statements, parsed when they are first asked for."""
+        if self._body is None:
+            self._body = self.node if isinstance(self.node, cst.Module) else self.node.body
+            if self._cut is not None:
+                try:
+                    self._part = body_part(self.module.lines, self._cut)
+                    header = self._part.tree.body[0]
+                    assert isinstance(header, cst.FunctionDef)
+                    self._body = header.body
+                    self._inner = self.module.collect(self._body.body, self)
+                except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
+                    self.module.failure = _failure(self.module.path, self.module.text, error)
+        return self._body
+
+    @property
+    def inner(self) -> List[Function]:
+        """The functions that are defined in its body, and theirs, in source order."""
+        if self._cut is not None and self._body is None and _DEFINES.search(self.text):
+            assert self.body is not None  # which finds them
+        return self._inner
+
+    def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
+        """Say where a node of its body stands in the file, on request with the brackets around it.
+
+        Raises:
+            ValueError: LibCST would write another text than it read.
+        """
+        scope: Function = self
+        while scope._cut is None and scope.parent is not None:
+            scope = scope.parent
+        return (scope._part or self.module.outline).place(node, brackets)
+
+    @property
     def flow(self) -> Flow:
         """Its reaching definitions, computed once."""
         if self._flow is None:
-            if isinstance(self.node, cst.FunctionDef):
-                self._flow = Flow(self.node.body, self.node.params)
-            else:
-                self._flow = Flow(self.node)
+            parameters = self.node.params if isinstance(self.node, cst.FunctionDef) else None
+            self._flow = Flow(self.body, parameters)
         return self._flow
 
     @property
@@ -93,24 +135,21 @@ class Class:
         self.name = node.name.value
         self.methods: Dict[str, Function] = {}
         self.fields: Dict[str, cst.BaseExpression] = dict(_fields(node))
-        self._stores: Optional[Dict[str, List[Tuple[Function, Definition]]]] = None
 
     @property
     def bases(self) -> List[str]:
         """The last names of its base classes."""
         return [(dotted(arg.value) or "").split(".")[-1] for arg in self.node.bases]
 
-    def stores(self, attribute: str) -> List[Tuple[Function, Definition]]:
-        """Return what its methods assign to ``self.attribute``."""
-        if self._stores is None:
-            self._stores = {}
-            for method in self.methods.values():
-                for place, definitions in method.flow.definitions.items():
-                    if place.startswith("self.") and place.count(".") == 1 and "[" not in place:
-                        entries = self._stores.setdefault(place[5:], [])
-                        # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
-                        entries.extend((method, d) for d in definitions if not str(d.key).startswith("."))
-        return self._stores.get(attribute, [])
+    def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
+        """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""
+        found: List[Tuple[Function, Definition]] = []
+        for method in self.methods.values():
+            if attribute in method.text and where(method):
+                definitions = method.flow.definitions.get(f"self.{attribute}", [])
+                # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
+                found.extend((method, d) for d in definitions if not str(d.key).startswith("."))
+        return found
 
 
 def _fields(node: cst.ClassDef) -> Iterator[Tuple[str, cst.BaseExpression]]:
@@ -124,118 +163,91 @@ def _fields(node: cst.ClassDef) -> Iterator[Tuple[str, cst.BaseExpression]]:
                 yield small.target.value, small.value
 
 
-class Place(NamedTuple):
-    """Where a node stands: bytes of the file without its byte order mark; lines count from 1, columns from 0."""
-
-    start: int
-    end: int
-    line: int
-    column: int
-    last_line: int
-
-
 class Module:
     """A parsed file.
 
     Attributes:
-        text: the file's text.
-        functions: every function in it, methods and nested functions too, in source order; ``top`` is its top level.
-        classes: every class in it.
+        text, lines: the file's text.
+        outline, outline_text: the file without the bodies of its functions.
+        classes: every class in it, but for those that functions define.
+        failure: why a body of it could not be parsed after all.
     """
 
-    def __init__(self, path: str, tree: cst.Module, text: str) -> None:
+    def __init__(self, path: str, text: str) -> None:
         self.path = path
-        self.tree = tree
         self.text = text
-        self.top = Function(self, tree)
-        self.functions: List[Function] = []
+        self.lines = Lines(text.encode("utf-8"))
+        self.outline, cuts = outline_part(self.lines)
+        self.outline_text = self.outline.text.decode("utf-8")
+        self.failure: Optional[Unreadable] = None
         self.classes: List[Class] = []
         self.by_node: Dict[int, Function | Class] = {}
-        self._collect(tree.body, self.top)
-        self._places: Optional[_Places] = None
+        self.top = Function(self, self.outline.tree)
+        self._cuts: Iterator[Optional[Cut]] = iter(cuts)
+        self._functions = self.collect(self.outline.tree.body, self.top)
+        self._cuts = iter(())
 
-    def _collect(self, statements: Sequence[cst.CSTNode], parent: Function, owner: Optional[Class] = None) -> None:
+    def collect(
+        self, statements: Sequence[cst.CSTNode], parent: Function, owner: Optional[Class] = None
+    ) -> List[Function]:
+        """Take in what statements define; return its functions, in source order."""
+        functions: List[Function] = []
         for node in _definitions(statements):
             if isinstance(node, cst.FunctionDef):
-                function = Function(self, node, parent, owner)
-                self.functions.append(function)
+                cut = next(self._cuts, None) if parent is self.top else None
+                function = Function(self, node, parent, owner, cut)
+                functions.append(function)
                 self.by_node[id(node)] = function
                 if owner is not None:
                     owner.methods.setdefault(function.name, function)
-                self._collect(node.body.body, function)
+                if cut is None:
+                    function._inner = self.collect(node.body.body, function)
             else:
                 found = Class(self, node, parent)
                 self.classes.append(found)
                 self.by_node[id(node)] = found
-                self._collect(node.body.body, parent, found)
+                functions += self.collect(node.body.body, parent, found)
+        return functions
 
-    def everything(self) -> List[Function]:
-        """Every function and the top level."""
-        return [self.top, *self.functions]
+    def functions(self, says: Callable[[str], object]) -> Iterator[Function]:
+        """Yield the functions whose text says so, methods and nested functions too, in source order."""
+        return _chosen(self._functions, says)
 
-    @property
-    def places(self) -> _Places:
-        """Where its nodes stand, computed once."""
-        if self._places is None:
-            self._places = _Places(self.tree, self.text)
-        return self._places
+    def named(self, name: str) -> Iterator[Function]:
+        """Yield the functions of this name."""
+        for function in self._functions:
+            if function.name == name:
+                yield function
+            if name in function.text:
+                yield from (inner for inner in _chosen(function.inner, bool) if inner.name == name)
 
-
-class _Places:
-    """Where the nodes of a tree stand in the file that it was parsed from."""
-
-    def __init__(self, tree: cst.Module, text: str) -> None:
-        parsed, shifts = _without_form_feeds(text)
-        self.bytes = text.encode("utf-8")
-        self._spans = MetadataWrapper(tree, unsafe_skip_copy=True).resolve(ByteSpanPositionProvider)
-        self._lines = [0, *(match.end() for match in _NEWLINE.finditer(self.bytes))]
-        self._shifts = shifts
-        if tree.bytes != parsed.encode("utf-8"):
-            raise ValueError("LibCST would write another text")
-
-    def of(self, node: cst.CSTNode, brackets: bool = False) -> Place:
-        """Return where a node begins and ends, on request with the brackets around it."""
-        span = self._spans[node]
-        start, end = span.start, span.start + span.length
-        if brackets and isinstance(node, cst.BaseExpression):
-            start -= sum(len(code(part).encode()) for part in node.lpar)
-            end += sum(len(code(part).encode()) for part in node.rpar)
-        start, end = self._in_file(start), self._in_file(end)
-        line, last = bisect.bisect_right(self._lines, start), bisect.bisect_left(self._lines, end)
-        return Place(start, end, line, start - self._lines[line - 1], max(line, last))
-
-    def line_start(self, line: int) -> int:
-        """Return the byte where a line begins; the end of the file for the line after the last."""
-        return self._lines[line - 1] if line <= len(self._lines) else len(self.bytes)
-
-    def _in_file(self, at: int) -> int:
-        return at + self._shifts[bisect.bisect_right(self._shifts, (at, len(self.bytes))) - 1][1]
+    def scopes(self, says: Callable[[str], object]) -> Iterator[Function]:
+        """Yield the top level and the functions whose text says so."""
+        return _chosen([self.top, *self._functions], says)
 
 
-def _without_form_feeds(text: str) -> Tuple[str, List[Tuple[int, int]]]:
-    """Return a text without the form feeds that begin its lines, and (byte, bytes that are missing from there on)."""
-    shifts, parts, at, length, missing = [(0, 0)], [], 0, 0, 0
-    for match in _FORM_FEED.finditer(text):
-        parts.append(text[at : match.start()])
-        length += len(parts[-1].encode("utf-8"))
-        missing += match.end() - match.start()
-        shifts.append((length, missing))
-        at = match.end()
-    return "".join([*parts, text[at:]]), shifts
+def _chosen(functions: Sequence[Function], says: Callable[[str], object]) -> Iterator[Function]:
+    for function in functions:
+        if says(function.text):
+            yield function
+            yield from _chosen(function.inner, says)
 
 
 def parse(source: Source) -> Module | Unreadable:
     """Parse one file; what is not Python, or not of this version, is returned with its reason."""
     try:
-        return Module(source.path, cst.parse_module(_without_form_feeds(source.text)[0]), source.text)
-    except cst.ParserSyntaxError as error:
-        python2 = _PRINT_STATEMENT.search(source.text) is not None
-        reason = "Python 2" if python2 else f"does not parse (line {getattr(error, 'raw_line', 0)})"
-        return Unreadable(source.path, reason)
-    except RecursionError:
-        return Unreadable(source.path, "is nested too deeply")
-    except ValueError as error:
-        return Unreadable(source.path, f"cannot be parsed: {type(error).__name__}")
+        return Module(source.path, source.text)
+    except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
+        return _failure(source.path, source.text, error)
+
+
+def _failure(path: str, text: str, error: Exception) -> Unreadable:
+    if isinstance(error, cst.ParserSyntaxError):
+        python2 = _PRINT_STATEMENT.search(text) is not None
+        return Unreadable(path, "Python 2" if python2 else f"does not parse (line {getattr(error, 'raw_line', 0)})")
+    if isinstance(error, RecursionError):
+        return Unreadable(path, "is nested too deeply")
+    return Unreadable(path, f"cannot be parsed: {type(error).__name__}")
 
 
 def _definitions(statements: Sequence[cst.CSTNode]) -> Iterator[cst.FunctionDef | cst.ClassDef]:

@@ -14,10 +14,11 @@ import libcst as cst
 
 from legs_adapters.flow import Definition
 from legs_adapters.module import Class, Function, Module, parse
+from legs_adapters.prospects import Prospects
 from legs_adapters.repo import Source, Unreadable
 from legs_adapters.syntax import arguments, call_name, dotted, path_of, word_set
 
-__all__ = ["Program", "Reference", "mention"]
+__all__ = ["Program", "Reference"]
 
 _DEFINED = re.compile(r"^[ \t]*(?:async[ \t]+)?(?:def|class)[ \t]+(\w+)", re.M)
 _COMMON = word_set(
@@ -28,11 +29,6 @@ _COMMON = word_set(
     """
 )
 _DEPTH = 12
-
-
-def mention(name: str, called: bool = False) -> re.Pattern[str]:
-    """Return a pattern for texts that mention a name, or call it."""
-    return re.compile(r"\b" + re.escape(name) + (r"\s*\(" if called else r"\b"))
 
 
 class Reference(NamedTuple):
@@ -54,13 +50,15 @@ class Program:
         sources: the readable files.
 
     Attributes:
-        unreadable: files that turned out not to parse, with the reason.
+        prospects: which texts can lead to an L1.
     """
 
     def __init__(self, sources: Iterable[Source]) -> None:
         self.sources: Dict[str, Source] = {source.path: source for source in sources}
-        self.unreadable: Dict[str, Unreadable] = {}
+        self._unreadable: Dict[str, Unreadable] = {}
+        self.prospects = Prospects(source.text for source in self.sources.values())
         self._modules: Dict[str, Optional[Module]] = {}
+        self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
         self._defined: Dict[str, List[str]] = {}
         for source in self.sources.values():
             for name in set(_DEFINED.findall(source.text)):
@@ -71,14 +69,36 @@ class Program:
         if path not in self._modules:
             parsed = parse(self.sources[path])
             if isinstance(parsed, Unreadable):
-                self.unreadable[path] = parsed
+                self._unreadable[path] = parsed
             self._modules[path] = parsed if isinstance(parsed, Module) else None
         return self._modules[path]
+
+    @property
+    def unreadable(self) -> Dict[str, Unreadable]:
+        """Files that turned out not to parse, by path, each with the reason."""
+        failed = {m.path: m.failure for m in self._modules.values() if m is not None and m.failure is not None}
+        return {**self._unreadable, **failed}
+
+    def give_up(self, path: str, reason: str) -> None:
+        """Count a file as unreadable."""
+        self._unreadable[path] = Unreadable(path, reason)
 
     def matching(self, pattern: re.Pattern[str]) -> List[Module]:
         """Return the modules whose text matches."""
         found = [self.module(path) for path, source in self.sources.items() if pattern.search(source.text)]
         return [module for module in found if module is not None]
+
+    def mentioning(self, name: str, called: bool = False) -> List[Function]:
+        """Return the functions and top levels whose text mentions a name, or calls it."""
+        pattern = re.compile(r"\b" + re.escape(name) + (r"\s*\(" if called else r"\b"))
+
+        def says(text: str) -> bool:
+            return name in text and pattern.search(text) is not None
+
+        if (name, called) not in self._mentions:
+            modules = [self.module(path) for path, source in self.sources.items() if says(source.text)]
+            self._mentions[name, called] = [f for module in modules if module is not None for f in module.scopes(says)]
+        return self._mentions[name, called]
 
     # -- names
 
@@ -340,7 +360,7 @@ class Program:
         for path in self._defined.get(name, []):
             module = self.module(path)
             if module is not None:
-                found.extend(f for f in module.functions if f.name == name and f.owner is not None)
+                found.extend(f for f in module.named(name) if f.owner is not None)
         return found
 
     def functions_named(self, name: str) -> List[Function]:
@@ -349,7 +369,7 @@ class Program:
         for path in self._defined.get(name, []):
             module = self.module(path)
             if module is not None:
-                found.extend(f for f in module.functions if f.name == name)
+                found.extend(module.named(name))
         return found
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> List[Reference]:

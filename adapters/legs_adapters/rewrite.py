@@ -8,12 +8,14 @@ An edit never changes the number of lines of the expression it replaces: comment
 
 from __future__ import annotations
 
+import ast
 import re
+import warnings
 from typing import List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
 
-from legs_adapters.module import Module
+from legs_adapters.module import Function, Module
 from legs_adapters.repo import Source, decode
 from legs_adapters.sites import Site
 from legs_adapters.syntax import code, dotted
@@ -54,34 +56,44 @@ def rewrite(source: Source, module: Module, sites: Sequence[Site], in_place: boo
     Raises:
         LegsError: an edit would not parse (a fault of this tool; nothing is written then).
     """
-    text = _Text(source, module)
     name, imported = _package_name(module)
-    edits = [edit for site in sites for edit in text.edits_for(site, name)]
+    edits = [edit for site in sites for edit in _Text(source, site.scope).edits_for(site, name)]
     if sites and not imported:
-        edits.append(text.import_edit(name, in_place))
+        edits.append(_Text(source, module.top).import_edit(name, in_place))
     edits.sort()
-    after = apply_edits(source.data, edits)
-    checked = decode(source.path, after)
-    try:
-        assert isinstance(checked, Source)
-        cst.parse_module(checked.text)
-    except (AssertionError, cst.ParserSyntaxError):
-        raise LegsError(f"{source.path}: the rewritten file would not parse; please report this") from None
+    checked = decode(source.path, apply_edits(source.data, edits))
+    if not isinstance(checked, Source) or not _parses(checked.text):
+        raise LegsError(f"{source.path}: the rewritten file would not parse; please report this")
     return edits
 
 
-class _Text:
-    """A file's bytes, and where its nodes stand in them."""
+def _parses(text: str) -> bool:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            ast.parse(text)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):  # newer than this Python, perhaps
+        try:
+            cst.parse_module(text)
+        except cst.ParserSyntaxError:
+            return False
+    return True
 
-    def __init__(self, source: Source, module: Module) -> None:
+
+class _Text:
+    """A file's bytes, and where the nodes of one function stand in them."""
+
+    def __init__(self, source: Source, function: Function) -> None:
         self.source = source
-        self.module = module
-        self.bytes = module.places.bytes
+        self.function = function
+        self.module = function.module
+        self.bytes = self.module.lines.data
+        self.body = self.module.outline.tree.body
         self.shift = len(source.bom)
 
     def span(self, node: cst.CSTNode, brackets: bool = False) -> Tuple[int, int]:
         """Where a node begins and ends, on request with the brackets around it."""
-        place = self.module.places.of(node, brackets)
+        place = self.function.place(node, brackets)
         return place.start, place.end
 
     def text(self, start: int, end: int) -> str:
@@ -238,7 +250,7 @@ class _Text:
         anchor = self._anchor()
         if anchor is None:
             at = self._before_first()
-            if in_place and self.module.tree.body and isinstance(self.module.tree.body[0], cst.SimpleStatementLine):
+            if in_place and self.body and isinstance(self.body[0], cst.SimpleStatementLine):
                 return self.edit(at, at, f"{line}; ")
             return self.edit(at, at, line + self._newline())
         first, last = anchor.body[0], anchor.body[-1]
@@ -248,7 +260,7 @@ class _Text:
                 return self.edit(at, at, f"{line}; ")
             at = self.span(last)[1]
             return self.edit(at, at, f"; {line}")
-        at, newline = self._next_line(self.module.places.of(anchor).last_line)
+        at, newline = self._next_line(self.module.top.place(anchor).last_line)
         if newline:
             return self.edit(at, at, line + newline)
         return self.edit(at, at, self._newline() + line)  # the last line of a file that does not end in one
@@ -258,7 +270,7 @@ class _Text:
         imports: List[cst.SimpleStatementLine] = []
         torch: List[cst.SimpleStatementLine] = []
         header: Optional[cst.SimpleStatementLine] = None
-        for i, statement in enumerate(self.module.tree.body):
+        for i, statement in enumerate(self.body):
             if not isinstance(statement, cst.SimpleStatementLine):
                 if imports and not isinstance(statement, (cst.If, cst.Try, cst.With)):
                     break
@@ -282,19 +294,17 @@ class _Text:
         return imports[-1] if imports else header
 
     def _before_first(self) -> int:
-        body = self.module.tree.body
-        if not body:
+        if not self.body:
             return len(self.bytes)
-        places = self.module.places
-        decorators = getattr(body[0], "decorators", ())
-        return places.line_start(min(places.of(node).line for node in (body[0], *decorators)))
+        first = (self.body[0], *getattr(self.body[0], "decorators", ()))
+        return self.module.lines.start(min(self.module.top.place(node).line for node in first))
 
     def _newline(self) -> str:
-        return self.module.tree.default_newline
+        return self.module.outline.tree.default_newline
 
     def _next_line(self, line: int) -> Tuple[int, str]:
         """Return where the line after this one begins, and what ends this one; nothing where it is the last."""
-        at = self.module.places.line_start(line + 1)
+        at = self.module.lines.start(line + 1)
         ending = re.search(rb"(\r\n|\r|\n)?\Z", self.bytes[:at])
         assert ending is not None
         return at, ending.group().decode()
@@ -303,7 +313,7 @@ class _Text:
 def _package_name(module: Module) -> Tuple[str, bool]:
     """The name that legs_loss has, or will have, in a file; and whether the file imports it already."""
     imported = False
-    for function in module.everything():
+    for function in module.scopes(lambda text: PACKAGE in text):
         for definition in function.flow.definitions.get(PACKAGE, []):
             alias = definition.node
             if isinstance(alias, cst.ImportAlias) and dotted(alias.name) == PACKAGE and alias.asname is None:

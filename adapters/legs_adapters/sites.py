@@ -15,7 +15,7 @@ from legs_adapters.l1 import Form, forms, own_shape
 from legs_adapters.layout import is_channels_last
 from legs_adapters.meaning import Meaning, Meanings
 from legs_adapters.module import Function, Module
-from legs_adapters.program import Program, mention
+from legs_adapters.program import Program
 from legs_adapters.provenance import View, Views
 from legs_adapters.repo import Source, Unreadable
 from legs_adapters.steps import Steps
@@ -87,7 +87,7 @@ class Site(NamedTuple):
         selection: the index by a mask that both arguments carry, as written with its brackets; empty without.
         channels_last: the images are [H, W, C].
         view: the verdict on ``view=``.
-        function: the name of the function that it stands in.
+        scope: the function that it stands in.
         aside: other reads of the same error map, which are not the loss and keep the plain one.
     """
 
@@ -100,8 +100,13 @@ class Site(NamedTuple):
     selection: str
     channels_last: bool
     view: View
-    function: str
+    scope: Function
     aside: Tuple[cst.Name, ...] = ()
+
+    @property
+    def function(self) -> str:
+        """The name of the function that it stands in."""
+        return self.scope.name
 
     def named_by(self, line: int) -> bool:
         """Whether a line that a person names is one of its lines."""
@@ -170,17 +175,21 @@ class _Finder:
         self.found = Findings([], [], [], [], [], program)
         self._forms: Dict[Function, List[Form]] = {}
         self._handed: Set[Function] = set()
+        self._splats: Dict[str, bool] = {}
         self._references: Dict[Function, List[Tuple[cst.BaseExpression, str, List[Tuple[Function, cst.Call]]]]] = {}
 
     def run(self) -> Findings:
-        modules = [m for m in self.program.matching(_MAY_HAVE_L1)]
+        says = self.program.prospects.of
+        modules = self.program.matching(_MAY_HAVE_L1)
         for module in modules:
-            for function in module.everything():
-                self._forms[function] = forms(self.program, function)
+            for function in module.scopes(says):
+                # Elsewhere an L1 could only be one by a name of a name, and nothing trains on it.
+                if self.program.prospects.near(function.text) or self.training.touches(function):
+                    self._forms[function] = forms(self.program, function)
         self._hand_over()
         for module in modules:
             if (
-                any(self._forms[function] or function in self._references for function in module.everything())
+                any(self._forms.get(function) or function in self._references for function in module.scopes(says))
                 or "legs_loss" in module.text
                 or registered.MENTIONED.search(module.text)
             ):
@@ -190,25 +199,38 @@ class _Finder:
 
     def _module(self, module: Module) -> None:
         try:
-            places = module.places
+            entries, patched = self._entries(module)
         except ValueError:
-            self.program.unreadable[module.path] = Unreadable(module.path, "cannot be written back exactly")
+            self.program.give_up(module.path, "cannot be written back exactly")
             return
-        lines = places.bytes.decode("utf-8").splitlines()
-        entries: List[Tuple[Tuple[int, int], object]] = []
+        if module.failure is not None:
+            return
+        for _, entry in sorted(entries, key=lambda item: item[0]):
+            if isinstance(entry, Site):
+                self.found.sites.append(entry)
+            elif isinstance(entry, Problem):
+                self.found.problems.append(entry)
+            else:
+                self.found.left.append(entry)
+        self.found.patched.extend(sorted(patched, key=lambda entry: entry.line))
+
+    def _entries(self, module: Module) -> Tuple[List[Tuple[Tuple[int, int], Site | Left | Problem]], List[Left]]:
+        """What is to be said of each L1 in a file, by where it is; and what is patched already."""
+        entries: List[Tuple[Tuple[int, int], Site | Left | Problem]] = []
+        patched: List[Left] = []
         by_hand = bool(self.by_hand)
         chosen = {line for path, line in self.by_hand if path == module.path}
-        for function in module.everything():
-            for form in self._forms[function]:
-                start = places.of(form.node)
+        for function in module.scopes(self.program.prospects.of):
+            for form in self._forms.get(function, []):
+                start = function.place(form.node)
                 where = (start.line, start.column)
                 end = start.last_line
-                text = lines[start.line - 1].strip()
+                text = module.lines.text(start.line)
                 verdict = self._verdict(
                     module, function, form, where, end, text, any(start.line <= line <= end for line in chosen)
                 )
                 if isinstance(verdict, Site) and verdict.form.node is not form.node:
-                    span = places.of(verdict.form.node)
+                    span = function.place(verdict.form.node)
                     verdict = verdict._replace(line=span.line, column=span.column, last_line=span.last_line)
                 if by_hand and not isinstance(verdict, Left):
                     assert verdict is None or isinstance(verdict, (Site, Problem))
@@ -216,31 +238,22 @@ class _Finder:
                         verdict = Left(module.path, start.line, text, "not chosen")
                 if verdict is not None and not (isinstance(verdict, Left) and _is_noise(form, verdict)):
                     entries.append((where, verdict))
-            for reference in self._referenced(module, function, lines):
+            for reference in self._referenced(module, function):
                 if not by_hand or reference.line in chosen:
                     entries.append(((reference.line, 0), reference))
             for node in self._patched(function) if "legs_loss" in module.text else ():
-                start = places.of(node)
-                self.found.patched.append(Left(module.path, start.line, lines[start.line - 1].strip(), "patched"))
-            for call in function.flow.calls:
+                start = function.place(node)
+                patched.append(Left(module.path, start.line, module.lines.text(start.line), "patched"))
+            for call in function.flow.calls if registered.MENTIONED.search(function.text) else ():
                 callable_form = registered.form_of(self.program, function, call)
                 if callable_form is not None:
-                    start = places.of(callable_form.node)
+                    start = function.place(callable_form.node)
                     where = (start.line, start.column)
                     if not by_hand or start.line in chosen:
                         view = View(None, "a registered callable has no view")
-                        site = Site(
-                            module.path, *where, start.line, callable_form, False, "", False, view, function.name
-                        )
+                        site = Site(module.path, *where, start.line, callable_form, False, "", False, view, function)
                         entries.append((where, site))
-        for _, entry in sorted(entries, key=lambda item: item[0]):
-            if isinstance(entry, Site):
-                self.found.sites.append(entry)
-            elif isinstance(entry, Problem):
-                self.found.problems.append(entry)
-            elif isinstance(entry, Left):
-                self.found.left.append(entry)
-        self.found.patched.sort(key=lambda entry: (entry.path, entry.line))
+        return entries, patched
 
     def _patched(self, function: Function) -> List[cst.CSTNode]:
         """What refers to legs_loss.l1_loss already: calls, and names that it is given."""
@@ -290,7 +303,7 @@ class _Finder:
         prediction, target = (second, first) if swapped else (first, second)
         last = is_channels_last(self.training, function, prediction, target)
         view = self.views.of(function, target, form.call)
-        return Site(module.path, *where, end, form, swapped, index, last, view, function.name, aside)
+        return Site(module.path, *where, end, form, swapped, index, last, view, function, aside)
 
     def _shared(self, function: Function, form: Form) -> Optional[_Shared]:
         """``error = torch.abs(image - gt)`` that also makes a mask, say: which reads of it are the loss, which are not.
@@ -430,37 +443,35 @@ class _Finder:
             ]
             if not unknown:
                 continue
-            for module in self.program.matching(mention(function.name)):
-                for holder in module.everything():
-                    for definitions in list(holder.flow.definitions.values()):
-                        for definition in definitions:
-                            value = definition.value
-                            if definition.kind != "assign" or not isinstance(value, (cst.Name, cst.Attribute)):
-                                continue
-                            references = self.program.resolve(holder, value)
-                            if [r.target for r in references] != [function] or references[0].guess:
-                                continue
-                            self._handed.add(function)
-                            near = [(c, call) for c, call in unknown if c.module is module] or unknown
-                            self._references.setdefault(holder, []).append((value, shape, near))
+            for holder in self.program.mentioning(function.name):
+                for definition in [d for found in holder.flow.definitions.values() for d in found]:
+                    value = definition.value
+                    if definition.kind != "assign" or not isinstance(value, (cst.Name, cst.Attribute)):
+                        continue
+                    references = self.program.resolve(holder, value)
+                    if [r.target for r in references] != [function] or references[0].guess:
+                        continue
+                    self._handed.add(function)
+                    near = [(c, call) for c, call in unknown if c.module is holder.module] or unknown
+                    self._references.setdefault(holder, []).append((value, shape, near))
 
-    def _referenced(self, module: Module, holder: Function, lines: List[str]) -> List[Site | Left]:
+    def _referenced(self, module: Module, holder: Function) -> List[Site | Left]:
         found: List[Site | Left] = []
         for value, shape, calls in self._references.get(holder, []):
             caller, call = calls[0]
             first, second = call.args[0].value, call.args[1].value
             a, b = self.meanings.of(caller, first), self.meanings.of(caller, second)
-            start = module.places.of(value)
+            start = holder.place(value)
             form = Form(value, call, first, second, "callable" if shape == "mean" else "registered", value)
             reason = self._why_left(caller.module, caller, form, a, b)
             if reason is None and self._swapped(a, b) is not False:
                 reason = "unknown"
             if reason is not None:
-                found.append(Left(module.path, start.line, lines[start.line - 1].strip(), reason))
+                found.append(Left(module.path, start.line, module.lines.text(start.line), reason))
             else:
                 view = View(None, "a callable that is handed over has no view")
                 found.append(
-                    Site(module.path, start.line, start.column, start.line, form, False, "", False, view, holder.name)
+                    Site(module.path, start.line, start.column, start.line, form, False, "", False, view, holder)
                 )
         return found
 
@@ -507,13 +518,12 @@ class _Finder:
     def _callers(self, function: Function) -> List[Function]:
         if not function.name or function.name.startswith("__"):
             return []
-        pattern = mention(function.name, called=True)
-        modules = [m for m in self.program.matching(pattern) if m is function.module or function.name in m.text]
         return [
             caller
-            for module in modules
-            for caller in module.functions
-            if caller is not function and any(call_name(call) == function.name for call in caller.flow.calls)
+            for caller in self.program.mentioning(function.name, called=True)
+            if caller is not function
+            and caller.parent is not None
+            and any(call_name(call) == function.name for call in caller.flow.calls)
         ][:8]
 
     def _about_splats(self, function: Function) -> bool:
@@ -525,7 +535,7 @@ class _Finder:
             if current in seen:
                 continue
             seen.add(current)
-            if _SPLATS.search(current.module.text):
+            if self._speaks_of_splats(current.module.path):
                 return True
             queue.extend(caller for caller, _ in self.training.sites.get(current, []))
         return False
@@ -543,8 +553,13 @@ class _Finder:
             return False
         rendered = any(word.startswith(("render", "raster")) for word in names)
         folder = module.path.rpartition("/")[0]
-        near = (s for path, s in self.program.sources.items() if not folder or path.startswith(folder + "/"))
-        return any(_SPLATS.search(s.text) for s in (self.program.sources.values() if rendered else near))
+        near = [path for path in self.program.sources if rendered or not folder or path.startswith(folder + "/")]
+        return any(self._speaks_of_splats(path) for path in near)
+
+    def _speaks_of_splats(self, path: str) -> bool:
+        if path not in self._splats:
+            self._splats[path] = _SPLATS.search(self.program.sources[path].text) is not None
+        return self._splats[path]
 
     @staticmethod
     def _swapped(a: Meaning, b: Meaning) -> Optional[bool]:

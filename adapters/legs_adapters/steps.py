@@ -44,7 +44,7 @@ class Steps:
         calls = {id(call): call for call in function.flow.calls}
         if not any(_is_backward(call) for call in calls.values()):
             return self._of_callers(function, depth)
-        scopes = [*_loops_around(function.node, node), function.node]
+        scopes = [*_loops_around(function.body, node), function.body]
         stepped = False
         for scope in scopes:
             inside = list(_calls(scope, node, calls))

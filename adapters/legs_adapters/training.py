@@ -9,12 +9,12 @@ import libcst as cst
 
 from legs_adapters.flow import Definition
 from legs_adapters.module import Class, Function
-from legs_adapters.program import Program, Reference, mention
+from legs_adapters.program import Program, Reference
 from legs_adapters.syntax import arguments, call_name, children, constant, key_of
 
 __all__ = ["Training"]
 
-_BACKWARD = re.compile(r"backward\s*\(")
+_BACKWARD = re.compile(r"\b(manual_)?backward\s*\(")
 # Methods whose result a framework trains on: Lightning, nerfstudio.
 _HOOKS = {"training_step", "get_loss_dict", "get_train_loss_dict"}
 _HOOK = re.compile(r"def\s+(training_step|get_loss_dict|get_train_loss_dict)\s*\(")
@@ -36,14 +36,15 @@ class Training:
         self.sites: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
         self.referenced: Set[int] = set()
         self._trained: Set[int] = set()
+        self._touched: Set[Function] = set()
         self._done: Set[Tuple[int, object]] = set()
         self._work: List[Tuple[Function, cst.CSTNode, object]] = []
         for module in program.matching(_BACKWARD):
-            for function in module.everything():
+            for function in module.scopes(_BACKWARD.search):
                 self._start(function)
         for module in program.matching(_HOOK):
-            for function in module.functions:
-                if function.name in _HOOKS and function.owner is not None:
+            for function in (f for name in sorted(_HOOKS) for f in module.named(name)):
+                if function.owner is not None:
                     self._root(function)
                     for value in function.flow.returns:
                         self._push(function, value)
@@ -53,9 +54,9 @@ class Training:
         """Return whether a backward pass reaches this expression."""
         return id(node) in self._trained
 
-    def reached(self, function: Function) -> bool:
-        """Return whether a function contributes to a backward pass."""
-        return function in self.sites or function in self.roots or id(function.node) in self.referenced
+    def touches(self, function: Function) -> bool:
+        """Return whether a backward pass reaches an expression of this function."""
+        return function in self._touched
 
     # -- roots
 
@@ -82,16 +83,14 @@ class Training:
             if definition.kind != "parameter" or definition.place not in parameters:
                 continue
             position = parameters.index(definition.place)
-            pattern = mention(function.name, called=True)
-            for module in self.program.matching(pattern):
-                for caller in module.everything():
-                    for call in caller.flow.calls:
-                        if call_name(call) == function.name and caller is not function:
-                            positional, keywords, _ = arguments(call)
-                            if definition.place in keywords:
-                                self._push(caller, keywords[definition.place])
-                            elif position < len(positional):
-                                self._push(caller, positional[position])
+            for caller in self.program.mentioning(function.name, called=True):
+                for call in caller.flow.calls:
+                    if call_name(call) == function.name and caller is not function:
+                        positional, keywords, _ = arguments(call)
+                        if definition.place in keywords:
+                            self._push(caller, keywords[definition.place])
+                        elif position < len(positional):
+                            self._push(caller, positional[position])
 
     # -- the slice
 
@@ -104,6 +103,7 @@ class Training:
     def _run(self) -> None:
         while self._work:
             function, node, key = self._work.pop()
+            self._touched.add(function)
             self._visit(function, node, key)
 
     def _visit(self, function: Function, node: cst.CSTNode, key: object) -> None:
@@ -194,8 +194,16 @@ class Training:
         sites = self.sites.setdefault(callee, [])
         if (caller, call) not in sites:
             sites.append((caller, call))
-        for value in callee.flow.returns:
-            self._push(callee, value, key)
+        self._returned(callee, key)
+
+    def _returned(self, function: Function, key: object = _ANY) -> None:
+        if self._matters(function):
+            for value in function.flow.returns:
+                self._push(function, value, key)
+
+    def _matters(self, function: Function) -> bool:
+        """Whether there can be an L1 in what a function does: the slice need not go into the others."""
+        return self.program.prospects.of(function.text)
 
     def _place(self, function: Function, node: cst.CSTNode, key: object) -> bool:
         definitions = self.program.lookup(function, node)
@@ -225,7 +233,7 @@ class Training:
                     continue
                 for reference in self.program.resolve(function, call.func):
                     callee = reference.target
-                    if reference.kind != "function" or not isinstance(callee, Function):
+                    if reference.kind != "function" or not isinstance(callee, Function) or not self._matters(callee):
                         continue
                     names = callee.parameters
                     parameter = name if isinstance(name, str) else ""
@@ -241,10 +249,8 @@ class Training:
                         self._definition(callee, definition, key)
 
     def _stores(self, owner: Class, attribute: str) -> List[Tuple[Function, Definition]]:
-        found = list(owner.stores(attribute))
-        for base in self.program.bases(owner):
-            found.extend(base.stores(attribute))
-        return found
+        owners = [owner, *self.program.bases(owner)]
+        return [entry for one in owners for entry in one.stores(attribute, self._matters)]
 
     def _definition(self, function: Function, definition: Definition, key: object) -> None:
         value = definition.value
@@ -252,8 +258,7 @@ class Training:
             for reference in self.program._of_definition(function, definition, 0):
                 if reference.kind == "function" and isinstance(reference.target, Function):
                     self.referenced.add(id(reference.target.node))
-                    for returned in reference.target.flow.returns:
-                        self._push(reference.target, returned)
+                    self._returned(reference.target)
             return
         if definition.kind == "store":
             if definition.key is not None and key is not _ANY and definition.key != key:

@@ -37,6 +37,7 @@ _OPERATORS: Dict[str, Tuple[int, float, float]] = {
     "scharr": (2, 3.0, 10.0),
 }
 _NORMS = {1.0: 1, 2.0: 2, float("inf"): 3}
+_SQUARED = 4  # the square of the norm 2
 # C5 needs a sine; it and curves of the user's own are applied by torch, to a map.
 CURVES = {"C1": 1, "C2": 2, "C3": 3, "C4": 4}
 
@@ -101,7 +102,13 @@ def _reduced(image: np.ndarray, spec: WeightSpec, out: Optional[np.ndarray]) -> 
     found = np.empty((views * strips, 4), np.float32)
     kept = np.empty(0, np.float32) if out is None else out.reshape(-1)
     with ONE_AT_A_TIME:
-        _strips(image.reshape(-1), (views, channels, height, width), settings_of(spec), strips, kept, found)
+        *operator, norm = settings_of(spec)
+        # The root of the greatest square is the greatest root: one a view is enough.
+        rooted = out is None and norm == _NORMS[2.0]
+        settings = (*operator, _SQUARED if rooted else norm)
+        _strips(image.reshape(-1), (views, channels, height, width), settings, strips, kept, found)
+    if rooted:
+        np.sqrt(found[:, :2], out=found[:, :2])
     found = found.reshape(views, strips, 4)
     return np.stack([found[..., 0].min(1), found[..., 1].max(1), found[..., 2].max(1), found[..., 3].sum(1)], 1)
 
@@ -210,10 +217,10 @@ def _responses(image, view, shape, row, j, settings):  # type: ignore[no-untyped
 def _accumulated(sum, value, norm):  # type: ignore[no-untyped-def]
     if norm == 1:
         sum = sum + absolute(value)
-    elif norm == 2:
-        sum = sum + value * value
-    else:
+    elif norm == 3:
         sum = maximum(sum, absolute(value))
+    else:
+        sum = sum + value * value
     return sum
 
 
@@ -270,9 +277,9 @@ def _magnitude(image, at, count):  # type: ignore[no-untyped-def]
 def weight_row(image, view, shape, row, left, right, settings, curve, low, span, beta, out, at):  # type: ignore[no-untyped-def]
     """Write the weights of a row's pixels left <= j < right to out[at:], rounded up to whole vectors."""
     _response_row(image, view, shape, row, left, right, settings, out, at)
-    lows, spans, betas, one = splat(low), splat(span), splat(beta), splat(_ONE)
+    lows, scale, betas, one = splat(low), splat(_ONE / span), splat(beta), splat(_ONE)
     for j in range(at, at + right - left, LANES):
-        x = (load(out, j) - lows) / spans
+        x = (load(out, j) - lows) * scale
         if curve == 2:
             x = x * x
         elif curve == 3:

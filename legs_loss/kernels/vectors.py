@@ -14,6 +14,7 @@ from typing import Any, Sequence, Tuple
 from llvmlite import ir
 from numba import extending, njit, types
 from numba.core import cgutils
+from numba.core.errors import RequireLiteralValue
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import lower_builtin, models, register_model
 
@@ -25,6 +26,8 @@ __all__ = [
     "maximum",
     "minimum",
     "multiply_add",
+    "prefetch",
+    "shifted",
     "sign",
     "splat",
     "square_root",
@@ -110,6 +113,24 @@ def store(typingctx, array, index, value):  # type: ignore[no-untyped-def]
 
 
 @_intrinsic
+def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
+    """Ask for the cache line of array[index] ahead of time. An index beyond the array does no harm."""
+    if not (_is_row(array) and isinstance(index, types.Integer)):
+        return None
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        byte, integer = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, integer, integer, integer])
+        ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        reading, keep, data_cache = integer(0), integer(3), integer(1)
+        builder.call(ask, [builder.bitcast(builder.gep(data, [args[1]]), byte), reading, keep, data_cache])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
+
+
+@_intrinsic
 def splat(typingctx, value):  # type: ignore[no-untyped-def]
     """Return a vector of one value eight times."""
 
@@ -171,6 +192,23 @@ def sign(typingctx, a):  # type: ignore[no-untyped-def]
         return builder.fsub(above, below)
 
     return float8(float8), generate
+
+
+@_intrinsic
+def shifted(typingctx, a, b, count):  # type: ignore[no-untyped-def]
+    """Return array[i + count : i + count + 8] where a and b are its values from i and from i + 4; count is 1, 2 or 3.
+
+    It takes one instruction of the shuffling units, where a load across two cache lines takes two of the loading ones.
+    """
+    if not isinstance(count, types.IntegerLiteral):
+        raise RequireLiteralValue("count")
+    count = count.literal_value
+    lanes = [half + (k + count if k + count < 4 else LANES + k + count - 4) for half in (0, 4) for k in range(4)]
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.shuffle_vector(args[0], args[1], ir.Constant(ir.VectorType(ir.IntType(32), LANES), lanes))
+
+    return float8(float8, float8, types.IntegerLiteral(count)), generate
 
 
 @_intrinsic

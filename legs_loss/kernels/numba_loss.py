@@ -42,7 +42,7 @@ _C1, _C2 = np.float32(C1), np.float32(C2)
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 # A tile's inner size, a width of whole vectors; it repeats ten rows and columns of its neighbours' work on each side.
-_TILE_HEIGHT, _TILE_WIDTH = 168, 272
+_TILE_HEIGHT, _TILE_WIDTH = 128, 272
 _STEP = 8  # rows
 _KEPT = 3 * _STEP  # rows in a ring: those of this step and the ten before them
 _BLOCK = 9  # vectors whose rows of all four quantities fit in the first cache

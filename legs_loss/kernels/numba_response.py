@@ -87,13 +87,29 @@ def _photograph(image, full, settings, planes, out):  # type: ignore[no-untyped-
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         for i in range(top - 1, bottom + 1):
-            source = image[_folded(i, height)]
-            for channel in range(channels):
-                for j in range(width):
-                    planes[channel, i - top + 1, j] = np.float32(source[j, channel]) / full
+            _row_in_planes(image[_folded(i, height)].reshape(-1), full, planes, i - top + 1)
         for i in range(top, bottom):
             _response_row(planes.reshape(-1), 0, shape, i - top + 1, 0, width, settings, row, 0)
             out[i * width : (i + 1) * width] = row[:width]
+
+
+@compiled(fastmath=False)
+def _row_in_planes(source, full, planes, row):  # type: ignore[no-untyped-def]
+    channels, _, width = planes.shape
+    if channels == 3:  # a step that is known when it is compiled becomes shuffles of vectors
+        red, green, blue = planes[0, row], planes[1, row], planes[2, row]
+        for j in range(width):
+            red[j] = np.float32(source[3 * j])
+            green[j] = np.float32(source[3 * j + 1])
+            blue[j] = np.float32(source[3 * j + 2])
+    else:
+        for channel in range(channels):
+            for j in range(width):
+                planes[channel, row, j] = np.float32(source[channels * j + channel])
+    for channel in range(channels):
+        plane = planes[channel, row]
+        for j in range(width):
+            plane[j] /= full
 
 
 def _reduced(image: np.ndarray, spec: WeightSpec, out: Optional[np.ndarray]) -> np.ndarray:

@@ -9,9 +9,9 @@ import pytest
 import torch
 from legs_adapters.cpu import fastergs
 from legs_adapters.cpu.missing import MissingStandIn
-from legs_adapters.cpu.surfels import harmonics
 
 from legs_loss import LegsError
+from legs_loss.reference.rasterizer import oracle
 
 NAMES = ("means", "scales", "rotations", "opacities", "sh_0", "sh_rest")
 
@@ -50,8 +50,11 @@ def scene(count=40, seed=0, dtype=torch.float32, faint=False):
             normal(count, 1, 3), 0.3 * normal(count, 15, 3)]  # fmt: skip
 
 
-def written_out(raw, camera):
-    """FasterGS's image from its formulas: every Gaussian at every pixel, centres at +0.5; and the centres."""
+def written_out(raw, camera, falloffs=None):
+    """FasterGS's image from its formulas: every Gaussian at every pixel, centres at +0.5; and the centres.
+
+    `falloffs` is filled with the falloff at every pixel of each Gaussian that is drawn, or gives it.
+    """
     means, scales, rotations, opacities, first, rest = raw
     points = means @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
     order = torch.argsort(points[:, 2])
@@ -76,22 +79,25 @@ def written_out(raw, camera):
         [camera.focal_x / z, zero, -camera.focal_x * u / z, zero, camera.focal_y / z, -camera.focal_y * v / z], 1
     ).reshape(-1, 2, 3)
     on_image = jacobian @ camera.w2c[:3, :3]
-    flat = on_image @ covariance @ on_image.transpose(1, 2) + 0.3 * torch.eye(2, dtype=means.dtype)
+    sharp = on_image @ covariance @ on_image.transpose(1, 2)
+    flat = sharp + (0.1 if camera.proper_antialiasing else 0.3) * torch.eye(2, dtype=means.dtype)
     conic = torch.linalg.inv(flat)
+    alphas = torch.sigmoid(opacities)
+    if camera.proper_antialiasing:  # as upstream, a constant to the gradient
+        alphas = alphas * (torch.linalg.det(sharp) / torch.linalg.det(flat)).clamp_min(0).sqrt().detach()[:, None]
     centres = torch.stack([x / z * camera.focal_x + camera.center_x, y / z * camera.focal_y + camera.center_y], 1)
     if centres.requires_grad:
         centres.retain_grad()
     degree = round(camera.active_sh_bases**0.5) - 1
-    basis = harmonics(means - camera.cam_position, degree)
-    colours = (basis[:, None] @ torch.cat([first, rest], 1)[:, : camera.active_sh_bases])[:, 0] + 0.5
-    colours = colours.clamp_min(0)
+    directions = torch.nn.functional.normalize(means - camera.cam_position, dim=1)
+    colours = oracle.colours(directions, torch.cat([first, rest], 1), degree)
     rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     pixels = torch.stack([columns, rows], 2).to(means.dtype) + 0.5
     image, left_over = torch.zeros(camera.height, camera.width, 3, dtype=means.dtype), 1.0
     for n in order.tolist():
         offset = centres[n] - pixels
         power = -0.5 * ((offset @ conic[n]) * offset).sum(2)
-        alpha = torch.sigmoid(opacities[n]) * torch.exp(power)
+        alpha = alphas[n] * (torch.exp(power) if falloffs is None else falloffs.setdefault(n, torch.exp(power)))
         alpha = torch.where(alpha >= 1 / 255, alpha, torch.zeros_like(alpha))
         image = image + (left_over * alpha)[:, :, None] * colours[n]
         left_over = left_over * (1 - alpha)
@@ -207,12 +213,34 @@ class TestRasterizer:
         assert torch.equal(fastergs.inference(*raw, *camera, True, False), image)
         assert torch.equal(fastergs.inference(*raw, *camera, False, True), image.clamp(0, 1).permute(1, 2, 0))
 
-    def test_what_has_no_stand_in(self):
-        raw = scene()
-        with pytest.raises(MissingStandIn, match=r"FasterGSCudaBackend\._C\.forward .* antialiasing"):
-            fastergs.forward(*raw, *settings(antialiasing=True))
-        with pytest.raises(MissingStandIn, match=r"FasterGSCudaBackend\._C\.pruning_scores"):
-            fastergs.pruning_scores(torch.zeros(40), *raw, *settings())
+    def test_proper_antialiasing(self):
+        raw = scene(30, faint=True)
+        raw[0] *= 0.35
+        raw[1] -= 1.5  # small enough to be dimmed much
+        image, gradients, weights = run(raw, settings(antialiasing=True))
+        leaves = [tensor.double().requires_grad_() for tensor in raw]
+        expected, _ = written_out(leaves, settings(antialiasing=True, dtype=torch.float64))
+        (expected * weights).sum().backward()
+        torch.testing.assert_close(image.double(), expected.detach(), atol=2e-5, rtol=0)
+        assert_close(gradients, [leaf.grad for leaf in leaves], 2e-3)
+        assert (image - run(raw, settings())[0]).abs().max() > 0.01
+
+    @pytest.mark.parametrize("antialiasing", [False, True])
+    def test_pruning_scores(self, antialiasing):
+        raw, camera = scene(25, faint=True), settings(antialiasing=antialiasing, dtype=torch.float64)
+        scores = torch.full((25, 1), 2.0)
+        fastergs.pruning_scores(scores, *raw, *settings(antialiasing=antialiasing))
+        falloffs = {}
+        doubled = [tensor.double() for tensor in raw]
+        written_out(doubled, camera, falloffs)
+        leaves = {n: falloff.requires_grad_() for n, falloff in falloffs.items()}
+        image, _ = written_out(doubled, camera, leaves)
+        image.sum().backward()
+        expected = torch.full((25,), 2.0, dtype=torch.float64)
+        for n, leaf in leaves.items():
+            expected[n] += leaf.grad.square().sum()
+        assert (expected > 2.5).sum() > 5
+        torch.testing.assert_close(scores[:, 0].double(), expected, rtol=1e-3, atol=1e-3)
 
     def test_values_that_are_not_finite(self):
         raw = scene()

@@ -14,6 +14,7 @@ pytest.importorskip("scipy")
 
 from legs_adapters.cpu import fastgs, fused_ssim, generic, inria, lpips, simple_knn, standins, taming, torchvision
 from legs_adapters.cpu.camera import pinhole
+from legs_adapters.cpu.drawing import covariance
 from legs_adapters.cpu.missing import Absent, MissingStandIn
 from legs_adapters.cpu.relocation import compute_relocation
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
@@ -191,6 +192,38 @@ class TestImages:
         image, _ = inria.GaussianRasterizer(settings)(means2D=torch.zeros(len(shs), 3), colors_precomp=colours, **plain)
         dense = Dense(given, fields)
         close(image, (dense.weights @ colours[dense.order].double()).T.reshape(image.shape))
+
+    @pytest.mark.parametrize("kind", ["inria", "fastgs"])
+    def test_covariances_that_are_ready(self, kind):
+        # Against the same shapes as scales and rotations, gradients through the covariances to these included.
+        more = {"mult": 0.5, "get_flag": None, "metric_map": None} if kind == "fastgs" else {}
+        given, fields = gaussians(), camera()
+        given["scales"][:9] *= 0.02  # some that reach no pixel's centre
+        weights = torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
+        found = []
+        for ready in (False, True):
+            leaves = {name: tensor.clone().requires_grad_() for name, tensor in given.items()}
+            asked = dict(leaves)
+            if ready:
+                matrices = covariance(asked.pop("scales"), asked.pop("rotations"))
+                asked["cov3D_precomp"] = matrices.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+            # A modifier of scales is none of covariances.
+            results, means2D = draw(kind, asked, dict(fields, scale_modifier=2.0 if ready else 1.0), **more)
+            (results[0] * weights).sum().backward()
+            found.append((results, {**{name: leaf.grad for name, leaf in leaves.items()}, "means2D": means2D.grad}))
+        (plain, wanted), (other, got) = found
+        close(other[0], plain[0].detach())
+        assert torch.equal(other[1], plain[1])
+        for name, gradient in wanted.items():
+            assert (got[name] - gradient).norm() < 2e-3 * gradient.norm(), name
+
+    def test_a_matrix_that_is_no_covariance_is_not_drawn(self):
+        given, fields = gaussians(20), camera()
+        del given["scales"], given["rotations"]
+        given["cov3D_precomp"] = torch.tensor([[-1.0, 0, 0, -1.0, 0, 1.0]]).repeat(20, 1)
+        (image, radii), _ = draw("inria", given, fields)
+        assert not radii.any()
+        close(image, BACKGROUND[:, None, None].expand_as(image))
 
     @pytest.mark.parametrize("mult", [0.3, 0.5, 0.8, 1.0])
     @pytest.mark.parametrize("seed", range(2))
@@ -458,11 +491,9 @@ class TestErrors:
         with pytest.raises(MissingStandIn, match="campos"):
             draw("inria", gaussians(), dict(camera(), campos=torch.ones(3)))
 
-    def test_covariances(self):
-        given = gaussians()
-        del given["scales"], given["rotations"]
-        with pytest.raises(MissingStandIn, match="cov3D_precomp"):
-            draw("inria", dict(given, cov3D_precomp=torch.ones(60, 6)), camera())
+    def test_shapes_given_twice(self):
+        with pytest.raises(LegsError, match="either scales and rotations or cov3D_precomp"):
+            draw("inria", dict(gaussians(), cov3D_precomp=torch.ones(60, 6)), camera())
 
     def test_values_that_are_not_finite(self):
         given = gaussians()

@@ -12,6 +12,7 @@ from legs_adapters.cpu.missing import MissingStandIn
 
 from legs_loss import LegsError
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA
+from legs_loss.reference.rasterizer import oracle
 
 NAMES = ("means", "scales", "quaternions", "opacities", "sh", "viewspace")
 BACKGROUND = (0.2, 0.5, 0.8)
@@ -360,7 +361,7 @@ class TestDerivatives:
         rows = surfels_oracle.homographies(*inputs[:3], 1.0, settings.projmatrix, 70, 45).requires_grad_()
         normals = surfels_oracle.axes(inputs[2])[2] @ settings.viewmatrix[:3, :3]
         points = inputs[0] @ settings.viewmatrix[:3, :3] + settings.viewmatrix[3, :3]
-        rgb = surfels.harmonics(inputs[0] - settings.campos, 3)[:, None] @ inputs[4]
+        directions = torch.nn.functional.normalize(inputs[0] - settings.campos, dim=1)
         visible = torch.ones(6, dtype=torch.bool)
         centres = surfels_oracle.bounds(rows.detach(), visible, 70, 45).centres
         pixels = torch.stack([torch.arange(70.0).repeat(45), torch.arange(45.0).repeat_interleave(70)], 1).double()
@@ -369,7 +370,7 @@ class TestDerivatives:
         colour, others = surfels_oracle.blend(
             hit,
             inputs[3][order, 0],
-            (rgb[:, 0] + 0.5).clamp_min(0)[order],
+            oracle.colours(directions, inputs[4], 3)[order],
             surfels_oracle.facing(normals, points)[order],
             settings.bg,
         )

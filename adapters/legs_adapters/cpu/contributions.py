@@ -13,7 +13,7 @@ from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTA
 from legs_loss.reference.rasterizer.projection import TALL, WIDE
 from legs_loss.reference.rasterizer.strips import exp2
 
-__all__ = ["COUNT", "DISTANCE", "FIELDS", "MOST", "VALUE", "WEIGHT", "contribute"]
+__all__ = ["COUNT", "DISTANCE", "FIELDS", "MOST", "VALUE", "WEIGHT", "contribute", "sensitivity"]
 
 PIXELS = WIDE * TALL
 COUNT, WEIGHT, VALUE, DISTANCE, MOST, FIELDS = 0, 1, 2, 3, 4, 5
@@ -78,3 +78,53 @@ def contribute(across, ranges, ends, splats, owners, rows, entries, values, sums
         for k in range(ranges[strip], ends[strip]):
             for field in range(FIELDS):
                 sums[owners[k], field] += parts[k, field]
+
+
+@compiled()
+def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, squares):
+    """For each entry of a strip, the sum over its pixels of the squared derivative by its alpha."""
+    before, rest = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.float32)
+    work = np.empty(PIXELS, np.float32)
+    for row in range(tall):
+        for column in range(wide):
+            for channel in range(3):
+                rest[row * WIDE + column] += image[channel, top + row, left + column]
+    for k in range(begin, end):
+        e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
+        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
+        middle = (np.float32(first) + np.float32(last) - _ONE) * _HALF
+        for i in range(first * WIDE, last * WIDE):
+            x, y = np.float32(i % WIDE) - np.float32((WIDE - 1) / 2), np.float32(i // WIDE) - middle
+            work[i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
+        own, total = entries[k, 6] + entries[k, 7] + entries[k, 8], 0.0
+        for row in range(first, min(last, tall)):
+            for column in range(wide):
+                i = row * WIDE + column
+                alpha = min(work[i], _MAX)
+                if before[i] < _ZERO or alpha < _MIN:
+                    continue
+                after = before[i] - alpha * before[i]
+                if after < _LAST:
+                    before[i] = -before[i]
+                    continue
+                rest[i] -= alpha * before[i] * own
+                slope = before[i] * own - rest[i] / (_ONE - alpha)
+                total += slope * slope
+                before[i] = after
+        squares[k] = total
+
+
+@compiled(parallel=True)
+def sensitivity(across, ranges, ends, splats, owners, rows, entries, image, sums):
+    """Fill sums [N]: over pixels, of the squared derivative of the image's summed channels by a Gaussian's falloff."""
+    height, width = image.shape[1], image.shape[2]
+    parts = np.zeros(len(entries))
+    for strip in prange(len(ends)):
+        left, top = strip % across * WIDE, strip // across * TALL
+        wide, tall = min(WIDE, width - left), min(TALL, height - top)
+        _sensitive_strip(left, top, wide, tall, ranges[strip], ends[strip], rows, entries, image, parts)
+    sums[:] = 0
+    for strip in range(len(ends)):
+        for k in range(ranges[strip], ends[strip]):
+            opacity = np.exp(splats[owners[k], 5])
+            sums[owners[k]] += opacity * opacity * parts[k]

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from legs_adapters.cpu.camera import pinhole
-from legs_adapters.cpu.missing import MissingStandIn
 from legs_loss import LegsError
 from legs_loss.reference.conventions import DILATION, NEAR, View
 from legs_loss.reference.rasterizer import compiled
@@ -24,7 +23,8 @@ class Gaussians(NamedTuple):
     """What Inria's rasterizer is given: colours as harmonics or ready, shapes as scales and rotations.
 
     means3D [N, 3]; means2D [N, 2 to 4], whose gradient is asked for; opacities [N, 1]; shs [N, K, 3];
-    colors_precomp [N, 3]; scales [N, 3]; rotations [N, 4], wxyz; cov3D_precomp is not covered.
+    colors_precomp [N, 3]; scales [N, 3] and rotations [N, 4], wxyz; or cov3D_precomp [N, 6], the upper triangle of each
+    covariance by its rows, in world units^2, to which no scale_modifier is applied.
     """
 
     means3D: Tensor
@@ -134,8 +134,19 @@ def depths(means: Tensor, view: View) -> Tensor:
     return means @ row[:3] + row[3]
 
 
-def compensation(means: Tensor, scales: Tensor, quaternions: Tensor, view: View, dilation: float) -> Tensor:
-    """[N, 1]: the square root of the splat's determinant before its dilation over that after, at least 0.005."""
+def covariance(scales: Tensor, quaternions: Tensor) -> Tensor:
+    """[N, 3, 3] of Gaussians, from scales [N, 3] and wxyz [N, 4]."""
+    axes = rotations(quaternions) * scales[:, None]
+    return axes @ axes.transpose(1, 2)
+
+
+def full(triangles: Tensor) -> Tensor:
+    """[N, 3, 3] symmetric matrices of their upper triangles [N, 6]."""
+    return triangles[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def compensation(means: Tensor, covariances: Tensor, view: View, dilation: float, least: float = LEAST_RATIO) -> Tensor:
+    """[N, 1]: the square root of the splat's determinant before its dilation over that after, but at least `least`."""
     to_camera = torch.from_numpy(view.world_to_camera).to(means.dtype)
     points = means @ to_camera[:3, :3].T + to_camera[:3, 3]
     x, y, z = points[:, 0], points[:, 1], points[:, 2].clamp_min(NEAR)
@@ -143,11 +154,11 @@ def compensation(means: Tensor, scales: Tensor, quaternions: Tensor, view: View,
     zero = torch.zeros_like(z)
     rows = (view.fx / z, zero, -view.fx * held[0] / z), (zero, view.fy / z, -view.fy * held[1] / z)
     jacobian = torch.stack([torch.stack(row, 1) for row in rows], 1)
-    axes = jacobian @ to_camera[:3, :3] @ rotations(quaternions) * scales[:, None]
-    covariance = axes @ axes.transpose(1, 2)
-    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    axes = jacobian @ to_camera[:3, :3]
+    flat = axes @ covariances @ axes.transpose(1, 2)
+    a, b, c = flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1]
     ratio = (a * c - b * b) / ((a + dilation) * (c + dilation) - b * b)
-    return ratio.clamp_min(LEAST_RATIO).sqrt()[:, None]
+    return ratio.clamp_min(least).sqrt()[:, None]
 
 
 def draw(
@@ -161,19 +172,24 @@ def draw(
 
     Raises:
         LegsError: both or none of two ways to give colours or shapes; values that are not finite.
-        MissingStandIn: a way of giving them, or a camera, that is not covered.
+        MissingStandIn: a camera that is not covered.
     """
     if _given(gaussians.shs) == _given(gaussians.colors_precomp):
         raise LegsError(f"{module}: give either shs or colors_precomp")
     if (_given(gaussians.scales) and _given(gaussians.rotations)) == _given(gaussians.cov3D_precomp):
         raise LegsError(f"{module}: give either scales and rotations or cov3D_precomp")
-    if not _given(gaussians.scales):
-        raise MissingStandIn(module, "GaussianRasterizer.forward(cov3D_precomp=...)")
     view = View.of(pinhole(settings, module))
-    scales = gaussians.scales if settings.scale_modifier == 1 else gaussians.scales * settings.scale_modifier
-    opacities = gaussians.opacities
+    opacities, covariances = gaussians.opacities, None
+    scales: Any = None
+    quaternions: Any = None
+    if _given(gaussians.cov3D_precomp):
+        covariances = gaussians.cov3D_precomp
+    else:
+        scales, quaternions = gaussians.scales, gaussians.rotations
+        scales = scales if settings.scale_modifier == 1 else scales * settings.scale_modifier
     if lens.compensated:
-        opacities = opacities * compensation(gaussians.means3D, scales, gaussians.rotations, view, lens.dilation)
+        shapes = covariance(scales, quaternions) if covariances is None else full(covariances)
+        opacities = opacities * compensation(gaussians.means3D, shapes, view, lens.dilation)
     viewspace = None
     if gaussians.means2D.requires_grad:
         viewspace = gaussians.means2D[:, : 4 if gaussians.means2D.shape[1] == 4 else 2]
@@ -181,8 +197,9 @@ def draw(
             scale = (depths(gaussians.means3D, view).detach() / lens.fade).square().clamp_max(1)[:, None]
             viewspace.register_hook(lambda gradient: gradient * scale)
     tensors = compiled.Tensors(
-        gaussians.means3D, scales, gaussians.rotations, opacities, gaussians.shs, gaussians.colors_precomp, viewspace
-    )
+        gaussians.means3D, scales, quaternions, opacities, gaussians.shs, gaussians.colors_precomp, viewspace,
+        covariances,
+    )  # fmt: skip
     for name, tensor in tensors._asdict().items():
         if tensor is not None and not bool(torch.isfinite(tensor.detach().sum())):
             raise LegsError(f"{module}: {name} {list(tensor.shape)} holds NaN or infinity")

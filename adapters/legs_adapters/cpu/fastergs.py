@@ -17,13 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_adapters.cpu.missing import MissingStandIn, attribute_guard, deferred_guard
+from legs_adapters.cpu.drawing import compensation, covariance
+from legs_adapters.cpu.missing import attribute_guard, deferred_guard
 from legs_loss import LegsError
 from legs_loss.reference.conventions import MIN_ALPHA, NEAR, View
 from legs_loss.reference.rasterizer import compiled
 
 BACKEND, MORTON, PPISP = "FasterGSCudaBackend", "MortonEncoding", "ppisp"
 SQUARE = math.sqrt(-2 * math.log(MIN_ALPHA)) + 0.01  # standard deviations: past them even opaque ones are not drawn
+SMOOTHED = 0.1  # pixels^2: the dilation with proper antialiasing
 MOST_SAMPLES = 50  # copies of one Gaussian that relocation reckons with
 MORTON_BITS = 21  # of each coordinate
 
@@ -53,12 +55,12 @@ class _Drawn(NamedTuple):
     tensors: compiled.Tensors  # activated, and scaled by `size`
     size: float
     visible: Tensor  # bool [N]
+    alphas: Tensor  # [N, 1], before antialiasing
+    drawing: compiled.Drawing
 
 
 def _draw(function: str, raw: Sequence[Tensor], settings: _Settings) -> _Drawn:
     """Draw the six `raw` tensors; `function` is named in errors."""
-    if settings.proper_antialiasing:
-        raise MissingStandIn(f"{BACKEND}._C", function, "with proper antialiasing")
     means, scales, rotations, opacities, first, rest = (tensor.detach() for tensor in raw)
     for name, given in zip(("means", "scales", "rotations", "opacities", "sh_coefficients_0"), raw):
         if not bool(torch.isfinite(given.detach().sum())):
@@ -84,11 +86,17 @@ def _draw(function: str, raw: Sequence[Tensor], settings: _Settings) -> _Drawn:
             world_to_camera=world_to_camera,
         )
     )
+    means, scales, alphas = means * size if size != 1 else means.clone(), scales.exp().mul_(size), opacities.sigmoid()
+    shown, footprint = alphas * inside[:, None], compiled.Footprint(square=SQUARE)
+    if settings.proper_antialiasing:
+        footprint = footprint._replace(dilation=SMOOTHED)
+        shapes = covariance(scales.double(), rotations.double())
+        shown *= compensation(means.double(), shapes, view, SMOOTHED, least=0).to(shown.dtype)
     tensors = compiled.Tensors(
-        means=means * size if size != 1 else means.clone(),
-        scales=scales.exp() * size,
+        means=means,
+        scales=scales,
         quaternions=rotations,
-        opacities=torch.sigmoid(opacities) * inside[:, None],
+        opacities=shown,
         sh=torch.cat([first, rest[:, : (degree + 1) ** 2 - 1]], 1),
         colours=None,
         viewspace=torch.zeros(len(means), 2),
@@ -96,12 +104,12 @@ def _draw(function: str, raw: Sequence[Tensor], settings: _Settings) -> _Drawn:
     for tensor in tensors:
         if tensor is not None:
             tensor.requires_grad_()
-    drawing = compiled.draw(tensors, view, settings.bg_color.detach(), degree, compiled.Footprint(square=SQUARE))
+    drawing = compiled.draw(tensors, view, settings.bg_color.detach(), degree, footprint)
     visible = np.zeros(len(means), np.bool_)
     visible[drawing.owners[: len(drawing.entries)]] = True
     with torch.enable_grad():
         image, _ = compiled.attach(drawing, tensors)
-    return _Drawn(image, tensors, size, torch.from_numpy(visible))
+    return _Drawn(image, tensors, size, torch.from_numpy(visible), alphas, drawing)
 
 
 def forward(*arguments: Any) -> Tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int, int, int]:
@@ -133,12 +141,13 @@ def backward(densification_info: Tensor, grad_image: Tensor, *arguments: Any) ->
     rest = sh[:, 1:].contiguous()
     if rest.shape != arguments[5].shape:  # harmonics that are not in use yet
         rest = torch.nn.functional.pad(rest, (0, 0, 0, arguments[5].shape[1] - rest.shape[1]))
-    alphas = tensors.opacities.detach()
+    assert tensors.scales is not None
+    # As upstream: how far antialiasing lowers an opacity is no part of its gradient's way to the shape.
     return (
         means * drawn.size,
         scales * tensors.scales.detach(),
         rotations,
-        opacities * alphas * (1 - alphas),
+        opacities * tensors.opacities.detach() * (1 - drawn.alphas),
         sh[:, :1].contiguous(),
         rest,
     )
@@ -152,9 +161,19 @@ def inference(*arguments: Any) -> Tensor:
     return image if to_chw else image.permute(1, 2, 0).contiguous()
 
 
-def pruning_scores(*arguments: Any) -> None:
-    """Not provided: it sums squares of gradients over pixels, which the rasterizer does not keep apart."""
-    raise MissingStandIn(f"{BACKEND}._C", "pruning_scores", "train without Speedy-Splat's pruning")
+def pruning_scores(scores: Tensor, *arguments: Any) -> None:
+    """Add to `scores` [N], in place, how much an image depends on each Gaussian; then `forward`'s arguments.
+
+    That is, the sum over pixels of the squared derivative of the sum of their channels by the Gaussian's falloff there.
+    Source: Speedy-Splat (Hanson et al. 2025).
+    """
+    from legs_adapters.cpu.contributions import sensitivity
+
+    drawn = _draw("pruning_scores", arguments[:6], _Settings(*arguments[6:]))
+    it = drawn.drawing
+    sums = np.empty(len(it.radii))
+    sensitivity(it.across, it.ranges, it.ends, it.splats, it.owners, it.rows, it.entries, it.image, sums)
+    scores.view(-1).add_(torch.from_numpy(sums).to(scores.dtype))
 
 
 @torch.no_grad()
@@ -169,11 +188,13 @@ def adam_step(
     beta2: float,
     epsilon: float,
 ) -> None:
-    """One step of Adam, in place."""
-    exp_avg.lerp_(param_grad, 1 - beta1)
-    exp_avg_sq.mul_(beta2).addcmul_(param_grad, param_grad, value=1 - beta2)
-    scale = exp_avg_sq.sqrt().mul_((1 - beta2**step_count) ** -0.5).add_(epsilon)
-    param.addcdiv_(exp_avg, scale, value=-learning_rate / (1 - beta1**step_count))
+    """One step of Adam, in place, of float tensors of one shape; the moments and the parameter contiguous."""
+    from legs_adapters.cpu.adam import update
+
+    kind = np.float32 if param.dtype == torch.float32 else np.float64
+    arrays = (tensor.detach().view(-1).numpy() for tensor in (param, param_grad.contiguous(), exp_avg, exp_avg_sq))
+    rate, correction = learning_rate / (1 - beta1**step_count), (1 - beta2**step_count) ** -0.5
+    update(*arrays, *(kind(number) for number in (1 - beta1, 1 - beta2, rate, correction, epsilon)))
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from legs_adapters.cpu import inria
 from legs_adapters.cpu.camera import pinhole
-from legs_adapters.cpu.drawing import Gaussians, Lens, draw
+from legs_adapters.cpu.drawing import Gaussians, Lens, draw, full
 from legs_adapters.cpu.missing import complete, refuse_unknown
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 from legs_loss.reference.conventions import TILE, View
@@ -104,8 +104,12 @@ class _CompactBox:
         reach, size = torch.from_numpy(radii)[:, None].double() + 1, TILE * torch.from_numpy(tiles)
         near = torch.nonzero(((centres + reach > 0) & (centres - reach < size)).all(1))[:, 0]
         chosen = rows[near]
-        scales = self.gaussians.scales.detach()[chosen].double() * self.settings.scale_modifier
-        shapes = oracle.project(points[near], scales, self.gaussians.rotations.detach()[chosen].double(), view)
+        if self.gaussians.scales is None or not self.gaussians.scales.numel():
+            scales, rotations = _axes(self.gaussians.cov3D_precomp.detach()[chosen].double())
+        else:
+            scales = self.gaussians.scales.detach()[chosen].double() * self.settings.scale_modifier
+            rotations = self.gaussians.rotations.detach()[chosen].double()
+        shapes = oracle.project(points[near], scales, rotations, view)
         opacities = self.gaussians.opacities.detach()[chosen, 0].double()
         found = np.zeros(len(rows), np.bool_)
         found[near.numpy()] = touches(
@@ -113,6 +117,16 @@ class _CompactBox:
             opacities.numpy(), float(self.settings.mult), tiles,
         )  # fmt: skip
         return found
+
+
+def _axes(triangles: Tensor) -> Tuple[Tensor, Tensor]:
+    """Scales [N, 3] and quaternions wxyz [N, 4] of covariances [N, 6]."""
+    from scipy.spatial.transform import Rotation
+
+    squares, axes = torch.linalg.eigh(full(triangles))
+    axes[:, :, 2] *= torch.linalg.det(axes)[:, None]
+    xyzw = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat().reshape(-1, 4))
+    return squares.clamp_min(0).sqrt(), xyzw.roll(1, 1)
 
 
 def module(name: str) -> types.ModuleType:

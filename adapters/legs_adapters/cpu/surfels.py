@@ -11,10 +11,9 @@ from typing import Any, NamedTuple, Optional, Tuple
 import torch
 from torch import Tensor
 
-from legs_adapters.cpu import surfels_oracle
 from legs_adapters.cpu.missing import attribute_guard
 from legs_loss.errors import LegsError
-from legs_loss.reference.conventions import NEAR, SH_C0, SH_C1, SH_C2, SH_C3
+from legs_loss.reference.conventions import NEAR
 
 
 class GaussianRasterizationSettings(NamedTuple):
@@ -122,64 +121,12 @@ def rasterize(
         return empty.expand(3, height, width), torch.zeros(0, dtype=torch.int32), empty.expand(7, height, width)
     _check(means, viewspace, opacities, sh, rgb, scales, quaternions, homography, settings.sh_degree)
 
-    # Geometry in float64 on the way to the fast kernel: the homography of a thin disc cancels badly in float32.
-    kind = torch.float64 if backend == "numba" else means.dtype
-    view = settings.viewmatrix.detach().to(kind)
-    points = _to_camera(means.detach().to(kind), view)
-    if homography is None:
-        assert scales is not None and quaternions is not None
-        homographies = surfels_oracle.homographies(
-            means.to(kind),
-            scales.to(kind),
-            quaternions.to(kind),
-            float(settings.scale_modifier),
-            settings.projmatrix.detach().to(kind),
-            width,
-            height,
-        )
-        normals = surfels_oracle.axes(quaternions.to(kind))[2] @ view[:3, :3]
-    else:
-        homographies = homography.to(kind).reshape(-1, 3, 3)
-        normals = torch.tensor([0.0, 0.0, 1.0], dtype=kind).expand(len(means), 3)
-    normals = surfels_oracle.facing(normals, points).to(means.dtype)
-    if rgb is None:
-        assert sh is not None
-        basis = harmonics(means - settings.campos.detach().to(means.dtype), settings.sh_degree)
-        rgb = ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
     if backend == "torch":
         from legs_adapters.cpu.surfels_oracle import render
     else:
         from legs_adapters.cpu.surfels_compiled import render
-    image, others, radii = render(
-        homographies,
-        normals,
-        points[:, 2],
-        opacities,
-        rgb,
-        viewspace,
-        settings.bg.detach().to(means.dtype),
-        width,
-        height,
-        homography is not None,
-    )
+    image, others, radii = render(means, viewspace, opacities, sh, rgb, scales, quaternions, homography, settings)
     return image, radii, others
-
-
-def harmonics(directions: Tensor, degree: int) -> Tensor:
-    """The (degree + 1)^2 spherical harmonics, [N, (degree + 1)^2], of directions [N, 3] of any length."""
-    x, y, z = torch.nn.functional.normalize(directions, dim=1).unbind(1)
-    basis = [torch.full_like(x, SH_C0)]
-    if degree > 0:
-        basis += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
-    if degree > 1:
-        xx, yy, zz, xy = x * x, y * y, z * z, x * y
-        a, b, c, d, e = SH_C2
-        basis += [a * xy, b * y * z, c * (2 * zz - xx - yy), d * x * z, e * (xx - yy)]
-    if degree > 2:
-        f, g, h, k, l, m, n = SH_C3
-        basis += [f * y * (3 * xx - yy), g * xy * z, h * y * (4 * zz - xx - yy), k * z * (2 * zz - 3 * xx - 3 * yy)]
-        basis += [l * x * (4 * zz - xx - yy), m * z * (xx - yy), n * x * (xx - 3 * yy)]
-    return torch.stack(basis, 1)
 
 
 def _to_camera(points: Tensor, view: Tensor) -> Tensor:

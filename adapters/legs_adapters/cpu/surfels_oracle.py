@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR, TILE
+from legs_loss.reference.rasterizer.oracle import colours
 
 FAR = 100.0  # with NEAR, the scale of the distortion's depths; nothing is cut off there
 CUTOFF = 3.0  # standard deviations: where a surfel's square of tiles ends
@@ -38,13 +39,18 @@ def homographies(
     """T of each surfel, [N, 3, 3], from centres [N, 3], radii [N, 2], wxyz [N, 4] and 3DGS's transposed projection."""
     first, second, _ = axes(quaternions)
     radii = modifier * scales
-    to_pixels = projection @ projection.new_tensor(
+    pixels = to_pixels(projection, width, height)
+    discs = torch.stack([first * radii[:, :1], second * radii[:, 1:], means], 1)  # [N, 3, 3]: u, v, 1 to the world
+    transposed = discs.reshape(-1, 3) @ pixels[:3]
+    origin = torch.cat([pixels.new_zeros(2, 3), pixels[3:]])
+    return (transposed.reshape(-1, 3, 3) + origin).transpose(1, 2)
+
+
+def to_pixels(projection: Tensor, width: int, height: int) -> Tensor:
+    """3DGS's transposed projection [4, 4] from the world to homogeneous pixels, [4, 3]; their centres are integers."""
+    return projection @ projection.new_tensor(
         [[width / 2, 0, 0], [0, height / 2, 0], [0, 0, 0], [(width - 1) / 2, (height - 1) / 2, 1]]
     )
-    discs = torch.stack([first * radii[:, :1], second * radii[:, 1:], means], 1)  # [N, 3, 3]: u, v, 1 to the world
-    transposed = discs.reshape(-1, 3) @ to_pixels[:3]
-    origin = torch.cat([to_pixels.new_zeros(2, 3), to_pixels[3:]])
-    return (transposed.reshape(-1, 3, 3) + origin).transpose(1, 2)
 
 
 def axes(quaternions: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
@@ -167,6 +173,42 @@ class _Tap(torch.autograd.Function):
 
 
 def render(
+    means: Tensor,
+    viewspace: Optional[Tensor],
+    opacities: Tensor,
+    sh: Optional[Tensor],
+    rgb: Optional[Tensor],
+    scales: Optional[Tensor],
+    quaternions: Optional[Tensor],
+    handed: Optional[Tensor],
+    settings: Any,
+) -> Tuple[Tensor, Tensor, Tensor]:
+    """Image [3, H, W], the other channels [7, H, W] and radii [N]; arguments as `surfels.rasterize` has them.
+
+    `handed` [N, 9] are homographies in place of scales and quaternions.
+    """
+    width, height = int(settings.image_width), int(settings.image_height)
+    view = settings.viewmatrix.detach().to(means.dtype)
+    points = means.detach() @ view[:3, :3] + view[3, :3]
+    if handed is None:
+        assert scales is not None and quaternions is not None
+        projection = settings.projmatrix.detach().to(means.dtype)
+        homography = homographies(means, scales, quaternions, float(settings.scale_modifier), projection, width, height)
+        normals = axes(quaternions)[2] @ view[:3, :3]
+    else:
+        homography = handed.reshape(-1, 3, 3)
+        normals = means.new_tensor([0.0, 0.0, 1.0]).expand(len(means), 3)
+    normals = facing(normals, points)
+    if rgb is None:
+        assert sh is not None
+        directions = torch.nn.functional.normalize(means - settings.campos.detach().to(means.dtype), dim=1)
+        rgb = colours(directions, sh, int(settings.sh_degree))
+    background = settings.bg.detach().to(means.dtype)
+    return draw(homography, normals, points[:, 2], opacities, rgb, viewspace, background, width, height,
+                handed is not None)  # fmt: skip
+
+
+def draw(
     homography: Tensor,
     normals: Tensor,
     depths: Tensor,
@@ -178,7 +220,7 @@ def render(
     height: int,
     whole_tap: bool,
 ) -> Tuple[Tensor, Tensor, Tensor]:
-    """Image [3, H, W], the other channels [7, H, W] and radii [N]; arguments as `surfels.rasterize` makes them."""
+    """As `render`, from each disc's T, normal, depth and colour."""
     if viewspace is not None:
         tapped = _Tap.apply(homography, viewspace, width, height)
     else:

@@ -17,15 +17,20 @@ Clip = Callable[..., None]
 
 
 class Tensors(NamedTuple):
-    """What a drawing is differentiable in; ``colours`` [N, 3] in place of ``sh``."""
+    """What a drawing is differentiable in.
+
+    ``colours`` [N, 3] in place of ``sh``; ``covariances`` [N, 6] (xx, xy, xz, yy, yz, zz), world units^2, in place of
+    ``scales`` and ``quaternions``.
+    """
 
     means: Tensor
-    scales: Tensor
-    quaternions: Tensor
+    scales: Optional[Tensor]
+    quaternions: Optional[Tensor]
     opacities: Tensor
     sh: Optional[Tensor]
     colours: Optional[Tensor]
     viewspace: Optional[Tensor]
+    covariances: Optional[Tensor] = None
 
 
 class Footprint(NamedTuple):
@@ -41,7 +46,7 @@ class Drawing(NamedTuple):
     A slot is a strip in a Gaussian's box of strips; an entry, one that it reaches, sorted by strip and depth.
     """
 
-    parameters: Tuple[np.ndarray, ...]  # means, scales, quaternions, opacities, sh
+    parameters: Tuple[np.ndarray, ...]  # means, scales, quaternions, opacities, sh, covariances
     degree: int
     camera: Tuple[np.ndarray, np.ndarray, np.ndarray]  # intrinsics, world to camera, the camera's centre
     splats: np.ndarray
@@ -66,7 +71,7 @@ class Drawing(NamedTuple):
         splats = self.splats.copy()
         splats[:, 6:9] = _array(colours)
         return self._replace(
-            parameters=(*self.parameters[:4], np.zeros((len(splats), 1, 3), np.float32)),
+            parameters=(*self.parameters[:4], np.zeros((len(splats), 1, 3), np.float32), self.parameters[5]),
             degree=0,
             splats=splats,
             clamped=np.zeros_like(self.clamped),
@@ -103,8 +108,17 @@ def draw(
     """
     count = len(tensors.means)
     degree = degree if tensors.sh is not None else 0
-    sh = torch.zeros(count, 1, 3) if tensors.sh is None else tensors.sh
-    parameters = tuple(_array(tensor) for tensor in (*tensors[:4], sh))
+    parameters = tuple(
+        _array(torch.zeros(shape) if tensor is None else tensor)
+        for tensor, shape in (
+            (tensors.means, ()),
+            (tensors.scales, (0, 3)),
+            (tensors.quaternions, (0, 4)),
+            (tensors.opacities, ()),
+            (tensors.sh, (count, 1, 3)),
+            (tensors.covariances, (0, 6)),
+        )
+    )
     size = np.array([view.width, view.height], np.int64)
     camera = (
         np.array([view.fx, view.fy, view.cx, view.cy, *view.limits]),
@@ -160,7 +174,7 @@ def attach(drawing: Drawing, tensors: Tensors) -> Tuple[Tensor, Tensor]:
     """A drawing as image [3, H, W] and radii int32 [N], with the gradient to the tensors it was drawn from."""
     # A colour is 1 / C0 of its constant harmonic, as the way back sees it.
     sh = tensors.sh if tensors.colours is None else tensors.colours[:, None] / projection.SH_C0
-    return _Attach.apply(*tensors[:4], sh, tensors.viewspace, drawing)
+    return _Attach.apply(*tensors[:4], sh, tensors.covariances, tensors.viewspace, drawing)
 
 
 class _Attach(torch.autograd.Function):
@@ -168,17 +182,19 @@ class _Attach(torch.autograd.Function):
     def forward(
         ctx: Any,
         means: Tensor,
-        scales: Tensor,
-        quaternions: Tensor,
+        scales: Optional[Tensor],
+        quaternions: Optional[Tensor],
         opacities: Tensor,
         sh: Tensor,
+        covariances: Optional[Tensor],
         viewspace: Optional[Tensor],
         drawing: Drawing,
     ) -> Tuple[Tensor, Tensor]:
         # The image that is handed out may be changed in place; the one of the way back may not.
         image, radii = torch.from_numpy(drawing.image.copy()), torch.from_numpy(drawing.radii)
         ctx.mark_non_differentiable(radii)
-        ctx.save_for_backward(means, scales, quaternions, opacities, sh)  # so that torch sees if one is changed
+        # So that torch sees if one is changed.
+        ctx.save_for_backward(means, scales, quaternions, opacities, sh, covariances)
         ctx.columns = 2 if viewspace is None else viewspace.shape[1]
         ctx.drawing = drawing
         return image, radii
@@ -201,8 +217,8 @@ class _Attach(torch.autograd.Function):
             it.slot_rows, it.places, entry_gradients, np.array([width / 2, height / 2]),
             *[gradient.numpy() for gradient in gradients],
         )  # fmt: skip
-        viewspace = gradients.pop() if ctx.needs_input_grad[5] else None
-        return (*gradients[:5], viewspace, None)
+        found = [gradient if wanted else None for gradient, wanted in zip(gradients, ctx.needs_input_grad)]
+        return (*found, None)
 
 
 def render(

@@ -40,7 +40,7 @@ _E0, _E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(c) for c in SH_C3)
 
 
 @compiled()
-def _rotation(quaternions, i):
+def rotation(quaternions, i):
     """Row-major rotation matrix, the normalised quaternion, and the length it had."""
     w, x = np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1])
     y, z = np.float64(quaternions[i, 2]), np.float64(quaternions[i, 3])
@@ -108,7 +108,22 @@ def _times_rotation(t, r):
 
 
 @compiled()
-def _direction(means, i, position):
+def _times_covariance(t, v, i):
+    """A 2x3 matrix times a Gaussian's covariance, given by the upper triangle's rows."""
+    xx, xy, xz = np.float64(v[i, 0]), np.float64(v[i, 1]), np.float64(v[i, 2])
+    yy, yz, zz = np.float64(v[i, 3]), np.float64(v[i, 4]), np.float64(v[i, 5])
+    return (
+        t[0] * xx + t[1] * xy + t[2] * xz,
+        t[0] * xy + t[1] * yy + t[2] * yz,
+        t[0] * xz + t[1] * yz + t[2] * zz,
+        t[3] * xx + t[4] * xy + t[5] * xz,
+        t[3] * xy + t[4] * yy + t[5] * yz,
+        t[3] * xz + t[4] * yz + t[5] * zz,
+    )
+
+
+@compiled()
+def direction(means, i, position):
     """From the camera's centre to the Gaussian's, of length 1, and the length it had."""
     x, y, z = means[i, 0] - position[0], means[i, 1] - position[1], means[i, 2] - position[2]
     length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
@@ -117,7 +132,7 @@ def _direction(means, i, position):
 
 
 @compiled()
-def _harmonics(degree, x, y, z, basis):
+def harmonics(degree, x, y, z, basis):
     """Fill `basis` with the spherical harmonics of a direction."""
     two, three, four = np.float32(2), np.float32(3), np.float32(4)
     basis[0] = _C0
@@ -138,7 +153,7 @@ def _harmonics(degree, x, y, z, basis):
 
 
 @compiled()
-def _harmonics_gradient(degree, x, y, z, g):
+def harmonics_gradient(degree, x, y, z, g):
     """Gradient to the direction, from the gradient `g` to each of its harmonics."""
     two, three, four, six, eight = np.float32(2), np.float32(3), np.float32(4), np.float32(6), np.float32(8)
     gx = gy = gz = np.float32(0)
@@ -179,25 +194,27 @@ def _harmonics_gradient(degree, x, y, z, g):
 
 
 @compiled()
-def _floor(value):
+def floor(value):
+    """As an integer, within 1e8 of 0."""
     return np.int64(math.floor(max(min(value, 1e8), -1e8)))
 
 
 @compiled()
-def _ceil(value):
-    return -_floor(-value)
+def ceil(value):
+    """As an integer, within 1e8 of 0."""
+    return -floor(-value)
 
 
 @compiled()
-def _tile_range(centre, radius, tiles):
+def tile_range(centre, radius, tiles):
     """First tile of the square around a splat, and the one past the last, by 3DGS's rounding."""
-    first, end = _floor((centre - radius) / TILE), _floor((centre + radius + (TILE - 1)) / TILE)
+    first, end = floor((centre - radius) / TILE), floor((centre + radius + (TILE - 1)) / TILE)
     return min(max(first, 0), tiles), min(max(end, 0), tiles)
 
 
 @compiled()
 def _project_block(
-    first, end, means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, size,
+    first, end, means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position, size,
     dilation, square, splats, depths, radii, clamped, boxes, slots,
 ):  # fmt: skip
     fx, fy, cx, cy, limit_x, limit_y = intrinsics
@@ -211,16 +228,27 @@ def _project_block(
             continue
         held_x, _ = _held(x, z, limit_x)
         held_y, _ = _held(y, z, limit_y)
-        rotation, _, _ = _rotation(quaternions, i)
-        u = _times_rotation(_linearised(fx, fy, held_x, held_y, z, pose), rotation)
-        s0, s1, s2 = np.float64(scales[i, 0]) ** 2, np.float64(scales[i, 1]) ** 2, np.float64(scales[i, 2]) ** 2
-        a = u[0] * u[0] * s0 + u[1] * u[1] * s1 + u[2] * u[2] * s2
-        b = u[0] * u[3] * s0 + u[1] * u[4] * s1 + u[2] * u[5] * s2
-        c = u[3] * u[3] * s0 + u[4] * u[4] * s1 + u[5] * u[5] * s2
-        determinant = dilation * (a + c + dilation)
-        determinant += (u[0] * u[4] - u[1] * u[3]) ** 2 * s0 * s1
-        determinant += (u[0] * u[5] - u[2] * u[3]) ** 2 * s0 * s2
-        determinant += (u[1] * u[5] - u[2] * u[4]) ** 2 * s1 * s2
+        t = _linearised(fx, fy, held_x, held_y, z, pose)
+        if len(covariances) > 0:
+            u = _times_covariance(t, covariances, i)
+            a = u[0] * t[0] + u[1] * t[1] + u[2] * t[2]
+            b = u[0] * t[3] + u[1] * t[4] + u[2] * t[5]
+            c = u[3] * t[3] + u[4] * t[4] + u[5] * t[5]
+            # A matrix that was handed in need be no covariance.
+            determinant = dilation * (a + c + dilation) + a * c - b * b
+            if not (determinant > 0 and a + dilation > 0):
+                continue
+        else:
+            r, _, _ = rotation(quaternions, i)
+            u = _times_rotation(t, r)
+            s0, s1, s2 = np.float64(scales[i, 0]) ** 2, np.float64(scales[i, 1]) ** 2, np.float64(scales[i, 2]) ** 2
+            a = u[0] * u[0] * s0 + u[1] * u[1] * s1 + u[2] * u[2] * s2
+            b = u[0] * u[3] * s0 + u[1] * u[4] * s1 + u[2] * u[5] * s2
+            c = u[3] * u[3] * s0 + u[4] * u[4] * s1 + u[5] * u[5] * s2
+            determinant = dilation * (a + c + dilation)
+            determinant += (u[0] * u[4] - u[1] * u[3]) ** 2 * s0 * s1
+            determinant += (u[0] * u[5] - u[2] * u[3]) ** 2 * s0 * s2
+            determinant += (u[1] * u[5] - u[2] * u[4]) ** 2 * s1 * s2
         a += dilation
         c += dilation
         middle = 0.5 * (a + c)
@@ -229,8 +257,8 @@ def _project_block(
         reach = radius if square == SQUARE else min(math.ceil(square * math.sqrt(largest)), float(FARTHEST))
         nearness = 1 / z
         centre_x, centre_y = fx * x * nearness + cx - 0.5, fy * y * nearness + cy - 0.5
-        left, right = _tile_range(centre_x, reach, -(-size[0] // TILE))
-        top, bottom = _tile_range(centre_y, reach, -(-size[1] // TILE))
+        left, right = tile_range(centre_x, reach, -(-size[0] // TILE))
+        top, bottom = tile_range(centre_y, reach, -(-size[1] // TILE))
         if right <= left or bottom <= top:
             continue
         radii[i] = np.int32(radius)
@@ -242,16 +270,16 @@ def _project_block(
         summit = math.log(opacity)
         level = 2 * (summit - FAINTEST)
         reach_x, reach_y = math.sqrt(level * a), math.sqrt(level * c)
-        x0, x1 = max(TILE * left, _ceil(centre_x - reach_x)), min(TILE * right, size[0], _floor(centre_x + reach_x) + 1)
-        y0, y1 = max(TILE * top, _ceil(centre_y - reach_y)), min(TILE * bottom, size[1], _floor(centre_y + reach_y) + 1)
+        x0, x1 = max(TILE * left, ceil(centre_x - reach_x)), min(TILE * right, size[0], floor(centre_x + reach_x) + 1)
+        y0, y1 = max(TILE * top, ceil(centre_y - reach_y)), min(TILE * bottom, size[1], floor(centre_y + reach_y) + 1)
         if x1 <= x0 or y1 <= y0:
             continue
         x0, x1 = x0 // WIDE, (x1 - 1) // WIDE + 1
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, y0, x1, y1
         slots[i] = (x1 - x0) * ((y1 - 1) // TALL + 1 - y0 // TALL)
 
-        dx, dy, dz, _ = _direction(means, i, position)
-        _harmonics(degree, dx, dy, dz, basis)
+        dx, dy, dz, _ = direction(means, i, position)
+        harmonics(degree, dx, dy, dz, basis)
         for channel in range(3):
             colour = np.float32(0.5)
             for k in range(coefficients):
@@ -267,27 +295,38 @@ def _project_block(
 
 @compiled(parallel=True)
 def project(
-    means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position, size,
+    means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position, size,
     dilation, square, splats, depths, radii, clamped, boxes, slots,
 ):  # fmt: skip
-    """Fill, for each Gaussian: splat, depth, radius, which channels are clamped, box of strips, how many they are."""
+    """Fill, for each Gaussian: splat, depth, radius, which channels are clamped, box of strips, how many they are.
+
+    Shapes are `scales` and `quaternions`, or `covariances` [N, 6] (xx, xy, xz, yy, yz, zz); the others are [0, ...].
+    """
     count = len(means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
         _project_block(
-            first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, degree, intrinsics, pose,
-            position, size, dilation, square, splats, depths, radii, clamped, boxes, slots,
+            first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, covariances, degree,
+            intrinsics, pose, position, size, dilation, square, splats, depths, radii, clamped, boxes, slots,
         )  # fmt: skip
 
 
 @compiled()
-def _quaternion_gradient(g, q, length):
-    """From the gradient to the rotation matrix (row-major) to that of the quaternion before its normalisation."""
+def quaternion_partials(g, q):
+    """From the gradient to the rotation matrix (row-major) to that of the four numbers in its formula."""
     w, x, y, z = q
     gw = 2 * (z * (g[3] - g[1]) + y * (g[2] - g[6]) + x * (g[7] - g[5]))
     gx = 2 * (y * (g[1] + g[3]) + z * (g[2] + g[6]) - 2 * x * (g[4] + g[8]) + w * (g[7] - g[5]))
     gy = 2 * (x * (g[1] + g[3]) + z * (g[5] + g[7]) - 2 * y * (g[0] + g[8]) + w * (g[2] - g[6]))
     gz = 2 * (x * (g[2] + g[6]) + y * (g[5] + g[7]) - 2 * z * (g[0] + g[4]) + w * (g[3] - g[1]))
+    return gw, gx, gy, gz
+
+
+@compiled()
+def _quaternion_gradient(g, q, length):
+    """As `quaternion_partials`, to the quaternion before its normalisation."""
+    gw, gx, gy, gz = quaternion_partials(g, q)
+    w, x, y, z = q
     along = w * gw + x * gx + y * gy + z * gz
     scale = 1 / length
     return (gw - w * along) * scale, (gx - x * along) * scale, (gy - y * along) * scale, (gz - z * along) * scale
@@ -337,9 +376,9 @@ def _collect(splats, boxes, i, slot_rows, places, slot, gradients, sums):
 
 @compiled()
 def _project_backward_block(
-    first, end, means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position,
+    first, end, means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position,
     splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients, half,
-    g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
+    g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
 ):  # fmt: skip
     fx, fy, _, _, limit_x, limit_y = intrinsics
     coefficients = (degree + 1) * (degree + 1)
@@ -349,8 +388,11 @@ def _project_backward_block(
             _ask_for(first_slots[i + AHEAD], slots[i + AHEAD], slot_rows, places, entry_gradients)
         if slots[i] == 0:
             g_means[i] = 0
-            g_scales[i] = 0
-            g_quaternions[i] = 0
+            if len(covariances) > 0:
+                g_covariances[i] = 0
+            else:
+                g_scales[i] = 0
+                g_quaternions[i] = 0
             g_opacities[i] = 0
             g_sh[i] = 0
             g_view[i] = 0
@@ -362,8 +404,8 @@ def _project_backward_block(
             g_view[i, 2], g_view[i, 3] = sums[9] * half[0], sums[10] * half[1]
 
         # Colour: to the coefficients, and through the direction to the mean.
-        dx, dy, dz, distance = _direction(means, i, position)
-        _harmonics(degree, dx, dy, dz, basis)
+        dx, dy, dz, distance = direction(means, i, position)
+        harmonics(degree, dx, dy, dz, basis)
         red = np.float32(0) if clamped[i, 0] else np.float32(sums[6])
         green = np.float32(0) if clamped[i, 1] else np.float32(sums[7])
         blue = np.float32(0) if clamped[i, 2] else np.float32(sums[8])
@@ -371,7 +413,7 @@ def _project_backward_block(
             g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = basis[k] * red, basis[k] * green, basis[k] * blue
             g_basis[k] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
         g_sh[i, coefficients:] = 0
-        vx, vy, vz = _harmonics_gradient(degree, dx, dy, dz, g_basis)
+        vx, vy, vz = harmonics_gradient(degree, dx, dy, dz, g_basis)
         along = vx * dx + vy * dy + vz * dz
         nearness = 1 / distance
         mx, my, mz = (vx - along * dx) * nearness, (vy - along * dy) * nearness, (vz - along * dz) * nearness
@@ -382,41 +424,54 @@ def _project_backward_block(
         p10, p11 = b * sums[2] + c * sums[3] / 2, b * sums[3] / 2 + c * sums[4]
         s00, s01, s11 = -(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)
 
-        # Covariance to the scaled axes U S, U = T R: 2 G U S.
+        # Covariance to T = J W.
         x, y, z = _to_camera(means, i, pose)
         held_x, free_x = _held(x, z, limit_x)
         held_y, free_y = _held(y, z, limit_y)
-        rotation, q, length = _rotation(quaternions, i)
         t = _linearised(fx, fy, held_x, held_y, z, pose)
-        u = _times_rotation(t, rotation)
-        n0, n1, n2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
-        e0, e3 = 2 * (s00 * u[0] + s01 * u[3]), 2 * (s01 * u[0] + s11 * u[3])
-        e1, e4 = 2 * (s00 * u[1] + s01 * u[4]), 2 * (s01 * u[1] + s11 * u[4])
-        e2, e5 = 2 * (s00 * u[2] + s01 * u[5]), 2 * (s01 * u[2] + s11 * u[5])
-        g_scales[i, 0] = n0 * (e0 * u[0] + e3 * u[3])
-        g_scales[i, 1] = n1 * (e1 * u[1] + e4 * u[4])
-        g_scales[i, 2] = n2 * (e2 * u[2] + e5 * u[5])
-        e0, e1, e2, e3, e4, e5 = e0 * n0 * n0, e1 * n1 * n1, e2 * n2 * n2, e3 * n0 * n0, e4 * n1 * n1, e5 * n2 * n2
-        g_rotation = (
-            t[0] * e0 + t[3] * e3, t[0] * e1 + t[3] * e4, t[0] * e2 + t[3] * e5,
-            t[1] * e0 + t[4] * e3, t[1] * e1 + t[4] * e4, t[1] * e2 + t[4] * e5,
-            t[2] * e0 + t[5] * e3, t[2] * e1 + t[5] * e4, t[2] * e2 + t[5] * e5,
-        )  # fmt: skip
-        w0, w1, w2, w3 = _quaternion_gradient(g_rotation, q, length)
-        g_quaternions[i, 0], g_quaternions[i, 1], g_quaternions[i, 2], g_quaternions[i, 3] = w0, w1, w2, w3
+        if len(covariances) > 0:
+            # The image's is T V T^t: 2 G T V; and to V, of which the triangle has three numbers that stand twice.
+            v = _times_covariance(t, covariances, i)
+            t0, t1, t2 = 2 * (s00 * v[0] + s01 * v[3]), 2 * (s00 * v[1] + s01 * v[4]), 2 * (s00 * v[2] + s01 * v[5])
+            t3, t4, t5 = 2 * (s01 * v[0] + s11 * v[3]), 2 * (s01 * v[1] + s11 * v[4]), 2 * (s01 * v[2] + s11 * v[5])
+            h0, h1, h2 = s00 * t[0] + s01 * t[3], s00 * t[1] + s01 * t[4], s00 * t[2] + s01 * t[5]
+            h3, h4, h5 = s01 * t[0] + s11 * t[3], s01 * t[1] + s11 * t[4], s01 * t[2] + s11 * t[5]
+            g_covariances[i, 0], g_covariances[i, 3] = t[0] * h0 + t[3] * h3, t[1] * h1 + t[4] * h4
+            g_covariances[i, 5] = t[2] * h2 + t[5] * h5
+            g_covariances[i, 1] = 2 * (t[0] * h1 + t[3] * h4)
+            g_covariances[i, 2] = 2 * (t[0] * h2 + t[3] * h5)
+            g_covariances[i, 4] = 2 * (t[1] * h2 + t[4] * h5)
+        else:
+            # The scaled axes U S, U = T R: 2 G U S.
+            r, q, length = rotation(quaternions, i)
+            u = _times_rotation(t, r)
+            n0, n1, n2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
+            e0, e3 = 2 * (s00 * u[0] + s01 * u[3]), 2 * (s01 * u[0] + s11 * u[3])
+            e1, e4 = 2 * (s00 * u[1] + s01 * u[4]), 2 * (s01 * u[1] + s11 * u[4])
+            e2, e5 = 2 * (s00 * u[2] + s01 * u[5]), 2 * (s01 * u[2] + s11 * u[5])
+            g_scales[i, 0] = n0 * (e0 * u[0] + e3 * u[3])
+            g_scales[i, 1] = n1 * (e1 * u[1] + e4 * u[4])
+            g_scales[i, 2] = n2 * (e2 * u[2] + e5 * u[5])
+            e0, e1, e2, e3, e4, e5 = e0 * n0 * n0, e1 * n1 * n1, e2 * n2 * n2, e3 * n0 * n0, e4 * n1 * n1, e5 * n2 * n2
+            g_rotation = (
+                t[0] * e0 + t[3] * e3, t[0] * e1 + t[3] * e4, t[0] * e2 + t[3] * e5,
+                t[1] * e0 + t[4] * e3, t[1] * e1 + t[4] * e4, t[1] * e2 + t[4] * e5,
+                t[2] * e0 + t[5] * e3, t[2] * e1 + t[5] * e4, t[2] * e2 + t[5] * e5,
+            )  # fmt: skip
+            w0, w1, w2, w3 = _quaternion_gradient(g_rotation, q, length)
+            g_quaternions[i, 0], g_quaternions[i, 1], g_quaternions[i, 2], g_quaternions[i, 3] = w0, w1, w2, w3
+            t0, t1, t2 = (
+                e0 * r[0] + e1 * r[1] + e2 * r[2],
+                e0 * r[3] + e1 * r[4] + e2 * r[5],
+                e0 * r[6] + e1 * r[7] + e2 * r[8],
+            )
+            t3, t4, t5 = (
+                e3 * r[0] + e4 * r[1] + e5 * r[2],
+                e3 * r[3] + e4 * r[4] + e5 * r[5],
+                e3 * r[6] + e4 * r[7] + e5 * r[8],
+            )
 
-        # To T = J W, to the Jacobian, and with the centre's gradient to the mean.
-        r = rotation
-        t0, t1, t2 = (
-            e0 * r[0] + e1 * r[1] + e2 * r[2],
-            e0 * r[3] + e1 * r[4] + e2 * r[5],
-            e0 * r[6] + e1 * r[7] + e2 * r[8],
-        )
-        t3, t4, t5 = (
-            e3 * r[0] + e4 * r[1] + e5 * r[2],
-            e3 * r[3] + e4 * r[4] + e5 * r[5],
-            e3 * r[6] + e4 * r[7] + e5 * r[8],
-        )
+        # To the Jacobian, and with the centre's gradient to the mean.
         j00 = t0 * pose[0, 0] + t1 * pose[0, 1] + t2 * pose[0, 2]
         j02 = t0 * pose[2, 0] + t1 * pose[2, 1] + t2 * pose[2, 2]
         j11 = t3 * pose[1, 0] + t4 * pose[1, 1] + t5 * pose[1, 2]
@@ -438,16 +493,16 @@ def _project_backward_block(
 
 @compiled(parallel=True)
 def project_backward(
-    means, scales, quaternions, opacities, sh, degree, intrinsics, pose, position,
+    means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position,
     splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients, half,
-    g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
+    g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
 ):  # fmt: skip
     """Fill the gradients `g_...` of each Gaussian from those of its entries."""
     count = len(means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
         _project_backward_block(
-            first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, degree, intrinsics, pose,
-            position, splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients, half,
-            g_means, g_scales, g_quaternions, g_opacities, g_sh, g_view,
+            first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, covariances, degree,
+            intrinsics, pose, position, splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients,
+            half, g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
         )  # fmt: skip

@@ -9,9 +9,9 @@ import libcst as cst
 
 from legs_adapters.module import Function
 from legs_adapters.program import Program, Reference
-from legs_adapters.syntax import arguments, call_name, code, constant, dotted, walk_expressions
+from legs_adapters.syntax import arguments, call_name, code, constant, walk_expressions
 
-__all__ = ["Form", "forms", "is_l1_name", "own_shape"]
+__all__ = ["Form", "Forms", "forms", "is_l1_name", "own_shape"]
 
 _TORCH_L1 = re.compile(r"(^|\.)(torch\.nn\.functional|nn\.functional|functional)\.l1_loss$")
 _GSPLAT_L1 = re.compile(r"^gsplat\.losses\.l1_loss$")
@@ -22,6 +22,7 @@ _L1_NAME = re.compile(
 _SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)
 _SHAPE_ONLY = {"shape", "device", "dtype", "dim", "ndim", "size", "numel", "is_cuda"}
 _TRANSFORMS = {"pow", "square", "log", "log1p", "log2", "log10", "exp", "sqrt", "tanh", "sigmoid"}
+_ASKING = {"isnan", "isfinite", "isinf", "zeros_like", "ones_like"}
 _NOT_L1 = {"pow", "square", "sqrt", "log", "exp", "mse_loss", "norm", "smooth_l1_loss", "huber_loss"}
 
 
@@ -39,6 +40,7 @@ class Form(NamedTuple):
         extras: the call's further arguments.
         difference: the ``a - b``, for a form that is an absolute value.
         direct: False where the difference has a name of its own, so that there is no one expression to replace.
+        selection: for such a difference, the index that it is taken with, ``[mask]``; empty without.
     """
 
     node: cst.BaseExpression
@@ -50,6 +52,7 @@ class Form(NamedTuple):
     extras: Tuple[cst.Arg, ...] = ()
     difference: Optional[cst.BinaryOperation] = None
     direct: bool = True
+    selection: str = ""
 
 
 def is_l1_name(name: str) -> bool:
@@ -71,6 +74,20 @@ def forms(program: Program, function: Function) -> List[Form]:
             if form.difference is None or form.callee is None:
                 inside.update(id(n) for n in walk_expressions(form.node) if isinstance(n, cst.Call) and _is_abs(n))
     return found
+
+
+class Forms:
+    """The forms of each function of one program, looked for once."""
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._known: Dict[Function, List[Form]] = {}
+
+    def of(self, function: Function) -> List[Form]:
+        """Return the L1 expressions in a function's own body."""
+        if function not in self._known:
+            self._known[function] = forms(self._program, function)
+        return self._known[function]
 
 
 def _transformed(function: Function) -> Set[int]:
@@ -104,12 +121,16 @@ def _absolute(function: Function, node: cst.Call) -> Optional[Form]:
         for side in (argument.left, argument.right)[: 1 if isinstance(argument.operator, cst.Divide) else 2]:
             if isinstance(side, cst.BinaryOperation) and isinstance(side.operator, cst.Subtract):
                 return Form(inner, inner, side.left, side.right, "wrapped", difference=side)
+    selection = ""
+    if isinstance(argument, cst.Subscript):
+        selection = code(argument)[len(code(argument.value)) :].strip()
+        argument = argument.value
     if isinstance(argument, cst.Name):
         definitions = list(function.flow.reaching(argument))
         if len(definitions) == 1 and definitions[0].kind == "assign":
             value = definitions[0].value
             if isinstance(value, cst.BinaryOperation) and isinstance(value.operator, cst.Subtract):
-                return Form(node, inner, value.left, value.right, reduction, difference=value, direct=False)
+                return Form(node, inner, value.left, value.right, reduction, None, (), value, False, selection)
     return None
 
 
@@ -119,7 +140,7 @@ def _mean_of(node: cst.Call) -> Optional[cst.Call]:
         return None
     if not node.args and isinstance(node.func.value, cst.Call):
         return node.func.value
-    if dotted(node.func) == "torch.mean" and len(node.args) == 1 and isinstance(node.args[0].value, cst.Call):
+    if _is_module(node.func.value) and len(node.args) == 1 and isinstance(node.args[0].value, cst.Call):
         return node.args[0].value
     return None
 
@@ -127,20 +148,22 @@ def _mean_of(node: cst.Call) -> Optional[cst.Call]:
 def _abs_argument(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
     if not isinstance(node, cst.Call) or not _is_abs(node):
         return None
-    if isinstance(node.func, cst.Attribute) and dotted(node.func) not in ("torch.abs", "torch.absolute"):
-        return None if node.args else node.func.value
+    if isinstance(node.func, cst.Attribute) and not node.args:
+        return node.func.value
     return node.args[0].value if len(node.args) == 1 and not node.args[0].star else None
 
 
 def _is_abs(node: cst.Call) -> bool:
     if isinstance(node.func, cst.Name):
         return node.func.value == "abs"
-    if isinstance(node.func, cst.Attribute):
-        name = dotted(node.func)
-        return name in ("torch.abs", "torch.absolute") or (
-            node.func.attr.value in ("abs", "absolute") and not node.args and name not in ("np.abs", "numpy.abs")
-        )
+    if isinstance(node.func, cst.Attribute) and node.func.attr.value in ("abs", "absolute"):
+        return not node.args or (len(node.args) == 1 and _is_module(node.func.value))
     return False
+
+
+def _is_module(node: cst.CSTNode) -> bool:
+    """Whether what has ``abs`` or ``mean`` can be torch, under whatever name: a tensor's own take no tensor."""
+    return isinstance(node, cst.Name) and node.value not in ("np", "numpy", "math", "jnp", "cp", "cupy", "tf")
 
 
 # -- calls of functions
@@ -422,6 +445,8 @@ def _only_differences(program: Program, function: Function, a: str, b: str, dept
             name = call_name(node)
             if name in _NOT_L1:
                 return False
+            if name in _ASKING:
+                allowed.update(id(n) for arg in node.args for n in walk_expressions(arg))
             absolute = absolute or _is_abs(node)
             positional = arguments(node)[0]
             spread = any(arg.star == "*" for arg in node.args)

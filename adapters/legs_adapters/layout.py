@@ -39,6 +39,8 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
             return [3] if after[-1:] == ["c"] else [-3]
         if call_name(node) in _LAST_RENDERERS:
             return [2]
+        if call_name(node) in ("reshape", "view", "flatten", "mv", "mm", "matmul"):
+            return _shape_vote(node)
         inner: List[cst.CSTNode] = [node.func.value] if isinstance(node.func, cst.Attribute) else []
         inner += arguments(node)[0][:1]
         return [vote for part in inner for vote in _votes(training, function, part, seen, depth + 1)]
@@ -160,6 +162,15 @@ def _pattern(node: cst.Call) -> Optional[str]:
     return None
 
 
+def _shape_vote(node: cst.Call) -> List[int]:
+    """``x.reshape(height, width, 3)``: what stood where before does not count."""
+    sizes = [constant(value) for value in arguments(node)[0]]
+    sizes = list(sizes[0]) if len(sizes) == 1 and isinstance(sizes[0], tuple) else sizes
+    if call_name(node) not in ("reshape", "view") or len(sizes) not in (3, 4):
+        return []
+    return [3] if sizes[-1] == 3 else [-3] if sizes[-3] == 3 else []
+
+
 def _slice_vote(node: cst.Subscript) -> List[int]:
     parts = [element.slice for element in node.slice]
     spread = isinstance(parts[0], cst.Index) and isinstance(parts[0].value, cst.Ellipsis)
@@ -167,6 +178,8 @@ def _slice_vote(node: cst.Subscript) -> List[int]:
     if spread and len(parts) == 2 and isinstance(last, cst.Slice) and constant(last.upper) == 3:
         return [2]
     first = parts[0]
+    if isinstance(first, cst.Index) and constant(first.value, "") is None and len(parts) == 3:
+        return [-2]  # grey[None, :, :]
     if isinstance(first, cst.Slice) and constant(first.upper) == 3:
         return [-2]
     if (

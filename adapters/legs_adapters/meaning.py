@@ -7,7 +7,7 @@ that says "image": ``gt_image = cam.depth`` is a depth.
 
 from __future__ import annotations
 
-from typing import Dict, Iterable, NamedTuple, Optional, Set
+from typing import Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
@@ -35,6 +35,7 @@ _FIRST = {
     "conv2d", "mul", "where_first", "abs", "array", "enumerate", "iter", "next", "list", "tuple", "reversed", "zip",
     "tqdm", "DataLoader", "deepcopy", "no_grad", "max_pool2d", "center_crop", "crop", "gaussian_blur",
 }  # fmt: skip
+_MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _DEPTH = 24
 _BUDGET = 20000  # steps to answer one question: some code is one large knot
@@ -58,6 +59,7 @@ class Meanings:
         self.training = training
         self._known: Dict[int, Meaning] = {}
         self._here: Dict[int, Meaning] = {}
+        self._calls: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
         self._open: Set[int] = set()
         self._spent = 0
 
@@ -82,6 +84,10 @@ class Meanings:
             self._known[id(node)] = meaning
             self._here.clear()
         return meaning
+
+    def origin(self, function: Function, node: cst.CSTNode) -> Meaning:
+        """Return what a name's definitions say of it, whatever the name itself says."""
+        return self._flow(function, node, 0) if isinstance(node, cst.Name) else self.of(function, node)
 
     def _of(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
         if isinstance(node, cst.Name):
@@ -176,7 +182,7 @@ class Meanings:
         if definition.place not in names:
             return _UNKNOWN
         position, found = names.index(definition.place), []
-        for caller, call in self.training.sites.get(function, [])[:12]:
+        for caller, call in (self.training.sites.get(function) or self._calls_of(function))[:12]:
             positional, keywords, _ = arguments(call)
             if definition.place in keywords:
                 found.append(self.of(caller, keywords[definition.place], depth))
@@ -184,6 +190,18 @@ class Meanings:
                 found.append(self.of(caller, positional[position], depth))
         images = [meaning for meaning in found if meaning.kind == "image"]
         return _mix(images or found)
+
+    def _calls_of(self, function: Function) -> List[Tuple[Function, cst.Call]]:
+        """The calls of a function that training does not go through."""
+        if function not in self._calls:
+            self._calls[function] = [
+                (caller, call)
+                for caller in self.program.mentioning(function.name, called=True)[:12]
+                for call in caller.flow.calls
+                if call_name(call) == function.name
+                and any(ref.target is function and not ref.guess for ref in self.program.resolve(caller, call.func))
+            ]
+        return self._calls[function]
 
     def _attribute(self, function: Function, node: cst.Attribute, depth: int) -> Meaning:
         name = node.attr.value
@@ -203,7 +221,7 @@ class Meanings:
         return Meaning(_closer(kind, local.kind), role)
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> Meaning:
-        key = key_of(node) or _formatted_key(node)
+        key = key_of(node) or _formatted_key(node) or self._default_key(function, node)
         if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in _PARAMETERS:
             return Meaning("parameter", None)
         if isinstance(key, str):
@@ -213,6 +231,15 @@ class Meanings:
                 role = local.role or self._role_of_holder(function, node.value, depth) or role
             return Meaning(_closer(kind_of_words(key), local.kind), role)
         return self.of(function, node.value, depth)
+
+    @staticmethod
+    def _default_key(function: Function, node: cst.Subscript) -> object:
+        """``preds[key]`` of a function with the parameter ``key="rgb"``."""
+        index = node.slice[0].slice
+        if len(node.slice) != 1 or not isinstance(index, cst.Index) or not isinstance(index.value, cst.Name):
+            return None
+        found = list(function.flow.reaching(index.value))
+        return constant(found[0].value) if len(found) == 1 and found[0].kind == "parameter" else None
 
     def _role_of_holder(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[str]:
         """``outputs["rgb"]`` was rendered, ``batch["rgb"]`` and ``viewpoint.image`` were photographed."""
@@ -241,14 +268,14 @@ class Meanings:
         positional, keywords, _ = arguments(node)
         values = [*positional, *keywords.values()]
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
-        module = isinstance(base, cst.Name) and base.value in ("torch", "F", "np", "nn", "einops", "functional", "TF")
+        module = isinstance(base, cst.Name) and (base.value in _MODULES or self._imported(function, base))
         if name == "get" and positional and isinstance(constant(positional[0]), str) and base is not None:
             key = constant(positional[0])
             role = role_of_words(key) or self._role_of_holder(function, base, depth)
             return Meaning(kind_of_words(key), role)
         if name == "where" and len(values) == 3:
             return _mix([self.of(function, value, depth) for value in values[1:]])
-        if name in ("conv2d", "filter2d", "spatial_gradient") and values:
+        if name in ("conv2d", "filter2d", "spatial_gradient") and values and "stride" not in keywords:
             return Meaning("gradient", self.of(function, values[0], depth).role)
         if name in _JOIN and values:
             return self.of(function, values[0], depth)
@@ -294,6 +321,11 @@ class Meanings:
         if base is not None and not module:
             return Meaning(kind, self.of(function, base, depth).role if kind else None)
         return Meaning(kind, None)
+
+    def _imported(self, function: Function, node: cst.Name) -> bool:
+        """Whether a name is a module's, ``th`` of ``import torch as th``."""
+        definitions = self.program.lookup(function, node)
+        return bool(definitions) and all(isinstance(d.value, cst.Import) for _, d in definitions or ())
 
     def _made_by(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[Meaning]:
         """``rasterizer = GaussianRasterizer(...)``, then ``rasterizer(...)``; a function whose returns are images."""

@@ -17,11 +17,12 @@ _WORD = re.compile(r"[^\W\d]\w*")
 _DEFINITION = re.compile(r"^([ \t]*)(?:async[ \t]+)?(def|class)[ \t]+(\w+)", re.M)
 # A value goes on where its line ends in an opening bracket, a comma or a backslash.
 _GIVEN = re.compile(
-    r"^(?:[ \t]*self\.)?(\w+)[ \t]*(?::[^=\n]+)?=(?!=)[ \t]*"
+    r"^(?:[ \t]*self\.)?(\w+)(?:\[[^\]\n]*\]|\.\w+)*[ \t]*(?::[^=\n]+|[-+*/])?=(?!=)[ \t]*"
     r"((?:[^\n]*[\[({,\\][ \t]*(?:#[^\n]*)?\n)*[^\n]*)",
     re.M,
 )
-_ONE_CALL = re.compile(r"([\w.]+)[ \t]*\((?!.*\)[ \t]*(?:if|or|and)\b)", re.S)
+_ADDED = re.compile(r"\bself\.(\w+)\.(?:append|add|extend|update|setdefault)\(([^\n]*)")
+_CALLEE = re.compile(r"([\w.]+)[ \t]*\(")
 _RENAMED = re.compile(r"\b(\w+)[ \t]+as[ \t]+(\w+)")
 _DEFAULT = re.compile(r"\b(\w+)(?:[ \t]*:[^=,()\n]+)?[ \t]*=[ \t]*([\w.]*[lL]1\w*)(?![\w.]*[ \t]*\()")
 _HOLDERS = {"dict", "partial", "functools.partial", "nn.ModuleDict", "ModuleDict", "torch.nn.ModuleDict", "OrderedDict"}
@@ -77,9 +78,21 @@ def _said(text: str) -> Iterator[Tuple[str, str]]:
         if name in _CALLED and classes:
             yield classes[-1][1], text[match.end() : end]
     for match in _GIVEN.finditer(text):
-        call = _ONE_CALL.match(match.group(2))
-        given = match.group(2) if call is None or call.group(1) in _HOLDERS else call.group(1).split(".")[-1]
         if not match.group(1).startswith("__") and match.group(1) != "_":
-            yield match.group(1), given
-    yield from ((match.group(1), match.group(2)) for match in _DEFAULT.finditer(text))
+            yield match.group(1), _made(match.group(2))
+    for pattern in (_ADDED, _DEFAULT):
+        yield from ((match.group(1), match.group(2)) for match in pattern.finditer(text))
     yield from ((match.group(2), match.group(1)) for match in _RENAMED.finditer(text))
+
+
+def _made(value: str) -> str:
+    """Return what a value is made by: of one call that is all of it the function, which its arguments do not change."""
+    call = _CALLEE.match(value)
+    if call is None or call.group(1) in _HOLDERS:
+        return value
+    depth = 0
+    for i, letter in enumerate(value[call.end() - 1 :], call.end()):
+        depth += (letter in "([{") - (letter in ")]}")
+        if depth == 0:
+            return call.group(1).split(".")[-1] if not value[i:].split("#")[0].strip() else value
+    return value

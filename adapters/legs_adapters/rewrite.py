@@ -15,9 +15,9 @@ from typing import List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
 
+from legs_adapters.findings import Site
 from legs_adapters.module import Function, Module
 from legs_adapters.repo import Source, decode
-from legs_adapters.sites import Site
 from legs_adapters.syntax import code, dotted
 from legs_loss import LegsError
 
@@ -122,11 +122,25 @@ class _Text:
             texts = [" ".join(self.text(*self.span(node, True)).split()) for node in (first, second)]
             settings = self._settings(site, name, "none", "")
             return [self.edit(*self.span(form.node, True), f"{name}.l1_loss({texts[0]}, {texts[1]}{settings})")]
+        if not form.direct:
+            return self._named(site, name)
         if form.reduction == "wrapped":
             return self._wrapped(site, name)
         if form.callee is None:
             return self._absolute(site, name)
         return self._call(site, name)
+
+    def _named(self, site: Site, name: str) -> List[Edit]:
+        """``diff = a - b``, then ``diff[mask].abs().mean()``: the pictures are named in the difference's place."""
+        form = site.form
+        texts = [" ".join(self.text(*self.span(node, True)).split()) for node in (form.first, form.second)]
+        if site.swapped:
+            texts.reverse()
+        reduction = "none" if site.selection else form.reduction
+        tail = site.selection + (".mean()" if site.selection and form.reduction == "mean" else "")
+        residue = _residue(self.text(*self.span(form.node)))
+        call = f"{name}.l1_loss({texts[0]}, {texts[1]}{self._settings(site, name, reduction, '')}{residue}){tail}"
+        return [self.edit(*self.span(form.node), call)]
 
     def _settings(self, site: Site, name: str, reduction: str, own: str) -> str:
         parts = []

@@ -74,7 +74,8 @@ class Steps:
         parts: List[cst.CSTNode] = [step.func.value, *(arg.value for arg in step.args)]
         found: Set[str] = set()
         for part in parts:
-            found |= _spoken(part)
+            name = set(words(part.attr.value)) if isinstance(part, cst.Attribute) else set()
+            found |= name if name & _POSE else _spoken(part)  # gaussians.optimizer_cam moves cameras
             for where, definition in self.program.lookup(function, part) or []:
                 made = definition.value
                 if (
@@ -84,13 +85,26 @@ class Steps:
                 ):
                     continue
                 for arg in made.args:
-                    found |= _spoken(arg.value)
+                    found |= self._moved(where, arg.value)
                     if isinstance(arg.value, cst.Name):  # opt_params = [], then opt_params.append(...)
                         for other in where.flow.definitions.get(arg.value.value, []):
                             if other.kind == "mutate" or isinstance(other.value, cst.List):
                                 assert other.value is not None
-                                found |= _spoken(other.value)
+                                found |= self._moved(where, other.value)
         return found - _PLUMBING
+
+    def _moved(self, where: Function, node: cst.CSTNode) -> Set[str]:
+        """The words in what an optimiser is given; of ``model._rot`` those of the model's class, if it is a pose's."""
+        found: Set[str] = set()
+        held: Set[str] = set()
+        for part in _walk(node):
+            if isinstance(part, cst.Attribute) and isinstance(part.value, cst.Name):
+                for reference in self.program.resolve(where, part.value):
+                    spoken = set(words(getattr(reference.target, "name", "")))
+                    if reference.kind == "instance" and spoken & _POSE:
+                        found |= spoken & _POSE
+                        held |= set(words(part.value.value))
+        return found | (_spoken(node) - held)
 
 
 def _is_backward(call: cst.Call) -> bool:

@@ -58,6 +58,7 @@ _RENDER = word_set(
     """
 )
 _LAID_OVER = word_set("mask masks valid weight weights diff error errors")
+_HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
 DATA = word_set(
     """
     data batch sample item items datum cam camera cameras cams view views viewpoint viewpoints info infos
@@ -71,9 +72,8 @@ def kind_of_words(name: str) -> Optional[str]:
     spoken = words(name)
     if "no" in spoken[1:]:  # image_no_sh
         spoken = spoken[: spoken.index("no", 1)]
-    if [word for word in spoken if not word.isdigit()][-1:] and [w for w in spoken if not w.isdigit()][
-        -1
-    ] in _LAID_OVER:
+    said = [word for word in spoken if not word.isdigit() and word not in _HELD_IN]
+    if said and said[-1] in _LAID_OVER:
         return "mask"  # of whatever: laid over an image, it leaves an image
     kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF}
     return min(kinds, key=KINDS.index) if kinds else None

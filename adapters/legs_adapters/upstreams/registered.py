@@ -7,7 +7,7 @@ calls it later, with ``input=`` and ``target=``. What is replaced is the callabl
 from __future__ import annotations
 
 import re
-from typing import Optional
+from typing import List
 
 import libcst as cst
 
@@ -16,24 +16,24 @@ from legs_adapters.module import Function
 from legs_adapters.program import Program
 from legs_adapters.syntax import arguments, call_name, constant, dotted, words
 
-__all__ = ["MENTIONED", "form_of"]
+__all__ = ["MENTIONED", "forms_of"]
 
 MENTIONED = re.compile(r"\badd_loss_metric\s*\(")
 _COLOUR = {"color", "colour", "rgb", "image", "photometric", "l1"}
 
 
-def form_of(program: Program, function: Function, call: cst.Call) -> Optional[Form]:
-    """Return the form of a registered photometric L1, whose node is the callable; None for any other call."""
+def forms_of(program: Program, function: Function, call: cst.Call) -> List[Form]:
+    """Return the form of a registered photometric L1, whose node is the callable; nothing for any other call."""
     if call_name(call) != "add_loss_metric":
-        return None
+        return []
     positional, keywords, _ = arguments(call)
     name = constant(keywords.get("name", positional[0] if positional else None))
     metric = keywords.get("metric", positional[1] if len(positional) > 1 else None)
     if not isinstance(name, str) or metric is None or not _is_l1(program, function, metric):
-        return None
+        return []
     if not set(words(name)) & _COLOUR or set(words(name)) & {"depth", "normal", "alpha", "mask", "flow", "feature"}:
-        return None
-    return Form(metric, call, cst.Name("input"), cst.Name("target"), "registered", metric)
+        return []
+    return [Form(metric, call, cst.Name("input"), cst.Name("target"), "registered", metric)]
 
 
 def _is_l1(program: Program, function: Function, node: cst.BaseExpression) -> bool:

@@ -1,0 +1,82 @@
+"""What is found in a checkout: terms to weight, terms left alone, and terms that a person must settle."""
+
+from __future__ import annotations
+
+from typing import List, NamedTuple, Tuple
+
+import libcst as cst
+
+from legs_adapters.l1 import Form
+from legs_adapters.module import Function
+from legs_adapters.program import Program
+from legs_adapters.provenance import View
+from legs_adapters.repo import Unreadable
+
+__all__ = ["Findings", "Left", "Problem", "Site"]
+
+
+class Site(NamedTuple):
+    """One photometric L1 term.
+
+    Attributes:
+        path, line, column: where it begins; the line counts from 1, the column from 0.
+        last_line: where it ends.
+        form: the expression.
+        swapped: the ground truth is the first of the two arguments.
+        selection: the index by a mask that both arguments carry, as written with its brackets; empty without.
+        channels_last: the images are [H, W, C].
+        view: the verdict on ``view=``.
+        scope: the function that it stands in.
+        aside: other reads of the same error map, which are not the loss and keep the plain one.
+    """
+
+    path: str
+    line: int
+    column: int
+    last_line: int
+    form: Form
+    swapped: bool
+    selection: str
+    channels_last: bool
+    view: View
+    scope: Function
+    aside: Tuple[cst.Name, ...] = ()
+
+    @property
+    def function(self) -> str:
+        """The name of the function that it stands in."""
+        return self.scope.name
+
+    def named_by(self, line: int) -> bool:
+        """Whether a line that a person names is one of its lines."""
+        return self.line <= line <= self.last_line
+
+
+class Left(NamedTuple):
+    """An L1 that was seen and left, with one word why."""
+
+    path: str
+    line: int
+    text: str
+    reason: str
+
+
+class Problem(NamedTuple):
+    """A term that a person must settle: where it is, what it says, and what to write there by hand."""
+
+    path: str
+    line: int
+    text: str
+    reason: str
+    advice: str
+
+
+class Findings(NamedTuple):
+    """All that was found; in the order of the files."""
+
+    sites: List[Site]
+    left: List[Left]
+    problems: List[Problem]
+    patched: List[Left]
+    unreadable: List[Unreadable]
+    program: Program

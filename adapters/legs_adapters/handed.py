@@ -1,0 +1,58 @@
+"""L1 functions handed over by their name, ``self.criterion = l1_loss``: what is replaced stands where that is said."""
+
+from __future__ import annotations
+
+from typing import Dict, List, NamedTuple, Set
+
+import libcst as cst
+
+from legs_adapters.l1 import Form, Forms, own_shape
+from legs_adapters.module import Function
+from legs_adapters.program import Program
+from legs_adapters.training import Training
+
+__all__ = ["Handed", "HandedOver"]
+
+
+class HandedOver(NamedTuple):
+    """A name handed over: the form to replace, and the function where it is called in the end."""
+
+    form: Form
+    caller: Function
+
+
+class Handed:
+    """All of them in one program.
+
+    Attributes:
+        functions: the L1 functions that are handed over.
+        by_holder: where, by the function or top level that says so.
+    """
+
+    def __init__(self, program: Program, training: Training, forms: Forms) -> None:
+        self.functions: Set[Function] = set()
+        self.by_holder: Dict[Function, List[HandedOver]] = {}
+        for function, calls in list(training.sites.items()):
+            shape = own_shape(program, function)
+            if shape is None:
+                continue
+            known = {id(form.call) for caller, _ in calls for form in forms.of(caller)}
+            unknown = [
+                (caller, call)
+                for caller, call in calls
+                if id(call) not in known and own_shape(program, caller) is None and len(call.args) == 2
+            ]
+            for holder in program.mentioning(function.name) if unknown else ():
+                for definition in [d for found in holder.flow.definitions.values() for d in found]:
+                    value = definition.value
+                    if definition.kind != "assign" or not isinstance(value, (cst.Name, cst.Attribute)):
+                        continue
+                    references = program.resolve(holder, value)
+                    if [r.target for r in references] != [function] or references[0].guess:
+                        continue
+                    self.functions.add(function)
+                    near = [(c, call) for c, call in unknown if c.module is holder.module] or unknown
+                    caller, call = near[0]
+                    reduction = "callable" if shape == "mean" else "registered"
+                    form = Form(value, call, call.args[0].value, call.args[1].value, reduction, value)
+                    self.by_holder.setdefault(holder, []).append(HandedOver(form, caller))

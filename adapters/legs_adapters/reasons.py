@@ -1,0 +1,210 @@
+"""Why an L1 is left alone, in one word: it compares no pictures, or nothing trains on it, or not the Gaussians."""
+
+from __future__ import annotations
+
+import re
+from typing import Dict, List, Optional, Set
+
+import libcst as cst
+
+from legs_adapters.l1 import Form
+from legs_adapters.meaning import Meaning, Meanings
+from legs_adapters.module import Function, Module
+from legs_adapters.pair import Pair, are_counterparts, is_detached, makes_mask, of_rays, same_root, swapped
+from legs_adapters.program import Program
+from legs_adapters.steps import Steps
+from legs_adapters.syntax import attribute_chain, call_name, code, constant, walk_expressions, word_set, words
+from legs_adapters.training import Training
+
+__all__ = ["Reasons"]
+
+_SPLATS = re.compile(r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_pkg|3dgs|surfel", re.I)
+_RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
+_RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
+_EVALUATION = word_set(
+    """
+    eval evaluate evaluation test testing report reports metric metrics valid validate validation render
+    visualize vis benchmark compare psnr quality
+    """
+)
+_SCORING = word_set(
+    """
+    score scores scoring importance densify densification prune pruning sensitivity sample sampling error
+    """
+)
+_NOT_TRAINING = {"render", "eval", "evaluate", "test", "validate", "validation", "inference"}
+_EVALUATING = {"eval", "evaluate", "evaluation", "evaluator", "test"}
+_POSE = {"tracking", "track", "tracker", "localize", "localization", "relocalize", "relocalization"}
+_WHY = {
+    "depth": "depth", "normal": "normals", "feature": "features", "flow": "flow", "mask": "mask", "warp": "synthetic",
+    "gradient": "gradients", "parameter": "regulariser",
+}  # fmt: skip
+
+
+class Reasons:
+    """Answers for one program."""
+
+    def __init__(self, program: Program, training: Training, meanings: Meanings) -> None:
+        self.program = program
+        self.training = training
+        self.meanings = meanings
+        self.steps = Steps(program, training)
+        self._splats: Dict[str, bool] = {}
+
+    def why(self, function: Function, form: Form, pair: Pair) -> Optional[str]:
+        """Return why a form is left; None where it is to be weighted."""
+        for meaning in (pair.a, pair.b):
+            if meaning.kind in _WHY:
+                return _WHY[meaning.kind]
+        if constant(form.first) is not None or constant(form.second) is not None:
+            return "regulariser"
+        trained = self.training.includes(form.node) or self.training.includes(form.call)
+        trained = trained or self._called_by_framework(function)
+        if not trained or self._without_grad(function, form):
+            return self._why_untrained(function, form)
+        if "image" not in (pair.a.kind, pair.b.kind) and not are_counterparts(form):
+            return "unknown"
+        if same_root(form):
+            return "regulariser"
+        target, other = (pair.first, pair.second) if swapped(pair.a, pair.b) else (pair.second, pair.first)
+        if pair.a.role == pair.b.role == "render" or self.meanings.origin(function, target).role == "render":
+            return "distillation"
+        if self._of_model(function, target):
+            return "regulariser"
+        if is_detached(other) or any(
+            makes_mask(call) and any(arg.value is form.node for arg in call.args) for call in function.flow.calls
+        ):
+            return "weighting"
+        return self._elsewhere(function, form) or self.steps.purpose(function, form.call)
+
+    def _of_model(self, function: Function, target: cst.CSTNode) -> bool:
+        """Whether a target is what the Gaussians themselves have: ``self.get_radiances.gather(1, index)``."""
+        parts = list(attribute_chain(target))
+        owner = self.program.owner_of(function)
+        own = isinstance(parts[-1], cst.Name) and parts[-1].value == "self" and len(parts) > 1
+        return own and owner is not None and bool({"get_xyz", "oneupSHdegree"} & set(owner.methods))
+
+    def use(self, caller: Function, call: cst.Call, target: Meaning) -> Optional[str]:
+        """What a call of a function that compares pictures is for, if not for the loss of a Gaussian model."""
+        if target.kind in _WHY:
+            return _WHY[target.kind]
+        if target.role == "render":
+            return "distillation"
+        return "tracking" if self._moves_poses(caller, call) else self.steps.purpose(caller, call)
+
+    def _moves_poses(self, function: Function, call: cst.Call) -> bool:
+        owner = self.program.owner_of(function)
+        names = (function.name, *function.flow.conditions.get(id(call), ()), owner.name if owner is not None else "")
+        return bool({word for name in names for word in words(name)} & _POSE)
+
+    def _elsewhere(self, function: Function, form: Form) -> Optional[str]:
+        """Why it is not the loss of a Gaussian model, going by the names of what is around it."""
+        module = function.module
+        if self._moves_poses(function, form.call):
+            return "tracking"
+        names = (function.name, *function.flow.conditions.get(id(form.call), ()))
+        spoken = {word for name in names for word in words(name)}
+        if len(words(function.name)) > 1 and words(function.name)[0] in _NOT_TRAINING:
+            return "evaluation"
+        folders, _, file = module.path.rpartition("/")
+        if (words(file)[:1] and words(file)[0] in _EVALUATING) or set(folders.split("/")) & _EVALUATING:
+            return "evaluation"
+        if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
+            return "evaluation"
+        about = self._about_splats(function) or self._rendered(module, function, form)
+        if not about or of_rays(form) or any(_draws_mesh(part) for part in _made_of(function, form)):
+            return "other"
+        return "other" if "eikonal" in module.text and _RAY_COLOURS.search(code(form.node)) else None
+
+    def _called_by_framework(self, function: Function) -> bool:
+        """Whether it makes the loss of a module's ``forward``, whose caller is settled at run time (a registry)."""
+        if "loss" not in words(function.name) and "losses" not in words(function.name):
+            return False
+        above = [function, *self._callers(function)]
+        if any(set(words(f.name)) & (_EVALUATION | _SCORING) for f in above):
+            return False
+        return bool(self.training.roots) and any(
+            f.name == "forward" and f.owner is not None and f not in self.training.sites for f in above
+        )
+
+    def _without_grad(self, function: Function, form: Form) -> bool:
+        scope: Optional[Function] = function
+        if id(form.call) in function.flow.without_grad or id(form.node) in function.flow.without_grad:
+            return True
+        while scope is not None:
+            if set(scope.decorators) & {"no_grad", "inference_mode"}:
+                return True
+            if scope.parent is not None and id(scope.node) in scope.parent.flow.without_grad:
+                return True
+            scope = scope.parent
+        return False
+
+    def _why_untrained(self, function: Function, form: Form) -> str:
+        names, queue = [function], [function]
+        for _ in range(2):
+            queue = [caller for callee in queue for caller in self._callers(callee)]
+            names.extend(queue)
+        spoken = {word for f in names for word in (*words(f.name), *words(f.module.path.rsplit("/", 1)[-1]))}
+        if spoken & _SCORING:
+            return "scoring"
+        if spoken & _EVALUATION or self._without_grad(function, form):
+            return "evaluation"
+        return "untrained"
+
+    def _callers(self, function: Function) -> List[Function]:
+        if not function.name or function.name.startswith("__"):
+            return []
+        return [
+            caller
+            for caller in self.program.mentioning(function.name, called=True)
+            if caller is not function
+            and caller.parent is not None
+            and any(call_name(call) == function.name for call in caller.flow.calls)
+        ][:8]
+
+    def _about_splats(self, function: Function) -> bool:
+        """Whether the file, or a file that trains through it, is about Gaussian splatting: not a network for depth."""
+        seen: Set[Function] = set()
+        queue = [function]
+        while queue:
+            current = queue.pop()
+            if current in seen:
+                continue
+            seen.add(current)
+            if self._speaks_of_splats(current.module.path):
+                return True
+            queue.extend(caller for caller, _ in self.training.sites.get(current, []))
+        return False
+
+    def _rendered(self, module: Module, function: Function, form: Form) -> bool:
+        """Whether the rendering says so itself, or files beside it do, where the file is not about rays."""
+        sides = _made_of(function, form)
+        names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
+        if _RAYS.search(module.text):
+            return False
+        rendered = any(word.startswith(("render", "raster")) for word in names)
+        folder = module.path.rpartition("/")[0]
+        near = [path for path in self.program.sources if rendered or not folder or path.startswith(folder + "/")]
+        return any(self._speaks_of_splats(path) for path in near)
+
+    def _speaks_of_splats(self, path: str) -> bool:
+        if path not in self._splats:
+            self._splats[path] = _SPLATS.search(self.program.sources[path].text) is not None
+        return self._splats[path]
+
+
+def _made_of(function: Function, form: Form) -> List[cst.CSTNode]:
+    """The parts of both sides, and of what their names were made from."""
+    parts: List[cst.CSTNode] = [*walk_expressions(form.first), *walk_expressions(form.second)]
+    for part in list(parts):
+        if isinstance(part, cst.Name):
+            for definition in function.flow.reaching(part):
+                if definition.value is not None:
+                    parts.extend(walk_expressions(definition.value))
+    return parts
+
+
+def _draws_mesh(node: cst.CSTNode) -> bool:
+    """``render_mesh(...)``, ``mesh_renderer(...)``."""
+    spoken = words(call_name(node)) if isinstance(node, cst.Call) else ()
+    return "mesh" in spoken and any(word.startswith(("render", "raster")) for word in spoken)

@@ -1,0 +1,108 @@
+"""An error map that serves more than the loss: ``error = torch.abs(image - gt)`` that also makes a mask, say."""
+
+from __future__ import annotations
+
+from typing import List, NamedTuple, Optional
+
+import libcst as cst
+
+from legs_adapters.l1 import Form
+from legs_adapters.module import Function
+from legs_adapters.pair import makes_mask
+from legs_adapters.syntax import arguments, attribute_chain, call_name, walk_expressions
+from legs_adapters.training import Training
+
+__all__ = ["Shared", "shared_of", "unchanged"]
+
+
+class Shared(NamedTuple):
+    """The reads of an error map: the one to be weighted in its place; and those that are to keep the plain map.
+
+    ``trains`` is False where none of the reads is the loss.
+    """
+
+    loss: List[cst.Name]
+    aside: List[cst.Name]
+    trains: bool = True
+
+
+def shared_of(training: Training, function: Function, form: Form) -> Optional[Shared]:
+    """Say which reads of a form that got a name are the loss, and which are not.
+
+    None where it is the loss alone (and what is logged of it).
+    """
+    made = [
+        definition
+        for definitions in function.flow.definitions.values()
+        for definition in definitions
+        if definition.kind == "assign" and definition.value is form.node and "." not in definition.place
+    ]
+    if form.reduction != "none" or not made:
+        return None
+    reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
+    callers = {id(arg.value): call for call in function.flow.calls for arg in call.args}
+    masks = [
+        read
+        for read in reads
+        if id(read) in callers
+        and (makes_mask(callers[id(read)]) or _only_measured(training, function, callers[id(read)], read))
+    ]
+    loss = [read for read in reads if training.includes(read) and read not in masks]
+    logged = {
+        id(part)
+        for call in function.flow.calls
+        if call_name(call) in ("item", "tolist", "numpy")
+        for part in attribute_chain(call)
+    } | function.flow.without_grad
+    aside = [read for read in reads if read not in loss and id(read) not in logged]
+    if not aside:
+        return None
+    if not loss:
+        return Shared([], [], False)
+    again = loss if len(loss) == 1 and unchanged(function, form.first, form.second) else []
+    known = all(
+        function.flow.names_at(callers[id(read)], part.value) == function.flow.reaching(part)
+        for read in aside
+        for image in (form.first, form.second)
+        for part in walk_expressions(image)
+        if id(read) in callers and isinstance(part, cst.Name) and function.flow.reaching(part)
+    )
+    return Shared(again, aside if known and all(id(read) in callers for read in aside) else [])
+
+
+def _only_measured(training: Training, function: Function, call: cst.Call, read: cst.Name) -> bool:
+    """Whether a function of the checkout takes no gradient of what it is given: ``normalise(error).detach()``."""
+    references = training.program.resolve(function, call.func)
+    if not references or not all(isinstance(r.target, Function) and not r.guess for r in references):
+        return False
+    for reference in references:
+        callee = reference.target
+        assert isinstance(callee, Function)
+        positional, keywords, _ = arguments(call)
+        position = next((i for i, value in enumerate(positional) if value is read), None)
+        names = [name for name, value in keywords.items() if value is read]
+        if position is not None and position < len(callee.parameters):
+            names.append(callee.parameters[position])
+        silent = set(callee.flow.without_grad)
+        for inner in callee.flow.calls:
+            if call_name(inner) in ("detach", "item", "tolist", "numpy") and isinstance(inner.func, cst.Attribute):
+                silent.update(id(part) for part in walk_expressions(inner.func.value))
+        uses = [
+            use
+            for use in callee.flow.reads
+            if any(d.kind == "parameter" and d.place in names for d in callee.flow.reaching(use))
+        ]
+        if not uses or not all(id(use) in silent for use in uses):
+            return False
+    return True
+
+
+def unchanged(function: Function, *images: cst.CSTNode) -> bool:
+    """Whether names mean the same all through a function, once they have been read here."""
+    for part in (part for image in images for part in walk_expressions(image)):
+        if isinstance(part, cst.Name):
+            known = function.flow.reaching(part)
+            everywhere = [d for d in function.flow.definitions.get(part.value, []) if d.kind != "store"]
+            if known and not set(everywhere) <= known:
+                return False
+    return True

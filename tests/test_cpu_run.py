@@ -213,6 +213,28 @@ class TestTheScriptIsNotBent:
         noise = [line for line in ours.stderr.splitlines() if not line.startswith("legs-loss: ")]
         assert noise == theirs.stderr.splitlines()
 
+    @pytest.mark.slow
+    def test_place_names_and_output_are_python_s(self, tmp_path):
+        # From another folder than the script's, fed by a pipe, with a helper beside it, a thread that fails, and an
+        # end that runs after the last line.
+        root = checkout(
+            tmp_path / "repo", dict(texts(), **{"tools/place.py": PLACE, "tools/helper.py": "HERE = __file__\n"})
+        )
+        elsewhere = tmp_path / "elsewhere"
+        elsewhere.mkdir()
+        script = os.path.relpath(str(root / "tools" / "place.py"), str(elsewhere))
+        found = []
+        for command in (["-m", "legs_loss", "run", "--cpu"], []):
+            done = subprocess.run(
+                [sys.executable, *command, script, "--x=1", "a b", ""], input=b"first\nsecond\n", cwd=str(elsewhere),
+                env=dict(legs_environment(), PYTHONWARNINGS="ignore"), capture_output=True,
+            )  # fmt: skip
+            errors = [line for line in done.stderr.decode().splitlines() if not line.startswith("legs-loss: ")]
+            found.append((done.returncode, done.stdout, errors))
+        assert found[0] == found[1]
+        assert found[0][0] == 3
+        assert found[0][1].endswith(b"at the end\n")
+
     @pytest.mark.skipif(os.name != "posix", reason="signals")
     def test_ctrl_c(self, tmp_path):
         text = "import time\nprint('ready', flush=True)\ntime.sleep(60)\n"
@@ -246,4 +268,25 @@ try:
 except ImportError:
     knn = False
 print(json.dumps({"zeros": type(torch.zeros).__name__, "cpu": torch.cuda.is_available(), "knn": knn}))
+"""
+
+PLACE = """
+import atexit, os, sys, threading
+import helper
+atexit.register(print, "at the end")
+print(sys.argv, os.getcwd(), __name__, __file__, os.path.realpath(sys.path[0]), helper.HERE)
+print(__package__, sys.modules["__main__"].__dict__ is globals(), sys.stdout.isatty())
+print(sys.stdin.readline(), sys.stdin.read())
+os.write(1, bytes([0, 255, 10]))
+sys.stderr.write("to stderr, no newline")
+print(file=sys.stderr)
+
+def fail():
+    raise ValueError("in a thread")
+
+thread = threading.Thread(target=fail, name="one")
+thread.start()
+thread.join()
+sys.stdout.flush()
+sys.exit(3)
 """

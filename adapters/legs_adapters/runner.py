@@ -81,7 +81,7 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
     Returns:
         The exit code, where the script does not leave by ``sys.exit``.
     """
-    file = os.path.abspath(name) if sys.version_info >= (3, 9) else name
+    file = _as_python_names(name)
     sys.meta_path.insert(0, _Finder(sources))
     refusals: Tuple[Type[BaseException], ...] = ()
     if cpu_root is not None:
@@ -107,6 +107,13 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
         _show(error)
         return 1
     return 0
+
+
+def _as_python_names(script: str) -> str:
+    """`__file__` of a script, as it stands in tracebacks too: since 3.9 absolute, with `..` left as it is on POSIX."""
+    if sys.version_info < (3, 9):
+        return script
+    return os.path.join(os.getcwd(), script) if os.name == "posix" else os.path.abspath(script)
 
 
 class _Loader(importlib.machinery.SourceFileLoader):

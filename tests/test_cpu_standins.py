@@ -279,8 +279,8 @@ def forked(results, extra=(), **more):
     return forked_call(module.GaussianRasterizer(settings), given), Dense(given, fields), given, fields
 
 
-def forked_call(rasterizer, given):
-    return rasterizer(means2D=torch.zeros(len(given["means3D"]), 3, requires_grad=True), **given)
+def forked_call(rasterizer, given, **more):
+    return rasterizer(means2D=torch.zeros(len(given["means3D"]), 3, requires_grad=True), **given, **more)
 
 
 class TestGeneric:
@@ -315,6 +315,22 @@ class TestGeneric:
         before = torch.linalg.det(covariance - 0.3 * torch.eye(2))
         ratio = (before / torch.linalg.det(covariance)).clamp_min(0.000025).sqrt()
         close(image, Dense(dict(given, opacities=given["opacities"] * ratio[:, None]), fields).image, 5e-4)
+
+    def test_the_gradient_of_scores_is_a_sum_of_squares(self):
+        # Of one Gaussian, d image / d falloff is its opacity times its colour's distance from the background.
+        module, given, fields = generic.module("diff_fork", Interface()), gaussians(1, seed=3), camera()
+        scores = torch.zeros(1, 1, requires_grad=True)
+        rasterizer = module.GaussianRasterizer(module.GaussianRasterizationSettings(**fields))
+        image, _ = forked_call(rasterizer, given, scores=scores)
+        weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(1))
+        (image * weights).sum().backward()
+        dense = Dense(given, fields)
+        drawn = (dense.weights[:, 0] > 0).reshape(dense.shape)
+        assert drawn.sum() > 50
+        at = int(dense.weights.argmax())
+        away = (dense.image.reshape(3, -1)[:, at] - BACKGROUND.double()) / dense.weights[at, 0]
+        slopes = given["opacities"].double() * (weights.double() * away[:, None, None]).sum(0)
+        assert scores.grad.item() == pytest.approx(slopes[drawn].square().sum().item(), rel=1e-3)
 
     def test_a_gradient_through_depth(self):
         (_, depth, _), dense, given, _ = forked(("image", "rendered_depth", "radii"))

@@ -81,14 +81,16 @@ def contribute(across, ranges, ends, splats, owners, rows, entries, values, sums
 
 
 @compiled()
-def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, squares):
+def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, g_image, squares):
     """For each entry of a strip, the sum over its pixels of the squared derivative by its alpha."""
-    before, rest = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.float32)
+    before, rest, g = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.float32), np.zeros((PIXELS, 3), np.float32)
     work = np.empty(PIXELS, np.float32)
     for row in range(tall):
         for column in range(wide):
             for channel in range(3):
-                rest[row * WIDE + column] += image[channel, top + row, left + column]
+                i, gradient = row * WIDE + column, g_image[channel, top + row, left + column]
+                g[i, channel] = gradient
+                rest[i] += gradient * image[channel, top + row, left + column]
     for k in range(begin, end):
         e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
         first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
@@ -96,7 +98,7 @@ def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, sq
         for i in range(first * WIDE, last * WIDE):
             x, y = np.float32(i % WIDE) - np.float32((WIDE - 1) / 2), np.float32(i // WIDE) - middle
             work[i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
-        own, total = entries[k, 6] + entries[k, 7] + entries[k, 8], 0.0
+        total = 0.0
         for row in range(first, min(last, tall)):
             for column in range(wide):
                 i = row * WIDE + column
@@ -107,6 +109,7 @@ def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, sq
                 if after < _LAST:
                     before[i] = -before[i]
                     continue
+                own = g[i, 0] * entries[k, 6] + g[i, 1] * entries[k, 7] + g[i, 2] * entries[k, 8]
                 rest[i] -= alpha * before[i] * own
                 slope = before[i] * own - rest[i] / (_ONE - alpha)
                 total += slope * slope
@@ -115,14 +118,17 @@ def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, sq
 
 
 @compiled(parallel=True)
-def sensitivity(across, ranges, ends, splats, owners, rows, entries, image, sums):
-    """Fill sums [N]: over pixels, of the squared derivative of the image's summed channels by a Gaussian's falloff."""
+def sensitivity(across, ranges, ends, splats, owners, rows, entries, image, g_image, sums):
+    """Fill sums [N]: over pixels, of the squared derivative by a Gaussian's falloff there, `g_image` being the image's.
+
+    Source: Speedy-Splat (Hanson et al. 2025).
+    """
     height, width = image.shape[1], image.shape[2]
     parts = np.zeros(len(entries))
     for strip in prange(len(ends)):
         left, top = strip % across * WIDE, strip // across * TALL
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        _sensitive_strip(left, top, wide, tall, ranges[strip], ends[strip], rows, entries, image, parts)
+        _sensitive_strip(left, top, wide, tall, ranges[strip], ends[strip], rows, entries, image, g_image, parts)
     sums[:] = 0
     for strip in range(len(ends)):
         for k in range(ranges[strip], ends[strip]):

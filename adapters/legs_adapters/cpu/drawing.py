@@ -120,12 +120,37 @@ class Drawn:
         found = torch.from_numpy(sums).to(torch.float32)
         return Contributions(found[:, 0].to(torch.int32), *found[:, 1:].unbind(1))
 
+    def scored(self, scores: Tensor) -> Tensor:
+        """The image, whose way back leaves in the gradient of ``scores`` [N, 1] what `squared_slopes` says."""
+        return _Scored.apply(self.image, scores, self._drawing)
+
     def _extra(self, channel: int) -> Tensor:
         if self._extras is None:
             depth = depths(self._tensors.means, self._view)
             inverse = torch.where(depth > NEAR, 1 / depth.clamp_min(NEAR), torch.zeros_like(depth))
             self._extras = self.features(torch.stack([depth, torch.ones_like(depth), inverse], 1))
         return self._extras[channel : channel + 1]
+
+
+def squared_slopes(drawing: compiled.Drawing, gradient: Tensor) -> Tensor:
+    """[N]: the sum over pixels of the squared derivative by each Gaussian's falloff; ``gradient`` is the image's."""
+    from legs_adapters.cpu.contributions import sensitivity
+
+    sums, it = np.empty(len(drawing.radii)), drawing
+    g_image = gradient.detach().to(torch.float32).contiguous().numpy()
+    sensitivity(it.across, it.ranges, it.ends, it.splats, it.owners, it.rows, it.entries, it.image, g_image, sums)
+    return torch.from_numpy(sums)
+
+
+class _Scored(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, scores: Tensor, drawing: compiled.Drawing) -> Tensor:
+        ctx.drawing, ctx.shape, ctx.kind = drawing, scores.shape, scores.dtype
+        return image.clone()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tuple[Tensor, Tensor, None]:
+        return gradient, squared_slopes(ctx.drawing, gradient).to(ctx.kind).reshape(ctx.shape), None
 
 
 def depths(means: Tensor, view: View) -> Tensor:

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_adapters.cpu.drawing import compensation, covariance
+from legs_adapters.cpu.drawing import compensation, covariance, squared_slopes
 from legs_adapters.cpu.missing import attribute_guard, deferred_guard
 from legs_loss import LegsError
 from legs_loss.reference.conventions import MIN_ALPHA, NEAR, View
@@ -167,13 +167,8 @@ def pruning_scores(scores: Tensor, *arguments: Any) -> None:
     That is, the sum over pixels of the squared derivative of the sum of their channels by the Gaussian's falloff there.
     Source: Speedy-Splat (Hanson et al. 2025).
     """
-    from legs_adapters.cpu.contributions import sensitivity
-
     drawn = _draw("pruning_scores", arguments[:6], _Settings(*arguments[6:]))
-    it = drawn.drawing
-    sums = np.empty(len(it.radii))
-    sensitivity(it.across, it.ranges, it.ends, it.splats, it.owners, it.rows, it.entries, it.image, sums)
-    scores.view(-1).add_(torch.from_numpy(sums).to(scores.dtype))
+    scores.view(-1).add_(squared_slopes(drawn.drawing, torch.ones_like(drawn.image)).to(scores.dtype))
 
 
 @torch.no_grad()

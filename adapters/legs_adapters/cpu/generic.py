@@ -72,10 +72,13 @@ def module(name: str, interface: Optional[Interface] = None) -> types.ModuleType
                 known["shs"] = torch.cat([dc, known["shs"]], 1)
             elif dc is not None and dc.numel():
                 known["shs"] = dc
+            scores = inputs.pop("scores", None)
             refuse_unknown(name, inputs)
             names = _names_at_call(found) or ("image", "radii")
             gaussians = Gaussians(means3D, means2D, opacities, **known)
             drawn = draw(gaussians, self.raster_settings, name, _lens(self.raster_settings, name))
+            if scores is not None and scores.requires_grad:  # Speedy-Splat's, read from their gradient
+                drawn.image = drawn.scored(scores)
             results = [_result(drawn, result, self.raster_settings, name) for result in names]
             return results[0] if len(results) == 1 else tuple(results)
 

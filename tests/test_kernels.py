@@ -273,6 +273,19 @@ class TestSelection:
         said = capfd.readouterr().err
         assert said == "legs-loss: numba is not used, torch is: RuntimeError: no such instruction\n"
 
+    def test_a_backend_that_fails_after_its_trial_is_left(self, chosen, monkeypatch, capfd):
+        def breaks_at_four_channels(prediction, *rest):
+            if prediction.shape[0] == 4:
+                raise RuntimeError("out of resource: shared memory")
+            return fused_loss(prediction, *rest)
+
+        monkeypatch.setattr("legs_loss.kernels.numba_loss.fused_loss", breaks_at_four_channels)
+        assert used(legs_loss(*images((3, 20, 30)))) == "fused"
+        for channels in (4, 4, 3):
+            assert used(legs_loss(*images((channels, 20, 30)))) == "torch"
+        said = capfd.readouterr().err
+        assert said == "legs-loss: numba is not used, torch is: RuntimeError: out of resource: shared memory\n"
+
     def test_a_backend_that_computes_something_else_is_found_out(self, chosen, monkeypatch, capfd):
         monkeypatch.setattr(
             "legs_loss.kernels.numba_loss.fused_loss", lambda *args: 1.01 * fused_loss(*args[:2], *args[2:])

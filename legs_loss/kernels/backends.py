@@ -1,8 +1,8 @@
 """Which code computes the loss: torch, or where they are installed and work, numba on the CPU and Triton on a GPU.
 
 A backend is tried once before it is used, on a small image against torch. One that is not installed is passed over in
-silence; one that fails is named once on stderr; torch does the work then. ``LEGS_BACKEND=torch|numba|triton`` forces
-one; what that one does not take is torch's all the same.
+silence; one that fails, then or later, is named once on stderr; torch does the work then.
+``LEGS_BACKEND=torch|numba|triton`` forces one; what that one does not take is torch's all the same.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ _MODULES = {"numba": "legs_loss.kernels.numba_loss", "triton": "legs_loss.kernel
 BACKENDS = ("torch", *_MODULES)
 _DTYPES = (torch.float32, torch.float16, torch.bfloat16)
 _MOST_CHANNELS = 4
+_OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 
 
 class Finding(NamedTuple):
@@ -71,11 +72,18 @@ def finding(name: str, device: torch.device) -> Finding:
     if key not in _findings:
         with _lock:
             if key not in _findings:
-                found = _try(name, device)
-                _findings[key] = found
-                if found.fused is None and (found.installed or _forced() == name):
-                    print(f"legs-loss: {name} is not used, torch is: {found.reason}", file=sys.stderr, flush=True)
+                _record(name, device, _try(name, device))
     return _findings[key]
+
+
+def _record(name: str, device: torch.device, found: Finding) -> None:
+    _findings[f"{name} {device.type}"] = found
+    if found.fused is None and (found.installed or _forced() == name):
+        print(f"legs-loss: {name} is not used, torch is: {found.reason}", file=sys.stderr, flush=True)
+
+
+def _in_words(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).strip() or 'no message'}".splitlines()[0]
 
 
 def fused_or_none(
@@ -103,19 +111,26 @@ def fused_or_none(
     name = backend_for(prediction.device)
     if name == "torch":
         return None
-    fused = finding(name, prediction.device).fused
-    assert fused is not None
     first, second = channels_first(prediction, channels_last), channels_first(target, channels_last)
+    factor: Union[Tensor, WeightSpec, None] = weight
     if unweighted and mask is None:
-        return fused(first, second, None, lambda_dssim)
-    if mask is not None or not isinstance(weight, WeightSpec):
+        factor = None
+    elif mask is not None or not isinstance(weight, WeightSpec):
         # A mask is a factor of the weight.
         factor = _map(weight, target, channels_last)
         if mask is not None:
             mask = as_map(mask, prediction, channels_last, "mask").float()
             factor = factor * (mask / _covered(mask) if renormalise else mask)
-        weight = channels_first(factor, channels_last)
-    return fused(first, second, weight, lambda_dssim)
+        factor = channels_first(factor, channels_last)
+    fused = finding(name, prediction.device).fused
+    assert fused is not None
+    try:
+        return fused(first, second, factor, lambda_dssim)
+    except (LegsError, MemoryError, _OUT_OF_MEMORY):
+        raise
+    except Exception as error:  # a size, type or number of channels that its trial did not compile
+        _record(name, prediction.device, Finding(None, True, _in_words(error)))
+        return None
 
 
 def _map(weight: Union[Tensor, WeightSpec], target: Tensor, channels_last: bool) -> Tensor:
@@ -169,30 +184,37 @@ def _try(name: str, device: torch.device) -> Finding:
         problem = _difference_from_torch(fused, device)
         torch.set_num_threads(threads)  # numba's first parallel loop sets OpenMP's number, which is torch's too
     except Exception as error:  # whatever a broken install, compiler or driver raises
-        return Finding(None, True, f"{type(error).__name__}: {str(error).strip() or 'no message'}".splitlines()[0])
+        return Finding(None, True, _in_words(error))
     return Finding(None if problem else fused, True, problem or "its trial agreed with torch")
 
 
 def _difference_from_torch(fused: Fused, device: torch.device) -> Optional[str]:
-    """Run a backend on a small image with every kind of weight; say what is wrong with the result."""
-    rows, columns = torch.arange(21.0).reshape(1, 21, 1), torch.arange(37.0).reshape(1, 1, 37)
+    """Run a backend on a small image with every kind of weight; say what is wrong with the result.
+
+    Of two tiles each way, where tiles are small; against float64, since a GPU's convolutions in float32 may be tf32's.
+    """
+    rows, columns = torch.arange(50.0).reshape(1, 50, 1), torch.arange(60.0).reshape(1, 1, 60)
     channels = torch.arange(1.0, 4.0).reshape(3, 1, 1)
     target = (0.5 + 0.4 * torch.sin(channels * (0.3 * rows + 0.2 * columns))).to(device)
     spec = WeightSpec()
     weights = weight_map(target, spec)
+    exact = target.double()
     for weight, expected_weight in ((None, torch.ones_like(weights)), (spec, weights), (weights, weights)):
         results = []
-        for function in (
-            lambda image, weight=weight: fused(image, target, weight, 0.2),
-            lambda image, weight=expected_weight: (
-                0.8 * (weight * (image - target).abs()).mean() + 0.2 * d_ssim(image, target)
+        for function, dtype in (
+            (lambda image, weight=weight: fused(image, target, weight, 0.2), torch.float32),
+            (
+                lambda image, weight=expected_weight: (
+                    0.8 * (weight * (image - exact).abs()).mean() + 0.2 * d_ssim(image, exact)
+                ),
+                torch.float64,
             ),
         ):
-            image = (0.9 * target + 0.02).requires_grad_()
+            image = (0.9 * target + 0.02).to(dtype).requires_grad_()
             with torch.enable_grad():
                 loss = function(image)
                 (gradient,) = torch.autograd.grad(loss, image)
-            results.append((loss.detach(), gradient))
+            results.append((loss.detach().double(), gradient.double()))
         (loss, gradient), (expected, reference) = results
         apart = float((gradient - reference).norm() / reference.norm())
         if not (abs(float(loss - expected)) <= 1e-4 * float(expected) and apart <= 1e-3):

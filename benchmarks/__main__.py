@@ -3,8 +3,8 @@
     python -m benchmarks                                      # all of them: an hour on a slow machine
     python -m benchmarks --parts loss-1 memory --json all.json
 
-What is measured again replaces what the file has of it; the rest stays, so a long measurement may be divided, by parts or,
-with --only CONTENDER ..., by contenders: a row's ratio is always to ours of the same run.
+What is measured again replaces what the file has of it; the rest stays, so a long measurement may be divided, by parts
+or, with --only CONTENDER ..., by contenders: a row's ratio is always to ours of the same run.
 What each part measures and how is said by its script, `python benchmarks/NAME.py --help`.
 """
 

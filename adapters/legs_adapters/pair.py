@@ -25,8 +25,8 @@ from legs_adapters.syntax import (
 from legs_adapters.vocabulary import kind_of_words, role_of_words
 
 __all__ = [
-    "Pair", "are_counterparts", "is_detached", "is_rows", "makes_mask", "of_rays", "pair_of", "same_root", "swapped",
-    "without_rows",
+    "Pair", "are_counterparts", "is_detached", "is_role", "is_rows", "makes_mask", "of_rays", "pair_of", "same_root",
+    "swapped", "without_rows",
 ]  # fmt: skip
 
 _MASK_WORDS = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
@@ -147,6 +147,11 @@ def makes_mask(call: cst.Call) -> bool:
 def of_rays(form: Form) -> bool:
     """Whether the names speak of rays: a batch of them is a list of colours, whatever it is called."""
     return any(_RAYS.search(code(node)) for node in (form.first, form.second))
+
+
+def is_role(node: cst.CSTNode) -> bool:
+    """Whether a name says nothing but what it is to the loss: ``pred``, ``target``."""
+    return isinstance(node, cst.Name) and all(role_of_words(word) is not None for word in words(node.value))
 
 
 def is_rows(function: Function, node: cst.CSTNode, depth: int = 0) -> bool:

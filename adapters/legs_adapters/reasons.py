@@ -180,7 +180,7 @@ class Reasons:
         """Whether the rendering says so itself, or files beside it do, where the file is not about rays."""
         sides = _made_of(function, form)
         names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
-        if _RAYS.search(module.text):
+        if _RAYS.search(module.text) or "mesh" in words(module.path.rpartition("/")[2]):
             return False
         rendered = any(word.startswith(("render", "raster")) for word in names)
         folder = module.path.rpartition("/")[0]

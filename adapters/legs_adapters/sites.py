@@ -17,7 +17,7 @@ from legs_adapters.l1 import Form, Forms, own_shape
 from legs_adapters.layout import is_channels_last
 from legs_adapters.meaning import Meanings
 from legs_adapters.module import Function, Module
-from legs_adapters.pair import is_rows, pair_of, same_root, swapped, without_rows
+from legs_adapters.pair import is_role, is_rows, pair_of, same_root, swapped, without_rows
 from legs_adapters.parts import Place
 from legs_adapters.program import Program
 from legs_adapters.provenance import View, Views
@@ -122,7 +122,8 @@ class _Finder:
         if not in_module and left.reason not in ("untrained", "unknown", "distillation", "synthetic", "other"):
             return False
         pair = pair_of(self.meanings, function, form)
-        pictures = "image" in (pair.a.kind, pair.b.kind) or function.name in _FORWARD
+        pictures = "image" in (pair.a.kind, pair.b.kind)
+        pictures = pictures or (function.name in _FORWARD and is_role(form.first) and is_role(form.second))
         roles = "target" in (pair.a.role, pair.b.role) or left.reason == "distillation"
         return pictures and roles and not same_root(form)
 
@@ -150,7 +151,7 @@ class _Finder:
 
     @staticmethod
     def _callable(function: Function, form: Form, place: Place) -> Site:
-        view = View(None, "a callable that is handed over has no view")
+        view = View(None, "a callable has no view")
         where = (function.module.path, place.line, place.column, place.line)
         return Site(*where, form, False, "", False, view, function)
 
@@ -244,17 +245,23 @@ class _Finder:
     @staticmethod
     def _problem(function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
         module = function.module
-        return Problem(module.path, place.line, module.lines.text(place.line), reason, _advice(form, flipped))
+        return Problem(module.path, place.line, module.lines.text(place.line), reason, _advice(function, form, flipped))
 
 
-def _advice(form: Form, flipped: bool) -> str:
+def _advice(function: Function, form: Form, flipped: bool) -> str:
     """What to write by hand: the pictures themselves, where the form has lists of their pixels."""
     prediction, target = (form.second, form.first) if flipped else (form.first, form.second)
     whole, other = without_rows(prediction), without_rows(target)
-    if whole is not prediction or other is not target:
+    if whole is not prediction and other is not target:
         return f"legs_loss.l1_loss({_short(whole)}, {_short(other)}.reshape({_short(whole)}.shape), channels_last=True)"
-    reduction = ', reduction="none"' if form.reduction == "none" else ""
-    return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{reduction})"
+    if is_rows(function, prediction) or is_rows(function, target):
+        return "legs_loss.l1_loss(rendering, photograph), with the pictures before they became lists"
+    settings = ', reduction="none"' if form.reduction == "none" else ""
+    if form.callee is not None and form.extras:
+        first, second = ("b", "a") if flipped else ("a", "b")
+        extras = ", ".join(_short(extra) for extra in form.extras)
+        settings = f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
+    return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{settings})"
 
 
 def _is_noise(form: Form, left: Left) -> bool:

@@ -15,12 +15,9 @@ import torch
 from torch import Tensor
 
 from legs_adapters.cpu import inria
-from legs_adapters.cpu.camera import pinhole
-from legs_adapters.cpu.drawing import Gaussians, Lens, draw, full
+from legs_adapters.cpu.drawing import Gaussians, Lens, draw
 from legs_adapters.cpu.missing import complete, refuse_unknown
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
-from legs_loss.reference.conventions import TILE, View
-from legs_loss.reference.rasterizer import oracle
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
 
@@ -84,49 +81,14 @@ class _CompactBox:
         self.gaussians, self.settings = gaussians, settings
 
     def __call__(self, tiles: Any, splats: Any, boxes: Any, slots: Any, *arrays: Any) -> None:
-        from legs_adapters.cpu.compact_box import clip
+        from legs_adapters.cpu.compact_box import clip, touches
 
-        opacities = self.gaussians.opacities.detach().contiguous().numpy()
-        clip(splats, opacities, float(self.settings.mult), tiles, boxes, slots, *arrays)
+        opacities, mult = self.gaussians.opacities.detach().contiguous().numpy(), float(self.settings.mult)
+        clip(splats, opacities, mult, tiles, boxes, slots, *arrays)
         radii = arrays[-1]
         # A Gaussian that reaches no pixel's centre is visible, to FastGS, if it enters a tile all the same.
         faint = np.nonzero((slots == 0) & (radii > 0))[0]
-        radii[faint[~self._enters(torch.from_numpy(faint), tiles, radii[faint])]] = 0
-
-    def _enters(self, rows: Tensor, tiles: Any, radii: Any) -> Any:
-        from legs_adapters.cpu.compact_box import touches
-
-        view = View.of(pinhole(self.settings, NAME))
-        to_camera = torch.from_numpy(view.world_to_camera)
-        points = self.gaussians.means3D.detach()[rows].double() @ to_camera[:3, :3].T + to_camera[:3, 3]
-        centres = points[:, :2] / points[:, 2:] * torch.tensor([view.fx, view.fy])
-        centres = centres + torch.tensor([view.cx - 0.5, view.cy - 0.5])
-        reach, size = torch.from_numpy(radii)[:, None].double() + 1, TILE * torch.from_numpy(tiles)
-        near = torch.nonzero(((centres + reach > 0) & (centres - reach < size)).all(1))[:, 0]
-        chosen = rows[near]
-        if self.gaussians.scales is None or not self.gaussians.scales.numel():
-            scales, rotations = _axes(self.gaussians.cov3D_precomp.detach()[chosen].double())
-        else:
-            scales = self.gaussians.scales.detach()[chosen].double() * self.settings.scale_modifier
-            rotations = self.gaussians.rotations.detach()[chosen].double()
-        shapes = oracle.project(points[near], scales, rotations, view)
-        opacities = self.gaussians.opacities.detach()[chosen, 0].double()
-        found = np.zeros(len(rows), np.bool_)
-        found[near.numpy()] = touches(
-            torch.cat([shapes.centres, shapes.conics], 1).contiguous().numpy(),
-            opacities.numpy(), float(self.settings.mult), tiles,
-        )  # fmt: skip
-        return found
-
-
-def _axes(triangles: Tensor) -> Tuple[Tensor, Tensor]:
-    """Scales [N, 3] and quaternions wxyz [N, 4] of covariances [N, 6]."""
-    from scipy.spatial.transform import Rotation
-
-    squares, axes = torch.linalg.eigh(full(triangles))
-    axes[:, :, 2] *= torch.linalg.det(axes)[:, None]
-    xyzw = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat().reshape(-1, 4))
-    return squares.clamp_min(0).sqrt(), xyzw.roll(1, 1)
+        radii[faint[~touches(splats[faint, :5], opacities[faint, 0].astype(np.float64), mult, tiles)]] = 0
 
 
 def module(name: str) -> types.ModuleType:

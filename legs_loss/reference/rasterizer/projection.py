@@ -262,6 +262,9 @@ def _project_block(
         if right <= left or bottom <= top:
             continue
         radii[i] = np.int32(radius)
+        inverse = 1 / determinant
+        splats[i, 0], splats[i, 1] = centre_x, centre_y
+        splats[i, 2], splats[i, 3], splats[i, 4] = c * inverse, -b * inverse, a * inverse
 
         # Within the square's tiles, what the ellipse where alpha falls to MIN_ALPHA may reach.
         opacity = np.float64(opacities[i, 0])
@@ -286,9 +289,6 @@ def _project_block(
                 colour += basis[k] * sh[i, k, channel]
             clamped[i, channel] = colour < np.float32(0)
             splats[i, 6 + channel] = max(colour, np.float32(0))
-        splats[i, 0], splats[i, 1] = centre_x, centre_y
-        inverse = 1 / determinant
-        splats[i, 2], splats[i, 3], splats[i, 4] = c * inverse, -b * inverse, a * inverse
         splats[i, 5], splats[i, 9] = summit, determinant
         depths[i] = np.float32(z)
 

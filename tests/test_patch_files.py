@@ -323,6 +323,7 @@ class TestWhereItLooks:
             "test_train.py",
             "third_party/train.py",
             "__pycache__/train.py",
+            "scripts/.ipynb_checkpoints/train-checkpoint.py",
         ]
         root = checkout(tmp_path, {name: "x = 1\n" for name in [*foreign, "train.py", "scripts/train.py"]})
         (root / ".gitmodules").write_text('[submodule "m"]\n\tpath = sub/module\n\turl = x\n')

@@ -80,3 +80,13 @@ def test_a_vendored_network_that_is_not_about_splats_is_left(tmp_path):
     found = plan(checkout(tmp_path, texts))
     assert [site.path for site in found.findings.sites] == ["train.py"]
     assert ("depth_network/train.py", "other") in [(entry.path, entry.reason) for entry in found.findings.left]
+
+
+def test_a_value_with_very_many_ways_to_come_about_is_followed_once(tmp_path):
+    # Each branch doubles the ways: 2^30 of them, if each were gone for itself.
+    branches = "".join(f"        if opt.stage > {k}:\n            image += opt.noise\n" for k in range(30))
+    texts = files("inria")
+    before, line, after = texts["train.py"].partition("        gt_image = viewpoint_cam.original_image.cuda()\n")
+    texts["train.py"] = before + branches + line + after
+    found = plan(checkout(tmp_path, texts))
+    assert [site.view.text for site in found.findings.sites] == ["viewpoint_cam.image_name"]

@@ -7,7 +7,7 @@ that says "image": ``gt_image = cam.depth`` is a depth.
 
 from __future__ import annotations
 
-from typing import Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
+from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
@@ -37,7 +37,7 @@ _FIRST = {
 }  # fmt: skip
 _MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
-_DEPTH = 24
+_DEPTH = 40
 _BUDGET = 20000  # steps to answer one question: some code is one large knot
 
 
@@ -49,6 +49,7 @@ class Meaning(NamedTuple):
 
 
 _UNKNOWN = Meaning(None, None)
+_Question = Tuple[str, int]  # of an expression, or of the definitions that reach it; its id
 
 
 class Meanings:
@@ -57,31 +58,42 @@ class Meanings:
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
-        self._known: Dict[int, Meaning] = {}
-        self._here: Dict[int, Meaning] = {}
+        self._known: Dict[_Question, Meaning] = {}
+        self._here: Dict[_Question, Meaning] = {}
         self._calls: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
-        self._open: Set[int] = set()
+        self._open: Set[_Question] = set()
         self._spent = 0
 
     def of(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Meaning:
         """Return what an expression stands for."""
-        if id(node) in self._known:
-            return self._known[id(node)]
-        if id(node) in self._here:
-            return self._here[id(node)]
-        if id(node) in self._open or depth > _DEPTH or self._spent > _BUDGET:
+        return self._asked(("expression", id(node)), function, node, depth, self._of)
+
+    def _asked(
+        self,
+        question: _Question,
+        function: Function,
+        node: cst.CSTNode,
+        depth: int,
+        answer: Callable[[Function, cst.CSTNode, int], Meaning],
+    ) -> Meaning:
+        """Answer a question once: what depends on itself, or on too much, is unknown."""
+        if question in self._known:
+            return self._known[question]
+        if question in self._here:
+            return self._here[question]
+        if question in self._open or depth > _DEPTH or self._spent > _BUDGET:
             return _UNKNOWN
         outermost = not self._open
         self._spent = 0 if outermost else self._spent + 1
-        self._open.add(id(node))
+        self._open.add(question)
         try:
-            meaning = self._of(function, node, depth + 1)
+            meaning = answer(function, node, depth + 1)
         finally:
-            self._open.discard(id(node))
+            self._open.discard(question)
         # What was found inside of a loop is incomplete: it serves this question only.
-        self._here[id(node)] = meaning
+        self._here[question] = meaning
         if outermost:
-            self._known[id(node)] = meaning
+            self._known[question] = meaning
             self._here.clear()
         return meaning
 
@@ -126,7 +138,10 @@ class Meanings:
 
     def _flow(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
         """Join what the definitions say that reach this use."""
-        definitions = self.program.lookup(function, node) if depth <= _DEPTH else None
+        return self._asked(("definitions", id(node)), function, node, depth, self._defined)
+
+    def _defined(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
+        definitions = self.program.lookup(function, node)
         if definitions is None:
             return _UNKNOWN
         return _mix([self._definition(where, definition, depth) for where, definition in definitions])
@@ -139,7 +154,7 @@ class Meanings:
             return _UNKNOWN
         if definition.kind == "augment":
             assert isinstance(definition.node, cst.AugAssign)
-            old = self._flow(function, definition.node.target, depth + 1)
+            old = self._flow(function, definition.node.target, depth)
             return _mix([old, self.of(function, value, depth)])
         if definition.kind == "element" and definition.index is not None:
             return self._element(function, value, definition.index, depth)

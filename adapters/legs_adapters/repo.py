@@ -19,8 +19,8 @@ BOM = b"\xef\xbb\xbf"
 # Folders that hold other people's code, or none at all.
 _FOREIGN = word_set(
     """
-    .git .hg .svn __pycache__ node_modules site-packages dist-packages build dist submodules third_party
-    third-party thirdparty external externals extern venv env .venv .env tests test testing .tox .nox .eggs
+    .git .hg .svn __pycache__ .ipynb_checkpoints node_modules site-packages dist-packages build dist submodules
+    third_party third-party thirdparty external externals extern venv env .venv .env tests test testing .tox .nox .eggs
     .mypy_cache .pytest_cache SIBR_viewers
     """
 )

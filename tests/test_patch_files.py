@@ -15,7 +15,7 @@ from legs_adapters import journal as journal_module
 from legs_adapters.cli import main
 from legs_adapters.journal import JOURNAL
 from legs_adapters.patch import plan, undo, write
-from legs_adapters.repo import Source, decode, walk
+from legs_adapters.reading.repo import Source, decode, walk
 
 from legs_loss import LegsError
 from tests.patching_support import NAMES, checkout, expected, files, legs_patch, run_git, snapshot

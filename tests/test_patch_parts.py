@@ -8,10 +8,10 @@ import pytest
 
 cst = pytest.importorskip("libcst")
 
-from legs_adapters.module import Module, parse  # noqa: E402
-from legs_adapters.prospects import Prospects  # noqa: E402
-from legs_adapters.repo import Source, Unreadable  # noqa: E402
-from legs_adapters.syntax import code, walk_expressions  # noqa: E402
+from legs_adapters.reading.module import Module, parse  # noqa: E402
+from legs_adapters.reading.prospects import Prospects  # noqa: E402
+from legs_adapters.reading.repo import Source, Unreadable  # noqa: E402
+from legs_adapters.reading.syntax import code, walk_expressions  # noqa: E402
 
 FILES = sorted(Path(__file__).parent.glob("test_patch_*.py"))
 

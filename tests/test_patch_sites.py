@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from legs_adapters.patch import plan
-from legs_adapters.repo import decode
+from legs_adapters.reading.repo import decode
 
 from tests.patching_support import NAMES, checkout, expected, files
 

@@ -95,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.patch import plan, write
-    from legs_adapters.repo import check_root
+    from legs_adapters.reading.repo import check_root
     from legs_adapters.report import as_diff, as_json, as_table
     from legs_adapters.settings import SETTINGS_FILE, settings_text
 

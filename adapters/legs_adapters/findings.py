@@ -6,11 +6,11 @@ from typing import List, NamedTuple, Tuple
 
 import libcst as cst
 
-from legs_adapters.l1 import Form
-from legs_adapters.module import Function
-from legs_adapters.program import Program
-from legs_adapters.provenance import View
-from legs_adapters.repo import Unreadable
+from legs_adapters.reading.l1 import Form
+from legs_adapters.reading.module import Function
+from legs_adapters.reading.program import Program
+from legs_adapters.reading.provenance import View
+from legs_adapters.reading.repo import Unreadable
 
 __all__ = ["Findings", "Left", "Problem", "Site"]
 

@@ -9,7 +9,7 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_adapters.findings import Findings
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest, replace_files, undo_edits
-from legs_adapters.repo import Source, Unreadable, check_root, read_source, walk
+from legs_adapters.reading.repo import Source, Unreadable, check_root, read_source, walk
 from legs_adapters.rewrite import Edit, apply_edits, rewrite
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.sites import find

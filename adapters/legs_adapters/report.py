@@ -7,8 +7,8 @@ import json
 from typing import Dict, List, Sequence, Tuple
 
 from legs_adapters.patch import Plan
-from legs_adapters.repo import Source, decode
-from legs_adapters.syntax import code
+from legs_adapters.reading.repo import Source, decode
+from legs_adapters.reading.syntax import code
 
 __all__ = ["as_diff", "as_json", "as_table"]
 

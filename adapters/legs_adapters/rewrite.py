@@ -16,9 +16,9 @@ from typing import List, NamedTuple, Optional, Sequence, Tuple
 import libcst as cst
 
 from legs_adapters.findings import Site
-from legs_adapters.module import Function, Module
-from legs_adapters.repo import Source, decode
-from legs_adapters.syntax import code, dotted
+from legs_adapters.reading.module import Function, Module
+from legs_adapters.reading.repo import Source, decode
+from legs_adapters.reading.syntax import code, dotted
 from legs_loss import LegsError
 
 __all__ = ["Edit", "apply_edits", "rewrite"]

@@ -19,7 +19,7 @@ from types import CodeType
 from typing import Dict, Optional, Sequence, Tuple, Type
 
 from legs_adapters.patch import plan
-from legs_adapters.repo import check_root
+from legs_adapters.reading.repo import check_root
 from legs_loss import LegsError
 
 __all__ = ["checkout_of", "execute", "run_script"]

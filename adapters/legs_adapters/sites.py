@@ -12,20 +12,20 @@ from typing import Iterable, List, Optional, Sequence, Tuple
 import libcst as cst
 
 from legs_adapters.findings import Findings, Left, Problem, Site
-from legs_adapters.handed import Handed, HandedOver
-from legs_adapters.l1 import Form, Forms, own_shape
-from legs_adapters.layout import is_channels_last
-from legs_adapters.meaning import Meanings
-from legs_adapters.module import Function, Module
-from legs_adapters.pair import is_role, is_rows, pair_of, same_root, swapped, without_rows
-from legs_adapters.parts import Place
-from legs_adapters.program import Program
-from legs_adapters.provenance import View, Views
-from legs_adapters.reasons import Reasons
-from legs_adapters.repo import Source
-from legs_adapters.shared import shared_of, unchanged
-from legs_adapters.syntax import arguments, call_name, code
-from legs_adapters.training import Training
+from legs_adapters.reading.handed import Handed, HandedOver
+from legs_adapters.reading.l1 import Form, Forms, own_shape
+from legs_adapters.reading.layout import is_channels_last
+from legs_adapters.reading.meaning import Meanings
+from legs_adapters.reading.module import Function, Module
+from legs_adapters.reading.pair import is_role, is_rows, pair_of, same_root, swapped, without_rows
+from legs_adapters.reading.parts import Place
+from legs_adapters.reading.program import Program
+from legs_adapters.reading.provenance import View, Views
+from legs_adapters.reading.reasons import Reasons
+from legs_adapters.reading.repo import Source
+from legs_adapters.reading.shared import shared_of, unchanged
+from legs_adapters.reading.syntax import arguments, call_name, code
+from legs_adapters.reading.training import Training
 from legs_adapters.upstreams import registered
 
 __all__ = ["find"]

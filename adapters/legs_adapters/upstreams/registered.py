@@ -11,10 +11,10 @@ from typing import List
 
 import libcst as cst
 
-from legs_adapters.l1 import Form, is_l1_name
-from legs_adapters.module import Function
-from legs_adapters.program import Program
-from legs_adapters.syntax import arguments, call_name, constant, dotted, words
+from legs_adapters.reading.l1 import Form, is_l1_name
+from legs_adapters.reading.module import Function
+from legs_adapters.reading.program import Program
+from legs_adapters.reading.syntax import arguments, call_name, constant, dotted, words
 
 __all__ = ["MENTIONED", "forms_of"]
 

@@ -11,10 +11,10 @@ from typing import Dict, Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.module import Function
-from legs_adapters.program import Program
-from legs_adapters.syntax import call_name, children, constant, word_set, words
-from legs_adapters.training import Training
+from legs_adapters.reading.module import Function
+from legs_adapters.reading.program import Program
+from legs_adapters.reading.syntax import call_name, children, constant, word_set, words
+from legs_adapters.reading.training import Training
 
 __all__ = ["Steps"]
 

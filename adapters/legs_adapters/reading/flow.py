@@ -11,7 +11,7 @@ from typing import Dict, FrozenSet, Iterator, List, Optional, Sequence, Set, Tup
 
 import libcst as cst
 
-from legs_adapters.syntax import call_name, children, constant, dotted, path_of
+from legs_adapters.reading.syntax import call_name, children, constant, dotted, path_of
 
 __all__ = ["Definition", "Flow"]
 

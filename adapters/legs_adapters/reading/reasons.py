@@ -7,14 +7,14 @@ from typing import Dict, List, Optional, Set
 
 import libcst as cst
 
-from legs_adapters.l1 import Form
-from legs_adapters.meaning import Meaning, Meanings
-from legs_adapters.module import Function, Module
-from legs_adapters.pair import Pair, are_counterparts, is_detached, makes_mask, of_rays, same_root, swapped
-from legs_adapters.program import Program
-from legs_adapters.steps import Steps
-from legs_adapters.syntax import attribute_chain, call_name, code, constant, walk_expressions, word_set, words
-from legs_adapters.training import Training
+from legs_adapters.reading.l1 import Form
+from legs_adapters.reading.meaning import Meaning, Meanings
+from legs_adapters.reading.module import Function, Module
+from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, makes_mask, of_rays, same_root, swapped
+from legs_adapters.reading.program import Program
+from legs_adapters.reading.steps import Steps
+from legs_adapters.reading.syntax import attribute_chain, call_name, code, constant, walk_expressions, word_set, words
+from legs_adapters.reading.training import Training
 
 __all__ = ["Reasons"]
 

@@ -7,9 +7,9 @@ from typing import Dict, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.module import Function
-from legs_adapters.program import Program, Reference
-from legs_adapters.syntax import arguments, call_name, code, constant, walk_expressions
+from legs_adapters.reading.module import Function
+from legs_adapters.reading.program import Program, Reference
+from legs_adapters.reading.syntax import arguments, call_name, code, constant, walk_expressions
 
 __all__ = ["Form", "Forms", "forms", "is_l1_name", "own_shape"]
 

@@ -6,10 +6,10 @@ from typing import Dict, List, NamedTuple, Set
 
 import libcst as cst
 
-from legs_adapters.l1 import Form, Forms, own_shape
-from legs_adapters.module import Function
-from legs_adapters.program import Program
-from legs_adapters.training import Training
+from legs_adapters.reading.l1 import Form, Forms, own_shape
+from legs_adapters.reading.module import Function
+from legs_adapters.reading.program import Program
+from legs_adapters.reading.training import Training
 
 __all__ = ["Handed", "HandedOver"]
 

@@ -6,9 +6,9 @@ from typing import List, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.module import Function
-from legs_adapters.syntax import arguments, call_name, constant
-from legs_adapters.training import Training
+from legs_adapters.reading.module import Function
+from legs_adapters.reading.syntax import arguments, call_name, constant
+from legs_adapters.reading.training import Training
 
 __all__ = ["is_channels_last"]
 

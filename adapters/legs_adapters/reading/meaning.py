@@ -11,12 +11,12 @@ from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Set, Tu
 
 import libcst as cst
 
-from legs_adapters.flow import Definition
-from legs_adapters.module import Function
-from legs_adapters.program import Program
-from legs_adapters.syntax import arguments, call_name, constant, key_of, same, words
-from legs_adapters.training import Training
-from legs_adapters.vocabulary import DATA, KINDS, kind_of_words, role_of_words
+from legs_adapters.reading.flow import Definition
+from legs_adapters.reading.module import Function
+from legs_adapters.reading.program import Program
+from legs_adapters.reading.syntax import arguments, call_name, constant, key_of, same, words
+from legs_adapters.reading.training import Training
+from legs_adapters.reading.vocabulary import DATA, KINDS, kind_of_words, role_of_words
 
 __all__ = ["Meaning", "Meanings"]
 

@@ -12,10 +12,10 @@ from typing import List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.flow import Definition
-from legs_adapters.module import Class, Function
-from legs_adapters.program import Program
-from legs_adapters.syntax import arguments, call_name, code, constant, dotted, words
+from legs_adapters.reading.flow import Definition
+from legs_adapters.reading.module import Class, Function
+from legs_adapters.reading.program import Program
+from legs_adapters.reading.syntax import arguments, call_name, code, constant, dotted, words
 
 __all__ = ["View", "Views"]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Iterator, List, Sequence
 
-from legs_adapters.syntax import word_set
+from legs_adapters.reading.syntax import word_set
 from legs_loss import LegsError
 
 __all__ = ["Source", "Unreadable", "check_root", "read_source", "walk"]

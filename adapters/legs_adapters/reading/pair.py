@@ -7,10 +7,10 @@ from typing import List, NamedTuple, Optional
 
 import libcst as cst
 
-from legs_adapters.l1 import Form
-from legs_adapters.meaning import Meaning, Meanings
-from legs_adapters.module import Function
-from legs_adapters.syntax import (
+from legs_adapters.reading.l1 import Form
+from legs_adapters.reading.meaning import Meaning, Meanings
+from legs_adapters.reading.module import Function
+from legs_adapters.reading.syntax import (
     arguments,
     attribute_chain,
     call_name,
@@ -22,7 +22,7 @@ from legs_adapters.syntax import (
     word_set,
     words,
 )
-from legs_adapters.vocabulary import kind_of_words, role_of_words
+from legs_adapters.reading.vocabulary import kind_of_words, role_of_words
 
 __all__ = [
     "Pair", "are_counterparts", "is_detached", "is_role", "is_rows", "makes_mask", "of_rays", "pair_of", "same_root",

@@ -7,10 +7,10 @@ from typing import Dict, List, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.flow import Definition
-from legs_adapters.module import Class, Function
-from legs_adapters.program import Program, Reference
-from legs_adapters.syntax import arguments, call_name, children, constant, key_of
+from legs_adapters.reading.flow import Definition
+from legs_adapters.reading.module import Class, Function
+from legs_adapters.reading.program import Program, Reference
+from legs_adapters.reading.syntax import arguments, call_name, children, constant, key_of
 
 __all__ = ["Training"]
 

@@ -7,10 +7,10 @@ from typing import Callable, Dict, Iterator, List, Optional, Sequence, Tuple
 
 import libcst as cst
 
-from legs_adapters.flow import Definition, Flow
-from legs_adapters.parts import Cut, Lines, Part, Place, body_part, outline_part
-from legs_adapters.repo import Source, Unreadable
-from legs_adapters.syntax import dotted
+from legs_adapters.reading.flow import Definition, Flow
+from legs_adapters.reading.parts import Cut, Lines, Part, Place, body_part, outline_part
+from legs_adapters.reading.repo import Source, Unreadable
+from legs_adapters.reading.syntax import dotted
 
 __all__ = ["Class", "Function", "Module", "parse"]
 

@@ -12,11 +12,11 @@ from typing import Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.flow import Definition
-from legs_adapters.module import Class, Function, Module, parse
-from legs_adapters.prospects import Prospects
-from legs_adapters.repo import Source, Unreadable
-from legs_adapters.syntax import arguments, call_name, dotted, path_of, word_set
+from legs_adapters.reading.flow import Definition
+from legs_adapters.reading.module import Class, Function, Module, parse
+from legs_adapters.reading.prospects import Prospects
+from legs_adapters.reading.repo import Source, Unreadable
+from legs_adapters.reading.syntax import arguments, call_name, dotted, path_of, word_set
 
 __all__ = ["Program", "Reference"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Optional
 
-from legs_adapters.syntax import word_set, words
+from legs_adapters.reading.syntax import word_set, words
 
 __all__ = ["DATA", "KINDS", "kind_of_words", "role_of_words"]
 

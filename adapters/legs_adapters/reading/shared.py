@@ -6,11 +6,11 @@ from typing import List, NamedTuple, Optional
 
 import libcst as cst
 
-from legs_adapters.l1 import Form
-from legs_adapters.module import Function
-from legs_adapters.pair import makes_mask
-from legs_adapters.syntax import arguments, attribute_chain, call_name, walk_expressions
-from legs_adapters.training import Training
+from legs_adapters.reading.l1 import Form
+from legs_adapters.reading.module import Function
+from legs_adapters.reading.pair import makes_mask
+from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, walk_expressions
+from legs_adapters.reading.training import Training
 
 __all__ = ["Shared", "shared_of", "unchanged"]
 

@@ -16,7 +16,7 @@ from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 import libcst as cst
 from libcst.metadata import ByteSpanPositionProvider, CodeSpan, MetadataWrapper
 
-from legs_adapters.syntax import code
+from legs_adapters.reading.syntax import code
 
 __all__ = ["Cut", "Lines", "Part", "Place", "body_part", "outline_part"]
 

@@ -10,8 +10,9 @@ import libcst as cst
 from legs_adapters.reading.l1 import Form
 from legs_adapters.reading.meaning import Meaning, Meanings
 from legs_adapters.reading.module import Function, Module
-from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, makes_mask, of_rays, same_root, swapped
+from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, of_rays, same_root, swapped
 from legs_adapters.reading.program import Program
+from legs_adapters.reading.shared import takes_no_gradient
 from legs_adapters.reading.steps import Steps
 from legs_adapters.reading.syntax import attribute_chain, call_name, code, constant, walk_expressions, word_set, words
 from legs_adapters.reading.training import Training
@@ -72,7 +73,9 @@ class Reasons:
         if self._of_model(function, target):
             return "regulariser"
         if is_detached(other) or any(
-            makes_mask(call) and any(arg.value is form.node for arg in call.args) for call in function.flow.calls
+            any(arg.value is form.node for arg in call.args)
+            and takes_no_gradient(self.training, function, call, form.node)
+            for call in function.flow.calls
         ):
             return "weighting"
         return self._elsewhere(function, form) or self.steps.purpose(function, form.call)

@@ -12,7 +12,7 @@ from legs_adapters.reading.pair import makes_mask
 from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, walk_expressions
 from legs_adapters.reading.training import Training
 
-__all__ = ["Shared", "shared_of", "unchanged"]
+__all__ = ["Shared", "shared_of", "takes_no_gradient", "unchanged"]
 
 
 class Shared(NamedTuple):
@@ -42,10 +42,7 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
     reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
     callers = {id(arg.value): call for call in function.flow.calls for arg in call.args}
     masks = [
-        read
-        for read in reads
-        if id(read) in callers
-        and (makes_mask(callers[id(read)]) or _only_measured(training, function, callers[id(read)], read))
+        read for read in reads if id(read) in callers and takes_no_gradient(training, function, callers[id(read)], read)
     ]
     loss = [read for read in reads if training.includes(read) and read not in masks]
     logged = {
@@ -70,8 +67,12 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
     return Shared(again, aside if known and all(id(read) in callers for read in aside) else [])
 
 
-def _only_measured(training: Training, function: Function, call: cst.Call, read: cst.Name) -> bool:
-    """Whether a function of the checkout takes no gradient of what it is given: ``normalise(error).detach()``."""
+def takes_no_gradient(training: Training, function: Function, call: cst.Call, given: cst.CSTNode) -> bool:
+    """Whether a call makes a mask of an error that it is given, or measures it: ``normalise(error).detach()``."""
+    return makes_mask(call) or _only_measured(training, function, call, given)
+
+
+def _only_measured(training: Training, function: Function, call: cst.Call, given: cst.CSTNode) -> bool:
     references = training.program.resolve(function, call.func)
     if not references or not all(isinstance(r.target, Function) and not r.guess for r in references):
         return False
@@ -79,8 +80,8 @@ def _only_measured(training: Training, function: Function, call: cst.Call, read:
         callee = reference.target
         assert isinstance(callee, Function)
         positional, keywords, _ = arguments(call)
-        position = next((i for i, value in enumerate(positional) if value is read), None)
-        names = [name for name, value in keywords.items() if value is read]
+        position = next((i for i, value in enumerate(positional) if value is given), None)
+        names = [name for name, value in keywords.items() if value is given]
         if position is not None and position < len(callee.parameters):
             names.append(callee.parameters[position])
         silent = set(callee.flow.without_grad)

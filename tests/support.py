@@ -57,3 +57,8 @@ def legs(*arguments, **options):
         text=True,
         **{"cwd": str(ROOT), "env": legs_environment(), "timeout": 300, **options},
     )
+
+
+def without_times(metrics):
+    """Return a run's metrics without what differs from run to run."""
+    return {name: value for name, value in metrics.items() if not name.endswith("seconds")}

@@ -11,7 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, List, Mapping
+from typing import Any, Dict, List
 
 import numpy as np
 import pytest
@@ -38,6 +38,7 @@ from legs_loss.reference.training.dataset import TrainingView, load_dataset
 from legs_loss.reference.training.side_by_side import train_arm
 from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, train
 from legs_loss.scenes import read_scene
+from tests.support import without_times
 
 BASE = TrainConfig(iterations=40, resolution=2)
 
@@ -251,10 +252,6 @@ def test_rows_are_complete_and_can_be_run_alone(tiny_scene: Path, tmp_path: Path
     del told[:]
     assert comparison.train(arms, [0, 1], 2, lambda name, progress: told.append(name)) == rows
     assert not told
-
-
-def without_times(metrics: Mapping[str, Any]) -> Dict[str, Any]:
-    return {name: value for name, value in metrics.items() if not name.endswith("seconds")}
 
 
 def test_an_interrupted_row_goes_on(tiny_scene: Path, tmp_path: Path) -> None:

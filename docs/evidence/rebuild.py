@@ -1,9 +1,9 @@
 """Rebuild docs/evidence.md's tables and plots from the rows beside this file.
 
-    python docs/evidence/rebuild.py                           # tables and plots, from fox.json and embedded.json
+    python docs/evidence/rebuild.py                           # tables and plots, from the .json files beside it
     python docs/evidence/rebuild.py --take OUT docs/evidence/NAME.json    # first: the rows of a `legs compare` folder
 
-A table stands in the text between `<!-- SCENE STUDY -->` and `<!-- end -->`.
+A table stands in the text between `<!-- NAME STUDY -->` and `<!-- end -->`.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def plots() -> None:
                 at = max([y] + [below + line for beside, below in labels if abs(beside - x) < 10])
                 labels.append((x, at))
                 panel.annotate(f"  {summary.arm}", (x, at), fontsize=9, color=colour, va="center")
-            panel.set(xlabel="thousand Gaussians", ylabel=f"{score}, dB", title=scene, xlim=(11, 56))
-            panel.margins(y=0.12)
+            panel.set(xlabel="thousand Gaussians", ylabel=f"{score}, dB", title=scene)
+            panel.margins(x=0.25, y=0.12)
             panel.grid(alpha=0.3)
     figure.savefig(str(PICTURES / "evidence_gaussians.png"), dpi=110, facecolor="white")
 

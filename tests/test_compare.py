@@ -358,6 +358,9 @@ def test_tables_by_hand() -> None:
     assert (summary.mean["train PSNR"], summary.mean["Gaussians"], summary.mean["ms an iteration"]) == (26, 250, 30)
     assert summary.spread["Gaussians"] == pytest.approx(70.7, abs=0.02)
     assert summarise([row_of("legs", 0, better)]).mean["strongest 10%"] == 21.0
+    compiling = row_of("legs", 2, better)
+    compiling["metrics"]["processor_seconds"] = 60.0
+    assert summarise([compiling, *rows[2:]]).mean["ms an iteration"] == 30
     without = row_of("legs", 0, better)
     without["metrics"]["test"] = None  # nothing is held out
     assert math.isnan(summarise([without]).mean["held-out PSNR"])

@@ -31,7 +31,10 @@ RESAMPLES = 9999
 
 
 class Summary(NamedTuple):
-    """One arm: the number of its seeds, and of each of :data:`SCORES` its mean and standard deviation over them."""
+    """One arm: the number of its seeds, and of each of :data:`SCORES` its mean and standard deviation over them.
+
+    The mean of "ms an iteration" is the median.
+    """
 
     arm: str
     seeds: int
@@ -71,7 +74,8 @@ def summarise(rows: Rows) -> Summary:
     mean, spread = {}, {}
     for name in SCORES:
         values = np.array([_value(row["metrics"], name) for row in rows])
-        mean[name] = float(values.mean())
+        # A machine's first row compiles the kernels, which is no iteration's time.
+        mean[name] = float(np.median(values) if name == "ms an iteration" else values.mean())
         spread[name] = float(values.std(ddof=1)) if len(values) > 1 else math.nan
     return Summary(rows[0]["arm"], len(rows), mean, spread)
 

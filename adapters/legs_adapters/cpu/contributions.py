@@ -22,18 +22,25 @@ _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
 
 
 @compiled()
+def _respond(rows, entries, k, work):
+    """Fill `work` with an entry's response at each pixel that it reaches; return its first row, and the one past it."""
+    e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
+    first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
+    middle = (np.float32(first) + np.float32(last) - _ONE) * _HALF
+    for i in range(first * WIDE, last * WIDE):
+        x, y = np.float32(i % WIDE) - np.float32((WIDE - 1) / 2), np.float32(i // WIDE) - middle
+        work[i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
+    return first, last
+
+
+@compiled()
 def _strip(left, top, wide, tall, begin, end, splats, owners, rows, entries, values, sums):
     """Sums of one strip's entries, [entries, FIELDS]."""
     before, finished = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.bool_)
     largest, whose = np.zeros(PIXELS, np.float32), np.full(PIXELS, -1, np.int64)
     work = np.empty(PIXELS, np.float32)
     for k in range(begin, end):
-        e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
-        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
-        middle = (np.float32(first) + np.float32(last) - _ONE) * _HALF
-        for i in range(first * WIDE, last * WIDE):
-            x, y = np.float32(i % WIDE) - np.float32((WIDE - 1) / 2), np.float32(i // WIDE) - middle
-            work[i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
+        first, last = _respond(rows, entries, k, work)
         u, v = splats[owners[k], 0] - left, splats[owners[k], 1] - top
         count = weight = value = distance = 0.0
         for row in range(first, min(last, tall)):
@@ -92,12 +99,7 @@ def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, g_
                 g[i, channel] = gradient
                 rest[i] += gradient * image[channel, top + row, left + column]
     for k in range(begin, end):
-        e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
-        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
-        middle = (np.float32(first) + np.float32(last) - _ONE) * _HALF
-        for i in range(first * WIDE, last * WIDE):
-            x, y = np.float32(i % WIDE) - np.float32((WIDE - 1) / 2), np.float32(i // WIDE) - middle
-            work[i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
+        first, last = _respond(rows, entries, k, work)
         total = 0.0
         for row in range(first, min(last, tall)):
             for column in range(wide):

@@ -54,8 +54,8 @@ class Reasons:
 
     def why(self, function: Function, form: Form, pair: Pair) -> Optional[str]:
         """Return why a form is left; None where it is to be weighted."""
-        for meaning in (pair.a, pair.b):
-            if meaning.kind in _WHY:
+        for meaning, other in ((pair.a, pair.b), (pair.b, pair.a)):
+            if meaning.kind in _WHY and not _is_part_of_light(meaning, other):
                 return _WHY[meaning.kind]
         if constant(form.first) is not None or constant(form.second) is not None:
             return "regulariser"
@@ -194,6 +194,11 @@ class Reasons:
         if path not in self._splats:
             self._splats[path] = _SPLATS.search(self.program.sources[path].text) is not None
         return self._splats[path]
+
+
+def _is_part_of_light(meaning: Meaning, other: Meaning) -> bool:
+    """Whether a picture that is named after what it was made of is compared with a photograph: ``render_sh``, ``gt``."""
+    return meaning == ("parameter", "render") and other == ("image", "target")
 
 
 def _made_of(function: Function, form: Form) -> List[cst.CSTNode]:

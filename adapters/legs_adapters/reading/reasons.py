@@ -197,7 +197,7 @@ class Reasons:
 
 
 def _is_part_of_light(meaning: Meaning, other: Meaning) -> bool:
-    """Whether a picture that is named after what it was made of is compared with a photograph: ``render_sh``, ``gt``."""
+    """Whether a picture named after what it was made of meets a photograph: ``render_sh``, ``gt_image``."""
     return meaning == ("parameter", "render") and other == ("image", "target")
 
 

@@ -54,8 +54,8 @@ class Reasons:
 
     def why(self, function: Function, form: Form, pair: Pair) -> Optional[str]:
         """Return why a form is left; None where it is to be weighted."""
-        for meaning, other in ((pair.a, pair.b), (pair.b, pair.a)):
-            if meaning.kind in _WHY and not _is_part_of_light(meaning, other):
+        for meaning, counterpart in ((pair.a, pair.b), (pair.b, pair.a)):
+            if meaning.kind in _WHY and not _is_part_of_light(meaning, counterpart):
                 return _WHY[meaning.kind]
         if constant(form.first) is not None or constant(form.second) is not None:
             return "regulariser"

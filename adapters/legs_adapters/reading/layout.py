@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Optional, Set, Tuple
+from typing import Dict, FrozenSet, Iterator, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
+from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Function
-from legs_adapters.reading.syntax import arguments, call_name, constant
+from legs_adapters.reading.syntax import arguments, call_name, constant, path_of, same, walk_expressions
 from legs_adapters.reading.training import Training
 
 __all__ = ["is_channels_last"]
@@ -16,6 +17,7 @@ _TO_LAST = {(1, 2, 0), (0, 2, 3, 1)}
 _TO_FIRST = {(2, 0, 1), (0, 3, 1, 2)}
 _LAST_RENDERERS = {"rasterization", "rasterization_2dgs", "rasterize_gaussians", "rasterization_inria_wrapper"}
 _FIRST, _LAST = -3, -1
+_KEEPS = {"clip", "clamp", "contiguous", "cuda", "detach", "double", "float", "half", "to", "type"}  # the axes
 
 
 class Vote(NamedTuple):
@@ -28,6 +30,7 @@ class Vote(NamedTuple):
 def is_channels_last(training: Training, function: Function, *images: cst.CSTNode) -> bool:
     """Return whether the images are [H, W, C] or [B, H, W, C]; without a sign of it they are not."""
     votes = [vote for image in images for vote in _votes(training, function, image, set(), 0)]
+    votes += _votes_of_callees(training, function, images)
     last, first = (sum(vote.strength for vote in votes if vote.axis == axis) for axis in (_LAST, _FIRST))
     return last > first
 
@@ -57,13 +60,15 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
         swap = _swap(node)
         return votes if swap is None else [vote._replace(axis=swap.get(vote.axis, vote.axis)) for vote in votes]
     if isinstance(node, cst.Subscript):
+        votes.extend(_uses(function, node))
         votes.extend(_slice_vote(node))
         votes.extend(_votes(training, function, node.value, seen, depth + 1))
         return votes
     if isinstance(node, cst.BinaryOperation):
         for side in (node.left, node.right):
-            if isinstance(side, cst.Subscript) and _is_spread(side):
-                votes.append(Vote(_LAST, 2))
+            axis = _added(side) if isinstance(side, cst.Subscript) else None
+            if axis is not None:
+                votes.append(Vote(axis, 2))
             else:
                 votes.extend(_votes(training, function, side, seen, depth + 1))
         return votes
@@ -97,28 +102,87 @@ def _votes_of_callers(training: Training, function: Function, name: str, seen: S
     return votes
 
 
+def _votes_of_callees(training: Training, function: Function, images: Tuple[cst.CSTNode, ...]) -> List[Vote]:
+    """Pictures that go together into a function of the codebase lie as it takes them, for SSIM as for the L1."""
+    votes: List[Vote] = []
+    for scope in _beside(function):
+        for call in scope.flow.calls:
+            positional, keywords, starred = arguments(call)
+            given = [*positional, *keywords.values()]
+            if starred or not all(any(same(value, image) for value in given) for image in images):
+                continue
+            for reference in training.program.resolve(scope, call.func):
+                callee = reference.target
+                if reference.kind == "function" and isinstance(callee, Function) and not reference.guess:
+                    taken = [*zip(callee.parameters, positional), *keywords.items()]
+                    for name, value in taken:
+                        if any(same(value, image) for image in images):
+                            votes.extend(_of_parameter(callee, name))
+    return votes
+
+
+def _beside(function: Function) -> List[Function]:
+    """The function, and where it is nested in another one those beside it that take the same."""
+    parent = function.parent
+    if parent is None or parent.parent is None:
+        return [function]
+    same_names = [f for f in parent.inner if f.parent is parent and f.parameters == function.parameters]
+    return [function, *(f for f in same_names if f is not function)]
+
+
+def _of_parameter(function: Function, name: str) -> List[Vote]:
+    """How a function takes a parameter, by what it does with it in any case."""
+    given = frozenset(d for d in function.flow.definitions.get(name, []) if d.kind == "parameter")
+    certain = [line for line in function.body.body if isinstance(line, cst.SimpleStatementLine)]
+    calls = [part for line in certain for part in walk_expressions(line) if isinstance(part, cst.Call)]
+    return list(_permuted(function, calls, name, given)) if given else []
+
+
 def _uses(function: Function, node: cst.CSTNode) -> List[Vote]:
     """What else the function does with the same value: permuting it for SSIM tells how it lay before."""
-    definitions = function.flow.reaching(node)
-    if not definitions or not isinstance(node, cst.Name):
+    place, definitions = path_of(node), function.flow.reaching(node)
+    if place is None or (isinstance(node, cst.Name) and not definitions):
         return []
-    found: List[Vote] = []
-    for call in function.flow.calls:
-        order, subject = _permutation(call), _subject(call)
-        pattern = _pattern(call)
-        if subject is None or not isinstance(subject, cst.Name) or subject.value != node.value:
+    return list(_permuted(function, function.flow.calls, place, definitions))
+
+
+def _permuted(
+    function: Function, calls: List[cst.Call], place: str, definitions: FrozenSet[Definition]
+) -> Iterator[Vote]:
+    """Yield what calls say that permute, or reduce, the value which a place has from these definitions."""
+    for call in calls:
+        order, pattern, axis = _permutation(call), _pattern(call), _reduced(call)
+        if order is None and pattern is None and axis is None:
             continue
-        if not (function.flow.reaching(subject) & definitions):
+        subject = _before(_subject(call), order)
+        if subject is None or path_of(subject) != place:
+            continue
+        reaching = function.flow.reaching(subject)
+        if reaching != definitions and not reaching & definitions:
             continue
         if order in _TO_FIRST:
-            found.append(Vote(_LAST, 3))
+            yield Vote(_LAST, 3)
         elif order in _TO_LAST:
-            found.append(Vote(_FIRST, 3))
-        elif call_name(call) in ("mean", "sum") and _reduced(call) is not None:  # a grey image, a norm of the channels
-            found.append(Vote(_LAST if _reduced(call) == -1 else _FIRST, 1))
+            yield Vote(_FIRST, 3)
+        elif axis is not None:  # a grey image, a norm of the channels
+            yield Vote(_LAST if axis == -1 else _FIRST, 1)
         elif pattern is not None:
-            found.append(Vote(_LAST if pattern.split("->")[0].split()[-1:] == ["c"] else _FIRST, 3))
-    return found
+            yield Vote(_LAST if pattern.split("->")[0].split()[-1:] == ["c"] else _FIRST, 3)
+
+
+def _before(node: Optional[cst.CSTNode], order: Optional[Tuple[int, ...]]) -> Optional[cst.CSTNode]:
+    """Return ``x`` of what is permuted, ``x.clip(0, 1)[None]``: only an axis for the batch has come before x's own."""
+    while True:
+        if isinstance(node, cst.Call) and call_name(node) in _KEEPS:
+            node = _subject(node)
+        elif isinstance(node, cst.Call) and call_name(node) == "unsqueeze" and order is not None:
+            if constant(node.args[-1].value if node.args else None) != 0 or len(order) != 4:
+                return None
+            node = _subject(node)
+        elif isinstance(node, cst.Subscript) and order is not None and len(order) == 4 and _is_batched(node):
+            node = node.value
+        else:
+            return node
 
 
 def _permutation(node: cst.Call) -> Optional[Tuple[int, ...]]:
@@ -150,6 +214,8 @@ def _swap(node: cst.Call) -> Optional[Dict[int, int]]:
 
 def _reduced(node: cst.Call) -> Optional[int]:
     """The one axis that ``x.mean(dim=-1)`` goes over, if it can only be the channels: the last, or the first."""
+    if call_name(node) not in ("mean", "sum"):
+        return None
     positional, keywords, _ = arguments(node)
     values = [keywords[key] for key in ("dim", "axis") if key in keywords]
     if isinstance(node.func, cst.Attribute) and not (
@@ -214,13 +280,32 @@ def _slice_vote(node: cst.Subscript) -> List[Vote]:
     return []
 
 
-def _is_spread(node: cst.Subscript) -> bool:
-    """``mask[..., None]``: the channel is added at the end."""
-    parts = [element.slice for element in node.slice]
-    return (
-        len(parts) >= 2
-        and isinstance(parts[-1], cst.Index)
-        and constant(parts[-1].value, "") is None
-        and isinstance(parts[0], cst.Index)
-        and isinstance(parts[0].value, cst.Ellipsis)
-    )
+def _is_batched(node: cst.Subscript) -> bool:
+    """``x[None]``, ``x[None, ...]``, ``x[None, :, :, :]``."""
+    parts = _parts(node)
+    return parts[0] is None and all(part in (..., ":") for part in parts[1:])
+
+
+def _added(node: cst.Subscript) -> Optional[int]:
+    """Where the channels of an image are by the axes that are added to what is laid over it."""
+    parts = _parts(node)
+    if parts in ([None, None, ":"], [":", None, None, ":"]):
+        return _LAST  # colour[None, None, :]
+    if parts[-2:] == [None, None] and len(parts) > 2:
+        return _FIRST  # colour[:, None, None]
+    if parts[-1] is None and (parts[0] is ... or parts[:2] == [":", ":"]):
+        return _LAST  # mask[..., None]
+    return _FIRST if parts in ([":", None], [":", None, ":", ":"]) else None  # mask[:, None]
+
+
+def _parts(node: cst.Subscript) -> List[object]:
+    """Return an index as a list of ``None``, ``...``, ``":"`` and, for anything else, its node."""
+    parts: List[object] = []
+    for element in node.slice:
+        part = element.slice
+        if isinstance(part, cst.Slice):
+            parts.append(":" if part.lower is part.upper is part.step is None else part)
+        elif isinstance(part, cst.Index):
+            what: object = ... if isinstance(part.value, cst.Ellipsis) else constant(part.value, part.value)
+            parts.append(what)
+    return parts

@@ -10,9 +10,12 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import Optional, Sequence, Tuple
+from typing import TYPE_CHECKING, Optional, Sequence, Tuple
 
 from legs_loss import LegsError, __version__
+
+if TYPE_CHECKING:
+    from legs_adapters.findings import Problem
 
 __all__ = ["main"]
 
@@ -115,8 +118,7 @@ def _patch(args: argparse.Namespace) -> int:
             print(as_json(found, []), end="")
         else:
             print(as_table(found), end="")
-        for problem in problems:
-            print(_advice(problem), file=sys.stderr)
+        _left_to_the_user(problems)
         print(
             "legs-patch: nothing was changed (--partial patches the rest, --exclude leaves files out)", file=sys.stderr
         )
@@ -129,12 +131,12 @@ def _patch(args: argparse.Namespace) -> int:
     changes = bool(found.after) or settings is not None
     if args.diff:
         print(as_json(found, []) if args.json else as_diff(found, _colour()), end="")
-        return 0
+        return _left_to_the_user(problems)
     if args.check:
         print(as_json(found, []) if args.json else as_table(found), end="")
         if not args.json:
             print("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
-        return 1 if found.after else 0
+        return _left_to_the_user(problems) or (1 if found.after else 0)
     wrote = write(found, args.force) if changes else []
     if args.json:
         print(as_json(found, wrote), end="")
@@ -143,10 +145,8 @@ def _patch(args: argparse.Namespace) -> int:
         if wrote:
             print(f"\nwrote {', '.join(wrote)}; take it back with: legs-patch --undo {args.folder}")
         else:
-            print("\nnothing to do: it is patched")
-    for problem in problems:
-        print(_advice(problem), file=sys.stderr)
-    return 1 if problems else 0
+            print(f"\nnothing to do: {'it is patched' if found.findings.patched else 'nothing could be decided'}")
+    return _left_to_the_user(problems)
 
 
 def _verify(args: argparse.Namespace) -> int:
@@ -182,13 +182,17 @@ def _undo(args: argparse.Namespace) -> int:
     return 0
 
 
-def _advice(problem: object) -> str:
-    return (
-        f"legs-patch: error: {problem.path}:{problem.line}: {problem.reason}\n"  # type: ignore[attr-defined]
-        f"    {problem.text}\n"  # type: ignore[attr-defined]
-        f"  if this is the loss between rendering and photograph, write there: {problem.advice}\n"  # type: ignore[attr-defined]
-        f"  (rendering first), and import legs_loss at the top"
-    )
+def _left_to_the_user(problems: Sequence[Problem]) -> int:
+    """Say on stderr what to write by hand; return the exit code of that."""
+    for problem in problems:
+        print(
+            f"legs-patch: error: {problem.path}:{problem.line}: {problem.reason}\n"
+            f"    {problem.text}\n"
+            f"  if this is the loss between rendering and photograph, write there: {problem.advice}\n"
+            f"  (rendering first), and import legs_loss at the top",
+            file=sys.stderr,
+        )
+    return 1 if problems else 0
 
 
 def _site(root: Path, text: str) -> Tuple[str, int]:

@@ -24,7 +24,7 @@ from legs_adapters.reading.provenance import View, Views
 from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
 from legs_adapters.reading.shared import shared_of, unchanged
-from legs_adapters.reading.syntax import arguments, call_name, code
+from legs_adapters.reading.syntax import call_name, code
 from legs_adapters.reading.training import Training
 from legs_adapters.upstreams import registered
 
@@ -196,9 +196,13 @@ class _Finder:
             return self._problem(function, form, place, why, flipped)
         if not form.direct and not unchanged(function, form.first, form.second):
             return self._problem(function, form, place, "the difference has a name of its own", flipped)
-        twin = self._other_use(function, pair.first if flipped else pair.second)
-        if twin is not None:
-            return self._problem(function, form, place, f"{function.name} also serves {twin}", flipped)
+        prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
+        uses = self._uses(function, prediction, target)
+        for use, where in uses:
+            if use is not None and all(other is not None for other, _ in uses):
+                return self._left(function, place, use)
+            if use is not None:  # its body cannot be both
+                return self._problem(function, form, place, f"{function.name} also serves {use} at {where}", flipped)
         shared = shared_of(self.training, function, form)
         aside: Tuple[cst.Name, ...] = ()
         if shared is not None and not shared.trains:
@@ -210,27 +214,27 @@ class _Finder:
             aside = tuple(shared.aside)
         elif shared is not None:
             return self._problem(function, form, place, f"{_short(form.node)} serves more than the loss", flipped)
-        prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
         last = is_channels_last(self.training, function, prediction, target)
         view = self.views.of(function, target, form.call)
-        where = (function.module.path, place.line, place.column, place.last_line)
-        return Site(*where, form, flipped, form.selection or pair.selection, last, view, function, aside)
+        stands = (function.module.path, place.line, place.column, place.last_line)
+        return Site(*stands, form, flipped, form.selection or pair.selection, last, view, function, aside)
 
-    def _other_use(self, function: Function, target: cst.CSTNode) -> Optional[str]:
-        """What else a function serves that compares pictures: its body cannot be both."""
-        names = function.parameters
-        if not isinstance(target, cst.Name) or target.value not in names:
-            return None
-        served = False
-        other: Optional[str] = None
+    def _uses(
+        self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode
+    ) -> List[Tuple[Optional[str], str]]:
+        """What the calls of a function that compares two parameters are for, None for the loss, and where they are."""
+        found: List[Tuple[Optional[str], Optional[str], str]] = []
+        if not isinstance(target, cst.Name):
+            return []
         for caller, call in self.training.sites.get(function, []):
-            positional, keywords, _ = arguments(call)
-            at = names.index(target.value)
-            given = keywords.get(target.value, positional[at] if at < len(positional) else None)
-            use = None if given is None else self.reasons.use(caller, call, self.meanings.of(caller, given))
-            served = served or use is None
-            other = other or (use and f"{use} at {caller.module.path}:{caller.place(call).line}")
-        return other if served else None
+            photograph = function.given(call, target.value)
+            rendering = function.given(call, prediction.value) if isinstance(prediction, cst.Name) else None
+            if photograph is not None:
+                meanings = [self.meanings.of(caller, node) for node in (rendering, photograph) if node is not None]
+                where = f"{caller.module.path}:{caller.place(call).line}"
+                found.append((meanings[0].kind, self.reasons.use(caller, call, meanings), where))
+        pictures = any(kind == "image" for kind, _, _ in found)
+        return [("something unknown" if pictures and kind is None else use, where) for kind, use, where in found]
 
     def _is_definition(self, function: Function, form: Form) -> bool:
         """Whether this is the body of the codebase's own L1 function, whose calls are what counts."""

@@ -10,7 +10,7 @@ import libcst as cst
 from legs_adapters.reading.flow import Definition, Flow
 from legs_adapters.reading.parts import Cut, Lines, Part, Place, body_part, outline_part
 from legs_adapters.reading.repo import Source, Unreadable
-from legs_adapters.reading.syntax import dotted
+from legs_adapters.reading.syntax import arguments, dotted
 
 __all__ = ["Class", "Function", "Module", "parse"]
 
@@ -107,6 +107,14 @@ class Function:
             return []
         names = [param.name.value for param in (*self.node.params.posonly_params, *self.node.params.params)]
         return names[1:] if self.owner is not None and not self.static and names else names
+
+    def given(self, call: cst.Call, parameter: str) -> Optional[cst.BaseExpression]:
+        """What a call of it gives for a parameter; None where it leaves that out, or it cannot be seen."""
+        positional, keywords, _ = arguments(call)
+        if parameter in keywords or parameter not in self.parameters:
+            return keywords.get(parameter)
+        position = self.parameters.index(parameter)
+        return positional[position] if position < len(positional) else None
 
     @property
     def static(self) -> bool:

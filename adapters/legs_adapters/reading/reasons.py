@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Dict, List, Optional, Set
+from typing import Dict, List, Optional, Sequence, Set
 
 import libcst as cst
 
@@ -57,7 +57,7 @@ class Reasons:
         for meaning, counterpart in ((pair.a, pair.b), (pair.b, pair.a)):
             if meaning.kind in _WHY and not _is_part_of_light(meaning, counterpart):
                 return _WHY[meaning.kind]
-        if constant(form.first) is not None or constant(form.second) is not None:
+        if constant(form.first) is not None or constant(form.second) is not None or _of_points(form):
             return "regulariser"
         trained = self.training.includes(form.node) or self.training.includes(form.call)
         trained = trained or self._called_by_framework(function)
@@ -67,6 +67,8 @@ class Reasons:
             return "unknown"
         if same_root(form):
             return "regulariser"
+        if _is_leaf(function, form.first) or _is_leaf(function, form.second):
+            return "untrained"
         target, other = (pair.first, pair.second) if swapped(pair.a, pair.b) else (pair.second, pair.first)
         if pair.a.role == pair.b.role == "render" or self.meanings.origin(function, target).role == "render":
             return "distillation"
@@ -87,12 +89,19 @@ class Reasons:
         own = isinstance(parts[-1], cst.Name) and parts[-1].value == "self" and len(parts) > 1
         return own and owner is not None and bool({"get_xyz", "oneupSHdegree"} & set(owner.methods))
 
-    def use(self, caller: Function, call: cst.Call, target: Meaning) -> Optional[str]:
-        """What a call of a function that compares pictures is for, if not for the loss of a Gaussian model."""
-        if target.kind in _WHY:
-            return _WHY[target.kind]
+    def use(self, caller: Function, call: cst.Call, given: Sequence[Meaning]) -> Optional[str]:
+        """What a call of a function that compares pictures is for, if not for the loss of a Gaussian model.
+
+        ``given`` is what it is called with: the rendering, where that is known, then the photograph.
+        """
+        target = given[-1]
+        for meaning in given:
+            if meaning.kind in _WHY:
+                return _WHY[meaning.kind]
         if target.role == "render":
             return "distillation"
+        if set(words(caller.name)) & _EVALUATING and "train" not in words(caller.name):
+            return "evaluation"
         return "tracking" if self._moves_poses(caller, call) else self.steps.purpose(caller, call)
 
     def _moves_poses(self, function: Function, call: cst.Call) -> bool:
@@ -194,6 +203,19 @@ class Reasons:
         if path not in self._splats:
             self._splats[path] = _SPLATS.search(self.program.sources[path].text) is not None
         return self._splats[path]
+
+
+def _of_points(form: Form) -> bool:
+    """``model.rgb_colors[point_indexes]``: rows of points, no picture."""
+    indexed = [node for node in (form.first, form.second) if isinstance(node, cst.Subscript)]
+    names = [element.slice.value for node in indexed for element in node.slice if isinstance(element.slice, cst.Index)]
+    return any(isinstance(name, cst.Name) and {"point", "points"} & set(words(name.value)) for name in names)
+
+
+def _is_leaf(function: Function, node: cst.CSTNode) -> bool:
+    """``image = torch.tensor(array).requires_grad_()``: whose gradient is looked at, made by no rendering."""
+    values = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
+    return any(isinstance(value, cst.Call) and call_name(value) == "requires_grad_" for value in values)
 
 
 def _is_part_of_light(meaning: Meaning, other: Meaning) -> bool:

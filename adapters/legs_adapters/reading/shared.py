@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Optional
+from typing import List, NamedTuple, Optional, Set
 
 import libcst as cst
 
@@ -51,11 +51,14 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
         if call_name(call) in ("item", "tolist", "numpy")
         for part in attribute_chain(call)
     } | function.flow.without_grad
-    aside = [read for read in reads if read not in loss and id(read) not in logged]
+    edited = _edited(function)
+    aside = [read for read in reads if read not in loss and id(read) not in logged | edited]
     if not aside:
         return None
     if not loss:
         return Shared([], [], False)
+    if any(id(read) in edited for read in reads):
+        return Shared([], [])  # error[mask] *= 2: another map in the loss's place would not have that
     again = loss if len(loss) == 1 and unchanged(function, form.first, form.second) else []
     known = all(
         function.flow.names_at(callers[id(read)], part.value) == function.flow.reaching(part)
@@ -65,6 +68,14 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
         if id(read) in callers and isinstance(part, cst.Name) and function.flow.reaching(part)
     )
     return Shared(again, aside if known and all(id(read) in callers for read in aside) else [])
+
+
+def _edited(function: Function) -> Set[int]:
+    """The ids of the names whose tensors are changed in place: ``error[mask] *= 2``, ``error.mul_(2)``."""
+    changes = [d for definitions in function.flow.definitions.values() for d in definitions]
+    changed: List[cst.CSTNode] = [d.node.target for d in changes if isinstance(d.node, cst.AugAssign)]
+    changed += [d.value for d in changes if d.kind == "inplace" and d.value is not None]
+    return {id(part) for node in changed for part in attribute_chain(node)}
 
 
 def takes_no_gradient(training: Training, function: Function, call: cst.Call, given: cst.CSTNode) -> bool:

@@ -29,6 +29,8 @@ _MODEL = word_set(
 _SCHEDULES = word_set("sched scheduler schedulers lr strategy profiler progress")
 _PLUMBING = word_set("torch optim adam params lr name eps self")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
+_MAKES = {"optimizer", "optimiser", "optimizers", "optimisers"}
+_NOTHING = object()
 _DEPTH = 3
 
 
@@ -59,7 +61,8 @@ class Steps:
                 if all(some & _EMBEDDING and not some & _MODEL for some in spoken):
                     return "evaluation"
                 return None
-        return "scoring" if stepped else None
+        # At a module's top nobody else can take the step.
+        return "scoring" if stepped or function.parent is None else None
 
     def _of_callers(self, function: Function, depth: int) -> Optional[str]:
         sites = self.training.sites.get(function, [])
@@ -78,11 +81,11 @@ class Steps:
             found |= name if name & _POSE else _spoken(part)  # gaussians.optimizer_cam moves cameras
             for where, definition in self.program.lookup(function, part) or []:
                 made = definition.value
-                if (
-                    definition.kind != "assign"
-                    or not isinstance(made, cst.Call)
-                    or not _OPTIMISER.search(call_name(made))
-                ):
+                if definition.kind != "assign" or not isinstance(made, cst.Call):
+                    continue
+                if set(words(call_name(made))) & _MAKES:
+                    found |= _handed_to(made)
+                if not _OPTIMISER.search(call_name(made)):
                     continue
                 for arg in made.args:
                     found |= self._moved(where, arg.value)
@@ -105,6 +108,15 @@ class Steps:
                         found |= spoken & _POSE
                         held |= set(words(part.value.value))
         return found | (_spoken(node) - held)
+
+
+def _handed_to(call: cst.Call) -> Set[str]:
+    """The words in what a codebase's own ``setup_optimizer(config, cams=[camera])`` gets; of a setting's name none."""
+    found: Set[str] = set()
+    for arg in call.args:
+        if constant(arg.value, _NOTHING) is _NOTHING:
+            found |= _spoken(arg.value) | set(words(arg.keyword.value) if arg.keyword is not None else ())
+    return found
 
 
 def _is_backward(call: cst.Call) -> bool:

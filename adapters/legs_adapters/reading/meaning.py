@@ -37,6 +37,7 @@ _FIRST = {
 }  # fmt: skip
 _MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
+_BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
 _DEPTH = 40
 _BUDGET = 20000  # steps to answer one question: some code is one large knot
 
@@ -241,9 +242,9 @@ class Meanings:
             return Meaning("parameter", None)
         if isinstance(key, str):
             local = self._flow(function, node, depth) if function.flow.reaching(node) else _UNKNOWN
-            role = role_of_words(key)
-            if role is None:
-                role = local.role or self._role_of_holder(function, node.value, depth) or role
+            role = role_of_words(key) or local.role
+            if role is None and not _BACKGROUND & set(words(key)):
+                role = self._role_of_holder(function, node.value, depth)
             return Meaning(_closer(kind_of_words(key), local.kind), role)
         return self.of(function, node.value, depth)
 

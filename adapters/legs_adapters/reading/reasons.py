@@ -8,6 +8,7 @@ from typing import Dict, List, Optional, Sequence, Set
 import libcst as cst
 
 from legs_adapters.reading.l1 import Form
+from legs_adapters.reading.makers import is_of_mesh, is_rendering
 from legs_adapters.reading.meaning import Meaning, Meanings
 from legs_adapters.reading.module import Function, Module
 from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, of_rays, same_root, swapped
@@ -21,6 +22,7 @@ __all__ = ["Reasons"]
 
 _SPLATS = re.compile(r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_pkg|3dgs|surfel", re.I)
 _RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
+_FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
 _RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
 _EVALUATION = word_set(
     """
@@ -71,6 +73,8 @@ class Reasons:
             return "untrained"
         target, other = (pair.first, pair.second) if swapped(pair.a, pair.b) else (pair.second, pair.first)
         if pair.a.role == pair.b.role == "render" or self.meanings.origin(function, target).role == "render":
+            return "distillation"
+        if is_rendering(function, target):
             return "distillation"
         if self._of_model(function, target):
             return "regulariser"
@@ -125,6 +129,8 @@ class Reasons:
             return "evaluation"
         about = self._about_splats(function) or self._rendered(module, function, form)
         if not about or of_rays(form) or any(_draws_mesh(part) for part in _made_of(function, form)):
+            return "other"
+        if any(is_of_mesh(self.program, function, side) for side in (form.first, form.second)):
             return "other"
         return "other" if "eikonal" in module.text and _RAY_COLOURS.search(code(form.node)) else None
 
@@ -193,6 +199,8 @@ class Reasons:
         sides = _made_of(function, form)
         names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
         if _RAYS.search(module.text) or "mesh" in words(module.path.rpartition("/")[2]):
+            return False
+        if _FIELD.search(module.text):
             return False
         rendered = any(word.startswith(("render", "raster")) for word in names)
         folder = module.path.rpartition("/")[0]

@@ -176,6 +176,7 @@ def _call(program: Program, function: Function, node: cst.Call) -> Optional[Form
     if any(reference.kind == "external" and str(reference.target).startswith("legs_loss.") for reference in references):
         return None  # patched before
     name = call_name(node)
+    references = references or _handed_on(program, function, node.func)
     if not references:
         if not is_l1_name(name):
             return None
@@ -201,6 +202,28 @@ def _call(program: Program, function: Function, node: cst.Call) -> Optional[Form
         # The arguments that settled the shape; the call no longer needs them.
         extras = ()
     return Form(node, node, first, second, reduction, node.func, tuple(extras))
+
+
+def _handed_on(program: Program, function: Function, node: cst.CSTNode) -> List[Reference]:
+    """``def on_crops(image, gt, loss_fn)``: a parameter is torch's L1 where that is what every caller gives."""
+    given = function.flow.reaching(node)
+    if not isinstance(node, cst.Name) or node.value not in function.parameters:
+        return []
+    if not function.name or any(definition.kind != "parameter" for definition in given):
+        return []
+    position = function.parameters.index(node.value)
+    found: List[Reference] = []
+    for caller in program.mentioning(function.name, called=True):
+        for call in caller.flow.calls:
+            if call_name(call) != function.name:
+                continue
+            positional, keywords, _ = arguments(call)
+            value = keywords.get(node.value, positional[position] if position < len(positional) else None)
+            references = program.resolve(caller, value) if value is not None else []
+            if not references or not all(r.kind == "external" and _TORCH_L1.search(str(r.target)) for r in references):
+                return []
+            found += references
+    return found
 
 
 def _pair(

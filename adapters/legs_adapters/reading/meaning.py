@@ -35,6 +35,9 @@ _FIRST = {
     "conv2d", "mul", "where_first", "abs", "array", "enumerate", "iter", "next", "list", "tuple", "reversed", "zip",
     "tqdm", "DataLoader", "deepcopy", "no_grad", "max_pool2d", "center_crop", "crop", "gaussian_blur",
 }  # fmt: skip
+_RENDERERS = {
+    "render", "rendering", "rasterize", "rasterization", "rasterizer", "renderer", "raster", "splat", "splatting",
+}  # fmt: skip
 _MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
@@ -241,12 +244,31 @@ class Meanings:
         if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in _PARAMETERS:
             return Meaning("parameter", None)
         if isinstance(key, str):
-            local = self._flow(function, node, depth) if function.flow.reaching(node) else _UNKNOWN
+            here = bool(function.flow.reaching(node))
+            local = self._flow(function, node, depth) if here else self._of_forward(function, node.value, key, depth)
             role = role_of_words(key) or local.role
             if role is None and not _BACKGROUND & set(words(key)):
                 role = self._role_of_holder(function, node.value, depth)
             return Meaning(_closer(kind_of_words(key), local.kind), role)
         return self.of(function, node.value, depth)
+
+    def _of_forward(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
+        """``results["photo"]`` of a parameter, where the class's own ``forward`` returns such a dictionary."""
+        forward = function.owner.methods.get("forward") if function.owner is not None else None
+        given = function.flow.reaching(node)
+        if forward is None or forward is function or not given or any(d.kind != "parameter" for d in given):
+            return _UNKNOWN
+        returned: List[Optional[cst.CSTNode]] = []
+        for value in forward.flow.returns:
+            returned += [d.value for d in forward.flow.reaching(value)] if isinstance(value, cst.Name) else [value]
+        stored = [
+            element.value
+            for value in returned
+            if isinstance(value, cst.Dict)
+            for element in value.elements
+            if isinstance(element, cst.DictElement) and constant(element.key) == key
+        ]
+        return _mix([self.of(forward, value, depth) for value in stored])
 
     @staticmethod
     def _default_key(function: Function, node: cst.Subscript) -> object:
@@ -264,10 +286,9 @@ class Meanings:
             name_role = role_of_words(node.value)
             if name_role is not None:
                 return name_role
-            flow = self._flow(function, node, depth + 1)
-            if flow.role is not None:
-                return flow.role
-            return "target" if found & DATA else None
+            if found & DATA and not self._is_rendered(function, node):
+                return "target"  # a camera may have been anywhere before
+            return self._flow(function, node, depth + 1).role
         if isinstance(node, cst.Attribute):
             role = role_of_words(node.attr.value)
             return role or (
@@ -278,6 +299,17 @@ class Meanings:
         if isinstance(node, cst.Subscript):
             return self._role_of_holder(function, node.value, depth + 1)
         return self.of(function, node, depth).role
+
+    @staticmethod
+    def _is_rendered(function: Function, node: cst.Name) -> bool:
+        """``view = render(camera)``; not ``data = render(data)``, which has what it had before, too."""
+        made = [definition.value for definition in function.flow.reaching(node)]
+        return any(
+            isinstance(call, cst.Call)
+            and bool(set(words(call_name(call))) & _RENDERERS)
+            and not any(isinstance(arg.value, cst.Name) and arg.value.value == node.value for arg in call.args)
+            for call in made
+        )
 
     def _call(self, function: Function, node: cst.Call, depth: int) -> Meaning:
         name = call_name(node)
@@ -305,18 +337,7 @@ class Meanings:
         kind = kind_of_words(name)
         if "compute" in spoken and kind is None:
             spoken = spoken - {"compute"}
-        if spoken & {
-            "render",
-            "rendering",
-            "rasterize",
-            "rasterization",
-            "rasterizer",
-            "renderer",
-            "raster",
-            "splat",
-            "splatting",
-            "project",
-        }:
+        if spoken & _RENDERERS:
             return Meaning(kind if kind is not None else "image", "render")
         if kind is not None and kind not in ("image", "mask", "parameter"):
             return Meaning(kind, role_of_words(name))

@@ -20,7 +20,9 @@ from legs_adapters.reading.training import Training
 
 __all__ = ["Reasons"]
 
-_SPLATS = re.compile(r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_pkg|3dgs|surfel", re.I)
+_SPLATS = re.compile(
+    r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_gaussian|render_pkg|3dgs|surfel", re.I
+)
 _RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
 _FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
 _RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")

@@ -176,7 +176,7 @@ def _call(program: Program, function: Function, node: cst.Call) -> Optional[Form
     if any(reference.kind == "external" and str(reference.target).startswith("legs_loss.") for reference in references):
         return None  # patched before
     name = call_name(node)
-    references = references or _handed_on(program, function, node.func)
+    references = references or _handed_on(program, function, node)
     if not references:
         if not is_l1_name(name):
             return None
@@ -204,26 +204,31 @@ def _call(program: Program, function: Function, node: cst.Call) -> Optional[Form
     return Form(node, node, first, second, reduction, node.func, tuple(extras))
 
 
-def _handed_on(program: Program, function: Function, node: cst.CSTNode) -> List[Reference]:
+def _handed_on(program: Program, function: Function, node: cst.Call) -> List[Reference]:
     """``def on_crops(image, gt, loss_fn)``: a parameter is torch's L1 where that is what every caller gives."""
-    given = function.flow.reaching(node)
-    if not isinstance(node, cst.Name) or node.value not in function.parameters:
+    name, position = call_name(node), _parameter(function, node.func)
+    if position is None or arguments(node)[2] or not function.name or function.name in ("forward", "__call__"):
         return []
-    if not function.name or any(definition.kind != "parameter" for definition in given):
-        return []
-    position = function.parameters.index(node.value)
     found: List[Reference] = []
     for caller in program.mentioning(function.name, called=True):
         for call in caller.flow.calls:
             if call_name(call) != function.name:
                 continue
             positional, keywords, _ = arguments(call)
-            value = keywords.get(node.value, positional[position] if position < len(positional) else None)
+            value = keywords.get(name, positional[position] if position < len(positional) else None)
             references = program.resolve(caller, value) if value is not None else []
             if not references or not all(r.kind == "external" and _TORCH_L1.search(str(r.target)) for r in references):
                 return []
             found += references
     return found
+
+
+def _parameter(function: Function, node: cst.CSTNode) -> Optional[int]:
+    """Which parameter of a function a name is, where it is that and nothing else."""
+    given = function.flow.reaching(node)
+    if not isinstance(node, cst.Name) or node.value not in function.parameters:
+        return None
+    return function.parameters.index(node.value) if all(d.kind == "parameter" for d in given) else None
 
 
 def _pair(

@@ -17,7 +17,8 @@ _TO_LAST = {(1, 2, 0), (0, 2, 3, 1)}
 _TO_FIRST = {(2, 0, 1), (0, 3, 1, 2)}
 _LAST_RENDERERS = {"rasterization", "rasterization_2dgs", "rasterize_gaussians", "rasterization_inria_wrapper"}
 _FIRST, _LAST = -3, -1
-_KEEPS = {"clip", "clamp", "contiguous", "cuda", "detach", "double", "float", "half", "to", "type"}  # the axes
+# What leaves the axes where they are.
+_KEEPS = {"clip", "clamp", "contiguous", "cpu", "cuda", "detach", "double", "float", "half", "numpy", "to", "type"}
 
 
 class Vote(NamedTuple):

@@ -23,7 +23,7 @@ from legs_adapters.reading.program import Program
 from legs_adapters.reading.provenance import View, Views
 from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
-from legs_adapters.reading.shared import shared_of, unchanged
+from legs_adapters.reading.shared import is_huber, shared_of, unchanged_at
 from legs_adapters.reading.syntax import call_name, code
 from legs_adapters.reading.training import Training
 from legs_adapters.upstreams import registered
@@ -194,7 +194,11 @@ class _Finder:
         if is_rows(function, pair.first) or is_rows(function, pair.second):
             why = "the images are lists of pixels there, of which there is no weight map"
             return self._problem(function, form, place, why, flipped)
-        if not form.direct and not unchanged(function, form.first, form.second):
+        if is_huber(function, form):
+            why = "this is a Huber loss: a weight in it would move its threshold"
+            advice = f"legs_loss.weight_map({_short(target)}) times the loss, before its mean"
+            return self._problem(function, form, place, why)._replace(advice=advice)
+        if not form.direct and not unchanged_at(function, form.call, form.first, form.second):
             return self._problem(function, form, place, "the difference has a name of its own", flipped)
         prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
         uses = self._uses(function, prediction, target)

@@ -14,7 +14,7 @@ import libcst as cst
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import arguments, call_name, constant, key_of, same, words
+from legs_adapters.reading.syntax import arguments, call_name, constant, key_of, same, walk_expressions, words
 from legs_adapters.reading.training import Training
 from legs_adapters.reading.vocabulary import DATA, KINDS, kind_of_words, role_of_words
 
@@ -307,7 +307,7 @@ class Meanings:
         return any(
             isinstance(call, cst.Call)
             and bool(set(words(call_name(call))) & _RENDERERS)
-            and not any(isinstance(arg.value, cst.Name) and arg.value.value == node.value for arg in call.args)
+            and not any(same(part, node) for arg in call.args for part in walk_expressions(arg.value))
             for call in made
         )
 

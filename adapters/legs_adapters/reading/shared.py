@@ -12,7 +12,7 @@ from legs_adapters.reading.pair import makes_mask
 from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, walk_expressions
 from legs_adapters.reading.training import Training
 
-__all__ = ["Shared", "shared_of", "takes_no_gradient", "unchanged"]
+__all__ = ["Shared", "is_huber", "shared_of", "takes_no_gradient", "unchanged", "unchanged_at"]
 
 
 class Shared(NamedTuple):
@@ -61,13 +61,37 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
         return Shared([], [])  # error[mask] *= 2: another map in the loss's place would not have that
     again = loss if len(loss) == 1 and unchanged(function, form.first, form.second) else []
     known = all(
-        function.flow.names_at(callers[id(read)], part.value) == function.flow.reaching(part)
-        for read in aside
-        for image in (form.first, form.second)
-        for part in walk_expressions(image)
-        if id(read) in callers and isinstance(part, cst.Name) and function.flow.reaching(part)
+        id(read) in callers and unchanged_at(function, callers[id(read)], form.first, form.second) for read in aside
     )
-    return Shared(again, aside if known and all(id(read) in callers for read in aside) else [])
+    return Shared(again, aside if known else [])
+
+
+def is_huber(function: Function, form: Form) -> bool:
+    """``torch.where(error < d, error ** 2 / 2, d * (error - d / 2))``: an L1 above a threshold, and a square below."""
+
+    def reads_it(nodes: List[cst.CSTNode]) -> bool:
+        return any(node is form.node or form.node in _values(function, node) for node in nodes)
+
+    for node in function.flow.expressions:
+        if isinstance(node, cst.Call) and call_name(node) == "where":
+            parts = [part for arg in node.args for part in walk_expressions(arg.value)]
+            if any(_squared(part) is not None for part in parts) and reads_it(parts):
+                return True
+        base = _squared(node)
+        if base is not None and reads_it(list(walk_expressions(base))):
+            return True
+    return False
+
+
+def _squared(node: cst.CSTNode) -> Optional[cst.CSTNode]:
+    """Return ``x`` of ``x ** 2`` or ``x.square()``."""
+    if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Power):
+        return node.left
+    return node.func if isinstance(node, cst.Call) and call_name(node) in ("square", "pow") else None
+
+
+def _values(function: Function, node: cst.CSTNode) -> List[Optional[cst.CSTNode]]:
+    return [definition.value for definition in function.flow.reaching(node)]
 
 
 def _edited(function: Function) -> Set[int]:
@@ -118,3 +142,13 @@ def unchanged(function: Function, *images: cst.CSTNode) -> bool:
             if known and not set(everywhere) <= known:
                 return False
     return True
+
+
+def unchanged_at(function: Function, call: cst.Call, *images: cst.CSTNode) -> bool:
+    """Whether names that were read here mean the same at a call further down."""
+    return all(
+        function.flow.names_at(call, part.value) == function.flow.reaching(part)
+        for image in images
+        for part in walk_expressions(image)
+        if isinstance(part, cst.Name) and function.flow.reaching(part)
+    )

@@ -76,7 +76,7 @@ class Reasons:
         target, other = (pair.first, pair.second) if swapped(pair.a, pair.b) else (pair.second, pair.first)
         if pair.a.role == pair.b.role == "render" or self.meanings.origin(function, target).role == "render":
             return "distillation"
-        if is_rendering(function, target):
+        if swapped(pair.a, pair.b) is not None and is_rendering(function, target):
             return "distillation"
         if self._of_model(function, target):
             return "regulariser"

@@ -191,6 +191,7 @@ class _Finder:
             why = f"cannot tell which of {sides} is the rendering and which the photograph"
             return self._problem(function, form, place, why)
         flipped = bool(target_first)
+        prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
         if is_rows(function, pair.first) or is_rows(function, pair.second):
             why = "the images are lists of pixels there, of which there is no weight map"
             return self._problem(function, form, place, why, flipped)
@@ -200,7 +201,6 @@ class _Finder:
             return self._problem(function, form, place, why)._replace(advice=advice)
         if not form.direct and not unchanged_at(function, form.call, form.first, form.second):
             return self._problem(function, form, place, "the difference has a name of its own", flipped)
-        prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
         uses = self._uses(function, prediction, target)
         for use, where in uses:
             if use is not None and all(other is not None for other, _ in uses):

@@ -30,6 +30,7 @@ _SCHEDULES = word_set("sched scheduler schedulers lr strategy profiler progress"
 _PLUMBING = word_set("torch optim adam params lr name eps self")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 _MAKES = {"optimizer", "optimiser", "optimizers", "optimisers"}
+_STEPS = word_set("step steps update optimize optimise optim")
 _NOTHING = object()
 _DEPTH = 3
 
@@ -61,6 +62,9 @@ class Steps:
                 if all(some & _EMBEDDING and not some & _MODEL for some in spoken):
                     return "evaluation"
                 return None
+            here = {id(call) for call, _ in inside}
+            if _only_reads(scope, [call for call in function.flow.calls if id(call) in here]):
+                return "scoring"
         # At a module's top nobody else can take the step.
         return "scoring" if stepped or function.parent is None else None
 
@@ -127,6 +131,15 @@ def _is_step(call: cst.Call) -> bool:
     if call_name(call) != "step" or not isinstance(call.func, cst.Attribute):
         return False
     return not _spoken(call.func.value) & _SCHEDULES
+
+
+def _only_reads(scope: cst.CSTNode, calls: List[cst.Call]) -> bool:
+    """Whether the gradients are read and set to nothing after the last backward pass, and nothing can have stepped."""
+    last = max(i for i, call in enumerate(calls) if _is_backward(call))
+    named = {word for call in calls for word in words(call_name(call))}
+    if "zero_grad" not in [call_name(call) for call in calls[last:]] or named & _STEPS:
+        return False
+    return any(isinstance(part, cst.Attribute) and part.attr.value == "grad" for part in _walk(scope))
 
 
 def _spoken(node: cst.CSTNode) -> Set[str]:

@@ -206,16 +206,17 @@ def _call(program: Program, function: Function, node: cst.Call) -> Optional[Form
 
 def _handed_on(program: Program, function: Function, node: cst.Call) -> List[Reference]:
     """``def on_crops(image, gt, loss_fn)``: a parameter is torch's L1 where that is what every caller gives."""
-    name, position = call_name(node), _parameter(function, node.func)
-    if position is None or arguments(node)[2] or not function.name or function.name in ("forward", "__call__"):
+    name = call_name(node)
+    if not _is_parameter(function, node.func) or arguments(node)[2]:
+        return []
+    if not function.name or function.name in ("forward", "__call__"):
         return []
     found: List[Reference] = []
     for caller in program.mentioning(function.name, called=True):
         for call in caller.flow.calls:
             if call_name(call) != function.name:
                 continue
-            positional, keywords, _ = arguments(call)
-            value = keywords.get(name, positional[position] if position < len(positional) else None)
+            value = function.given(call, name)
             references = program.resolve(caller, value) if value is not None else []
             if not references or not all(r.kind == "external" and _TORCH_L1.search(str(r.target)) for r in references):
                 return []
@@ -223,12 +224,10 @@ def _handed_on(program: Program, function: Function, node: cst.Call) -> List[Ref
     return found
 
 
-def _parameter(function: Function, node: cst.CSTNode) -> Optional[int]:
-    """Which parameter of a function a name is, where it is that and nothing else."""
-    given = function.flow.reaching(node)
-    if not isinstance(node, cst.Name) or node.value not in function.parameters:
-        return None
-    return function.parameters.index(node.value) if all(d.kind == "parameter" for d in given) else None
+def _is_parameter(function: Function, node: cst.CSTNode) -> bool:
+    """Whether a name is a parameter of the function and nothing else."""
+    known = isinstance(node, cst.Name) and node.value in function.parameters
+    return known and all(definition.kind == "parameter" for definition in function.flow.reaching(node))
 
 
 def _pair(

@@ -91,13 +91,9 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
 
 def _votes_of_callers(training: Training, function: Function, name: str, seen: Set[int], depth: int) -> List[Vote]:
     """A parameter lies as what it is given where training calls the function."""
-    if name not in function.parameters:
-        return []
     votes: List[Vote] = []
     for caller, call in training.sites.get(function, [])[:4]:
-        positional, keywords, _ = arguments(call)
-        position = function.parameters.index(name)
-        value = keywords.get(name, positional[position] if position < len(positional) else None)
+        value = function.given(call, name)
         if value is not None:
             votes.extend(_votes(training, caller, value, seen, depth + 1))
     return votes

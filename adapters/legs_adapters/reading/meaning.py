@@ -197,16 +197,13 @@ class Meanings:
 
     def _parameter(self, function: Function, definition: Definition, depth: int) -> Meaning:
         """A parameter is what it is given where training calls the function."""
-        names = function.parameters
-        if definition.place not in names:
+        if definition.place not in function.parameters:
             return _UNKNOWN
-        position, found = names.index(definition.place), []
+        found = []
         for caller, call in (self.training.sites.get(function) or self._calls_of(function))[:12]:
-            positional, keywords, _ = arguments(call)
-            if definition.place in keywords:
-                found.append(self.of(caller, keywords[definition.place], depth))
-            elif position < len(positional):
-                found.append(self.of(caller, positional[position], depth))
+            value = function.given(call, definition.place)
+            if value is not None:
+                found.append(self.of(caller, value, depth))
         images = [meaning for meaning in found if meaning.kind == "image"]
         return _mix(images or found)
 

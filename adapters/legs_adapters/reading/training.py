@@ -78,19 +78,15 @@ class Training:
 
     def _upwards(self, function: Function, value: cst.CSTNode) -> None:
         """``def step(loss): loss.backward()``: what is trained stands where step is called."""
-        parameters = function.parameters
         for definition in function.flow.reaching(value):
-            if definition.kind != "parameter" or definition.place not in parameters:
+            if definition.kind != "parameter" or definition.place not in function.parameters:
                 continue
-            position = parameters.index(definition.place)
             for caller in self.program.mentioning(function.name, called=True):
                 for call in caller.flow.calls:
                     if call_name(call) == function.name and caller is not function:
-                        positional, keywords, _ = arguments(call)
-                        if definition.place in keywords:
-                            self._push(caller, keywords[definition.place])
-                        elif position < len(positional):
-                            self._push(caller, positional[position])
+                        given = function.given(call, definition.place)
+                        if given is not None:
+                            self._push(caller, given)
 
     # -- the slice
 

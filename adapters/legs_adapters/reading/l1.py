@@ -116,6 +116,8 @@ def _absolute(function: Function, node: cst.Call) -> Optional[Form]:
     if argument is None:
         return None
     if isinstance(argument, cst.BinaryOperation) and isinstance(argument.operator, cst.Subtract):
+        if _is_number(argument.left) or _is_number(argument.right):
+            return None
         return Form(node, inner, argument.left, argument.right, reduction, difference=argument)
     if isinstance(argument, cst.BinaryOperation) and isinstance(argument.operator, (cst.Multiply, cst.Divide)):
         for side in (argument.left, argument.right)[: 1 if isinstance(argument.operator, cst.Divide) else 2]:
@@ -132,6 +134,10 @@ def _absolute(function: Function, node: cst.Call) -> Optional[Form]:
             if isinstance(value, cst.BinaryOperation) and isinstance(value.operator, cst.Subtract):
                 return Form(node, inner, value.left, value.right, reduction, None, (), value, False, selection)
     return None
+
+
+def _is_number(node: cst.CSTNode) -> bool:
+    return isinstance(node, cst.Call) and isinstance(node.func, cst.Name) and node.func.value in ("int", "float", "len")
 
 
 def _mean_of(node: cst.Call) -> Optional[cst.Call]:

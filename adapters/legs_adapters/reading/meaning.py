@@ -161,7 +161,9 @@ class Meanings:
             old = self._flow(function, definition.node.target, depth)
             return _mix([old, self.of(function, value, depth)])
         if definition.kind == "element" and definition.index is not None:
-            return self._element(function, value, definition.index, depth)
+            meaning = self._element(function, value, definition.index, depth)
+            beside = definition.index > 0 and role_of_words(definition.place) == "target"
+            return meaning._replace(role=None) if beside else meaning  # image, gt_image = render(...)
         if definition.kind in ("mutate", "inplace", "store"):
             inner = arguments(value)[0] if isinstance(value, cst.Call) and definition.kind != "store" else [value]
             return _mix([self.of(function, part, depth) for part in inner])

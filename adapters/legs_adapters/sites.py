@@ -23,7 +23,7 @@ from legs_adapters.reading.program import Program
 from legs_adapters.reading.provenance import View, Views
 from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
-from legs_adapters.reading.shared import is_huber, shared_of, unchanged_at
+from legs_adapters.reading.shared import is_huber, is_measured, shared_of, unchanged_at
 from legs_adapters.reading.syntax import call_name, code
 from legs_adapters.reading.training import Training
 from legs_adapters.upstreams import registered
@@ -62,6 +62,8 @@ class _Finder:
             self._module(module)
         if not (self.found.sites or self.found.patched or self.found.problems or self.by_hand):
             self.found.problems.extend(self.doubtful)
+            quoted = {(problem.path, problem.line) for problem in self.doubtful}
+            self.found.left[:] = [left for left in self.found.left if (left.path, left.line) not in quoted]
         self.found.unreadable.extend(self.program.unreadable[path] for path in sorted(self.program.unreadable))
         return self.found
 
@@ -96,8 +98,7 @@ class _Finder:
             chosen = self._is_chosen(function, place)
             verdict = self._verdict(function, form, place, chosen)
             if isinstance(verdict, Left) and self._is_doubtful(function, form, verdict):
-                why = f"nothing shows that this is the loss ({verdict.reason})"
-                self.doubtful.append(self._problem(function, form, place, why))
+                self.doubtful.append(self._doubt(function, form, place, verdict.reason))
             if self.by_hand and not chosen and not isinstance(verdict, Left):
                 verdict = self._left(function, place, "not chosen")
             if not (isinstance(verdict, Left) and _is_noise(form, verdict)):
@@ -119,13 +120,25 @@ class _Finder:
     def _is_doubtful(self, function: Function, form: Form, left: Left) -> bool:
         """Whether a person should have a look at what was left, if nothing else is found."""
         in_module = left.reason == "definition" and function.name in _FORWARD
-        if not in_module and left.reason not in ("untrained", "unknown", "distillation", "synthetic", "other"):
+        if not in_module and left.reason not in ("untrained", "unknown", "distillation", "other", "huber"):
+            return False
+        if is_measured(function, form):
             return False
         pair = pair_of(self.meanings, function, form)
         pictures = "image" in (pair.a.kind, pair.b.kind)
         pictures = pictures or (function.name in _FORWARD and is_role(form.first) and is_role(form.second))
-        roles = "target" in (pair.a.role, pair.b.role) or left.reason == "distillation"
+        roles = "target" in (pair.a.role, pair.b.role) or left.reason in ("distillation", "huber")
         return pictures and roles and not same_root(form)
+
+    def _doubt(self, function: Function, form: Form, place: Place, reason: str) -> Problem:
+        pair = pair_of(self.meanings, function, form)
+        flipped = bool(swapped(pair.a, pair.b))
+        if not is_huber(function, form):
+            return self._problem(function, form, place, f"nothing shows that this is the loss ({reason})", flipped)
+        why = "this is a Huber loss: a weight in it would move its threshold"
+        target = _short(form.first if flipped else form.second)
+        advice = f"legs_loss.weight_map({target}) times the loss, before its mean"
+        return self._problem(function, form, place, why)._replace(advice=advice)
 
     def _is_kernel(self, function: Function, call: cst.Call) -> bool:
         """``fused_l1_ssim_loss(image, gt)``: L1 and SSIM in one, and not in this checkout."""
@@ -196,9 +209,7 @@ class _Finder:
             why = "the images are lists of pixels there, of which there is no weight map"
             return self._problem(function, form, place, why, flipped)
         if is_huber(function, form):
-            why = "this is a Huber loss: a weight in it would move its threshold"
-            advice = f"legs_loss.weight_map({_short(target)}) times the loss, before its mean"
-            return self._problem(function, form, place, why)._replace(advice=advice)
+            return self._left(function, place, "huber")
         if not form.direct and not unchanged_at(function, form.call, form.first, form.second):
             return self._problem(function, form, place, "the difference has a name of its own", flipped)
         uses = self._uses(function, prediction, target)
@@ -221,7 +232,7 @@ class _Finder:
         last = is_channels_last(self.training, function, prediction, target)
         view = self.views.of(function, target, form.call)
         stands = (function.module.path, place.line, place.column, place.last_line)
-        return Site(*stands, form, flipped, form.selection or pair.selection, last, view, function, aside)
+        return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside)
 
     def _uses(
         self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode
@@ -250,13 +261,14 @@ class _Finder:
             id(call) in known or own_shape(self.program, caller) is not None for caller, call in calls
         )
 
-    @staticmethod
-    def _problem(function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
+    def _problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
         module = function.module
-        return Problem(module.path, place.line, module.lines.text(place.line), reason, _advice(function, form, flipped))
+        last = is_channels_last(self.training, function, form.first, form.second)
+        advice = _advice(function, form, flipped, last)
+        return Problem(module.path, place.line, module.lines.text(place.line), reason, advice)
 
 
-def _advice(function: Function, form: Form, flipped: bool) -> str:
+def _advice(function: Function, form: Form, flipped: bool, last: bool) -> str:
     """What to write by hand: the pictures themselves, where the form has lists of their pixels."""
     prediction, target = (form.second, form.first) if flipped else (form.first, form.second)
     whole, other = without_rows(prediction), without_rows(target)
@@ -264,11 +276,12 @@ def _advice(function: Function, form: Form, flipped: bool) -> str:
         return f"legs_loss.l1_loss({_short(whole)}, {_short(other)}.reshape({_short(whole)}.shape), channels_last=True)"
     if is_rows(function, prediction) or is_rows(function, target):
         return "legs_loss.l1_loss(rendering, photograph), with the pictures before they became lists"
-    settings = ', reduction="none"' if form.reduction == "none" else ""
+    settings = ", channels_last=True" if last else ""
+    settings += ', reduction="none"' if form.reduction == "none" else ""
     if form.callee is not None and form.extras:
         first, second = ("b", "a") if flipped else ("a", "b")
         extras = ", ".join(_short(extra) for extra in form.extras)
-        settings = f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
+        settings += f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
     return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{settings})"
 
 
@@ -277,7 +290,7 @@ def _is_noise(form: Form, left: Left) -> bool:
     return (
         form.callee is None
         and form.reduction in ("none", "wrapped")
-        and left.reason not in ("definition", "tracking", "distillation")
+        and left.reason not in ("definition", "tracking", "distillation", "huber")
     )
 
 

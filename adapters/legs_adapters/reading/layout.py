@@ -86,6 +86,9 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
                     votes.append(Vote(_LAST, 2))
             elif definition.kind in ("assign", "augment"):
                 votes.extend(_votes(training, function, definition.value, seen, depth + 1))
+            elif definition.kind == "mutate" and isinstance(definition.value, cst.Call):  # images.append(image)
+                for given in arguments(definition.value)[0]:
+                    votes.extend(_votes(training, function, given, seen, depth + 1))
     return votes
 
 

@@ -337,7 +337,8 @@ class Meanings:
         if "compute" in spoken and kind is None:
             spoken = spoken - {"compute"}
         if spoken & _RENDERERS:
-            return Meaning(kind if kind is not None else "image", "render")
+            of_points = kind in (None, "parameter")  # points_to_render(...)
+            return Meaning("image" if of_points else kind, "render")
         if kind is not None and kind not in ("image", "mask", "parameter"):
             return Meaning(kind, role_of_words(name))
         if kind == "image" and (role_of_words(name) == "target" or spoken & {"load", "read", "get", "open", "fetch"}):

@@ -29,6 +29,8 @@ _COMMON = word_set(
     """
 )
 _DEPTH = 12
+_MADE = ("instance", "made by")
+_MOVES = {"cuda", "cpu", "to", "half", "float", "double", "eval", "train", "requires_grad_"}  # give the module itself
 
 
 class Reference(NamedTuple):
@@ -121,6 +123,10 @@ class Program:
                 return self.resolve(function, node.args[0].value, depth + 1)
             if call_name(node) == "super":
                 return []
+            if call_name(node) in _MOVES and isinstance(node.func, cst.Attribute):
+                moved = [ref for ref in self.resolve(function, node.func.value, depth + 1) if ref.kind in _MADE]
+                if moved:
+                    return moved
             made = self.resolve(function, node.func, depth + 1)
             instances = [Reference("instance", ref.target) for ref in made if ref.kind == "class"]
             instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]

@@ -40,6 +40,8 @@ _SCORING = word_set(
 _NOT_TRAINING = {"render", "eval", "evaluate", "test", "validate", "validation", "inference"}
 _EVALUATING = {"eval", "evaluate", "evaluation", "evaluator", "test"}
 _POSE = {"tracking", "track", "tracker", "localize", "localization", "relocalize", "relocalization"}
+_MAPPING = {"mapping", "map", "mapper"}  # a class that tracks and maps says nothing of one method
+_WARPED = {"reprojection", "reproject", "reprojected", "warp", "warped", "warping"}
 _WHY = {
     "depth": "depth", "normal": "normals", "feature": "features", "flow": "flow", "mask": "mask", "warp": "synthetic",
     "gradient": "gradients", "parameter": "regulariser",
@@ -113,7 +115,8 @@ class Reasons:
     def _moves_poses(self, function: Function, call: cst.Call) -> bool:
         owner = self.program.owner_of(function)
         names = (function.name, *function.flow.conditions.get(id(call), ()), owner.name if owner is not None else "")
-        return bool({word for name in names for word in words(name)} & _POSE)
+        spoken = [set(words(name)) for name in names]
+        return any(said & _POSE and not said & _MAPPING for said in spoken)
 
     def _elsewhere(self, function: Function, form: Form) -> Optional[str]:
         """Why it is not the loss of a Gaussian model, going by the names of what is around it."""
@@ -127,6 +130,8 @@ class Reasons:
         folders, _, file = module.path.rpartition("/")
         if (words(file)[:1] and words(file)[0] in _EVALUATING) or set(folders.split("/")) & _EVALUATING:
             return "evaluation"
+        if set(words(function.name)) & _WARPED:
+            return "synthetic"
         if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
             return "evaluation"
         about = self._about_splats(function) or self._rendered(module, function, form)
@@ -141,6 +146,7 @@ class Reasons:
         if "loss" not in words(function.name) and "losses" not in words(function.name):
             return False
         above = [function, *self._callers(function)]
+        above += [caller for callee in above[1:] for caller in self._callers(callee)]
         if any(set(words(f.name)) & (_EVALUATION | _SCORING) for f in above):
             return False
         return bool(self.training.roots) and any(

@@ -12,7 +12,7 @@ from legs_adapters.reading.pair import makes_mask
 from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, walk_expressions
 from legs_adapters.reading.training import Training
 
-__all__ = ["Shared", "is_huber", "shared_of", "takes_no_gradient", "unchanged", "unchanged_at"]
+__all__ = ["Shared", "is_huber", "is_measured", "shared_of", "takes_no_gradient", "unchanged", "unchanged_at"]
 
 
 class Shared(NamedTuple):
@@ -81,6 +81,14 @@ def is_huber(function: Function, form: Form) -> bool:
         if base is not None and reads_it(list(walk_expressions(base))):
             return True
     return False
+
+
+def is_measured(function: Function, form: Form) -> bool:
+    """Whether a term is turned into a number, ``error.mean().item()``, from which no gradient comes back."""
+    return any(
+        call_name(call) in ("item", "tolist") and any(part is form.node for part in attribute_chain(call))
+        for call in function.flow.calls
+    )
 
 
 def _squared(node: cst.CSTNode) -> Optional[cst.CSTNode]:

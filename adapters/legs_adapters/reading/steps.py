@@ -79,26 +79,32 @@ class Steps:
         """The words in an optimiser's name, and in what it was made of."""
         assert isinstance(step.func, cst.Attribute)
         parts: List[cst.CSTNode] = [step.func.value, *(arg.value for arg in step.args)]
-        found: Set[str] = set()
-        for part in parts:
-            name = set(words(part.attr.value)) if isinstance(part, cst.Attribute) else set()
-            found |= name if name & _POSE else _spoken(part)  # gaussians.optimizer_cam moves cameras
-            for where, definition in self.program.lookup(function, part) or []:
-                made = definition.value
-                if definition.kind != "assign" or not isinstance(made, cst.Call):
-                    continue
-                if set(words(call_name(made))) & _MAKES:
-                    found |= _handed_to(made)
-                if not _OPTIMISER.search(call_name(made)):
-                    continue
-                for arg in made.args:
-                    found |= self._moved(where, arg.value)
-                    if isinstance(arg.value, cst.Name):  # opt_params = [], then opt_params.append(...)
-                        for other in where.flow.definitions.get(arg.value.value, []):
-                            if other.kind == "mutate" or isinstance(other.value, cst.List):
-                                assert other.value is not None
-                                found |= self._moved(where, other.value)
-        return found - _PLUMBING
+        return {word for part in parts for word in self._words_of(function, part, 0)} - _PLUMBING
+
+    def _words_of(self, function: Function, node: cst.CSTNode, depth: int) -> Set[str]:
+        name = set(words(node.attr.value)) if isinstance(node, cst.Attribute) else set()
+        found = name if name & _POSE else _spoken(node)  # gaussians.optimizer_cam moves cameras
+        for where, definition in self.program.lookup(function, node) or []:
+            made = definition.value
+            if definition.kind == "parameter" and depth < _DEPTH:
+                for caller in self.program.mentioning(where.name, called=True):
+                    for call in caller.flow.calls if caller is not where else ():
+                        given = where.given(call, definition.place) if call_name(call) == where.name else None
+                        found |= self._words_of(caller, given, depth + 1) if given is not None else set()
+            if definition.kind != "assign" or not isinstance(made, cst.Call):
+                continue
+            if set(words(call_name(made))) & _MAKES:
+                found |= _handed_to(made)
+            if not _OPTIMISER.search(call_name(made)):
+                continue
+            for arg in made.args:
+                found |= self._moved(where, arg.value)
+                if isinstance(arg.value, cst.Name):  # opt_params = [], then opt_params.append(...)
+                    for other in where.flow.definitions.get(arg.value.value, []):
+                        if other.kind == "mutate" or isinstance(other.value, cst.List):
+                            assert other.value is not None
+                            found |= self._moved(where, other.value)
+        return found
 
     def _moved(self, where: Function, node: cst.CSTNode) -> Set[str]:
         """The words in what an optimiser is given; of ``model._rot`` those of the model's class, if it is a pose's."""

@@ -23,7 +23,8 @@ class Site(NamedTuple):
         last_line: where it ends.
         form: the expression.
         swapped: the ground truth is the first of the two arguments.
-        selection: the index by a mask that both arguments carry, as written with its brackets; empty without.
+        selection: the index by a mask that both arguments carry, as written with its brackets, and the one that a named
+            difference of them is taken with; empty without.
         channels_last: the images are [H, W, C].
         view: the verdict on ``view=``.
         scope: the function that it stands in.

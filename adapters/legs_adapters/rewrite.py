@@ -25,6 +25,10 @@ __all__ = ["Edit", "apply_edits", "rewrite"]
 
 PACKAGE = "legs_loss"
 
+_STRING = r"""("(?:\\.|[^"\\\r\n])*"|'(?:\\.|[^'\\\r\n])*')"""  # no comment begins inside
+_GAP = re.compile(_STRING + r"|(?:\s|\\(?=[\r\n])|#[^\r\n]*)+")
+_KEPT = re.compile(_STRING + r"|([ \t]*#[^\r\n]*|\\?(?:\r\n|\r|\n)[ \t]*)")
+
 
 class Edit(NamedTuple):
     """Bytes from ``start`` to ``end`` of a file (its byte order mark counted) become ``after``."""
@@ -106,7 +110,9 @@ class _Text:
     # -- one site
 
     def edits_for(self, site: Site, name: str) -> List[Edit]:
-        plain = " ".join(self.text(*self.span(site.form.node, True)).split())
+        plain = _one_line(self.text(*self.span(site.form.node, True)))
+        form = site.form._replace(selection=_one_line(site.form.selection))
+        site = site._replace(form=form, selection=_one_line(site.selection))
         return [*self._edits_for(site, name), *(self.edit(*self.span(read, True), plain) for read in site.aside)]
 
     def _edits_for(self, site: Site, name: str) -> List[Edit]:
@@ -119,9 +125,9 @@ class _Text:
             return [self.edit(*self.span(form.node, True), f"{name}.l1_loss")]
         if form.reduction == "again":
             first, second = (form.second, form.first) if site.swapped else (form.first, form.second)
-            texts = [" ".join(self.text(*self.span(node, True)).split()) for node in (first, second)]
-            settings = self._settings(site, name, "none", "")
-            return [self.edit(*self.span(form.node, True), f"{name}.l1_loss({texts[0]}, {texts[1]}{settings})")]
+            texts = [_one_line(self._argument(node, _carried(site))) for node in (first, second)]
+            call = f"{name}.l1_loss({texts[0]}, {texts[1]}{self._settings(site, name, 'none', '')}){site.selection}"
+            return [self.edit(*self.span(form.node, True), call)]
         if not form.direct:
             return self._named(site, name)
         if form.reduction == "wrapped":
@@ -133,7 +139,7 @@ class _Text:
     def _named(self, site: Site, name: str) -> List[Edit]:
         """``diff = a - b``, then ``diff[mask].abs().mean()``: the pictures are named in the difference's place."""
         form = site.form
-        texts = [" ".join(self.text(*self.span(node, True)).split()) for node in (form.first, form.second)]
+        texts = [_one_line(self._argument(node, _carried(site))) for node in (form.first, form.second)]
         if site.swapped:
             texts.reverse()
         reduction = "none" if site.selection else form.reduction
@@ -206,14 +212,13 @@ class _Text:
         """The codebase's own function, with what else it is given."""
         form = site.form
         assert form.callee is not None
-        callee = " ".join(code(form.callee).split())
+        callee = _one_line(code(form.callee))
         if not form.extras and not site.selection and not site.swapped:
             return callee
         extras = ", ".join(_flat(arg) for arg in form.extras)
         a, b = _names_for_two(f"{callee} {extras} {site.selection}")
-        index = " ".join(site.selection.split())
-        first, second = (b, a) if site.swapped else (a, b)
-        return f"lambda {a}, {b}: {callee}({first}{index}, {second}{index}{', ' + extras if extras else ''})"
+        first, second = (f"{name}{site.selection}" for name in ((b, a) if site.swapped else (a, b)))
+        return f"lambda {a}, {b}: {callee}({first}, {second}{', ' + extras if extras else ''})"
 
     def _absolute(self, site: Site, name: str) -> List[Edit]:
         """``torch.abs(a - b).mean()``: the words around the difference go, the difference becomes two arguments."""
@@ -240,16 +245,17 @@ class _Text:
         ]
 
     def _wrapped(self, site: Site, name: str) -> List[Edit]:
-        """``torch.abs((a - b) * mask)``: the expression stays, as a function of what is compared."""
+        """``torch.abs((a - b) * w)``: the expression stays, as a function of what is compared."""
         form = site.form
         difference = form.difference
         assert difference is not None
         start, end = self.span(form.node)
         left, right = self.span(difference.left, True), self.span(difference.right, True)
         pieces = [self.text(start, left[0]), self.text(left[1], right[0]), self.text(right[1], end)]
-        a, b = _names_for_two(" ".join(pieces))
-        own = " ".join(f"lambda {a}, {b}: {pieces[0]}{a}{pieces[1]}{b}{pieces[2]}".split())
-        texts = [self.text(*left), self.text(*right)]
+        index = site.selection  # into the pictures of own, for the weight is of whole ones
+        a, b = _names_for_two(_one_line("\n".join([*pieces, index])))
+        own = _one_line(f"lambda {a}, {b}: {pieces[0]}{a}{index}{pieces[1]}{b}{index}{pieces[2]}")
+        texts = [self._argument(difference.left, index), self._argument(difference.right, index)]
         if site.swapped:
             texts.reverse()
             own = own.replace(f"lambda {a}, {b}:", f"lambda {b}, {a}:", 1)
@@ -354,14 +360,23 @@ def _names_for_two(text: str) -> Tuple[str, str]:
     return next((pair for pair in pairs if not used & set(pair)), ("_prediction", "_target"))
 
 
+def _carried(site: Site) -> str:
+    """The index that both sides of a difference carry, without the one that the difference itself is taken with."""
+    return site.selection[: len(site.selection) - len(site.form.selection)]
+
+
 def _flat(arg: cst.Arg) -> str:
-    value = " ".join(code(arg.value).split())
+    value = _one_line(code(arg.value))
     return f"{arg.keyword.value}={value}" if arg.keyword is not None else f"{arg.star}{value}"
+
+
+def _one_line(text: str) -> str:
+    """An expression on one line, without its comments."""
+    return _GAP.sub(lambda gap: gap.group(1) or " ", text).strip()
 
 
 def _residue(text: str) -> str:
     """What must stay of text that goes: its comments and its line breaks."""
     if "\n" not in text and "\r" not in text:
         return ""
-    kept = re.findall(r"[ \t]*#[^\r\n]*|\\?(?:\r\n|\r|\n)[ \t]*", text)
-    return "".join(kept)
+    return "".join(kept for _, kept in _KEPT.findall(text))

@@ -33,11 +33,20 @@ def is_rendering(function: Function, node: cst.CSTNode) -> bool:
 def is_of_mesh(program: Program, function: Function, node: cst.CSTNode) -> bool:
     """Whether a value can have come out of a rasterizer of triangles, or is sampled from their texture."""
     return any(
-        reference.kind == "external" and str(reference.target).startswith(_MESH_RASTERIZER)
+        _draws_mesh(maker)
+        or any(
+            reference.kind == "external" and str(reference.target).startswith(_MESH_RASTERIZER)
+            for reference in program.resolve(function, maker.func)
+        )
         for maker in _makers(function, node, set())
         if maker is not None
-        for reference in program.resolve(function, maker.func)
     )
+
+
+def _draws_mesh(call: cst.Call) -> bool:
+    """``render_mesh(...)``, ``mesh_renderer(...)``."""
+    spoken = words(call_name(call))
+    return "mesh" in spoken and any(word.startswith(("render", "raster")) for word in spoken)
 
 
 def _renders(call: cst.Call) -> bool:

@@ -135,7 +135,7 @@ class Reasons:
         if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
             return "evaluation"
         about = self._about_splats(function) or self._rendered(module, function, form)
-        if not about or of_rays(form) or any(_draws_mesh(part) for part in _made_of(function, form)):
+        if not about or of_rays(form):
             return "other"
         if any(is_of_mesh(self.program, function, side) for side in (form.first, form.second)):
             return "other"
@@ -248,9 +248,3 @@ def _made_of(function: Function, form: Form) -> List[cst.CSTNode]:
                 if definition.value is not None:
                     parts.extend(walk_expressions(definition.value))
     return parts
-
-
-def _draws_mesh(node: cst.CSTNode) -> bool:
-    """``render_mesh(...)``, ``mesh_renderer(...)``."""
-    spoken = words(call_name(node)) if isinstance(node, cst.Call) else ()
-    return "mesh" in spoken and any(word.startswith(("render", "raster")) for word in spoken)

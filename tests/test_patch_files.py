@@ -15,7 +15,8 @@ from legs_adapters import journal as journal_module
 from legs_adapters.cli import main
 from legs_adapters.journal import JOURNAL
 from legs_adapters.patch import plan, undo, write
-from legs_adapters.reading.repo import Source, decode, walk
+from legs_adapters.reading.folders import walk
+from legs_adapters.reading.repo import Source, decode
 
 from legs_loss import LegsError
 from tests.patching_support import NAMES, checkout, expected, files, legs_patch, run_git, snapshot
@@ -491,6 +492,50 @@ class TestCommandLine:
         missing = run("--site", "train.py:3", root)
         assert missing.returncode == 2
         assert "there is no L1 term at train.py:3" in missing.stderr
+
+    def test_folders_that_are_not_entered_are_named_where_nothing_was_found(self, tmp_path, run):
+        vendored = {f"third_party/gaussian-splatting/{path}": text for path, text in files("inria").items()}
+        mentions = {path: "from losses import l1_loss\n" for path in ("extern/a/x.py", "tests/x.py", "venv/x.py")}
+        others = {"third_party/simple-knn/setup.py": "", "extern/deeper/third_party/b/x.py": "F.l1_loss\n"}
+        root = checkout(tmp_path, {"run.py": "import os\n", **vendored})
+        (root / "third_party" / "gaussian-splatting" / ".git").write_text("gitdir: elsewhere\n")
+        found = run(root)
+        assert (found.returncode, found.stderr.count("\n")) == (2, 1)
+        named = "third_party/gaussian-splatting (a checkout of its own)"
+        assert found.stderr.endswith(f"; not looked into: {named}: run legs-patch on that folder\n")
+        assert "not looked into" not in run(root, "--exclude", "third_party").stderr
+        checkout(root, {**mentions, **others})
+        assert run(root).stderr.endswith(
+            f"; not looked into: {named}, extern/a (other people's code), "
+            "extern/deeper/third_party/b (other people's code) and 1 more: run legs-patch on the one that trains\n"
+        )
+        assert run(root / "third_party" / "gaussian-splatting").returncode == 0
+
+    @pytest.mark.parametrize(
+        ("path", "message"),
+        [
+            (
+                "third_party/gs/train.py",
+                "third_party/gs is not looked into (a submodule): run legs-patch on that folder",
+            ),
+            (
+                "third_party/train.py",
+                "third_party is not looked into (other people's code): run legs-patch on that folder",
+            ),
+            ("a/extern/b/c/train.py", "a/extern/b is not looked into (other people's code): run legs-patch"),
+            ("my_env/train.py", "my_env is not looked into (a virtual environment)\n"),
+            ("old/train.py", "--exclude leaves it out"),
+            ("test_train.py", "tests are not looked into"),
+            ("train.sh", "it is no .py file"),
+            ("broken.py", "does not parse (line 1)"),
+        ],
+    )
+    def test_a_site_that_is_not_looked_into_is_said_to_be(self, path, message, tmp_path, run):
+        root = checkout(tmp_path, {"my_env/pyvenv.cfg": "", path: "l1_loss(image, gt_image) loss.backward()\n"})
+        (root / ".gitmodules").write_text('[submodule "gs"]\n\tpath = third_party/gs\n')
+        refused = run(root, "--site", f"{path}:1", "--exclude", "old")
+        assert refused.returncode == 2
+        assert f"legs-patch: error: {path}:1: {message}" in refused.stderr
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

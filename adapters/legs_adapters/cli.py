@@ -127,6 +127,7 @@ def _patch(args: argparse.Namespace) -> int:
         print(as_json(found, []) if args.json else as_table(found), end="")
         raise LegsError(
             f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
+            + _not_looked_into(root, args.exclude)
         )
     changes = bool(found.after) or settings is not None
     if args.diff:
@@ -147,6 +148,19 @@ def _patch(args: argparse.Namespace) -> int:
         else:
             print(f"\nnothing to do: {'it is patched' if found.findings.patched else 'nothing could be decided'}")
     return _left_to_the_user(problems)
+
+
+def _not_looked_into(root: Path, exclude: Sequence[str]) -> str:
+    """Name the folders that may have the term, and that legs-patch does not enter by itself."""
+    from legs_adapters.reading.folders import not_entered
+
+    folders = not_entered(root, exclude)
+    if not folders:
+        return ""
+    shown = ", ".join(f"{folder.path} ({folder.why})" for folder in folders[:3])
+    more = f" and {len(folders) - 3} more" if len(folders) > 3 else ""
+    which = "that folder" if len(folders) == 1 else "the one that trains"
+    return f"; not looked into: {shown}{more}: run legs-patch on {which}"
 
 
 def _verify(args: argparse.Namespace) -> int:

@@ -9,7 +9,8 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_adapters.findings import Findings
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest, replace_files, undo_edits
-from legs_adapters.reading.repo import Source, Unreadable, check_root, read_source, walk
+from legs_adapters.reading.folders import walk, why_left_out
+from legs_adapters.reading.repo import Source, Unreadable, check_root, read_source
 from legs_adapters.rewrite import Edit, apply_edits, rewrite
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.sites import find
@@ -78,6 +79,10 @@ def plan(
         if not any(site.path == name and site.named_by(line) for site in findings.sites) and not any(
             left.path == name and left.line == line for left in findings.patched
         ):
+            why = next((entry.reason for entry in findings.unreadable if entry.path == name), None)
+            why = why_left_out(root, name, exclude) or why
+            if why is not None:
+                raise LegsError(f"{name}:{line}: {why}")
             raise LegsError(f"there is no L1 term at {name}:{line} that can be rewritten")
     edits: Dict[str, List[Edit]] = {}
     after: Dict[str, bytes] = {}

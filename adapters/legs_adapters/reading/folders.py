@@ -1,0 +1,156 @@
+"""Where a checkout's own Python files are; and which of its folders are not looked into, and why."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import re
+from pathlib import Path
+from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+
+__all__ = ["Skipped", "not_entered", "walk", "why_left_out"]
+
+_VENDORED, _TESTS = "other people's code", "a folder of tests"
+_SUBMODULE, _CHECKOUT = "a submodule", "a checkout of its own"
+_FOREIGN = {
+    name: why
+    for why, names in (
+        (_VENDORED, "submodules third_party third-party thirdparty external externals extern SIBR_viewers"),
+        (_TESTS, "tests test testing"),
+        ("installed packages", "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs"),
+        ("what tools wrote", ".git .hg .svn __pycache__ .ipynb_checkpoints build dist .mypy_cache .pytest_cache"),
+    )
+    for name in names.split()
+}
+_PATCHABLE = (_VENDORED, _TESTS, _SUBMODULE, _CHECKOUT)
+_TEST_FILE = re.compile(r"^(test_.*|.*_test|conftest)\.py$")
+_L1 = re.compile(rb"l1_?loss", re.I)
+_TRAINS = re.compile(rb"\.backward\(")
+
+
+class Skipped(NamedTuple):
+    """A folder that is not looked into, relative to the root, and what it is."""
+
+    path: str
+    why: str
+
+
+def walk(root: Path, exclude: Sequence[str] = ()) -> Iterator[str]:
+    """Yield the paths of the checkout's own Python files, relative, posix separators, a folder's own files first.
+
+    Links are not followed, whether to files or to folders; left out are ``.git``, submodules, virtual environments,
+    vendored folders, tests, and what ``exclude`` names: globs on the relative path or, without a slash, on the name of
+    the file or of a folder above it.
+    """
+    for files, _ in _folders(root, exclude):
+        yield from files
+
+
+def not_entered(root: Path, exclude: Sequence[str] = ()) -> List[Skipped]:
+    """Return the folders, not looked into, whose Python mentions an L1; those that train with it first."""
+    found: Dict[Skipped, bool] = {}
+    for _, folders in _folders(root, exclude):
+        for folder in folders:
+            _mentions(root, folder, found)
+    return sorted(found, key=lambda folder: (not found[folder], folder))
+
+
+def why_left_out(root: Path, path: str, exclude: Sequence[str] = ()) -> Optional[str]:
+    """Say why a file of the checkout is not one that ``walk`` yields; None where it is."""
+    if _excluded(path, exclude):
+        return "--exclude leaves it out"
+    parts = path.split("/")
+    submodules = _submodules(root)
+    for i in range(1, len(parts)):
+        folder = "/".join(parts[:i])
+        if os.path.islink(str(root / folder)):
+            return f"{folder} is a link, and links are not followed"
+        why = _why_foreign(root, folder, submodules)
+        if why == _VENDORED and i + 1 < len(parts):  # one of those that are in it
+            folder = "/".join(parts[: i + 1])
+            why = _why_foreign(root, folder, submodules) or why
+        if why is not None:
+            instead = ": run legs-patch on that folder" if why in _PATCHABLE else ""
+            return f"{folder} is not looked into ({why}){instead}"
+    if not path.endswith(".py"):
+        return "it is no .py file"
+    if _TEST_FILE.match(parts[-1]):
+        return "tests are not looked into"
+    return "links are not followed" if os.path.islink(str(root / path)) else None
+
+
+def _folders(root: Path, exclude: Sequence[str]) -> Iterator[Tuple[List[str], List[Skipped]]]:
+    """Yield, a folder at a time, the Python files in it, and the folders in it that are not entered."""
+    submodules = _submodules(root)
+    for here, folders, files in os.walk(str(root), followlinks=False):
+        relative = Path(here).relative_to(root).as_posix()
+        prefix = "" if relative == "." else relative + "/"
+        skipped = []
+        for name in sorted(folders):
+            why = _why_foreign(root, prefix + name, submodules)
+            if _excluded(prefix + name, exclude) or os.path.islink(os.path.join(here, name)):
+                folders.remove(name)
+            elif why is not None:
+                folders.remove(name)
+                skipped.append(Skipped(prefix + name, why))
+        folders.sort()
+        own = []
+        for name in sorted(files):
+            full = os.path.join(here, name)
+            if not name.endswith(".py") or _TEST_FILE.match(name) or _excluded(prefix + name, exclude):
+                continue
+            if not os.path.islink(full) and os.path.isfile(full):
+                own.append(prefix + name)
+        yield own, skipped
+
+
+def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[str]:
+    """Say what a folder is that holds other people's code, or none at all; None for the checkout's own."""
+    full = str(root / path)
+    if path in submodules:
+        return _SUBMODULE
+    name = os.path.basename(path)
+    if name in _FOREIGN:
+        return _FOREIGN[name]
+    if os.path.exists(os.path.join(full, "pyvenv.cfg")):
+        return "a virtual environment"
+    return _CHECKOUT if os.path.lexists(os.path.join(full, ".git")) else None
+
+
+def _mentions(root: Path, skipped: Skipped, found: Dict[Skipped, bool]) -> None:
+    """Note what a folder holds that mentions an L1, and whether it trains: of third_party what is in it, each alone."""
+    if skipped.why not in _PATCHABLE:
+        return
+    for files, folders in _folders(root / skipped.path, ()):
+        for file in files:
+            try:
+                data = (root / skipped.path / file).read_bytes()
+            except OSError:
+                continue
+            if _L1.search(data):
+                inner, slash, _ = file.partition("/")
+                vendored = slash and skipped.why == _VENDORED
+                folder = Skipped(f"{skipped.path}/{inner}", _VENDORED) if vendored else skipped
+                found[folder] = found.get(folder, False) or _TRAINS.search(data) is not None
+        for folder in folders:
+            if folder.why != _TESTS:
+                _mentions(root, Skipped(f"{skipped.path}/{folder.path}", folder.why), found)
+
+
+def _excluded(path: str, patterns: Sequence[str]) -> bool:
+    parts = path.split("/")
+    for pattern in patterns:
+        pattern = pattern.rstrip("/")
+        if any(fnmatch.fnmatch("/".join(parts[: i + 1]), pattern) for i in range(len(parts))):
+            return True
+        if "/" not in pattern and any(fnmatch.fnmatch(part, pattern) for part in parts):
+            return True
+    return False
+
+
+def _submodules(root: Path) -> List[str]:
+    try:
+        text = (root / ".gitmodules").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return []
+    return [match.strip().rstrip("/") for match in re.findall(r"^\s*path\s*=\s*(.+)$", text, re.M)]

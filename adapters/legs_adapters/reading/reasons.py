@@ -41,6 +41,7 @@ _NOT_TRAINING = {"render", "eval", "evaluate", "test", "validate", "validation",
 _EVALUATING = {"eval", "evaluate", "evaluation", "evaluator", "test"}
 _POSE = {"tracking", "track", "tracker", "localize", "localization", "relocalize", "relocalization"}
 _MAPPING = {"mapping", "map", "mapper"}  # a class that tracks and maps says nothing of one method
+_NETWORKS = {"vgg", "vgg16", "vgg19", "perceptual", "lpips", "gram"}
 _WARPED = {"reprojection", "reproject", "reprojected", "warp", "warped", "warping"}
 _WHY = {
     "depth": "depth", "normal": "normals", "feature": "features", "flow": "flow", "mask": "mask", "warp": "synthetic",
@@ -113,10 +114,13 @@ class Reasons:
         return "tracking" if self._moves_poses(caller, call) else self.steps.purpose(caller, call)
 
     def _moves_poses(self, function: Function, call: cst.Call) -> bool:
-        owner = self.program.owner_of(function)
-        names = (function.name, *function.flow.conditions.get(id(call), ()), owner.name if owner is not None else "")
+        names = (function.name, *function.flow.conditions.get(id(call), ()), self._class_of(function))
         spoken = [set(words(name)) for name in names]
         return any(said & _POSE and not said & _MAPPING for said in spoken)
+
+    def _class_of(self, function: Function) -> str:
+        owner = self.program.owner_of(function)
+        return owner.name if owner is not None else ""
 
     def _elsewhere(self, function: Function, form: Form) -> Optional[str]:
         """Why it is not the loss of a Gaussian model, going by the names of what is around it."""
@@ -132,6 +136,9 @@ class Reasons:
             return "evaluation"
         if set(words(function.name)) & _WARPED:
             return "synthetic"
+        called = {word for name in (function.name, self._class_of(function), file) for word in words(name)}
+        if called & _NETWORKS and not (_is_given(function, form.first) and _is_given(function, form.second)):
+            return "features"
         if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
             return "evaluation"
         about = self._about_splats(function) or self._rendered(module, function, form)
@@ -219,6 +226,12 @@ class Reasons:
         if path not in self._splats:
             self._splats[path] = _SPLATS.search(self.program.sources[path].text) is not None
         return self._splats[path]
+
+
+def _is_given(function: Function, node: cst.CSTNode) -> bool:
+    """Whether it is what a parameter was given, as it was given."""
+    found = function.flow.reaching(node)
+    return bool(found) and all(definition.kind == "parameter" for definition in found)
 
 
 def _of_points(form: Form) -> bool:

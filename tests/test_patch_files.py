@@ -17,6 +17,7 @@ from legs_adapters.journal import JOURNAL
 from legs_adapters.patch import plan, undo, write
 from legs_adapters.reading.folders import walk
 from legs_adapters.reading.repo import Source, decode
+from legs_adapters.runner import checkout_of
 
 from legs_loss import LegsError
 from tests.patching_support import NAMES, checkout, expected, files, legs_patch, run_git, snapshot
@@ -331,6 +332,21 @@ class TestWhereItLooks:
         (root / "my_env" / "pyvenv.cfg").write_text("")
         (root / "nested_checkout" / ".git").write_text("gitdir: elsewhere\n")
         assert list(walk(root)) == ["train.py", "scripts/train.py"]
+
+    @pytest.mark.parametrize(
+        ("script", "root"),
+        [
+            ("scripts/train.py", "."),
+            ("tests/train.py", "."),
+            ("third_party/gaussian-splatting/tools/train.py", "third_party/gaussian-splatting"),
+            ("sub/module/train.py", "sub/module"),
+        ],
+    )
+    def test_what_is_run_is_looked_at_where_it_is(self, script, root, tmp_path):
+        folder = checkout(
+            tmp_path, {".git/config": "", script: "", ".gitmodules": "[submodule]\n\tpath = sub/module\n"}
+        )
+        assert checkout_of(folder / script) == (folder / root).resolve()
 
     @pytest.mark.skipif(sys.platform == "win32", reason="links want a privilege there")
     def test_links_are_not_followed(self, tmp_path):

@@ -19,6 +19,7 @@ from types import CodeType
 from typing import Dict, Optional, Sequence, Tuple, Type
 
 from legs_adapters.patch import plan
+from legs_adapters.reading.folders import SUBMODULE, VENDORED, foreign_folder
 from legs_adapters.reading.repo import check_root
 from legs_loss import LegsError
 
@@ -26,10 +27,16 @@ __all__ = ["checkout_of", "execute", "run_script"]
 
 
 def checkout_of(script: Path) -> Path:
-    """Return the folder that is looked at for a script: its git checkout's root, or its own folder."""
+    """Return the folder that is looked at for a script: its git checkout's root, or its own folder.
+
+    In a checkout that has others' code, under third_party say, that is the root of theirs for a script of theirs.
+    """
     folder = script.resolve().parent
     for candidate in (folder, *folder.parents):
         if (candidate / ".git").exists() or (candidate / ".legs-patch.json").exists():
+            foreign = foreign_folder(candidate, script.resolve().relative_to(candidate).as_posix())
+            if foreign is not None and foreign.why in (VENDORED, SUBMODULE):
+                return candidate / foreign.path
             return candidate
     return folder
 

@@ -8,21 +8,21 @@ import re
 from pathlib import Path
 from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
-__all__ = ["Skipped", "not_entered", "walk", "why_left_out"]
+__all__ = ["SUBMODULE", "VENDORED", "Skipped", "foreign_folder", "not_entered", "walk", "why_left_out"]
 
-_VENDORED, _TESTS = "other people's code", "a folder of tests"
-_SUBMODULE, _CHECKOUT = "a submodule", "a checkout of its own"
+VENDORED, SUBMODULE = "other people's code", "a submodule"
+_TESTS, _CHECKOUT = "a folder of tests", "a checkout of its own"
 _FOREIGN = {
     name: why
     for why, names in (
-        (_VENDORED, "submodules third_party third-party thirdparty external externals extern SIBR_viewers"),
+        (VENDORED, "submodules third_party third-party thirdparty external externals extern SIBR_viewers"),
         (_TESTS, "tests test testing"),
         ("installed packages", "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs"),
         ("what tools wrote", ".git .hg .svn __pycache__ .ipynb_checkpoints build dist .mypy_cache .pytest_cache"),
     )
     for name in names.split()
 }
-_PATCHABLE = (_VENDORED, _TESTS, _SUBMODULE, _CHECKOUT)
+_PATCHABLE = (VENDORED, _TESTS, SUBMODULE, _CHECKOUT)
 _TEST_FILE = re.compile(r"^(test_.*|.*_test|conftest)\.py$")
 _L1 = re.compile(rb"l1_?loss", re.I)
 _TRAINS = re.compile(rb"\.backward\(")
@@ -59,24 +59,32 @@ def why_left_out(root: Path, path: str, exclude: Sequence[str] = ()) -> Optional
     """Say why a file of the checkout is not one that ``walk`` yields; None where it is."""
     if _excluded(path, exclude):
         return "--exclude leaves it out"
-    parts = path.split("/")
-    submodules = _submodules(root)
-    for i in range(1, len(parts)):
-        folder = "/".join(parts[:i])
-        if os.path.islink(str(root / folder)):
-            return f"{folder} is a link, and links are not followed"
-        why = _why_foreign(root, folder, submodules)
-        if why == _VENDORED and i + 1 < len(parts):  # one of those that are in it
-            folder = "/".join(parts[: i + 1])
-            why = _why_foreign(root, folder, submodules) or why
-        if why is not None:
-            instead = ": run legs-patch on that folder" if why in _PATCHABLE else ""
-            return f"{folder} is not looked into ({why}){instead}"
+    foreign = foreign_folder(root, path)
+    if foreign is not None:
+        instead = ": run legs-patch on that folder" if foreign.why in _PATCHABLE else ""
+        return f"{foreign.path} is not looked into ({foreign.why}){instead}"
     if not path.endswith(".py"):
         return "it is no .py file"
-    if _TEST_FILE.match(parts[-1]):
+    if _TEST_FILE.match(os.path.basename(path)):
         return "tests are not looked into"
     return "links are not followed" if os.path.islink(str(root / path)) else None
+
+
+def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
+    """Return the folder of a file that is not looked into: of third_party the one in it; None where there is none."""
+    submodules = _submodules(root)
+    parts = path.split("/")
+    for i in range(1, len(parts)):
+        folder = "/".join(parts[:i])
+        why = _why_foreign(root, folder, submodules)
+        if why == VENDORED and i + 1 < len(parts):
+            folder = "/".join(parts[: i + 1])
+            why = _why_foreign(root, folder, submodules) or why
+        if os.path.islink(str(root / folder)):
+            why = "a link"
+        if why is not None:
+            return Skipped(folder, why)
+    return None
 
 
 def _folders(root: Path, exclude: Sequence[str]) -> Iterator[Tuple[List[str], List[Skipped]]]:
@@ -108,7 +116,7 @@ def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[s
     """Say what a folder is that holds other people's code, or none at all; None for the checkout's own."""
     full = str(root / path)
     if path in submodules:
-        return _SUBMODULE
+        return SUBMODULE
     name = os.path.basename(path)
     if name in _FOREIGN:
         return _FOREIGN[name]
@@ -129,8 +137,8 @@ def _mentions(root: Path, skipped: Skipped, found: Dict[Skipped, bool]) -> None:
                 continue
             if _L1.search(data):
                 inner, slash, _ = file.partition("/")
-                vendored = slash and skipped.why == _VENDORED
-                folder = Skipped(f"{skipped.path}/{inner}", _VENDORED) if vendored else skipped
+                vendored = slash and skipped.why == VENDORED
+                folder = Skipped(f"{skipped.path}/{inner}", VENDORED) if vendored else skipped
                 found[folder] = found.get(folder, False) or _TRAINS.search(data) is not None
         for folder in folders:
             if folder.why != _TESTS:

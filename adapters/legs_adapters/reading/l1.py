@@ -15,7 +15,7 @@ __all__ = ["Form", "Forms", "forms", "is_l1_name", "own_shape"]
 
 _TORCH_L1 = re.compile(r"(^|\.)(torch\.nn\.functional|nn\.functional|functional)\.l1_loss$")
 _GSPLAT_L1 = re.compile(r"^gsplat\.losses\.l1_loss$")
-_TORCH_MODULE = re.compile(r"(^|\.)nn\.(modules\.loss\.)?L1Loss$")
+_TORCH_MODULE = re.compile(r"(^|\.)L1Loss$")  # nerfstudio hands torch's on
 _L1_NAME = re.compile(
     r"^(masked|mask|weighted|pixel|pixelwise|rgb|color|image|photometric)*l1(loss)?(loss|mask(ed)?|rgb|withmask|v\d+)*$"
 )
@@ -23,6 +23,7 @@ _SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)
 _SHAPE_ONLY = {"shape", "device", "dtype", "dim", "ndim", "size", "numel", "is_cuda"}
 _TRANSFORMS = {"pow", "square", "log", "log1p", "log2", "log10", "exp", "sqrt", "tanh", "sigmoid"}
 _ASKING = {"isnan", "isfinite", "isinf", "zeros_like", "ones_like"}
+_AS_THAT = {"to", "type_as", "expand_as", "view_as", "reshape_as"}  # mask.to(prediction)
 _NOT_L1 = {"pow", "square", "sqrt", "log", "exp", "mse_loss", "norm", "smooth_l1_loss", "huber_loss"}
 
 
@@ -478,7 +479,7 @@ def _only_differences(program: Program, function: Function, a: str, b: str, dept
             name = call_name(node)
             if name in _NOT_L1:
                 return False
-            if name in _ASKING:
+            if name in _ASKING or name in _AS_THAT:
                 allowed.update(id(n) for arg in node.args for n in walk_expressions(arg))
             absolute = absolute or _is_abs(node)
             positional = arguments(node)[0]

@@ -61,8 +61,8 @@ class Reasons:
 
     def why(self, function: Function, form: Form, pair: Pair) -> Optional[str]:
         """Return why a form is left; None where it is to be weighted."""
-        for meaning, counterpart in ((pair.a, pair.b), (pair.b, pair.a)):
-            if meaning.kind in _WHY and not _is_part_of_light(meaning, counterpart):
+        for meaning in (pair.a, pair.b):
+            if meaning.kind in _WHY:
                 return _WHY[meaning.kind]
         if constant(form.first) is not None or constant(form.second) is not None or _of_points(form):
             return "regulariser"
@@ -245,11 +245,6 @@ def _is_leaf(function: Function, node: cst.CSTNode) -> bool:
     """``image = torch.tensor(array).requires_grad_()``: whose gradient is looked at, made by no rendering."""
     values = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
     return any(isinstance(value, cst.Call) and call_name(value) == "requires_grad_" for value in values)
-
-
-def _is_part_of_light(meaning: Meaning, other: Meaning) -> bool:
-    """Whether a picture named after what it was made of meets a photograph: ``render_sh``, ``gt_image``."""
-    return meaning == ("parameter", "render") and other == ("image", "target")
 
 
 def _made_of(function: Function, form: Form) -> List[cst.CSTNode]:

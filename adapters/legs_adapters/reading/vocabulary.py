@@ -58,7 +58,7 @@ _RENDER = word_set(
     """
 )
 _LAID_OVER = word_set("mask masks valid weight weights diff error errors")
-_SCENERY = word_set("sky")  # a mask of it, where nothing says that it is a picture
+_OF_PICTURES = word_set("sky sh shs")  # a mask or coefficients, where nothing says that it is a picture
 _HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
 DATA = word_set(
     """
@@ -77,8 +77,10 @@ def kind_of_words(name: str) -> Optional[str]:
     if said and said[-1] in _LAID_OVER:
         return "mask"  # of whatever: laid over an image, it leaves an image
     kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF}
-    if "image" in kinds:  # sky_rgb
-        kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF and word not in _SCENERY}
+    if "image" in kinds:  # sky_rgb, render_sh
+        kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF and word not in _OF_PICTURES}
+        if "base" in spoken:  # rendered_base_color
+            return "parameter"
     return min(kinds, key=KINDS.index) if kinds else None
 
 

@@ -7,7 +7,7 @@ from typing import Dict, FrozenSet, Iterator, List, NamedTuple, Optional, Set, T
 import libcst as cst
 
 from legs_adapters.reading.flow import Definition
-from legs_adapters.reading.module import Function
+from legs_adapters.reading.module import Class, Function
 from legs_adapters.reading.syntax import arguments, call_name, constant, path_of, same, walk_expressions
 from legs_adapters.reading.training import Training
 
@@ -108,17 +108,33 @@ def _votes_of_callees(training: Training, function: Function, images: Tuple[cst.
     for scope in _beside(function):
         for call in scope.flow.calls:
             positional, keywords, starred = arguments(call)
-            given = [*positional, *keywords.values()]
+            given = [_without_batch(value) for value in (*positional, *keywords.values())]
             if starred or not all(any(same(value, image) for value in given) for image in images):
                 continue
-            for reference in training.program.resolve(scope, call.func):
-                callee = reference.target
-                if reference.kind == "function" and isinstance(callee, Function) and not reference.guess:
-                    taken = [*zip(callee.parameters, positional), *keywords.items()]
-                    for name, value in taken:
-                        if any(same(value, image) for image in images):
-                            votes.extend(_of_parameter(callee, name))
+            for callee in _callees(training, scope, call):
+                for name, value in zip((*callee.parameters[: len(positional)], *keywords), given):
+                    if any(same(value, image) for image in images):
+                        votes.extend(_of_parameter(callee, name))
     return votes
+
+
+def _callees(training: Training, function: Function, call: cst.Call) -> Iterator[Function]:
+    """The functions of the codebase that a call runs; of an object what it does when it is called."""
+    for reference in training.program.resolve(function, call.func):
+        found = [reference]
+        if reference.kind == "instance" and isinstance(reference.target, Class):
+            found = [ref for name in ("forward", "__call__") for ref in training.program.member(reference.target, name)]
+        for ref in found:
+            if ref.kind == "function" and isinstance(ref.target, Function) and not ref.guess:
+                yield ref.target
+
+
+def _without_batch(node: cst.CSTNode) -> cst.CSTNode:
+    """``image`` of ``image.unsqueeze(0)``."""
+    if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) == "unsqueeze":
+        positional = arguments(node)[0]
+        return node.func.value if len(positional) == 1 and constant(positional[0]) == 0 else node
+    return node
 
 
 def _beside(function: Function) -> List[Function]:

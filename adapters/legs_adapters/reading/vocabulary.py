@@ -58,7 +58,7 @@ _RENDER = word_set(
     """
 )
 _LAID_OVER = word_set("mask masks valid weight weights diff error errors")
-_OF_PICTURES = word_set("sky sh shs")  # a mask or coefficients, where nothing says that it is a picture
+_OF_PICTURES = word_set("sky sh shs prior time")  # a mask or coefficients, where nothing says that it is a picture
 _HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
 DATA = word_set(
     """

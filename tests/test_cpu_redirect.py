@@ -215,6 +215,16 @@ class TestLoading:
 
 
 class TestRuntime:
+    @pytest.mark.skipif(not hasattr(torch, "accelerator"), reason="torch before 2.6 has no accelerator")
+    def test_torch_itself_sees_no_accelerator_whatever_it_was_built_for(self):
+        assert not torch.accelerator.is_available()
+        assert torch.accelerator.current_accelerator() is None
+        weight = torch.nn.Parameter(torch.ones(2, device="cuda"))
+        optimizer = torch.optim.Adam([weight], lr=0.1)
+        weight.sum().backward()
+        optimizer.step()
+        assert (weight < 1).all()
+
     def test_there_is_a_device(self):
         assert torch.cuda.is_available()
         assert torch.cuda.device_count() == 1

@@ -426,6 +426,10 @@ def _runtime(redirection: Redirection) -> None:
         redirection.replace(cuda, name, type(name, (_Nowhere,), {}))
     for name in ("range_push", "range_pop", "mark", "range_start", "range_end"):
         redirection.wrap(cuda.nvtx, name, lambda old: _constant(0))
+    # torch's own optimisers ask it whether a graph is being captured; in a build for CUDA it believes torch.cuda.
+    for name, value in (("is_available", False), ("current_accelerator", None), ("device_count", 0)):
+        accelerator = getattr(torch, "accelerator", None)
+        redirection.wrap(accelerator, name, functools.partial(lambda value, old: _constant(value), value))
     redirection.replace(cuda, "_lazy_init", _refuse)
     for name in ("CUDAGraph", "graph", "make_graphed_callables"):
         redirection.wrap(cuda, name, _no_graphs)

@@ -490,14 +490,10 @@ class TestCommandLine:
         done = run("--json", "--check", root)
         content = json.loads(done.stdout)
         assert done.returncode == 1
-        assert [(site["line"], site["channels_last"]) for site in content["sites"]][:4] == [
-            (16, True),
-            (19, True),
-            (25, True),
-            (39, True),
-        ]
+        found = [(s["line"], s["channels_last"]) for s in content["sites"] if s["file"] == "simple_trainer.py"]
+        assert found[:4] == [(16, True), (19, True), (25, True), (39, True)]
         assert content["left"][0]["reason"] == "definition" or content["left"][0]["reason"] == "depth"
-        assert content["would_change"] == ["simple_trainer.py"]
+        assert "simple_trainer.py" in content["would_change"]
         assert content["wrote"] == []
 
     def test_a_site_by_hand(self, tmp_path, run):

@@ -45,6 +45,8 @@ def tables(text: str) -> str:
     def table(match: re.Match[str]) -> str:
         scene, study = match.group(1), STUDIES[match.group(2)]
         rows = _rows(scene)
+        trained = {row["arm"] for row in rows}
+        study = study._replace(arms=tuple(arm for arm in study.arms if parse_arm(arm).name in trained))
         parts = [scores_table(rows, study.arms), differences_table(rows, study)]
         if study.paper:
             parts.append(paper_text(rows, study).partition("\n\n")[2])

@@ -17,7 +17,7 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, Dict, Generator, Iterator, List, NamedTuple, Optional, Sequence, Union
+from typing import Any, Dict, Generator, Iterator, List, NamedTuple, Optional, Sequence, Tuple, Union
 
 import numpy as np
 import torch
@@ -27,13 +27,14 @@ from legs_loss.errors import LegsError
 from legs_loss.kernels.backends import backend_for
 from legs_loss.response import response
 from legs_loss.scenes import Scene, View, image_size, image_tensor, load_training_image, training_size
-from legs_loss.scenes.images import row_strips
+from legs_loss.scenes.images import resized_pixels, row_strips
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.store import Entry, StoreWriter, fingerprint, is_intact, stage
 
 __all__ = ["Report", "normalised_map", "precompute"]
 
 _COMMIT_SECONDS = 1.0
+_KEPT_BLOCKS = 8  # of 16 MiB
 _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 
 
@@ -120,7 +121,7 @@ def normalised_map(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
 
 def _strength(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
-    if image.size >= _WORTH_COMPILING and backend_for(torch.device("cpu")) == "numba":
+    if _compiles(image.size):
         from legs_loss.kernels.numba_response import photograph_response
 
         return torch.from_numpy(photograph_response(image, spec))
@@ -132,6 +133,22 @@ def _strength(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
         strip = response(image_tensor(image[above:below]), spec.operator, spec.p)
         strength[rows] = strip[0, rows.start - above : rows.stop - above]
     return strength
+
+
+def _resized_pixels(image: Any, size: Tuple[int, int]) -> np.ndarray:
+    """Return what :func:`resized_pixels` returns, by compiled code where that is worth it."""
+    width, height = image.size
+    shrinks = 8 <= size[0] < width and size[1] <= height
+    if image.mode == "RGB" and shrinks and _compiles(3 * width * height):
+        from legs_loss.kernels.numba_resize import resized_as
+
+        return resized_as(resized_pixels, image, size)
+    return resized_pixels(image, size)
+
+
+def _compiles(values: int) -> bool:
+    """Whether numba is there, and worth loading for so many values of a photograph."""
+    return values >= _WORTH_COMPILING and backend_for(torch.device("cpu")) == "numba"
 
 
 class _Job(NamedTuple):
@@ -173,7 +190,7 @@ def _make(job: _Job, task: _Task) -> _Result:
         }
         if any(wanted.items() <= vars(entry).items() and is_intact(job.store, entry) for entry in task.known):
             return _Result(view.name)
-        image = load_training_image(view, job.resolution, job.white_background)
+        image = load_training_image(view, job.resolution, job.white_background, _resized_pixels)
         entry = Entry(fingerprint=fingerprint(image), **wanted)
         return _Result(view.name, stage(job.staging, entry, normalised_map(image, job.spec)))
     except LegsError as error:
@@ -241,6 +258,8 @@ class _Worker:
 
 def _work(connection: Any, job: _Job) -> None:
     torch.set_num_threads(1)
+    # Pillow then keeps the memory of a photograph for the next: a quarter of its decoding went into mapping it anew.
+    os.environ.setdefault("PILLOW_BLOCKS_MAX", str(_KEPT_BLOCKS))
     try:
         while True:
             connection.send(_make(job, connection.recv()))

@@ -240,16 +240,17 @@ def stage(staging: Path, entry: Entry, normalised: np.ndarray) -> Entry:
         entry: without ``file``, ``bytes`` and ``sha256``.
         normalised: E^ in [0, 1], [H, W].
     """
-    buffer = io.BytesIO()
-    np.save(buffer, normalised.astype(np.float16, copy=False), allow_pickle=False)
-    data = buffer.getbuffer()
-    sha256 = hashlib.sha256(data).hexdigest()
+    parts = _npy(np.ascontiguousarray(normalised, np.float16))
+    checksum = hashlib.sha256()
+    for part in parts:
+        checksum.update(part)
+    sha256 = checksum.hexdigest()
     # The name is for people; the digest, of the key and the content, keeps every two maps apart.
     readable = re.sub(r"[^0-9a-z]+", "_", os.path.splitext(entry.view)[0].lower()).strip("_")[-40:] or "view"
     digest = hashlib.sha256(f"{sha256}{entry.key}".encode()).hexdigest()[:16]
     file = f"{readable}-{digest}.npy"
-    _write(staging / file, data)
-    return replace(entry, file=file, bytes=len(data), sha256=sha256)
+    _write(staging / file, *parts)
+    return replace(entry, file=file, bytes=sum(len(part) for part in parts), sha256=sha256)
 
 
 def fingerprint(image: Union[Tensor, np.ndarray]) -> str:
@@ -316,9 +317,17 @@ def _leftovers(folder: Path, entries: Iterable[Entry]) -> List[Path]:
     ]
 
 
-def _write(path: Path, data: Union[bytes, memoryview]) -> None:
+def _npy(array: np.ndarray) -> Tuple[bytes, memoryview]:
+    """An .npy file in two parts, its head and the array's own memory: numpy.save to a buffer would copy that."""
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
+    return head.getvalue(), array.reshape(-1).view(np.uint8).data
+
+
+def _write(path: Path, *parts: Union[bytes, memoryview]) -> None:
     with open(str(path), "wb") as file:
-        file.write(data)
+        for part in parts:
+            file.write(part)
         file.flush()
         os.fsync(file.fileno())
 

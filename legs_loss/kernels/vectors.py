@@ -1,4 +1,4 @@
-"""Eight float32 at once, as a type that compiled functions compute with.
+"""Eight float32 or int32 at once, as types that compiled functions compute with.
 
 LLVM's own vectoriser gives up on loops that read more than a few rows: it cannot show in time that they do not overlap.
 Here the vectors are written down, and LLVM maps them to what the processor has (AVX, two halves of SSE or NEON).
@@ -21,8 +21,10 @@ from numba.extending import lower_builtin, models, register_model
 __all__ = [
     "LANES",
     "absolute",
+    "halves_added",
     "lane",
     "load",
+    "load_bytes",
     "maximum",
     "minimum",
     "multiply_add",
@@ -38,84 +40,110 @@ __all__ = [
 LANES = 8
 
 _VECTOR = ir.VectorType(ir.FloatType(), LANES)
+_INTEGERS = ir.VectorType(ir.IntType(32), LANES)
+_BYTES = ir.VectorType(ir.IntType(8), LANES)
 
 
-class _Float8(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="float8")
+class _Vector(types.Type):
+    def __init__(self, name: str, lanes: Any) -> None:
+        super().__init__(name=name)
+        self.lanes = lanes
 
 
-float8 = _Float8()
+float8, integer8 = _Vector("float8", _VECTOR), _Vector("integer8", _INTEGERS)
+_KINDS = {types.float32: float8, types.int32: integer8}
 
 
 def _intrinsic(function: Any) -> Any:
     return extending.intrinsic(function)
 
 
-@register_model(_Float8)
-class _Float8Model(models.PrimitiveModel):
+@register_model(_Vector)
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _VECTOR)
+        super().__init__(manager, kind, kind.lanes)
 
 
-def _operator(symbol: Any, instruction: str) -> None:
+def _operator(symbol: Any, kind: Any, instruction: str) -> None:
     class Template(ConcreteTemplate):
-        cases = [signature(float8, float8, float8)]
+        cases = [signature(kind, kind, kind)]
 
     infer_global(symbol)(Template)
 
-    @lower_builtin(symbol, float8, float8)
+    @lower_builtin(symbol, kind, kind)
     def lower(context: Any, builder: Any, sig: Any, args: Tuple[Any, Any]) -> Any:
         return getattr(builder, instruction)(*args)
 
 
-for _symbol, _instruction in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
+for _symbol, _kind, _instruction in (
+    (operator.add, float8, "fadd"),
+    (operator.sub, float8, "fsub"),
+    (operator.mul, float8, "fmul"),
+    (operator.truediv, float8, "fdiv"),
+    (operator.add, integer8, "add"),
+    (operator.mul, integer8, "mul"),
 ):
-    _operator(_symbol, _instruction)
+    _operator(_symbol, _kind, _instruction)
 
 
-def _is_row(array: Any) -> bool:
-    return isinstance(array, types.Array) and array.dtype == types.float32 and array.ndim == 1 and array.layout == "C"
+def _is_row(array: Any, dtype: Any) -> bool:
+    return isinstance(array, types.Array) and array.dtype == dtype and array.ndim == 1 and array.layout == "C"
 
 
-def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+def _vector_of(array: Any) -> Any:
+    """The kind of vector that a row holds, or None where it is no row of either."""
+    return next((kind for dtype, kind in _KINDS.items() if _is_row(array, dtype)), None)
+
+
+def _address(context: Any, builder: Any, kind: Any, lanes: Any, array: Any, index: Any) -> Any:
     data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+    return builder.bitcast(builder.gep(data, [index]), lanes.as_pointer())
 
 
 @_intrinsic
 def load(typingctx, array, index):  # type: ignore[no-untyped-def]
-    """Return array[index : index + 8] of a contiguous float32 array of one dimension. Nothing checks the bounds."""
-    if not (_is_row(array) and isinstance(index, types.Integer)):
+    """Return array[index : index + 8] of a contiguous array of one dimension. Nothing checks the bounds."""
+    kind = _vector_of(array)
+    if kind is None or not isinstance(index, types.Integer):
         return None
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.load(_address(context, builder, sig.args[0], *args), align=4)
+        return builder.load(_address(context, builder, sig.args[0], kind.lanes, *args), align=4)
 
-    return float8(array, types.intp), generate
+    return kind(array, types.intp), generate
+
+
+@_intrinsic
+def load_bytes(typingctx, array, index):  # type: ignore[no-untyped-def]
+    """Return array[index : index + 8] of a contiguous uint8 array as eight int32. Nothing checks the bounds."""
+    if not (_is_row(array, types.uint8) and isinstance(index, types.Integer)):
+        return None
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        values = builder.load(_address(context, builder, sig.args[0], _BYTES, *args), align=1)
+        return builder.zext(values, _INTEGERS)
+
+    return integer8(array, types.intp), generate
 
 
 @_intrinsic
 def store(typingctx, array, index, value):  # type: ignore[no-untyped-def]
     """Set array[index : index + 8]. Nothing checks the bounds."""
-    if not (_is_row(array) and isinstance(index, types.Integer) and value == float8):
+    kind = _vector_of(array)
+    if kind is None or not isinstance(index, types.Integer) or value != kind:
         return None
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        builder.store(args[2], _address(context, builder, sig.args[0], *args[:2]), align=4)
+        builder.store(args[2], _address(context, builder, sig.args[0], kind.lanes, *args[:2]), align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, float8), generate
+    return types.void(array, types.intp, kind), generate
 
 
 @_intrinsic
 def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
     """Ask for the cache line of array[index] ahead of time. An index beyond the array does no harm."""
-    if not (_is_row(array) and isinstance(index, types.Integer)):
+    if not (_is_row(array, types.float32) and isinstance(index, types.Integer)):
         return None
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -132,14 +160,16 @@ def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
 
 @_intrinsic
 def splat(typingctx, value):  # type: ignore[no-untyped-def]
-    """Return a vector of one value eight times."""
+    """Return a vector of one value eight times: an int32, or a float."""
+    dtype = types.int32 if value == types.int32 else types.float32
+    kind = _KINDS[dtype]
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        first = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), args[0], ir.Constant(ir.IntType(32), 0))
-        lanes = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-        return builder.shuffle_vector(first, ir.Constant(_VECTOR, ir.Undefined), lanes)
+        nothing = ir.Constant(kind.lanes, ir.Undefined)
+        first = builder.insert_element(nothing, args[0], ir.Constant(ir.IntType(32), 0))
+        return builder.shuffle_vector(first, nothing, ir.Constant(_INTEGERS, [0] * LANES))
 
-    return float8(types.float32), generate
+    return kind(dtype), generate
 
 
 def _calling(name: str) -> Any:
@@ -206,9 +236,20 @@ def shifted(typingctx, a, b, count):  # type: ignore[no-untyped-def]
     lanes = [half + (k + count if k + count < 4 else LANES + k + count - 4) for half in (0, 4) for k in range(4)]
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.shuffle_vector(args[0], args[1], ir.Constant(ir.VectorType(ir.IntType(32), LANES), lanes))
+        return builder.shuffle_vector(args[0], args[1], ir.Constant(_INTEGERS, lanes))
 
     return float8(float8, float8, types.IntegerLiteral(count)), generate
+
+
+@_intrinsic
+def halves_added(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return four values, a's lower half plus its upper, then b's, of two integer vectors."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        lower, upper = ([half + k for half in (start, LANES + start) for k in range(4)] for start in (0, 4))
+        return builder.add(*(builder.shuffle_vector(*args, ir.Constant(_INTEGERS, half)) for half in (lower, upper)))
+
+    return integer8(integer8, integer8), generate
 
 
 @_intrinsic

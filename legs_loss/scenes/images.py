@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Iterator, Tuple
+from typing import Any, Callable, Iterator, Tuple
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.scenes.model import View
 
-__all__ = ["image_size", "image_tensor", "load_training_image", "row_strips", "training_size"]
+__all__ = ["image_size", "image_tensor", "load_training_image", "resized_pixels", "row_strips", "training_size"]
 
 WIDEST = 1600  # pixels; 3DGS shrinks wider photographs to this unless -r says otherwise
 STRIP_PIXELS = 1 << 16
@@ -51,7 +51,17 @@ def training_size(width: int, height: int, resolution: int = -1) -> Tuple[int, i
     return size
 
 
-def load_training_image(view: View, resolution: int = -1, white_background: bool = False) -> np.ndarray:
+def resized_pixels(image: Any, size: Tuple[int, int]) -> np.ndarray:
+    """Return a Pillow image of mode L, RGB or RGBA at a size, without its alpha, as uint8 [H, W, C]."""
+    return _pixels(image if image.size == size else image.resize(size))
+
+
+def load_training_image(
+    view: View,
+    resolution: int = -1,
+    white_background: bool = False,
+    resize: Callable[[Any, Tuple[int, int]], np.ndarray] = resized_pixels,
+) -> np.ndarray:
     """Return a view's photograph as 3DGS's loader makes it: read, laid on a background, resized.
 
     Args:
@@ -60,6 +70,7 @@ def load_training_image(view: View, resolution: int = -1, white_background: bool
             Elsewhere its alpha is resized with it and dropped: 3DGS never multiplies the target's colour by alpha.
         resolution: see :func:`training_size`.
         white_background: 3DGS's ``-w``, for ``composited`` views: white in place of black.
+        resize: what stands in for :func:`resized_pixels` and gives the same.
 
     Returns:
         uint8 [H, W, C], C = 3, or 1 for a gray photograph; uint16 for a gray one of 16 bits (16-bit colour is read
@@ -78,7 +89,7 @@ def load_training_image(view: View, resolution: int = -1, white_background: bool
         else:
             mode = _colour_mode(image)
             prepared = image if image.mode == mode else image.convert(mode)
-        return _pixels(prepared if prepared.size == size else prepared.resize(size))
+        return resize(prepared, size)
 
 
 def image_size(path: Path) -> Tuple[int, int]:

@@ -31,6 +31,7 @@ from legs_adapters.upstreams import registered
 __all__ = ["find"]
 
 _FORWARD = ("forward", "__call__")
+_PICTURES = {"depth", "normals", "features", "flow", "mask"}  # what else is compared in a training step
 _MAY_HAVE_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(")
 
 
@@ -101,7 +102,7 @@ class _Finder:
                 self.doubtful.append(self._doubt(function, form, place, verdict.reason))
             if self.by_hand and not chosen and not isinstance(verdict, Left):
                 verdict = self._left(function, place, "not chosen")
-            if not (isinstance(verdict, Left) and _is_noise(form, verdict)):
+            if not (isinstance(verdict, Left) and self._is_noise(form, verdict)):
                 entries.append(((place.line, place.column), verdict))
         callables = [(entry.form, self._why_not_handed(entry)) for entry in self.handed.by_holder.get(function, ())]
         for call in function.flow.calls if registered.MENTIONED.search(function.text) else ():
@@ -133,7 +134,7 @@ class _Finder:
     def _doubt(self, function: Function, form: Form, place: Place, reason: str) -> Problem:
         pair = pair_of(self.meanings, function, form)
         flipped = bool(swapped(pair.a, pair.b))
-        if not is_huber(function, form):
+        if not is_huber(self.training, function, form):
             return self._problem(function, form, place, f"nothing shows that this is the loss ({reason})", flipped)
         why = "this is a Huber loss: a weight in it would move its threshold"
         target = _short(form.first if flipped else form.second)
@@ -153,6 +154,13 @@ class _Finder:
         advice = f"(1 - w) * legs_loss.l1_loss({sides}) + w * legs_loss.d_ssim({sides})"
         why = "L1 and SSIM are one function here; with w, its weight of SSIM, they are two"
         return Problem(module.path, place.line, module.lines.text(place.line), why, advice)
+
+    def _is_noise(self, form: Form, left: Left) -> bool:
+        """An absolute difference that is no loss: of angles, sizes, neighbouring pixels."""
+        if form.callee is not None or form.reduction not in ("none", "wrapped"):
+            return False
+        trained = self.training.includes(form.node) and left.reason in _PICTURES and not same_root(form)
+        return not trained and left.reason not in ("definition", "tracking", "distillation", "huber")
 
     def _is_chosen(self, function: Function, place: Place) -> bool:
         path = function.module.path
@@ -208,7 +216,7 @@ class _Finder:
         if is_rows(function, pair.first) or is_rows(function, pair.second):
             why = "the images are lists of pixels there, of which there is no weight map"
             return self._problem(function, form, place, why, flipped)
-        if is_huber(function, form):
+        if is_huber(self.training, function, form):
             return self._left(function, place, "huber")
         if not form.direct and not unchanged_at(function, form.call, form.first, form.second):
             return self._problem(function, form, place, "the difference has a name of its own", flipped)
@@ -280,18 +288,9 @@ def _advice(function: Function, form: Form, flipped: bool, last: bool) -> str:
     settings += ', reduction="none"' if form.reduction == "none" else ""
     if form.callee is not None and form.extras:
         first, second = ("b", "a") if flipped else ("a", "b")
-        extras = ", ".join(_short(extra) for extra in form.extras)
+        extras = ", ".join(_short(extra.with_changes(comma=cst.MaybeSentinel.DEFAULT)) for extra in form.extras)
         settings += f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
     return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{settings})"
-
-
-def _is_noise(form: Form, left: Left) -> bool:
-    """An absolute difference that is no loss: of angles, sizes, neighbouring pixels."""
-    return (
-        form.callee is None
-        and form.reduction in ("none", "wrapped")
-        and left.reason not in ("definition", "tracking", "distillation", "huber")
-    )
 
 
 def _short(node: cst.CSTNode) -> str:

@@ -24,6 +24,16 @@ _SHAPE_ONLY = {"shape", "device", "dtype", "dim", "ndim", "size", "numel", "is_c
 _TRANSFORMS = {"pow", "square", "log", "log1p", "log2", "log10", "exp", "sqrt", "tanh", "sigmoid"}
 _ASKING = {"isnan", "isfinite", "isinf", "zeros_like", "ones_like"}
 _AS_THAT = {"to", "type_as", "expand_as", "view_as", "reshape_as"}  # mask.to(prediction)
+_TRANSPARENT = {
+    "staticmethod",
+    "classmethod",
+    "script",
+    "compile",
+    "jaxtyped",
+    "torch_compile",
+    "autocast",
+    "typechecked",
+}
 _NOT_L1 = {"pow", "square", "sqrt", "log", "exp", "mse_loss", "norm", "smooth_l1_loss", "huber_loss"}
 
 
@@ -306,6 +316,8 @@ def own_shape(program: Program, function: Function, call: Optional[cst.Call] = N
     a, b = names[:2]
     if not _only_differences(program, function, a, b, depth):
         return None
+    if set(function.decorators) - _TRANSPARENT:
+        return "own"  # what is returned is the decorator's to say: a mean, a weight
     known = _known_arguments(function, call)
     returned = _follow(function.body.body, {}, known)
     if returned is not None:

@@ -137,6 +137,8 @@ class Meanings:
         kind = kind_of_words(name)
         if kind == "image" and flow.kind == "feature":
             return Meaning("image", role_of_words(name) or flow.role)  # `rgb = outputs["features"]`: colours, there
+        if kind == "mask" and flow.kind == "flow":
+            return Meaning("mask", role_of_words(name) or flow.role)  # motion_masks, to be laid over a rendering
         kinds = [k for k in (kind, flow.kind) if k is not None]
         return Meaning(min(kinds, key=KINDS.index) if kinds else None, role_of_words(name) or flow.role)
 

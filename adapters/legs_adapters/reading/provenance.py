@@ -142,6 +142,21 @@ class Views:
         for camera in self._cameras:
             if attribute in camera.methods and "property" in camera.methods[attribute].decorators:
                 return f"{attribute} is computed anew each time"
+        return self._named()
+
+    def _named(self) -> Optional[str]:
+        """Why what the cameras get as a name is none of a photograph, if it is none wherever they are made."""
+        given = [
+            keywords[_NAME]
+            for name in {camera.name for camera in self._cameras or ()}
+            for function in self.program.mentioning(name, called=True)
+            for call in function.flow.calls
+            if call_name(call) == name
+            for keywords in (arguments(call)[1],)
+            if _NAME in keywords
+        ]
+        if given and all(_is_no_name(value) for value in given):
+            return f"{_NAME} is {_short(given[0])}"
         return None
 
     @staticmethod
@@ -150,6 +165,12 @@ class Views:
         for definition in function.flow.definitions.get(place, []):
             return f"{place} is written here: {_short(definition.node)}"
         return None
+
+
+def _is_no_name(node: cst.CSTNode) -> bool:
+    """``image_name=info.image_path``, or the same for all: ``image_name=None``."""
+    path = dotted(node) is not None and "path" in words(code(node).split(".")[-1])
+    return path or constant(node, node) is not node
 
 
 def _unit_range(node: cst.Call, skip: int) -> bool:

@@ -24,6 +24,7 @@ _SPLATS = re.compile(
     r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_gaussian|render_pkg|3dgs|surfel", re.I
 )
 _RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
+_BUNDLES = {"ray_bundle", "ray_samples"}
 _FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
 _RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
 _EVALUATION = word_set(
@@ -142,11 +143,16 @@ class Reasons:
         if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
             return "evaluation"
         about = self._about_splats(function) or self._rendered(module, function, form)
-        if not about or of_rays(form):
+        if not about or of_rays(form) or self._casts_rays(function):
             return "other"
         if any(is_of_mesh(self.program, function, side) for side in (form.first, form.second)):
             return "other"
         return "other" if "eikonal" in module.text and _RAY_COLOURS.search(code(form.node)) else None
+
+    def _casts_rays(self, function: Function) -> bool:
+        """Whether it is of a model that is asked for rays, ``get_outputs(self, ray_bundle)``: they make no picture."""
+        owner = self.program.owner_of(function)
+        return owner is not None and any(_BUNDLES & set(method.parameters) for method in owner.methods.values())
 
     def _called_by_framework(self, function: Function) -> bool:
         """Whether it makes the loss of a module's ``forward``, whose caller is settled at run time (a registry)."""

@@ -66,19 +66,22 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
     return Shared(again, aside if known else [])
 
 
-def is_huber(function: Function, form: Form) -> bool:
-    """``torch.where(error < d, error ** 2 / 2, d * (error - d / 2))``: an L1 above a threshold, and a square below."""
+def is_huber(training: Training, function: Function, form: Form) -> bool:
+    """``torch.where(error < d, error ** 2 / 2, d * (error - d / 2))``: an L1 above a threshold, and a square below.
+
+    A mean that is squared for a log line, ``torch.log10(1 / torch.sqrt(loss ** 2))``, makes none.
+    """
 
     def reads_it(nodes: List[cst.CSTNode]) -> bool:
         return any(node is form.node or form.node in _values(function, node) for node in nodes)
 
-    for node in function.flow.expressions:
+    for node in function.flow.expressions if form.reduction != "mean" else ():
         if isinstance(node, cst.Call) and call_name(node) == "where":
             parts = [part for arg in node.args for part in walk_expressions(arg.value)]
             if any(_squared(part) is not None for part in parts) and reads_it(parts):
                 return True
         base = _squared(node)
-        if base is not None and reads_it(list(walk_expressions(base))):
+        if base is not None and training.includes(node) and reads_it(list(walk_expressions(base))):
             return True
     return False
 

@@ -58,7 +58,8 @@ _RENDER = word_set(
     """
 )
 _LAID_OVER = word_set("mask masks valid weight weights diff error errors")
-_OF_PICTURES = word_set("sky sh shs prior time")  # a mask or coefficients, where nothing says that it is a picture
+_WHICH = word_set("first second third last left right front back")  # of several of a kind
+_OF_PICTURES = word_set("sky sh shs prior time dx dy")  # a mask, say, where nothing says that it is a picture
 _HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
 DATA = word_set(
     """
@@ -73,7 +74,7 @@ def kind_of_words(name: str) -> Optional[str]:
     spoken = words(name)
     if "no" in spoken[1:]:  # image_no_sh
         spoken = spoken[: spoken.index("no", 1)]
-    said = [word for word in spoken if not word.isdigit() and word not in _HELD_IN]
+    said = [word for word in spoken if not word.isdigit() and word not in _HELD_IN | _WHICH]
     if said and said[-1] in _LAID_OVER:
         return "mask"  # of whatever: laid over an image, it leaves an image
     kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF}

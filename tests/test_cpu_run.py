@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -95,6 +96,18 @@ class TestTraining:
         assert found["psnr"] > 15
         if found["lpips"] == "nan":
             assert measured.stderr.count("LPIPS is NaN") == 1
+
+    @pytest.mark.slow
+    @pytest.mark.skipif(importlib.util.find_spec("torchvision") is not None, reason="its networks may be had")
+    def test_torchmetrics_measures_all_but_lpips(self, tmp_path):
+        pytest.importorskip("torchmetrics")
+        (tmp_path / "measure.py").write_text(MEASURE)
+        done = run(tmp_path, "measure.py")
+        found = result(done)
+        assert found["psnr"] == pytest.approx(20)
+        assert found["lpips"] == ["nan", "nan", "nan"]
+        assert found["each"] == ["nan", "nan"]
+        assert done.stderr.count("LPIPS is NaN") == 1
 
 
 def renderer(old, new, text=None):
@@ -258,6 +271,22 @@ class TestTheScriptIsNotBent:
         assert (done.returncode, done.stdout) == (0, "2.0\n")
         assert "nothing is weighted" in done.stderr
 
+
+MEASURE = """
+import json
+import torch
+import torchmetrics
+from torchmetrics.functional.image import learned_perceptual_image_patch_similarity as lpips
+from torchmetrics.image import LearnedPerceptualImagePatchSimilarity, PeakSignalNoiseRatio
+first = torch.full((2, 3, 32, 32), 0.5, device="cuda")
+second = first + 0.1
+metric = torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to("cuda")
+assert type(metric) is LearnedPerceptualImagePatchSimilarity
+found = [metric(first, second), metric.compute(), lpips(first, second, net_type="vgg", normalize=True)]
+each = LearnedPerceptualImagePatchSimilarity(reduction="none")(first, second)
+psnr = PeakSignalNoiseRatio(data_range=1.0).to("cuda")(first, second)
+print(json.dumps({"psnr": psnr.item(), "lpips": [str(x.item()) for x in found], "each": [str(x.item()) for x in each]}))
+"""
 
 LOOK = """
 import json

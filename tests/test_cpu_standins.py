@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from types import SimpleNamespace
 
@@ -362,6 +363,15 @@ class TestGeneric:
                 use()
 
 
+class Distance(torch.nn.Module):
+    def __init__(self, power, scale):
+        super().__init__()
+        self.power, self.scale = power, scale
+
+    def forward(self, x, y):
+        return self.scale * (x - y).abs().pow(self.power).mean((1, 2, 3))
+
+
 def loss_of(image):
     generator = torch.Generator().manual_seed(5)
     weights = torch.randn(image.shape, generator=generator, dtype=torch.float64)
@@ -604,9 +614,14 @@ class TestOthers:
         assert torch.isnan(module.LPIPS("vgg")(image, image)).all()
         assert capsys.readouterr().err.count("LPIPS is NaN") == 1
 
-    def test_the_table_names_files_that_are_there(self):
+    def test_lpips_is_the_real_one_where_it_can_be_had(self):
+        network = lpips._network(lambda power, scale=1: Distance(power, scale))(2, scale=3)
+        assert network(torch.ones(2, 3, 4, 4), torch.zeros(2, 3, 4, 4)).tolist() == [3, 3]
+
+    def test_the_tables_name_files_that_are_there(self):
         for name, entry in standins.TABLE.items():
             assert standins.build(name, entry).__name__ == name
+        assert {importlib.import_module(f"legs_adapters.cpu.{file}").amend for file in standins.AMENDED.values()}
 
     def test_a_fork_s_own_rasterizer_is_not_inria_s(self):
         plain, more, scored = Interface(), Interface(), Interface()

@@ -1,7 +1,7 @@
 """LPIPS, where the weights of its networks can be had; NaN and one warning where they cannot.
 
 Other metrics of an evaluation stay useful then. Under the names ``lpipsPyTorch``, which forks carry with them, and
-``lpips``, the package.
+``lpips``, the package; and in the real ``torchmetrics``, which needs torchvision for it.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 import importlib
 import sys
 import types
-from typing import Any, Optional
+from typing import Any, Callable, Optional, Type
 
 import torch
 from torch import Tensor, nn
 
 from legs_adapters.cpu import standins
 
-__all__ = ["module"]
+__all__ = ["amend", "module"]
 
 _said = False
 
@@ -42,9 +42,8 @@ def _real(name: str) -> Any:
         sys.modules.update(kept)
 
 
-def module(name: str) -> types.ModuleType:
-    """Return ``lpipsPyTorch`` or ``lpips``."""
-    made = types.ModuleType(name, __doc__)
+def _network(real: Callable[..., nn.Module]) -> Type[nn.Module]:
+    """A class that is the network which ``real`` builds, or NaN."""
 
     class LPIPS(nn.Module):
         """The real network, or NaN."""
@@ -53,7 +52,7 @@ def module(name: str) -> types.ModuleType:
             super().__init__()
             self.network: Optional[nn.Module] = None
             try:
-                self.network = _real(name).LPIPS(*args, **kwargs)
+                self.network = real(*args, **kwargs)
             except (KeyboardInterrupt, SystemExit):
                 raise
             except BaseException as error:
@@ -64,6 +63,13 @@ def module(name: str) -> types.ModuleType:
                 return self.network(x, y, *args, **kwargs)
             return torch.full((x.shape[0] if x.dim() == 4 else 1, 1, 1, 1), float("nan"))
 
+    return LPIPS
+
+
+def module(name: str) -> types.ModuleType:
+    """Return ``lpipsPyTorch`` or ``lpips``."""
+    made = types.ModuleType(name, __doc__)
+    LPIPS = _network(lambda *args, **kwargs: _real(name).LPIPS(*args, **kwargs))
     criteria: Any = {}
 
     def lpips(x: Tensor, y: Tensor, net_type: str = "alex", version: str = "0.1") -> Tensor:
@@ -81,3 +87,17 @@ def module(name: str) -> types.ModuleType:
     for part in (made, modules):
         part.__path__ = []
     return made
+
+
+def amend(module: types.ModuleType) -> None:
+    """Let one of torchmetrics' modules do without torchvision: its metric is the real one, its network may be NaN.
+
+    Where torchvision is not installed, ``torchmetrics.image`` leaves the metric out, and the metric refuses.
+    """
+    if module.__name__ == "torchmetrics.image":
+        metric = importlib.import_module("torchmetrics.image.lpip").LearnedPerceptualImagePatchSimilarity
+        module.LearnedPerceptualImagePatchSimilarity = metric  # type: ignore[attr-defined]
+    elif module.__name__ == "torchmetrics.image.lpip":
+        module._TORCHVISION_AVAILABLE = True  # type: ignore[attr-defined]
+    else:
+        module._NoTrainLpips = _network(module._NoTrainLpips)  # type: ignore[attr-defined]

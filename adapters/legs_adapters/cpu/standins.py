@@ -1,7 +1,8 @@
 """Which module stands in for which: the table, and the import hook that puts them in.
 
 A file of this package that is named in the table has ``module(name)``, which returns the stand-in for that import
-name, complete with its submodules as attributes.
+name, complete with its submodules as attributes. One that is named in ``AMENDED`` has ``amend(module)``, which is given
+the real module once it is loaded.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any, Dict, NamedTuple, Optional, Sequence
 from legs_adapters.cpu.missing import complete
 from legs_adapters.cpu.survey import Interface
 
-__all__ = ["TABLE", "Finder", "StandIn", "build", "install", "table_for"]
+__all__ = ["AMENDED", "TABLE", "Finder", "StandIn", "build", "install", "table_for"]
 
 INRIA = "diff_gaussian_rasterization"
 
@@ -42,6 +43,11 @@ TABLE: Dict[str, StandIn] = {
     "torchvision": StandIn("torchvision", real_first=True),
     "lpipsPyTorch": StandIn("lpips"),
     "lpips": StandIn("lpips"),
+}
+AMENDED: Dict[str, str] = {
+    "torchmetrics.functional.image.lpips": "lpips",
+    "torchmetrics.image.lpip": "lpips",
+    "torchmetrics.image": "lpips",
 }
 
 
@@ -87,8 +93,10 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         """Return the stand-in's spec, or None where the name is not in the table."""
         if self._asking:
             return None
+        if fullname in AMENDED:
+            return self._amended(fullname)
         if fullname in self.table:
-            if self.table[fullname].real_first and (_is_for_a_library() or self._is_installed(fullname)):
+            if self.table[fullname].real_first and (_is_for_a_library() or self._installed(fullname)):
                 return None
             module = build(fullname, self.table[fullname])
         else:
@@ -112,14 +120,27 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def _made(self, name: str) -> bool:
         return getattr(getattr(sys.modules.get(name), "__spec__", None), "loader", None) is self
 
-    def _is_installed(self, name: str) -> bool:
+    def _installed(self, name: str) -> Optional[importlib.machinery.ModuleSpec]:
         self._asking = True
         try:
-            return importlib.util.find_spec(name) is not None
+            return importlib.util.find_spec(name)
         except (ImportError, ValueError):
-            return False
+            return None
         finally:
             self._asking = False
+
+    def _amended(self, name: str) -> Optional[importlib.machinery.ModuleSpec]:
+        spec = self._installed(name)
+        if spec is None or spec.loader is None:
+            return None
+        load = spec.loader.exec_module
+
+        def exec_module(module: types.ModuleType) -> None:
+            load(module)
+            importlib.import_module(f"{__package__}.{AMENDED[name]}").amend(module)
+
+        spec.loader.exec_module = exec_module  # type: ignore[method-assign]
+        return spec
 
 
 def _is_for_a_library() -> bool:

@@ -7,12 +7,14 @@ Every line keeps its number, so that tracebacks point at the right lines.
 
 from __future__ import annotations
 
+import atexit
 import importlib.machinery
 import importlib.util
 import linecache
 import os
 import signal
 import sys
+import threading
 import types
 from pathlib import Path
 from types import CodeType
@@ -190,10 +192,15 @@ def _show(error: BaseException) -> None:
 
 
 def _interrupted() -> int:
-    """End as Python does on Ctrl-C: by the signal, so that a shell's loop ends too; before 3.8 with exit code 1."""
+    """End as Python does on Ctrl-C: by the signal, so that a shell's loop ends too; before 3.8 with exit code 1.
+
+    First threads end and exit functions run, since a signal gives them no time.
+    """
     if sys.version_info < (3, 8):
         return 1
     if os.name == "posix":
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
         sys.stdout.flush()
         sys.stderr.flush()
         signal.signal(signal.SIGINT, signal.SIG_DFL)

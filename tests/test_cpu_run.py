@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -213,6 +214,16 @@ class TestTheScriptIsNotBent:
         assert plain == {"zeros": "builtin_function_or_method", "cpu": False, "knn": False}
         assert json.loads(run(root, "look.py").stdout) == {"zeros": "function", "cpu": True, "knn": True}
 
+    @pytest.mark.skipif(os.name != "posix" or bool(shutil.which("nvidia-smi")), reason="the real one is asked")
+    def test_a_script_that_asks_nvidia_smi_for_a_free_gpu_is_given_one(self, tmp_path):
+        root = checkout(tmp_path, dict(texts(), **{"free.py": FREE}))
+        done = run(root, "free.py")
+        assert done.returncode == 3
+        *found, folder = done.stdout.splitlines()
+        assert found[:3] == ["[0]", "['memory.used [MiB]', '0 MiB', '']", "['0, 0', '']"]
+        assert found[3] == "1  legs: error: nvidia-smi --gpu-reset has no stand-in on the CPU"
+        assert not os.path.exists(folder)
+
     @pytest.mark.slow
     @pytest.mark.parametrize("body", ["sys.exit(7)", "sys.exit('a message')", "raise RuntimeError('here')", "1 / 0"])
     def test_exit_codes_and_tracebacks_are_python_s(self, body, tmp_path):
@@ -288,6 +299,25 @@ found = [metric(first, second), metric.compute(), lpips(first, second, net_type=
 each = LearnedPerceptualImagePatchSimilarity(reduction="none")(first, second)
 psnr = PeakSignalNoiseRatio(data_range=1.0).to("cuda")(first, second)
 print(json.dumps({"psnr": psnr.item(), "lpips": [str(x.item()) for x in found], "each": [str(x.item()) for x in each]}))
+"""
+
+FREE = """
+import os
+import subprocess
+import sys
+
+def ask(command):
+    done = subprocess.run(command, shell=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, universal_newlines=True)
+    return done.returncode, done.stdout, done.stderr
+
+used = ask("nvidia-smi -q -d Memory |grep -A4 GPU|grep Used")[1].split("\\n")
+print([int(line.split()[2]) for line in used[:-1]])
+print(ask("nvidia-smi --query-gpu=memory.used --format=csv")[1].split("\\n"))
+print(ask("nvidia-smi --query-gpu=index,utilization.gpu --format=csv,noheader,nounits")[1].split("\\n"))
+code, out, error = ask("nvidia-smi --gpu-reset")
+print(code, out, error)
+print(os.environ["PATH"].split(os.pathsep)[-1])
+sys.exit(3)
 """
 
 WAIT = """

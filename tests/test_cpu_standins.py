@@ -13,7 +13,18 @@ import torch
 pytest.importorskip("numba")
 pytest.importorskip("scipy")
 
-from legs_adapters.cpu import fastgs, fused_ssim, generic, inria, lpips, simple_knn, standins, taming, torchvision
+from legs_adapters.cpu import (
+    fastgs,
+    fused_ssim,
+    generic,
+    inria,
+    lpips,
+    simple_knn,
+    standins,
+    taming,
+    torch_scatter,
+    torchvision,
+)
 from legs_adapters.cpu.camera import pinhole
 from legs_adapters.cpu.drawing import covariance
 from legs_adapters.cpu.missing import Absent, MissingStandIn
@@ -538,6 +549,59 @@ class TestOthers:
         rasterizer = inria.GaussianRasterizer(inria.GaussianRasterizationSettings(**fields))
         points = torch.tensor([[0.0, 0, 4], [0, 0, -4], [0, 0, 0.1 - 0.3]])
         assert rasterizer.markVisible(points).tolist() == [True, False, False]
+
+    @pytest.mark.parametrize("modifier", [1.0, 2.5])
+    def test_the_visible_filter_is_the_radii_of_drawing(self, modifier):
+        given, fields = gaussians(200, seed=2), dict(camera(), scale_modifier=modifier)
+        given["means3D"][::2, 0] += 8  # out of sight, but for the largest
+        (_, radii), _ = draw("inria", given, fields)
+        rasterizer = inria.GaussianRasterizer(inria.GaussianRasterizationSettings(**fields))
+        found = rasterizer.visible_filter(given["means3D"], given["scales"], given["rotations"])
+        assert torch.equal(found, radii)
+        assert 0 < int((found > 0).sum()) < 200
+
+    def test_what_a_fork_s_rasterizer_has_more_is_an_error_that_names_it(self):
+        rasterizer = generic.module("diff_fork").GaussianRasterizer(None)
+        with pytest.raises(MissingStandIn, match=r"diff_fork\.GaussianRasterizer\.integrate has no stand-in"):
+            rasterizer.integrate(torch.ones(3))
+        assert not hasattr(rasterizer, "_private")
+
+    @pytest.mark.parametrize("dim", [0, 1, -1])
+    def test_scattering(self, dim):
+        generator = torch.Generator().manual_seed(0)
+        src = torch.randn(7, 6, 5, generator=generator, dtype=torch.float64, requires_grad=True)
+        index = torch.randint(0, 4, (src.shape[dim],), generator=generator)
+        index[index == 2] = 3  # nothing has 2
+        shown = src.detach().transpose(0, dim)
+        groups = [shown[index == k] for k in range(6)]
+        results = {
+            torch_scatter.scatter_sum: [group.sum(0) for group in groups],
+            torch_scatter.scatter_add: [group.sum(0) for group in groups],
+            torch_scatter.scatter_mean: [group.sum(0) / max(1, len(group)) for group in groups],
+        }
+        for function, wanted in results.items():
+            close(function(src, index, dim, dim_size=6), torch.stack(wanted).transpose(0, dim), 1e-12)
+        assert torch_scatter.scatter_sum(src, index, dim).shape[dim] == 4
+        found, where = torch_scatter.scatter_max(src, index, dim, dim_size=6)
+        found, where = found.transpose(0, dim), where.transpose(0, dim)
+        for k, group in enumerate(groups):
+            assert torch.equal(found[k].detach(), group.max(0).values if len(group) else torch.zeros_like(shown[0]))
+            assert torch.equal(index[where[k][where[k] < len(index)]].unique(), index[index == k].unique())
+        found.sum().backward()
+        assert int(src.grad.sum()) == sum(len(group) > 0 for group in groups) * shown[0].numel()
+
+    def test_scattering_takes_the_first_of_equal_ones_and_an_index_for_each(self):
+        src = torch.tensor([[2.0, 1.0], [2.0, 5.0], [0.0, 5.0]], requires_grad=True)
+        found, where = torch_scatter.scatter_max(src, torch.tensor([[0, 1], [0, 1], [0, 0]]), 0)
+        assert found.tolist() == [[2, 5], [0, 5]]
+        assert where.tolist() == [[0, 2], [3, 1]]
+        found.sum().backward()
+        assert src.grad.tolist() == [[1, 0], [0, 1], [0, 1]]
+        assert torch_scatter.scatter_mean(torch.tensor([3, 4]), torch.tensor([0, 0])).tolist() == [3]
+        with pytest.raises(MissingStandIn, match=r"torch_scatter\.scatter_sum\(out"):
+            torch_scatter.scatter_sum(src, torch.zeros(3, dtype=torch.int64), 0, torch.zeros(1, 2))
+        with pytest.raises(MissingStandIn, match=r"torch_scatter\.segment_csr"):
+            torch_scatter.module("torch_scatter").segment_csr(src, src)
 
     @pytest.mark.parametrize("count", [4, 50])
     def test_nearest_neighbours(self, count):

@@ -7,9 +7,8 @@ from typing import Any, NamedTuple, Optional
 import numpy as np
 
 from legs_adapters.cpu.missing import MissingStandIn
-from legs_loss.reference.conventions import NEAR
 
-__all__ = ["Pinhole", "pinhole", "visible"]
+__all__ = ["Pinhole", "pinhole"]
 
 TOLERANCE = 1e-3  # pixels, and world units: what float32 matrices leave of a camera's numbers
 
@@ -66,8 +65,3 @@ def _pinhole(view: np.ndarray, full: np.ndarray, width: int, height: int, fx: fl
     if np.abs(found - (fx, fy)).max() > TOLERANCE * max(fx, fy) or np.abs(rest).max() > 1:
         return None
     return Pinhole(width, height, float(found[0]), float(found[1]), float(cx), float(cy), np.ascontiguousarray(view.T))
-
-
-def visible(positions: Any, viewmatrix: Any) -> Any:
-    """Bool [N]: which of the points [N, 3] lie beyond the near plane; all that the rasterizer leaves out by itself."""
-    return positions @ viewmatrix[:3, 2] + viewmatrix[3, 2] > NEAR

@@ -48,6 +48,8 @@ class GaussianRasterizationSettings(NamedTuple):
 class GaussianRasterizer(inria.GaussianRasterizer):
     """Draws Gaussians from the view of its settings, each in the tiles of its compact box."""
 
+    module = NAME
+
     def forward(  # type: ignore[override]
         self,
         means3D: Tensor,

@@ -65,6 +65,11 @@ def module(name: str, interface: Optional[Interface] = None) -> types.ModuleType
     class GaussianRasterizer(inria.GaussianRasterizer):
         """Draws Gaussians from the view of its settings, and returns what the caller's line unpacks."""
 
+        module = name
+
+        def lens(self) -> Lens:
+            return _lens(self.raster_settings, name)
+
         def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **inputs: Any) -> Any:  # type: ignore[override]
             known = {key: inputs.pop(key, None) for key in Gaussians._fields[3:]}
             dc, _ = inputs.pop("dc", None), inputs.pop("means2D_densify", None)
@@ -76,7 +81,7 @@ def module(name: str, interface: Optional[Interface] = None) -> types.ModuleType
             refuse_unknown(name, inputs)
             names = _names_at_call(found) or ("image", "radii")
             gaussians = Gaussians(means3D, means2D, opacities, **known)
-            drawn = draw(gaussians, self.raster_settings, name, _lens(self.raster_settings, name))
+            drawn = draw(gaussians, self.raster_settings, name, self.lens())
             if scores is not None and scores.requires_grad:  # Speedy-Splat's, read from their gradient
                 drawn.image = drawn.scored(scores)
             results = [_result(drawn, result, self.raster_settings, name) for result in names]

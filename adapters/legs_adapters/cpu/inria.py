@@ -10,11 +10,11 @@ import types
 from typing import Any, NamedTuple, Optional, Tuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from legs_adapters.cpu.camera import visible
-from legs_adapters.cpu.drawing import Gaussians, draw
+from legs_adapters.cpu.drawing import Gaussians, Lens, draw
 from legs_adapters.cpu.missing import complete, refuse_unknown
+from legs_adapters.cpu.rasterizer import Rasterizer
 from legs_adapters.cpu.sparse_adam import SparseGaussianAdam
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
@@ -39,17 +39,27 @@ class GaussianRasterizationSettings(NamedTuple):
     debug: bool
 
 
-class GaussianRasterizer(nn.Module):
+class GaussianRasterizer(Rasterizer):
     """Draws Gaussians from the view of its settings."""
 
-    def __init__(self, raster_settings: Any) -> None:
-        super().__init__()
-        self.raster_settings = raster_settings
+    module = NAME
 
-    def markVisible(self, positions: Tensor) -> Tensor:
-        """Bool [N]: which points are beyond the near plane."""
-        with torch.no_grad():
-            return visible(positions, self.raster_settings.viewmatrix)
+    def visible_filter(
+        self,
+        means3D: Tensor,
+        scales: Optional[Tensor] = None,
+        rotations: Optional[Tensor] = None,
+        cov3D_precomp: Optional[Tensor] = None,
+    ) -> Tensor:
+        """Radii int32 [N], 0 for what is out of sight, of what is not drawn yet: Scaffold-GS and its family ask."""
+        nothing = means3D.new_zeros(len(means3D), 3)
+        with torch.no_grad():  # what is transparent has a radius, and costs no blending
+            gaussians = Gaussians(means3D, nothing, nothing[:, :1], None, nothing, scales, rotations, cov3D_precomp)
+            return draw(gaussians, self.raster_settings, self.module, self.lens()).radii
+
+    def lens(self) -> Lens:
+        """Return what the settings change about the picture."""
+        return Lens()
 
     def forward(
         self,

@@ -24,6 +24,7 @@ import torch.utils.data
 from torch import Tensor
 
 from legs_adapters.cpu.missing import MissingStandIn
+from legs_adapters.cpu.nvidia_smi import memory
 
 __all__ = ["Redirection", "redirect"]
 
@@ -393,7 +394,7 @@ def _runtime(redirection: Redirection) -> None:
     for name in MEMORY_NUMBERS:
         redirection.wrap(cuda, name, lambda old: _constant(0))
         redirection.wrap(cuda.memory, name, lambda old: _constant(0))
-    total = _memory()
+    total = memory()
     answers = {
         "is_available": True,
         "is_initialized": True,
@@ -447,15 +448,6 @@ class _Zeros(Dict[str, int]):
 
     def __missing__(self, key: str) -> int:
         return 0
-
-
-def _memory() -> int:
-    import os
-
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return 8 << 30
 
 
 def _refuse() -> None:

@@ -41,6 +41,7 @@ TABLE: Dict[str, StandIn] = {
     "simple_knn": StandIn("simple_knn"),
     "fused_ssim": StandIn("fused_ssim"),
     "torchvision": StandIn("torchvision", real_first=True),
+    "torch_scatter": StandIn("torch_scatter", real_first=True),
     "lpipsPyTorch": StandIn("lpips"),
     "lpips": StandIn("lpips"),
 }

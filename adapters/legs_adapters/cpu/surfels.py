@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from legs_adapters.cpu.missing import attribute_guard
+from legs_adapters.cpu.rasterizer import Rasterizer
 from legs_loss.errors import LegsError
-from legs_loss.reference.conventions import NEAR
 
 
 class GaussianRasterizationSettings(NamedTuple):
@@ -33,17 +33,10 @@ class GaussianRasterizationSettings(NamedTuple):
     debug: bool
 
 
-class GaussianRasterizer(torch.nn.Module):
+class GaussianRasterizer(Rasterizer):
     """Draws surfels for one camera."""
 
-    def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
-        super().__init__()
-        self.raster_settings = raster_settings
-
-    def markVisible(self, positions: Tensor) -> Tensor:
-        """Which of `positions` [N, 3] lie beyond the near plane, bool [N]."""
-        with torch.no_grad():
-            return _to_camera(positions, self.raster_settings.viewmatrix)[:, 2] > NEAR
+    module = "diff_surfel_rasterization"
 
     def forward(
         self,

@@ -22,8 +22,8 @@ from legs_loss.cli import main
 from legs_loss.experiments.arms import CHANGES, LOOSE, needed, parse_arm, parse_arms
 from legs_loss.experiments.baseline import prove_unweighted
 from legs_loss.experiments.statistics import difference, summarise, times_gaussians
-from legs_loss.experiments.studies import STUDIES
-from legs_loss.experiments.tables import differences_table, markdown, paper_text, scores_table
+from legs_loss.experiments.studies import STUDIES, these_arms
+from legs_loss.experiments.tables import again_text, differences_table, markdown, paper_text, scores_table
 
 pytest.importorskip("numba")
 pytest.importorskip("scipy")
@@ -31,7 +31,7 @@ pytest.importorskip("scipy")
 from skimage.metrics import structural_similarity
 
 from legs_loss.experiments.losses import LOSSES
-from legs_loss.experiments.running import Comparison, read_rows
+from legs_loss.experiments.running import Comparison, read_row, read_rows, train_again
 from legs_loss.experiments.weighting import WEIGHTINGS, fading, growing, multiscale, shuffled
 from legs_loss.reference.training import trainer
 from legs_loss.reference.training.dataset import TrainingView, load_dataset
@@ -94,6 +94,14 @@ def test_every_study_and_change_can_be_named() -> None:
     for change in CHANGES:
         assert parse_arm(f"legs:{change}").changes == (change,)
     assert set(WEIGHTINGS) | set(LOSSES) <= set(CHANGES)
+
+
+def test_a_users_arms_stand_beside_what_they_are_measured_against() -> None:
+    study = these_arms(["C1", "beta=0", "3dgs@C3", "legs@3dgs", "C1"])
+    assert study.arms == ("beta=0", "legs", "C1", "3dgs@C3", "legs@3dgs")
+    assert study.reference("3dgs@legs") == "legs"
+    assert study.reference("legs@3dgs") == "3dgs"
+    assert study.reference("3dgs") is None
 
 
 def test_the_settings_of_controls() -> None:
@@ -240,7 +248,7 @@ def test_rows_are_complete_and_can_be_run_alone(tiny_scene: Path, tmp_path: Path
         assert counted["growth"] == plain["growth"]
     row = by_name["legs@3dgs", 1]
     assert row["versions"]["torch"] == torch.__version__
-    # From its row alone, without the comparison.
+    # From its row alone, by the trainer and by the package.
     again = train(
         read_scene(tiny_scene),
         TrainConfig.from_dict(row["config"]),
@@ -248,6 +256,14 @@ def test_rows_are_complete_and_can_be_run_alone(tiny_scene: Path, tmp_path: Path
         evaluate_every=4,
     ).metrics
     assert without_times(again) == without_times(row["metrics"])
+    before = sorted(out.rglob("*"))
+    path = out / "legs-shuffled" / "seed-1" / "row.json"
+    now = train_again(path, None, lambda progress: None)
+    assert without_times(now["metrics"]) == without_times(by_name["legs:shuffled", 1]["metrics"])
+    assert again_text(read_row(path), now).endswith("The same to the last digit.")
+    assert sorted(out.rglob("*")) == before
+    now["versions"]["torch"], now["metrics"]["gaussians"] = "9.9", 1
+    assert f"What differs: torch ({torch.__version__}, now 9.9)." in again_text(read_row(path), now)
     # Given again, nothing is trained.
     del told[:]
     assert comparison.train(arms, [0, 1], 2, lambda name, progress: told.append(name)) == rows
@@ -272,6 +288,53 @@ def test_an_interrupted_row_goes_on(tiny_scene: Path, tmp_path: Path) -> None:
     assert (out / arm.folder / "seed-0" / CHECKPOINT).is_file()
     row = Comparison(tiny_scene, BASE, out).train_one(arm, 0)
     assert without_times(row["metrics"]) == without_times(whole["metrics"])
+
+
+def test_a_baseline_is_proven_anew_when_a_comparison_goes_on(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Comparison(tiny_scene, BASE, tmp_path)
+    plain = trainer.step_loss
+    monkeypatch.setattr(
+        "legs_loss.experiments.baseline.step_loss",
+        lambda prediction, target, weight, share: plain(prediction, target, weight_map(target, "legs"), share),
+    )
+    with pytest.raises(LegsError, match="the baseline's loss is not 3DGS's"):
+        Comparison(tiny_scene, BASE, tmp_path)
+
+
+@pytest.mark.parametrize("damage", ["{", "{}", "[]", '{"arm": "legs", "seed": 0}'])
+def test_damaged_files_are_named(damage: str, tiny_scene: Path, tmp_path: Path) -> None:
+    comparison = Comparison(tiny_scene, BASE, tmp_path)
+    plan = tmp_path / "3dgs" / "seed-0" / "plan.json"
+    row = plan.with_name("row.json")
+    plan.parent.mkdir(parents=True)
+    plan.write_text(damage)
+    with pytest.raises(LegsError, match=r"plan.json: this file is damaged"):
+        comparison.train_one(parse_arm("3dgs"), 0)
+    row.write_text(damage)
+    for read in (lambda: comparison.row(parse_arm("3dgs"), 0), lambda: read_rows(tmp_path), lambda: read_row(row)):
+        with pytest.raises(LegsError, match=r"row.json: this file is damaged"):
+            read()
+    with pytest.raises(LegsError, match="no row here"):
+        read_row(tmp_path)
+    (tmp_path / "comparison.json").write_text(damage)
+    with pytest.raises(LegsError, match=r"comparison.json: this file is damaged"):
+        Comparison(tiny_scene, BASE, tmp_path)
+
+
+def test_where_nothing_can_be_written(tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "file").write_text("")
+    settings = ["--iterations", "4", "-r", "2", "--seeds", "1", "--processes", "1"]
+    for scene in ([str(tiny_scene)], []):  # its own scene is written there first
+        assert main(["compare", *scene, *settings, "--out", str(tmp_path / "file")]) == 2
+        assert capsys.readouterr().err.startswith(f"legs: error: cannot write {tmp_path / 'file'}")
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "3dgs").write_text("")
+    assert main(["compare", str(tiny_scene), *settings, "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "cannot write" in error and "Traceback" not in error
 
 
 def test_another_comparison_in_the_folder_is_refused(tiny_scene: Path, tmp_path: Path) -> None:
@@ -417,7 +480,7 @@ def test_the_command(tiny_scene: Path, tmp_path: Path) -> None:
     assert "6 of 6 trainings to do" in done.stdout
     rows = read_rows(tmp_path / "out")[1]
     assert len(rows) == 6
-    assert scores_table(rows, ["legs", "legs@3dgs"]) in done.stdout
+    assert scores_table(rows, ["3dgs", "legs", "legs@3dgs"]) in done.stdout
     again = subprocess.run(arguments, env=environment(), capture_output=True, text=True, encoding="utf-8")
     assert again.returncode == 0
     assert "0 of 6 trainings to do" in again.stdout
@@ -440,12 +503,35 @@ def test_ctrl_c_keeps_the_rows_that_are_done(tiny_scene: Path, tmp_path: Path) -
     assert read_rows(out)[1][0]["arm"] == "3dgs"
 
 
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+def test_killed_it_goes_on(tiny_scene: Path, tmp_path: Path) -> None:
+    """Killed with no chance to clean up: its trainings end by themselves, in silence, and what is there is used."""
+    out = tmp_path / "out"
+    arguments = command("compare", tiny_scene, "--out", out, "--iterations", 150, "-r", 1, "--processes", 1)
+    arguments += ["--seeds", "1", "--arms", "legs"]
+    with open(str(tmp_path / "stderr"), "wb") as stderr:
+        process = subprocess.Popen(arguments, env=environment(), stderr=stderr, start_new_session=True)
+        deadline = time.monotonic() + 240
+        while not (out / "legs" / "seed-0" / CHECKPOINT).exists():
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        process.kill()
+        process.wait()
+    done = subprocess.run(arguments, env=environment(), capture_output=True, text=True, encoding="utf-8")
+    assert done.returncode == 0, done.stderr
+    assert "1 of 2 trainings to do" in done.stdout
+    assert b"Traceback" not in (tmp_path / "stderr").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
         (["--seeds", "0"], "--seeds must be at least 1"),
         (["--arms", "legs:louder"], "no change is named 'louder'"),
         (["--iterations", "0"], "iterations must be at least 1"),
+        (["--first_seed", "-1"], "--first_seed must be at least 0"),
+        (["--again", "row.json"], "row.json: there is no row here"),
     ],
 )
 def test_mistakes_on_the_command_line(
@@ -455,3 +541,4 @@ def test_mistakes_on_the_command_line(
     error = capsys.readouterr().err
     assert error.startswith("legs: error: ") and says in error
     assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()

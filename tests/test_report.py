@@ -114,8 +114,24 @@ def test_a_page_that_would_be_too_large(page_path: Path, comparison: Path, tmp_p
 def test_mistakes(arguments: List[str], says: str, comparison: Path, tmp_path: Path, capsys: Any) -> None:
     assert main(["report", str(comparison), "-o", str(tmp_path / "a.html"), *arguments]) == 2
     assert says in capsys.readouterr().err
+    assert not (tmp_path / "a.html").exists()
     assert main(["report", str(tmp_path)]) == 2
     assert "no comparison here" in capsys.readouterr().err
+
+
+def test_another_scene_and_a_place_that_cannot_be_written(
+    comparison: Path, tiny_scene: Path, tmp_path: Path, capsys: Any
+) -> None:
+    other = shutil.copytree(str(tiny_scene), str(tmp_path / "other"))
+    points = Path(other) / "sparse" / "0" / "points3D.bin"
+    data = bytearray(points.read_bytes())
+    data[20] ^= 1
+    points.write_bytes(bytes(data))
+    assert main(["report", str(comparison), "--scene", other, "-o", str(tmp_path / "a.html")]) == 2
+    assert "not the scene of the comparison" in capsys.readouterr().err
+    for place in (tmp_path, points / "a.html"):
+        assert main(["report", str(comparison), "-o", str(place)]) == 2
+        assert f"cannot write {place}" in capsys.readouterr().err
 
 
 # In a browser

@@ -11,6 +11,7 @@ embedded scene, which it makes first.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Dict
 
@@ -32,6 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", nargs="?", help="a COLMAP scene; default: the embedded scene")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--arms", nargs="+", metavar="ARM", help="default: those of --study")
+    what.add_argument(
+        "--again",
+        type=Path,
+        metavar="ROW",
+        help="train one row again from its own OUT/ARM/seed-N/row.json, and show its scores then and now; the other "
+        "settings are the row's",
+    )
     what.add_argument(
         "--study",
         choices=STUDIES,
@@ -71,32 +79,26 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.errors import LegsError
     from legs_loss.experiments.arms import needed, parse_arms
     from legs_loss.experiments.running import BASELINE, Comparison, read_rows
-    from legs_loss.experiments.studies import STUDIES, Study
+    from legs_loss.experiments.studies import STUDIES, these_arms
     from legs_loss.experiments.tables import study_text
-    from legs_loss.reference.embedded import write_embedded_scene
     from legs_loss.reference.training.trainer import Progress, TrainConfig
     from legs_loss.scenes import read_scene
 
     set_threads(None)  # without numba there is no training: say so now
-    for name in ("seeds", "processes"):
-        if getattr(args, name) < 1:
-            raise LegsError(f"--{name} must be at least 1, got {getattr(args, name)}")
-    study = STUDIES[args.study]
-    if args.arms is not None:
-        study = Study("These arms", tuple(args.arms), "The paper has no such table.")
+    if args.again is not None:
+        return _again(args)
+    for name, least in (("seeds", 1), ("first_seed", 0), ("processes", 1)):
+        if getattr(args, name) < least:
+            raise LegsError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    study = STUDIES[args.study] if args.arms is None else these_arms(args.arms)
     arms = needed(parse_arms([BASELINE, *study.arms]))
     seeds = range(args.first_seed, args.first_seed + args.seeds)
-    root = Path(args.scene) if args.scene is not None else args.out / "scene"
-    if args.scene is None and not (root / "sparse").is_dir():
-        print(f"making the embedded scene in {root}", flush=True)
-        write_embedded_scene(root, VIEWS, WIDTH, HEIGHT)
+    base = TrainConfig(iterations=args.iterations, densify_grad_threshold=args.densify_grad_threshold)
+    root = _embedded(args.out / "scene") if args.scene is None else Path(args.scene)
     resolution = args.resolution
     if resolution is None:
         resolution = default_resolution(read_scene(root, args.images))
-    base = TrainConfig(
-        iterations=args.iterations, resolution=resolution, densify_grad_threshold=args.densify_grad_threshold
-    )
-    comparison = Comparison(root, base, args.out, args.images)
+    comparison = Comparison(root, replace(base, resolution=resolution), args.out, args.images)
     proof = comparison.proof
     print(
         f"The baseline is unweighted: over {proof['views']} views its loss is {proof['loss']:.6f}, 3DGS's own "
@@ -118,6 +120,31 @@ def run(args: argparse.Namespace) -> int:
     print()
     print(READING)
     print(f"Rows: {args.out}; as a page: legs report {args.out}")
+    return 0
+
+
+def _embedded(root: Path) -> Path:
+    from legs_loss.errors import LegsError
+    from legs_loss.reference.embedded import write_embedded_scene
+
+    if not (root / "sparse" / "0" / "points3D.bin").is_file():  # what is written last
+        print(f"making the embedded scene in {root}", flush=True)
+        try:
+            write_embedded_scene(root, VIEWS, WIDTH, HEIGHT)
+        except OSError as error:
+            raise LegsError(f"cannot write {root}: {error.strerror or error}") from None
+    return root
+
+
+def _again(args: argparse.Namespace) -> int:
+    from legs_loss.cli.train import progress_bar
+    from legs_loss.experiments.running import read_row, train_again
+    from legs_loss.experiments.tables import again_text
+
+    row = read_row(args.again)
+    with progress_bar(row["config"]["iterations"], row["arm"]) as show:
+        now = train_again(args.again, None if args.scene is None else Path(args.scene), show)
+    print(again_text(row, now))
     return 0
 
 

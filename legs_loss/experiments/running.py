@@ -1,7 +1,7 @@
 """A comparison in a folder: its settings, and one row an arm and seed, each of which can be run again alone.
 
 OUT/comparison.json              the scene and the settings that all arms share, the proof of the baseline
-OUT/ARM/seed-N/plan.json         the row's own settings, complete
+OUT/ARM/seed-N/plan.json         the row's own settings, complete: from them alone it can be trained again
 OUT/ARM/seed-N/row.json          the same with the scores, once it is trained
 OUT/ARM/seed-N/point_cloud/...   its Gaussians
 """
@@ -31,10 +31,15 @@ from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
 
-__all__ = ["BASELINE", "Comparison", "Row", "read_rows", "versions"]
+__all__ = ["BASELINE", "Comparison", "Row", "read_row", "read_rows", "scene_of", "train_again", "versions"]
 
 BASELINE = "3dgs"
 EVALUATIONS = 10  # of the held-out views during a run, for the plots
+
+# What the files must hold to be of use; one that was cut off, or is something else, is called damaged.
+_SETTINGS = ("scene", "path", "images", "base", "baseline")
+_PLAN = ("arm", "seed", "config", "weighting", "loss", "caps")
+_ROW = (*_PLAN, "versions", "metrics")
 
 Row = Dict[str, Any]
 
@@ -82,7 +87,7 @@ class Comparison:
     def row(self, arm: ArmSpec, seed: int) -> Optional[Row]:
         """The row of an arm and seed, None if it is not trained yet."""
         path = self.folder(arm, seed) / "row.json"
-        return _read(path) if path.is_file() else None
+        return _read(path, _ROW) if path.is_file() else None
 
     def train(
         self,
@@ -135,19 +140,8 @@ class Comparison:
             "loss": arm.loss,
             "caps": None if caps is None else sorted(caps.items()),
         }
-        _keep(folder / "plan.json", json.loads(json.dumps(plan)), "row")
-        return Arm(
-            name,
-            self.root,
-            config,
-            folder,
-            self.images,
-            weighting=None if arm.weighting is None else WEIGHTINGS[arm.weighting],
-            loss=step_loss if arm.loss is None else LOSSES[arm.loss],
-            caps=caps,
-            evaluate_every=max(1, config.iterations // EVALUATIONS),
-            resume=(folder / CHECKPOINT).is_file(),
-        )
+        _keep(folder / "plan.json", json.loads(json.dumps(plan)), "row", _PLAN)
+        return _planned(name, plan, self.root, self.images, folder)
 
     def _config(self, arm: ArmSpec, seed: int) -> Tuple[TrainConfig, Optional[Dict[int, int]]]:
         mean_weight = self.mean_weight(arm.spec) if arm.needs_mean_weight else 1.0
@@ -163,7 +157,7 @@ class Comparison:
         folder = self.folder(arm, seed)
         if arm.name == BASELINE and metrics["mean_weight"] != 1.0:
             raise LegsError(f"the baseline was trained with weights of mean {metrics['mean_weight']}")
-        row = dict(_read(folder / "plan.json"), versions=versions(), metrics=metrics)
+        row = dict(_read(folder / "plan.json", _PLAN), versions=versions(), metrics=metrics)
         _write(folder / "row.json", row)
         (folder / CHECKPOINT).unlink()
 
@@ -175,12 +169,10 @@ class Comparison:
             "base": replace(self.base, densify_grad_threshold=self.threshold).as_dict(),
         }
         path = self.out / "comparison.json"
-        _keep(path, dict(settings, baseline=None), "comparison", ("path", "baseline"))
-        stored = _read(path)
-        if stored["baseline"] is None:
-            stored["baseline"] = prove_unweighted(self.data.train, self.base)
-            _write(path, stored)
-        self.proof: Dict[str, Any] = stored["baseline"]
+        _keep(path, dict(settings, baseline=None), "comparison", _SETTINGS, ("path", "baseline"))
+        # Anew each time: a comparison that goes on may do so with other code than it was begun with.
+        self.proof = prove_unweighted(self.data.train, self.base)
+        _write(path, dict(_read(path, _SETTINGS), baseline=self.proof))
 
 
 def read_rows(out: Path) -> Tuple[Dict[str, Any], List[Row]]:
@@ -191,10 +183,48 @@ def read_rows(out: Path) -> Tuple[Dict[str, Any], List[Row]]:
     """
     if not (out / "comparison.json").is_file():
         raise LegsError(f"{out}: there is no comparison here (comparison.json): `legs compare` makes one")
-    rows = [_read(path) for path in sorted(out.glob("*/seed-*/row.json"))]
+    rows = [_read(path, _ROW) for path in sorted(out.glob("*/seed-*/row.json"))]
     if not rows:
         raise LegsError(f"{out}: none of this comparison's rows is trained yet")
-    return _read(out / "comparison.json"), sorted(rows, key=lambda row: (row["arm"], row["seed"]))
+    return _read(out / "comparison.json", _SETTINGS), sorted(rows, key=lambda row: (row["arm"], row["seed"]))
+
+
+def scene_of(settings: Mapping[str, Any], moved: Optional[Path] = None) -> Scene:
+    """Return the scene of a comparison with these settings; ``moved`` is where it lies now.
+
+    Raises:
+        LegsError: it is not there, or it is another scene.
+    """
+    root = Path(settings["path"]) if moved is None else moved
+    if not root.is_dir():
+        raise LegsError(f"{root}: the scene is not there: say where it lies now (--scene)")
+    scene = read_scene(root, settings["images"])
+    if _identity(scene)["sha256"] != settings["scene"]["sha256"]:
+        raise LegsError(f"{root}: this is not the scene of the comparison: it has other views or points")
+    return scene
+
+
+def read_row(path: Path) -> Row:
+    """Return the row of a ``row.json``.
+
+    Raises:
+        LegsError: it is no row.
+    """
+    if path.name != "row.json" or not path.is_file():
+        raise LegsError(f"{path}: there is no row here: a row is COMPARISON/ARM/seed-N/row.json")
+    return _read(path, _ROW)
+
+
+def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progress], None]) -> Row:
+    """Train the row of a ``row.json`` anew, from that file alone, and keep nothing; return the new row.
+
+    Raises:
+        LegsError: it is no row, or its scene is not there.
+    """
+    row = read_row(path)
+    settings = _read(path.resolve().parents[2] / "comparison.json", _SETTINGS)
+    training = _planned(row["arm"], row, scene_of(settings, moved).root, settings["images"], None)
+    return dict(row, versions=versions(), metrics=train_arm(training, on_progress))
 
 
 def versions() -> Dict[str, str]:
@@ -209,7 +239,34 @@ def versions() -> Dict[str, str]:
         "numba": numba.__version__,
         "numpy": np.__version__,
         "machine": f"{platform.system()} {platform.machine()}",
+        "code": _code(),
     }
+
+
+def _code() -> str:
+    """A checksum of this package's sources: they change more often than its version, and rounding with them."""
+    digest = hashlib.sha256()
+    package = Path(__file__).resolve().parents[1]
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _planned(name: str, plan: Mapping[str, Any], root: Path, images: Optional[str], folder: Optional[Path]) -> Arm:
+    """The training that a plan describes; a folder that has its checkpoint is gone on with."""
+    config = TrainConfig.from_dict(plan["config"])
+    return Arm(
+        name,
+        root,
+        config,
+        folder,
+        images,
+        weighting=None if plan["weighting"] is None else WEIGHTINGS[plan["weighting"]],
+        loss=step_loss if plan["loss"] is None else LOSSES[plan["loss"]],
+        caps=None if plan["caps"] is None else {int(iteration): int(count) for iteration, count in plan["caps"]},
+        evaluate_every=max(1, config.iterations // EVALUATIONS),
+        resume=folder is not None and (folder / CHECKPOINT).is_file(),
+    )
 
 
 def _identity(scene: Scene) -> Dict[str, Any]:
@@ -220,13 +277,12 @@ def _identity(scene: Scene) -> Dict[str, Any]:
     return {"name": scene.root.resolve().name, "views": len(scene.views), "sha256": digest.hexdigest()[:16]}
 
 
-def _keep(path: Path, values: Dict[str, Any], what: str, free: Sequence[str] = ()) -> None:
+def _keep(path: Path, values: Dict[str, Any], what: str, names: Sequence[str], free: Sequence[str] = ()) -> None:
     """Write values, or find the same there already; those of the names in ``free`` may differ."""
     if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
         _write(path, values)
         return
-    there = _read(path)
+    there = _read(path, names)
     different = [
         name for name, text in _flat(values) if name.split(".")[0] not in free and dict(_flat(there)).get(name) != text
     ]
@@ -245,14 +301,23 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[Tuple[str, An
             yield prefix + name, value
 
 
-def _read(path: Path) -> Dict[str, Any]:
+def _read(path: Path, names: Sequence[str]) -> Dict[str, Any]:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LegsError(f"cannot read {path}: {error.strerror or error}") from None
     except ValueError:
-        raise LegsError(f"{path}: this file is damaged: delete it and run the comparison again") from None
+        values = None
+    if not isinstance(values, dict) or not set(names) <= set(values):
+        raise LegsError(f"{path}: this file is damaged: delete it and run the comparison again")
+    return values
 
 
 def _write(path: Path, values: Mapping[str, Any]) -> None:
     part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-    os.replace(str(part), str(path))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+        os.replace(str(part), str(path))
+    except OSError as error:
+        raise LegsError(f"cannot write {path}: {error.strerror or error}") from None

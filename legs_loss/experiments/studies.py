@@ -7,9 +7,11 @@ Of the paper this project knows the text and one table, the training PSNR by cur
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import Mapping, NamedTuple, Optional, Tuple
+from typing import Mapping, NamedTuple, Optional, Sequence, Tuple
 
-__all__ = ["STUDIES", "Study"]
+from legs_loss.experiments.arms import needed, parse_arm, parse_arms
+
+__all__ = ["STUDIES", "Study", "these_arms"]
 
 
 class Study(NamedTuple):
@@ -86,5 +88,27 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
             ),
             "The paper does not compare at equal numbers of Gaussians.",
         ),
+        # Weights of at most 1.00001: what differs is rounding, and what it grows to.
+        "noise": Study(
+            "What differs where nothing should",
+            ("3dgs", "beta=1e-6", "beta=2e-6", "beta=3e-6", "beta=4e-6", "beta=5e-6", "beta=6e-6"),
+            "The paper does not say how far its runs scatter.",
+        ),
     }
 )
+
+
+def these_arms(names: Sequence[str]) -> Study:
+    """Return the study of arms that a user names, with the baseline and the arms whose numbers they take.
+
+    3DGS with an arm's number of Gaussians is measured against that arm.
+
+    >>> these_arms(["C4", "3dgs@legs"]).arms
+    ('3dgs', 'legs', 'C4', '3dgs@legs')
+    """
+    own = dict(zip((arm.name for arm in map(parse_arm, names)), names))
+    arms = sorted(needed(parse_arms(["3dgs", *names])), key=lambda arm: arm.name != "3dgs")  # else as they were
+    against = {arm.name: arm.at for arm in arms if arm.spec.beta == 0 and arm.at not in (None, "3dgs")}
+    return Study(
+        "These arms", tuple(own.get(arm.name, arm.name) for arm in arms), "The paper has no such table.", against
+    )

@@ -8,10 +8,11 @@ from typing import Any, List, Mapping, Optional, Sequence
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE
-from legs_loss.experiments.statistics import SCORES, Difference, difference, summarise_all, times_gaussians
+from legs_loss.experiments.statistics import SCORES, Difference, difference, summarise, summarise_all, times_gaussians
 from legs_loss.experiments.studies import Study
 
 __all__ = [
+    "again_text",
     "difference_cell",
     "differences_table",
     "markdown",
@@ -116,6 +117,21 @@ def study_text(rows: Rows, study: Study) -> str:
     """Return a study's tables and what the paper says."""
     parts = [f"## {study.title}", scores_table(rows, study.arms), differences_table(rows, study)]
     return "\n\n".join([*parts, paper_text(rows, study)])
+
+
+def again_text(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Return a row's scores as they were and as they are when it is trained again, and whether they are the same."""
+    lines = [[when, *score_cells(*summarise([row])[2:])] for when, row in (("then", then), ("now", now))]
+    same = all(then["metrics"][name] == now["metrics"][name] for name in ("views", "gaussians", "growth"))
+    text = f"{then['arm']}, seed {then['seed']}\n\n{markdown(['', *SCORES], lines)}\n\n"
+    if same:
+        return text + "The same to the last digit."
+    changed = [name for name, value in now["versions"].items() if then["versions"].get(name) != value]
+    told = ", ".join(f"{name} ({then['versions'].get(name)}, now {now['versions'][name]})" for name in changed)
+    return text + (
+        f"Not the same. What differs: {told or 'the processor, it seems'}. Another rounding grows in a training "
+        "until it has moved the scores; --study noise shows how far."
+    )
 
 
 def _orders(rows: Rows, study: Study, gains: Mapping[str, Difference]) -> List[str]:

@@ -12,7 +12,7 @@ from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import parse_arm
-from legs_loss.experiments.running import BASELINE, read_rows
+from legs_loss.experiments.running import BASELINE, read_rows, scene_of
 from legs_loss.experiments.statistics import SCORES, difference, summarise_all, times_gaussians
 from legs_loss.experiments.tables import difference_cell, score_cells
 from legs_loss.reference.training.dataset import load_view, split_views
@@ -20,7 +20,7 @@ from legs_loss.reference.training.trainer import TrainConfig
 from legs_loss.report.html_pictures import FORMATS as IMAGE_FORMATS
 from legs_loss.report.html_pictures import Pictures, draw_row, encode
 from legs_loss.report.html_plots import by_gaussians, by_iterations
-from legs_loss.scenes import Scene, View, read_scene
+from legs_loss.scenes import Scene, View
 
 __all__ = ["LIMIT", "write_report"]
 
@@ -55,7 +55,7 @@ def write_report(
     settings, rows = read_rows(run)
     names = _arms(rows, arms)
     rows = [row for row in rows if row["arm"] in names]
-    read = _scene(settings, scene)
+    read = scene_of(settings, scene)
     shown = _views(read, views)
     first: Dict[str, Row] = {}
     for row in sorted(rows, key=lambda row: row["seed"]):
@@ -76,8 +76,11 @@ def write_report(
         page = _page(settings, rows, names, [encode(view, each, form) for view, each in drawn], first, run)
         data = page.encode("utf-8")
         if len(data) < LIMIT:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(data)
+            except OSError as error:
+                raise LegsError(f"cannot write {path}: {error.strerror or error}") from None
             return path
     raise LegsError(
         f"the page would have {len(data) / 1e6:.0f} MB, above {LIMIT / 1e6:.0f}: choose fewer --views or --arms"
@@ -211,7 +214,7 @@ def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> str:
         ),
     }
     shared.update({name: str(base[name]) for name in base if name not in ("spec", "seed", "max_gaussians")})
-    versions = {name: sorted({row["versions"][name] for row in rows}) for name in rows[0]["versions"]}
+    versions = {name: sorted({str(row["versions"].get(name)) for row in rows}) for name in rows[0]["versions"]}
     shared.update(
         {f"version of {name}" if name != "machine" else name: ", ".join(each) for name, each in versions.items()}
     )
@@ -238,13 +241,6 @@ def _arms(rows: Sequence[Row], asked: Optional[Sequence[str]]) -> List[str]:
         if name not in there:
             raise LegsError(f"no row of the arm {name} is trained: there are {', '.join(there)}")
     return names
-
-
-def _scene(settings: Mapping[str, Any], moved: Optional[Path]) -> Scene:
-    root = Path(settings["path"]) if moved is None else moved
-    if not root.is_dir():
-        raise LegsError(f"{root}: the scene is not there: say where it lies now (--scene)")
-    return read_scene(root, settings["images"])
 
 
 def _views(scene: Scene, asked: Optional[Sequence[str]]) -> List[View]:

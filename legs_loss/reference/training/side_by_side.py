@@ -24,7 +24,7 @@ class Arm(NamedTuple):
     name: str
     scene: Path
     config: TrainConfig
-    out: Path
+    out: Optional[Path]
     images: Optional[str] = None
     store: Optional[Path] = None
     weighting: Optional[Weighting] = None
@@ -121,6 +121,9 @@ def train_arm(arm: Arm, on_progress: Callable[[Progress], None]) -> Dict[str, An
 
 def _work(connection: Connection, arm: Arm) -> None:
     try:
-        connection.send(train_arm(arm, connection.send))
-    except LegsError as error:
-        connection.send(str(error))
+        try:
+            connection.send(train_arm(arm, connection.send))
+        except (LegsError, OSError) as error:  # a full disk is no fault of the code either
+            connection.send(str(error))
+    except OSError:
+        pass  # the parent was killed: nobody listens, and what is saved is gone on with

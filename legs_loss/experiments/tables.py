@@ -20,6 +20,7 @@ __all__ = [
     "score_cells",
     "scores_table",
     "study_text",
+    "times_cell",
 ]
 
 Rows = Sequence[Mapping[str, Any]]
@@ -96,7 +97,7 @@ def differences_table(rows: Rows, study: Study) -> str:
         ]
         ratio = times_gaussians(rows, name, reference)
         if ratio is not None:
-            lines.append([f"{label(arm)} − {reference}", *cells, _times(ratio)])
+            lines.append([f"{label(arm)} − {reference}", *cells, times_cell(ratio)])
     heads = ["difference", "train PSNR", "held-out PSNR", "held-out SSIM", "strongest 10%", "Gaussians"]
     return markdown(heads, lines)
 
@@ -158,5 +159,6 @@ def difference_cell(value: Optional[Difference], score: str) -> str:
     return text + ("" if value.clear else " ?")
 
 
-def _times(ratio: float) -> str:
+def times_cell(ratio: float) -> str:
+    """Return how many times as many Gaussians as a cell: "same" where the two numbers are as close as promised."""
     return "same" if abs(ratio - 1) <= SAME_NUMBER else f"{ratio:.2f}x"

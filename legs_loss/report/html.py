@@ -14,7 +14,7 @@ from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE, read_rows, scene_of
 from legs_loss.experiments.statistics import SCORES, difference, summarise_all, times_gaussians
-from legs_loss.experiments.tables import difference_cell, score_cells
+from legs_loss.experiments.tables import difference_cell, score_cells, times_cell
 from legs_loss.reference.training.dataset import load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
 from legs_loss.report.html_pictures import FORMATS as IMAGE_FORMATS
@@ -152,7 +152,7 @@ def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
             for one, (_, score) in zip(found, columns)
         ]
         ratio = times_gaussians(rows, arm, BASELINE)
-        times = ("–", _sortable(math.nan)) if ratio is None else (f"{ratio:.2f}x", _sortable(ratio))
+        times = ("–", _sortable(math.nan)) if ratio is None else (times_cell(ratio), _sortable(ratio))
         body.append([(arm, arm), *cells, times])
     return _table(
         f"Each arm minus {BASELINE}, paired by view. Brackets: 95% bootstrap interval over views. ? where it holds 0, "

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
-from typing import Any, Iterator, List
+from typing import Any, Dict, Iterator, List
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "examples" / "reproduce_paper"
 
 # A codebase with FastGS's arguments whose number of Gaussians follows its threshold.
 TRAIN = """
-import argparse, os, pathlib
+import argparse, os, pathlib, time
 parser = argparse.ArgumentParser()
 parser.add_argument("-s"); parser.add_argument("-m"); parser.add_argument("--eval", action="store_true")
 parser.add_argument("--grad_thresh", type=float, default=0.0002)
@@ -27,6 +29,8 @@ with open(pathlib.Path(args.s) / "log.txt", "a") as log:
     print(f"{os.path.basename(args.m)} {os.environ.get('LEGS_OFF')} {os.environ.get('LEGS_PRESET')}", file=log)
 if (pathlib.Path(args.s) / "broken").exists():
     raise SystemExit(3)
+while (pathlib.Path(args.s) / "endless").exists():
+    time.sleep(0.05)
 count = int(1000 * (0.0002 / args.grad_thresh) ** 0.8 * (2.5 if os.environ.get("LEGS_PRESET") else 1))
 folder = pathlib.Path(args.m) / "point_cloud" / "iteration_7"
 folder.mkdir(parents=True, exist_ok=True)
@@ -71,9 +75,12 @@ def checkout(tmp_path: Path) -> Path:
 
 def run(*arguments: Any, data: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(FOLDER / "reproduce.py"), *map(str, arguments)]
+    return subprocess.run(command, env=environment(), capture_output=True, text=True, cwd=str(data), encoding="utf-8")
+
+
+def environment() -> Dict[str, str]:
     root = str(FOLDER.parents[1])
-    env = dict(os.environ, PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])))
-    return subprocess.run(command, env=env, capture_output=True, text=True, cwd=str(data), encoding="utf-8")
+    return dict(os.environ, PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])))
 
 
 def test_a_dry_run_prints_every_command_and_runs_none(checkout: Path, tmp_path: Path) -> None:
@@ -138,6 +145,23 @@ def test_a_run_its_count_control_and_going_on(
     changed = codebases.FastGS(checkout, False, ["--eval"])
     with pytest.raises(SystemExit, match="done by other commands"):
         reproduce.Run(tmp_path / "out", False).scene(changed, place, ["legs"], True)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+def test_ctrl_c(checkout: Path, tmp_path: Path) -> None:
+    (tmp_path / "endless").touch()
+    words = [sys.executable, str(FOLDER / "reproduce.py"), "--fastgs", str(checkout), "--own", str(tmp_path)]
+    process = subprocess.Popen(
+        words, env=environment(), cwd=str(tmp_path), stderr=subprocess.PIPE, start_new_session=True
+    )
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "log.txt").exists():  # it trains
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    assert process.communicate(timeout=60)[1] == b"reproduce: interrupted: the same command goes on\n"
+    assert process.returncode == 130
+    assert not list((tmp_path / "reproduced").rglob("*.done"))
 
 
 def test_a_patched_checkout_is_no_baseline(checkout: Path, tmp_path: Path) -> None:

@@ -253,4 +253,8 @@ def _write(path: Path, values: Dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        print("reproduce: interrupted: the same command goes on", file=sys.stderr)
+        sys.exit(130)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -436,6 +437,21 @@ def test_tables_by_hand() -> None:
     assert times_gaussians(rows, "legs", "eggs") is None
     assert "legs − 3dgs" in differences and "+1.00 [+1.00, +1.00]" in differences and "2.50x" in differences
     assert len({len(line) for line in markdown(("a", "b"), (("x", "1"), ("long", "22"))).splitlines()}) == 1
+
+
+def test_arms_that_should_not_differ_are_compared_in_pairs() -> None:
+    study = STUDIES["noise"]
+    assert all(parse_arm(arm).spec.beta < 1e-5 for arm in study.arms)
+    plain = {"a": 20.0, "b": 30.0, "c": 25.0}
+    rows = [row_of(parse_arm(arm).name, seed, plain) for arm in study.arms for seed in (0, 1)]
+    for row in rows:
+        if row["arm"] == "beta=2e-6":  # clear of all others, by 0.3 dB
+            row["metrics"]["views"]["train"] = {
+                view: {"psnr": value + gain} for (view, value), gain in zip(plain.items(), (0.2, 0.3, 0.4))
+            }
+    table = differences_table(rows, study)
+    assert re.search(r"train PSNR +\| +0\.00 \| +0\.30 \| +6 of 21", table)
+    assert re.search(r"held-out SSIM +\| +0\.0000 \| +0\.0000 \| +0 of 21", table)
 
 
 def test_the_papers_order_is_compared() -> None:

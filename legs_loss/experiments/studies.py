@@ -20,6 +20,7 @@ class Study(NamedTuple):
     against: which arm each arm is measured against, where that is not the baseline.
     paper: the paper's training PSNR of an arm, where it gives one.
     paper_says: in words, with its source.
+    alike: whether its arms should not differ: each is then compared with each, to see how far they do all the same.
     """
 
     title: str
@@ -27,6 +28,7 @@ class Study(NamedTuple):
     paper_says: str
     against: Mapping[str, str] = MappingProxyType({})
     paper: Mapping[str, float] = MappingProxyType({})
+    alike: bool = False
 
     def reference(self, arm: str) -> Optional[str]:
         """The arm that this one is measured against, None for the baseline itself."""
@@ -93,6 +95,7 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
             "What differs where nothing should",
             ("3dgs", "beta=1e-6", "beta=2e-6", "beta=3e-6", "beta=4e-6", "beta=5e-6", "beta=6e-6"),
             "The paper does not say how far its runs scatter.",
+            alike=True,
         ),
     }
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
-from typing import Any, List, Mapping, Optional, Sequence
+from typing import Any, List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE
@@ -84,8 +84,19 @@ def scores_table(rows: Rows, arms: Sequence[str]) -> str:
     return markdown(["arm", *SCORES, "seeds"], lines)
 
 
+# A column of differences, and the split and score that it is of.
+DIFFERENCES: Mapping[str, Tuple[str, str]] = {
+    "train PSNR": ("train", "psnr"),
+    "held-out PSNR": ("test", "psnr"),
+    "held-out SSIM": ("test", "ssim"),
+    "strongest 10%": ("test", "psnr_strong"),
+}
+
+
 def differences_table(rows: Rows, study: Study) -> str:
     """Return each arm's differences from what it is measured against, with their intervals."""
+    if study.alike:
+        return _pairs_table(rows, study)
     lines = []
     for arm in study.arms:
         name, reference = parse_arm(arm).name, study.reference(parse_arm(arm).name)
@@ -93,13 +104,26 @@ def differences_table(rows: Rows, study: Study) -> str:
             continue
         cells = [
             difference_cell(difference(rows, name, reference, split, score), score)
-            for split, score in (("train", "psnr"), ("test", "psnr"), ("test", "ssim"), ("test", "psnr_strong"))
+            for split, score in DIFFERENCES.values()
         ]
         ratio = times_gaussians(rows, name, reference)
         if ratio is not None:
             lines.append([f"{label(arm)} − {reference}", *cells, times_cell(ratio)])
-    heads = ["difference", "train PSNR", "held-out PSNR", "held-out SSIM", "strongest 10%", "Gaussians"]
-    return markdown(heads, lines)
+    return markdown(["difference", *DIFFERENCES, "Gaussians"], lines)
+
+
+def _pairs_table(rows: Rows, study: Study) -> str:
+    """Of each score: how far any two of the arms differ at most, and how many of the differences pass for clear."""
+    lines = []
+    for column, (split, score) in DIFFERENCES.items():
+        pairs = combinations([parse_arm(arm).name for arm in study.arms], 2)
+        gaps = [difference(rows, first, second, split, score) for first, second in pairs]
+        found = [gap for gap in gaps if gap is not None]
+        if found:
+            sizes = sorted(abs(gap.mean) for gap in found)
+            shown = [f"{size:.{4 if score == 'ssim' else 2}f}" for size in (sizes[len(sizes) // 2], sizes[-1])]
+            lines.append([column, *shown, f"{sum(gap.clear for gap in found)} of {len(found)}"])
+    return markdown(["between any two", "median difference", "largest", "not marked ?"], lines)
 
 
 def paper_text(rows: Rows, study: Study) -> str:

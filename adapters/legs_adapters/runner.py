@@ -104,7 +104,12 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
     sys.modules["__main__"] = main
     loader = _Loader("__main__", file, sources.get(os.path.realpath(name)))
     try:
-        exec(loader.code(), main.__dict__)
+        code = loader.code()
+    except SyntaxError as error:
+        sys.excepthook(type(error), error.with_traceback(None), None)
+        return 1
+    try:
+        exec(code, main.__dict__)
     except SystemExit:
         raise
     except KeyboardInterrupt as error:

@@ -124,14 +124,15 @@ def main():
         return results[0], results
 
     surfels_module = surfels.module("diff_surfel_rasterization")
+    plain_module, depth_module = generic.module("diff_fork"), with_depth(generic)
     contestants = {
         "reference": lambda raw: direct(raw, 2),
         "reference, absolute sums": lambda raw: direct(raw, 4),
         "inria": lambda raw: standing(inria, raw, 3, False, {}),
         "taming": lambda raw: standing(taming, raw, 3, True, {"pixel_weights": None}),
         "fastgs": lambda raw: standing(fastgs, raw, 4, True, {"mult": 0.5, "get_flag": None, "metric_map": None}),
-        "generic": lambda raw: standing(generic.module("diff_fork"), raw, 3, False, {}),
-        "generic, depth and alpha": lambda raw: standing(with_depth(generic), raw, 3, False, {}),
+        "generic": lambda raw: standing(plain_module, raw, 3, False, {}),
+        "generic, depth and alpha": lambda raw: standing(depth_module, raw, 3, False, {}),
         "fastergs": lambda raw: (FasterGS.apply(info, *raw), ()),
         "surfels": lambda raw: standing(surfels_module, raw, 3, False, {}),
         "surfels, all channels": lambda raw: standing(surfels_module, raw, 3, False, {}),

@@ -5,6 +5,7 @@ Settings and inputs that change the picture in a way that is not known here are 
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import sys
@@ -91,10 +92,13 @@ def module(name: str, interface: Optional[Interface] = None) -> types.ModuleType
     return complete(name, __doc__, settings, GaussianRasterizer, SparseGaussianAdam, compute_relocation)
 
 
+_real_path = functools.lru_cache(maxsize=None)(os.path.realpath)
+
+
 def _names_at_call(interface: Interface) -> Optional[Tuple[str, ...]]:
     frame = sys._getframe(2)
     while frame is not None:
-        path = os.path.realpath(frame.f_code.co_filename)
+        path = _real_path(frame.f_code.co_filename)
         if any(call.path == path for call in interface.calls):
             return interface.results_at(path, frame.f_lineno)
         frame = frame.f_back  # type: ignore[assignment]

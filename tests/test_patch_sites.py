@@ -90,3 +90,23 @@ def test_a_value_with_very_many_ways_to_come_about_is_followed_once(tmp_path):
     texts["train.py"] = before + branches + line + after
     found = plan(checkout(tmp_path, texts))
     assert [site.view.text for site in found.findings.sites] == ["viewpoint_cam.image_name"]
+
+
+def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path):
+    texts = {
+        "losses.py": (
+            "from torch import nn\n\n\n"
+            "class MaskedL1(nn.Module):\n    def __init__(self):\n        super().__init__()\n"
+            '        self.loss_fn = nn.L1Loss(reduction="none")\n\n    def forward(self, pred, target, mask):\n'
+            "        return self.loss_fn(pred, target) * mask\n"
+        ),
+        "train.py": (
+            "from gaussian_renderer import render\nfrom losses import MaskedL1\n\n\ndef training(scene, gaussians):\n"
+            "    pictures, depths = MaskedL1(), MaskedL1()\n    for cam in scene:\n"
+            "        package = render(cam, gaussians, None, None)\n"
+            '        loss = pictures(package["render"], cam.original_image, cam.valid).mean()\n'
+            '        loss += depths(package["depth"], cam.depth, cam.valid).mean()\n        loss.backward()\n'
+        ),
+    }
+    (problem,) = plan(checkout(tmp_path, texts)).findings.problems
+    assert problem.advice == "legs_loss.l1_loss(pred, target, own=self.loss_fn)"

@@ -286,11 +286,18 @@ def _advice(function: Function, form: Form, flipped: bool, last: bool) -> str:
         return "legs_loss.l1_loss(rendering, photograph), with the pictures before they became lists"
     settings = ", channels_last=True" if last else ""
     settings += ', reduction="none"' if form.reduction == "none" else ""
+    if form.callee is not None and form.reduction == "own" and not form.extras and not _is_torch(form.callee):
+        settings += f", own={_short(form.callee)}" if not flipped else f", own=lambda a, b: {_short(form.callee)}(b, a)"
     if form.callee is not None and form.extras:
         first, second = ("b", "a") if flipped else ("a", "b")
         extras = ", ".join(_short(extra.with_changes(comma=cst.MaybeSentinel.DEFAULT)) for extra in form.extras)
         settings += f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
     return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{settings})"
+
+
+def _is_torch(callee: cst.BaseExpression) -> bool:
+    """``F.l1_loss``, whose mean needs no ``own=``."""
+    return code(callee).endswith(".l1_loss")
 
 
 def _short(node: cst.CSTNode) -> str:

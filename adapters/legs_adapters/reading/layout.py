@@ -30,10 +30,22 @@ class Vote(NamedTuple):
 
 def is_channels_last(training: Training, function: Function, *images: cst.CSTNode) -> bool:
     """Return whether the images are [H, W, C] or [B, H, W, C]; without a sign of it they are not."""
-    votes = [vote for image in images for vote in _votes(training, function, image, set(), 0)]
+    votes = [vote for image in _without_factor(*images) for vote in _votes(training, function, image, set(), 0)]
     votes += _votes_of_callees(training, function, images)
     last, first = (sum(vote.strength for vote in votes if vote.axis == axis) for axis in (_LAST, _FIRST))
     return last > first
+
+
+def _without_factor(*images: cst.CSTNode) -> Tuple[cst.CSTNode, ...]:
+    """``image`` and ``gt`` of ``weight * image`` and ``weight * gt``: how a weight came about says nothing of them."""
+    products = [i for i in images if isinstance(i, cst.BinaryOperation) and isinstance(i.operator, cst.Multiply)]
+    if len(products) == 2:
+        one, other = products
+        for factor, rest in ((one.left, one.right), (one.right, one.left)):
+            for its, others in ((other.left, other.right), (other.right, other.left)):
+                if isinstance(factor, cst.Name) and same(factor, its):
+                    return rest, others
+    return images
 
 
 def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[int], depth: int) -> List[Vote]:

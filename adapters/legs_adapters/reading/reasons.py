@@ -130,7 +130,8 @@ class Reasons:
             return "tracking"
         names = (function.name, *function.flow.conditions.get(id(form.call), ()))
         spoken = {word for name in names for word in words(name)}
-        if len(words(function.name)) > 1 and words(function.name)[0] in _NOT_TRAINING:
+        said = words(function.name)
+        if len(said) > 1 and said[0] in _NOT_TRAINING and not {"loss", "losses"} & set(said[1:]):
             return "evaluation"
         folders, _, file = module.path.rpartition("/")
         if (words(file)[:1] and words(file)[0] in _EVALUATING) or set(folders.split("/")) & _EVALUATING:

@@ -59,9 +59,11 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
         return Shared([], [], False)
     if any(id(read) in edited for read in reads):
         return Shared([], [])  # error[mask] *= 2: another map in the loss's place would not have that
-    again = loss if len(loss) == 1 and unchanged(function, form.first, form.second) else []
+    alone = [read for read in reads if function.flow.reaching(read) == {made[0]}]  # no other branch made it
+    again = loss if len(loss) == 1 and loss[0] in alone and unchanged(function, form.first, form.second) else []
     known = all(
-        id(read) in callers and unchanged_at(function, callers[id(read)], form.first, form.second) for read in aside
+        read in alone and id(read) in callers and unchanged_at(function, callers[id(read)], form.first, form.second)
+        for read in aside
     )
     return Shared(again, aside if known else [])
 

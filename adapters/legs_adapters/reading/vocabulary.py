@@ -36,7 +36,7 @@ _WORDS = {
         grids plane planes pose poses deform deformation delta deltas residual means mean2d pts points point light
         lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds c2w w2c intrinsics
         extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints vertex vertices verts
-        bone bones smpl center centers knn
+        bone bones smpl center centers knn kpt kpts keypoint keypoints
     """,
     "image": """
         image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering

@@ -150,8 +150,9 @@ def l1_loss(
     """Return the LEGS-weighted L1 loss; a drop-in for the ``l1_loss`` of a 3DGS codebase.
 
     Args:
-        prediction: the rendering, [C, H, W] or [B, C, H, W]; channels-last on request. Where it requires no gradient
-            (evaluation, ``no_grad``) the result is ``torch.abs(prediction - target).mean()``, unweighted.
+        prediction: the rendering, [C, H, W], [B, C, H, W], or with more axes in front, as the views of several
+            scenes [B, V, C, H, W]; channels-last on request. Where it requires no gradient (evaluation,
+            ``no_grad``) the result is ``torch.abs(prediction - target).mean()``, unweighted.
         target: the photograph as this step supervises it, the same shape.
         view: the name of the view (for a batch: one a view), if the target is that view's own stored image. It lets
             maps from ``legs precompute`` be used; they are used only where the target's fingerprint says that they
@@ -187,6 +188,8 @@ def l1_loss(
     run = _current_run()
     if not run.config.active:
         return _plain(prediction, target, mask, channels_last, reduction, own)
+    if isinstance(target, Tensor) and target.dim() > 4 and prediction.shape == target.shape:
+        return _in_one_batch(prediction, target, view, mask, channels_last, reduction, own)
     check_pair(prediction, target)
     _check_layout(target, channels_last)
     if is_compiling():  # what the compiler traces has no memory: the weight becomes part of the graph
@@ -201,6 +204,31 @@ def l1_loss(
         else:
             weight = torch.stack([run.weight(target[i], name, channels_last) for i, name in enumerate(views)])
     return _weighted(prediction, target, weight, mask, channels_last, reduction, own)
+
+
+def _in_one_batch(
+    prediction: Tensor,
+    target: Tensor,
+    view: View,
+    mask: Optional[Tensor],
+    channels_last: bool,
+    reduction: str,
+    own: Optional[Own],
+) -> Tensor:
+    """As `l1_loss` of images with several axes in front of their own three; ``own`` still meets them all."""
+    shape = target.shape
+
+    def folded(tensor: Tensor) -> Tensor:
+        return tensor.reshape(-1, *tensor.shape[len(shape) - 3 :])
+
+    def theirs(first: Tensor, second: Tensor) -> Tensor:
+        assert own is not None
+        return own(first.reshape(shape), second.reshape(shape))
+
+    masked = None if mask is None else folded(mask)
+    images = folded(prediction), folded(target)
+    loss = l1_loss(*images, view, masked, channels_last, reduction, None if own is None else theirs)
+    return loss.reshape(shape) if reduction == "none" else loss
 
 
 def configure(

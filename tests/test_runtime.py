@@ -89,6 +89,21 @@ class TestWhenItWeights:
             masked = (mask.unsqueeze(1) * torch.abs(prediction - target)).mean()
             torch.testing.assert_close(l1_loss(prediction, target, mask=mask), masked)
 
+    @pytest.mark.parametrize("channels_last", [False, True])
+    def test_the_views_of_several_scenes(self, channels_last):
+        prediction, target = pair(2, 3, 6, 5, 3) if channels_last else pair(2, 3, 3, 6, 5)
+        one = l1_loss(prediction.flatten(0, 1), target.flatten(0, 1), channels_last=channels_last, reduction="none")
+        whole = l1_loss(prediction, target, channels_last=channels_last, reduction="none")
+        assert torch.equal(whole, one.reshape(target.shape))
+        torch.testing.assert_close(l1_loss(prediction, target, channels_last=channels_last), whole.mean())
+        mask = (torch.rand(2, 3, 6, 5) > 0.5).float()
+        masked = l1_loss(prediction, target, mask=mask, channels_last=channels_last, reduction="none")
+        torch.testing.assert_close(masked, whole * mask.unsqueeze(-1 if channels_last else -3))
+        own = l1_loss(
+            prediction, target, channels_last=channels_last, own=lambda a, b: (a - b).abs().mean((0, 2, 3, 4))
+        )
+        torch.testing.assert_close(own, whole.mean((0, 2, 3, 4)))
+
     @pytest.mark.parametrize(
         ("shapes", "options", "message"),
         [

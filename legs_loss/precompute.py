@@ -246,7 +246,8 @@ class _Worker:
         context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, job), daemon=True)
-        with _on_interrupt(signal.SIG_IGN):  # the process inherits it: a Ctrl-C is the parent's to handle
+        # The process inherits both: a Ctrl-C is the parent's to handle.
+        with _on_interrupt(signal.SIG_IGN), _kept_blocks():
             self.process.start()
         theirs.close()
 
@@ -256,10 +257,25 @@ class _Worker:
         self.process.join()
 
 
+@contextmanager
+def _kept_blocks() -> Iterator[None]:
+    """Let Pillow, in processes started meanwhile, keep the memory of a photograph for the next.
+
+    Mapping it anew took a quarter of the decoding. What the user has set stays.
+    """
+    name = "PILLOW_BLOCKS_MAX"
+    if name in os.environ:
+        yield
+        return
+    os.environ[name] = str(_KEPT_BLOCKS)
+    try:
+        yield
+    finally:
+        del os.environ[name]
+
+
 def _work(connection: Any, job: _Job) -> None:
     torch.set_num_threads(1)
-    # Pillow then keeps the memory of a photograph for the next: a quarter of its decoding went into mapping it anew.
-    os.environ.setdefault("PILLOW_BLOCKS_MAX", str(_KEPT_BLOCKS))
     try:
         while True:
             connection.send(_make(job, connection.recv()))

@@ -34,6 +34,7 @@ from legs_loss.store import Entry, StoreWriter, fingerprint, is_intact, stage
 __all__ = ["Report", "normalised_map", "precompute"]
 
 _COMMIT_SECONDS = 1.0
+_PATIENCE = 5.0  # seconds; a process that is killed leaves numba's semaphore behind, and Python warns
 _KEPT_BLOCKS = 8  # of 16 MiB
 _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 
@@ -230,7 +231,7 @@ def _in_processes(job: _Job, tasks: Sequence[_Task], workers: int) -> Generator[
                 if waiting:
                     give(worker)
                 else:
-                    worker.end()
+                    worker.end(_PATIENCE)
                 yield result
     finally:
         for worker in crew.values():
@@ -251,8 +252,10 @@ class _Worker:
             self.process.start()
         theirs.close()
 
-    def end(self) -> None:
+    def end(self, patience: float = 0.0) -> None:
+        """Close its pipe, at which it ends by itself once it is idle; after some seconds of patience it is killed."""
         self.connection.close()
+        self.process.join(patience)
         self.process.terminate()
         self.process.join()
 

@@ -24,7 +24,7 @@ from legs_adapters.reading.provenance import View, Views
 from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
 from legs_adapters.reading.shared import is_huber, is_measured, shared_of, unchanged_at
-from legs_adapters.reading.syntax import call_name, code
+from legs_adapters.reading.syntax import call_name, code, words
 from legs_adapters.reading.training import Training
 from legs_adapters.upstreams import registered
 
@@ -120,7 +120,8 @@ class _Finder:
 
     def _is_doubtful(self, function: Function, form: Form, left: Left) -> bool:
         """Whether a person should have a look at what was left, if nothing else is found."""
-        in_module = left.reason == "definition" and function.name in _FORWARD
+        of_class = function.owner is not None and "loss" in words(function.name)
+        in_module = left.reason == "definition" and (function.name in _FORWARD or of_class)
         if not in_module and left.reason not in ("untrained", "unknown", "distillation", "other", "huber"):
             return False
         if is_measured(function, form):

@@ -24,6 +24,7 @@ import torch
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
+from legs_loss.interrupts import kept_from_children
 from legs_loss.kernels.backends import backend_for
 from legs_loss.response import response
 from legs_loss.scenes import Scene, View, image_size, image_tensor, load_training_image, training_size
@@ -247,8 +248,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, job), daemon=True)
-        # The process inherits both: a Ctrl-C is the parent's to handle.
-        with _on_interrupt(signal.SIG_IGN), _kept_blocks():
+        with kept_from_children(), _kept_blocks():
             self.process.start()
         theirs.close()
 

@@ -328,8 +328,9 @@ import time
 stopped = threading.Event()
 atexit.register(print, "at the end")
 threading.Thread(target=lambda: (stopped.wait(), time.sleep(0.2), print("the thread"))).start()
+# Said from beside, once the script sleeps: so that the traceback is always of the same line.
+threading.Thread(target=lambda: (time.sleep(1), print("ready", flush=True))).start()
 try:
-    print("ready", flush=True)
     time.sleep(60)
 finally:
     stopped.set()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence
 
 from legs_loss.errors import LegsError
+from legs_loss.interrupts import kept_from_children
 from legs_loss.reference.training.trainer import Loss, Progress, TrainConfig, Weighting, step_loss, train
 from legs_loss.scenes import read_scene
 
@@ -85,11 +85,8 @@ class _Process:
         context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, arm), daemon=True)
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # for good in the process: Ctrl-C is the parent's
-        try:
+        with kept_from_children():
             self.process.start()
-        finally:
-            signal.signal(signal.SIGINT, before)
         theirs.close()
 
     def end(self) -> None:

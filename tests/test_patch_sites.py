@@ -97,8 +97,8 @@ def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path)
         "losses.py": (
             "from torch import nn\n\n\n"
             "class MaskedL1(nn.Module):\n    def __init__(self):\n        super().__init__()\n"
-            '        self.loss_fn = nn.L1Loss(reduction="none")\n\n    def forward(self, pred, target, mask):\n'
-            "        return self.loss_fn(pred, target) * mask\n"
+            '        self.l1_loss = nn.L1Loss(reduction="none")\n\n    def forward(self, pred, target, mask):\n'
+            "        return self.l1_loss(pred, target) * mask\n"
         ),
         "train.py": (
             "from gaussian_renderer import render\nfrom losses import MaskedL1\n\n\ndef training(scene, gaussians):\n"
@@ -109,4 +109,4 @@ def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path)
         ),
     }
     (problem,) = plan(checkout(tmp_path, texts)).findings.problems
-    assert problem.advice == "legs_loss.l1_loss(pred, target, own=self.loss_fn)"
+    assert problem.advice == "legs_loss.l1_loss(pred, target, own=self.l1_loss)"

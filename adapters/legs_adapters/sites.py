@@ -300,7 +300,7 @@ def _advice(function: Function, form: Form, flipped: bool, last: bool) -> str:
 
 def _is_torch(callee: cst.BaseExpression) -> bool:
     """``F.l1_loss``, whose mean needs no ``own=``."""
-    return code(callee).endswith(".l1_loss")
+    return re.search(r"(^|\.)(F|functional)\.l1_loss$", code(callee)) is not None
 
 
 def _short(node: cst.CSTNode) -> str:

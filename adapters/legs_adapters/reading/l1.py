@@ -24,16 +24,8 @@ _SHAPE_ONLY = {"shape", "device", "dtype", "dim", "ndim", "size", "numel", "is_c
 _TRANSFORMS = {"pow", "square", "log", "log1p", "log2", "log10", "exp", "sqrt", "tanh", "sigmoid"}
 _ASKING = {"isnan", "isfinite", "isinf", "zeros_like", "ones_like"}
 _AS_THAT = {"to", "type_as", "expand_as", "view_as", "reshape_as"}  # mask.to(prediction)
-_TRANSPARENT = {
-    "staticmethod",
-    "classmethod",
-    "script",
-    "compile",
-    "jaxtyped",
-    "torch_compile",
-    "autocast",
-    "typechecked",
-}
+# Decorators that return what the function returns.
+_TRANSPARENT = {"staticmethod", "classmethod", "script", "compile", "jaxtyped", "typechecked", "autocast"}
 _NOT_L1 = {"pow", "square", "sqrt", "log", "exp", "mse_loss", "norm", "smooth_l1_loss", "huber_loss"}
 
 

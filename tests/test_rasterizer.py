@@ -385,8 +385,19 @@ def test_without_a_place_for_the_cache(monkeypatch):
 
 
 def test_exp2():
-    from legs_loss.reference.rasterizer.strips import exp2
+    import numba
 
-    exponents = np.linspace(-30, 0, 3001, dtype=np.float32)
-    got = np.array([exp2(exponent) for exponent in exponents], dtype=np.float64)
-    np.testing.assert_allclose(got, np.exp2(exponents.astype(np.float64)), rtol=5e-7)
+    from legs_loss.kernels.vectors import LANES, load, store
+    from legs_loss.reference.rasterizer.strips import exp2, exp2_lanes
+
+    @numba.njit
+    def by_lanes(exponents, powers):
+        for i in range(0, len(exponents), LANES):
+            store(powers, i, exp2_lanes(load(exponents, i)))
+
+    exponents = np.linspace(-30, 0, 3008, dtype=np.float32)
+    powers = np.empty_like(exponents)
+    by_lanes(exponents, powers)
+    one_by_one = np.array([exp2(exponent) for exponent in exponents], dtype=np.float64)
+    for got in (one_by_one, powers):
+        np.testing.assert_allclose(got, np.exp2(exponents.astype(np.float64)), rtol=5e-7)

@@ -21,6 +21,9 @@ from numba.extending import lower_builtin, models, register_model
 __all__ = [
     "LANES",
     "absolute",
+    "as_floats",
+    "as_integers",
+    "at_least",
     "halves_added",
     "lane",
     "load",
@@ -35,6 +38,8 @@ __all__ = [
     "square_root",
     "store",
     "total",
+    "totals",
+    "where",
 ]
 
 LANES = 8
@@ -42,6 +47,7 @@ LANES = 8
 _VECTOR = ir.VectorType(ir.FloatType(), LANES)
 _INTEGERS = ir.VectorType(ir.IntType(32), LANES)
 _BYTES = ir.VectorType(ir.IntType(8), LANES)
+_MASK = ir.VectorType(ir.IntType(1), LANES)
 
 
 class _Vector(types.Type):
@@ -50,7 +56,7 @@ class _Vector(types.Type):
         self.lanes = lanes
 
 
-float8, integer8 = _Vector("float8", _VECTOR), _Vector("integer8", _INTEGERS)
+float8, integer8, mask8 = _Vector("float8", _VECTOR), _Vector("integer8", _INTEGERS), _Vector("mask8", _MASK)
 _KINDS = {types.float32: float8, types.int32: integer8}
 
 
@@ -82,6 +88,8 @@ for _symbol, _kind, _instruction in (
     (operator.truediv, float8, "fdiv"),
     (operator.add, integer8, "add"),
     (operator.mul, integer8, "mul"),
+    (operator.lshift, integer8, "shl"),
+    (operator.and_, mask8, "and_"),
 ):
     _operator(_symbol, _kind, _instruction)
 
@@ -187,16 +195,62 @@ def multiply_add(typingctx, a, b, c):  # type: ignore[no-untyped-def]
     return float8(float8, float8, float8), _calling("fmuladd")
 
 
+def _choosing(comparison: str) -> Any:
+    def generate(context: Any, builder: Any, sig: Any, args: Sequence[Any]) -> Any:
+        return builder.select(builder.fcmp_ordered(comparison, *args), *args)
+
+    return generate
+
+
 @_intrinsic
 def minimum(typingctx, a, b):  # type: ignore[no-untyped-def]
-    """Return the smaller value of each lane; of a NaN and a number, the number."""
-    return float8(float8, float8), _calling("minnum")
+    """Return the smaller value of each lane; b's, where either is a NaN."""
+    return float8(float8, float8), _choosing("<")
 
 
 @_intrinsic
 def maximum(typingctx, a, b):  # type: ignore[no-untyped-def]
-    """Return the larger value of each lane; of a NaN and a number, the number."""
-    return float8(float8, float8), _calling("maxnum")
+    """Return the larger value of each lane; b's, where either is a NaN."""
+    return float8(float8, float8), _choosing(">")
+
+
+@_intrinsic
+def at_least(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return in which lanes a >= b."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.fcmp_ordered(">=", *args)
+
+    return mask8(float8, float8), generate
+
+
+@_intrinsic
+def where(typingctx, mask, a, b):  # type: ignore[no-untyped-def]
+    """Return a's value in the lanes of the mask, and b's in the others."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.select(*args)
+
+    return float8(mask8, float8, float8), generate
+
+
+def _reading(kind: Any) -> Any:
+    def generate(context: Any, builder: Any, sig: Any, args: Sequence[Any]) -> Any:
+        return builder.bitcast(args[0], kind)
+
+    return generate
+
+
+@_intrinsic
+def as_integers(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return the bits of float32 as int32."""
+    return integer8(float8), _reading(_INTEGERS)
+
+
+@_intrinsic
+def as_floats(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return the float32 that have the bits of int32."""
+    return float8(integer8), _reading(_VECTOR)
 
 
 @_intrinsic
@@ -250,6 +304,30 @@ def halves_added(typingctx, a, b):  # type: ignore[no-untyped-def]
         return builder.add(*(builder.shuffle_vector(*args, ir.Constant(_INTEGERS, half)) for half in (lower, upper)))
 
     return integer8(integer8, integer8), generate
+
+
+@_intrinsic
+def _pairs_added(typingctx, a, b, distance):  # type: ignore[no-untyped-def]
+    """Return sums of two lanes of a, `distance` apart, and of two of b, in turn for every `distance` lanes."""
+    if not isinstance(distance, types.IntegerLiteral):
+        raise RequireLiteralValue("distance")
+    distance = distance.literal_value
+    firsts = [k if k % (2 * distance) < distance else LANES + k - distance for k in range(LANES)]
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        both = args[:2]
+        first = builder.shuffle_vector(*both, ir.Constant(_INTEGERS, firsts))
+        second = builder.shuffle_vector(*both, ir.Constant(_INTEGERS, [k + distance for k in firsts]))
+        return builder.fadd(first, second)
+
+    return float8(float8, float8, types.IntegerLiteral(distance)), generate
+
+
+@njit(inline="always")
+def totals(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
+    """Return the sums of eight vectors, each always added in the same order."""
+    ab, cd, ef, gh = _pairs_added(a, b, 1), _pairs_added(c, d, 1), _pairs_added(e, f, 1), _pairs_added(g, h, 1)
+    return _pairs_added(_pairs_added(ab, cd, 2), _pairs_added(ef, gh, 2), 4)
 
 
 @_intrinsic

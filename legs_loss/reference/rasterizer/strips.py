@@ -1,9 +1,8 @@
 """The compiled rasterizer's work for each strip of the image: which splats reach it, and blending them, both ways.
 
 A strip is 8 pixels wide and 32 tall: a row of it fills one register, and the rows that a splat reaches are one
-contiguous loop, which the compiler turns into eight pixels at a time. (3DGS's own tiles of 16x16 matter to the result
-only where they cut off a splat; projection.py sees to that.) All of a strip's state is one array, a plane of 256
-numbers each: with separate arrays the compiler cannot prove that they do not overlap, and the loops stay scalar.
+contiguous loop. (3DGS's own tiles of 16x16 matter to the result only where they cut off a splat; projection.py sees to
+that.) All of a strip's state is one array, a plane of 256 numbers each.
 
 Within a strip a splat is the polynomial
 
@@ -22,9 +21,25 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
+from numba import njit, prange
 
 from legs_loss.kernels.compiling import FAST, compiled
+from legs_loss.kernels.vectors import (
+    absolute,
+    as_floats,
+    as_integers,
+    at_least,
+    lane,
+    load,
+    maximum,
+    minimum,
+    multiply_add,
+    splat,
+    store,
+    total,
+    totals,
+    where,
+)
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from legs_loss.reference.rasterizer.intrinsics import as_float, prefetch
 from legs_loss.reference.rasterizer.projection import BLOCK, FAINTEST, TALL, WIDE, origin
@@ -36,11 +51,12 @@ FIELDS = 9  # of an entry: e, gx, gy, a, b, c, red, green, blue
 MOMENTS = 11  # of an entry's gradient: h, hx, hy, hxx, hxy, hyy, red, green, blue, |u|, |v|
 
 # Planes of a strip's state. T: transmittance, its sign turned once the pixel is finished (or is outside the image).
-X, Y, T = 0, PIXELS, 2 * PIXELS
-RED, GREEN, BLUE = 3 * PIXELS, 4 * PIXELS, 5 * PIXELS  # forward: the colour so far; backward: the gradient to it
-REST = 6 * PIXELS  # backward: the gradient's product with the colour that is still to come
-WORK = 7 * PIXELS  # what one loop leaves for the next: short loops overlap in the processor, one long loop does not
-PLANES = 8
+T = 0
+RED, GREEN, BLUE = PIXELS, 2 * PIXELS, 3 * PIXELS  # forward: the colour so far; backward: the gradient to it
+REST = 4 * PIXELS  # backward: the gradient's product with the colour that is still to come
+WORK = 5 * PIXELS  # what one loop leaves for the next: short loops overlap in the processor, one long loop does not
+X = 6 * PIXELS  # one row: its pixels' x
+STATE = X + WIDE
 
 _MAX, _MIN, _LAST = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
@@ -59,6 +75,7 @@ _P0, _P1, _P2, _P3, _P4, _P5 = (
 )
 _UNDERFLOW = np.float32(-32)
 _BIAS, _MANTISSA = np.int32(127), np.int32(23)
+_ROUNDING = np.float32(3 << 22)  # added to a number, it leaves the nearest integer in the last bits
 
 
 @compiled(fastmath={"contract", "nnan", "ninf", "nsz"})
@@ -70,6 +87,20 @@ def exp2(x):
     ff = f * f
     fraction = (_P0 + _P1 * f) + ff * ((_P2 + _P3 * f) + ff * (_P4 + _P5 * f))  # in pairs: a shorter chain
     return fraction * as_float((whole + _BIAS) << _MANTISSA)
+
+
+@njit(inline="always")
+def exp2_lanes(x):
+    """2^x for x <= 0 in each lane, to 2e-7 relative."""
+    x = maximum(x, splat(_UNDERFLOW))
+    rounded = x + splat(_ROUNDING)
+    f = x - (rounded - splat(_ROUNDING))
+    fraction = multiply_add(splat(_P5), f, splat(_P4))
+    fraction = multiply_add(fraction, f, splat(_P3))
+    fraction = multiply_add(fraction, f, splat(_P2))
+    fraction = multiply_add(fraction, f, splat(_P1))
+    fraction = multiply_add(fraction, f, splat(_P0))
+    return as_floats(as_integers(fraction) + (as_integers(rounded) << splat(_MANTISSA)))
 
 
 # Which splats reach which strip
@@ -190,10 +221,10 @@ def _expand(begin, end, strip_x, strip_y, splats, owners, rows, entries):
 @compiled()
 def _place(state, across, down):
     """Pixel coordinates, full transmittance; pixels outside the image count as finished."""
+    for x in range(WIDE):
+        state[X + x] = x - (WIDE - 1) / 2
     for pixel in range(PIXELS):
-        x, y = pixel % WIDE, pixel // WIDE
-        state[X + pixel], state[Y + pixel] = x - (WIDE - 1) / 2, y
-        state[T + pixel] = _ONE if x < across and y < down else -_ONE
+        state[T + pixel] = _ONE if pixel % WIDE < across and pixel // WIDE < down else -_ONE
 
 
 @compiled(fastmath=FAST | {"reassoc"})
@@ -205,40 +236,56 @@ def _unfinished(state):
     return largest > _ZERO
 
 
-@compiled()
-def _middle(first, last):
-    """The row about which an entry's polynomial is written."""
-    return (np.float32(first) + np.float32(last) - _ONE) * _HALF
+@njit(inline="always")
+def _reach(rows, k):
+    """An entry's first row, the one past its last, and the first row's y, counted from the middle of them."""
+    first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
+    return first, last, splat((np.float32(first) - np.float32(last) + _ONE) * _HALF)
+
+
+@njit(inline="always")
+def _respond(state, first, last, ys, entries, k):
+    """Leave an entry's alpha, not yet held at its most, in WORK; `ys`: the first row's."""
+    xs = load(state, X)
+    at_middle = multiply_add(multiply_add(splat(entries[k, 3]), xs, splat(entries[k, 1])), xs, splat(entries[k, 0]))
+    slope, bend = multiply_add(splat(entries[k, 4]), xs, splat(entries[k, 2])), splat(entries[k, 5])
+    for i in range(first * WIDE, last * WIDE, WIDE):
+        store(state, WORK + i, exp2_lanes(multiply_add(multiply_add(bend, ys, slope), ys, at_middle)))
+        ys = ys + splat(_ONE)
+
+
+@njit(inline="always")
+def _cover(state, i):
+    """Take a row's alpha in WORK from its transmittance: the weight of the colour, alpha as it counts, and T before."""
+    none = splat(_ZERO)
+    alpha, before = minimum(load(state, WORK + i), splat(_MAX)), load(state, T + i)
+    alpha = where(at_least(alpha, splat(_MIN)), alpha, none)
+    weight = alpha * before
+    after = before - weight
+    drawn = at_least(after, splat(_LAST))  # false for a finished pixel too, whose transmittance is negative
+    store(state, T + i, where(drawn, after, none - absolute(before)))
+    return where(drawn, weight, none), alpha, before
 
 
 @compiled()
 def _blend(state, begin, end, rows, entries):
     """Blend entries of a strip, in their order."""
     for k in range(begin, end):
-        e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
-        red, green, blue = entries[k, 6], entries[k, 7], entries[k, 8]
-        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
-        middle = _middle(first, last)
-        for i in range(first * WIDE, last * WIDE):
-            x, y = state[X + i], state[Y + i] - middle
-            state[WORK + i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
-        for i in range(first * WIDE, last * WIDE):
-            alpha, before = min(state[WORK + i], _MAX), state[T + i]
-            alpha = alpha if alpha >= _MIN else _ZERO
-            after = before - alpha * before
-            drawn = after >= _LAST  # false for a finished pixel too, whose transmittance is negative
-            weight = alpha * before if drawn else _ZERO
-            state[T + i] = after if drawn else -abs(before)
-            state[RED + i] += weight * red
-            state[GREEN + i] += weight * green
-            state[BLUE + i] += weight * blue
+        first, last, top = _reach(rows, k)
+        red, green, blue = splat(entries[k, 6]), splat(entries[k, 7]), splat(entries[k, 8])
+        _respond(state, first, last, top, entries, k)
+        for i in range(first * WIDE, last * WIDE, WIDE):
+            weight, _, _ = _cover(state, i)
+            store(state, RED + i, multiply_add(weight, red, load(state, RED + i)))
+            store(state, GREEN + i, multiply_add(weight, green, load(state, GREEN + i)))
+            store(state, BLUE + i, multiply_add(weight, blue, load(state, BLUE + i)))
 
 
 @compiled()
 def _render_worker(
     worker, workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image
 ):
-    state = np.empty(PLANES * PIXELS, np.float32)
+    state = np.empty(STATE, np.float32)
     height, width = image.shape[1], image.shape[2]
     for turn in range(worker, len(strip_order), workers):
         strip = strip_order[turn]
@@ -270,73 +317,68 @@ def render(workers, strip_order, ranges, splats, owners, rows, entries, ends, ba
         )
 
 
-@compiled(fastmath=FAST | {"reassoc"})
-def _blend_backward(state, begin, end, rows, entries, absolute, gradients):
+@compiled()
+def _blend_backward(state, begin, end, rows, entries, absolutely, gradients):
     """As `_blend`, front to back, filling the entries' gradients: moments of h = dL/dpower, and the colour's.
 
     dL/dalpha = T (g . colour) - rest / (1 - alpha), where rest = g . (all the colour behind this splat): what is left
     of g . (the pixel's colour) after what came before. Nothing is carried from back to front.
     """
+    xs, none, one = load(state, X), splat(_ZERO), splat(_ONE)
     scale = np.float32(1 / _LOG2E)
     for k in range(begin, end):
-        e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
-        red, green, blue = entries[k, 6], entries[k, 7], entries[k, 8]
-        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
-        middle = _middle(first, last)
-        a2, c2 = a + a, c + c
-        m = mx = my = mxx = mxy = myy = r = g = bl = au = av = _ZERO
-        for i in range(first * WIDE, last * WIDE):
-            x, y = state[X + i], state[Y + i] - middle
-            state[WORK + i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
-        for i in range(first * WIDE, last * WIDE):
-            response, before = state[WORK + i], state[T + i]
-            alpha = min(response, _MAX)
-            alpha = alpha if alpha >= _MIN else _ZERO
-            after = before - alpha * before
-            drawn = after >= _LAST
-            weight = alpha * before if drawn else _ZERO
-            state[T + i] = after if drawn else -abs(before)
-            g_red, g_green, g_blue = state[RED + i], state[GREEN + i], state[BLUE + i]
-            own = g_red * red + g_green * green + g_blue * blue
-            rest = state[REST + i] - weight * own
-            state[REST + i] = rest
-            h = response * (before * own - rest / (_ONE - alpha))
-            state[WORK + i] = h if weight > _ZERO else _ZERO
-            r += weight * g_red
-            g += weight * g_green
-            bl += weight * g_blue
-        for i in range(first * WIDE, last * WIDE):
-            x, y, h = state[X + i], state[Y + i] - middle, state[WORK + i]
-            hx, hy = h * x, h * y
-            m += h
-            mx += hx
-            my += hy
-            mxx += hx * x
-            mxy += hx * y
-            myy += hy * y
-        if absolute:
-            for i in range(first * WIDE, last * WIDE):
-                x, y, h = state[X + i], state[Y + i] - middle, state[WORK + i]
-                au += abs(h * (a2 * x + (b * y + gx)))
-                av += abs(h * (c2 * y + (b * x + gy)))
-        gradients[k, 0], gradients[k, 1], gradients[k, 2] = m, mx, my
-        gradients[k, 3], gradients[k, 4], gradients[k, 5] = mxx, mxy, myy
-        gradients[k, 6], gradients[k, 7], gradients[k, 8] = r, g, bl
-        gradients[k, 9], gradients[k, 10] = au * scale, av * scale
+        first, last, top = _reach(rows, k)
+        red, green, blue = splat(entries[k, 6]), splat(entries[k, 7]), splat(entries[k, 8])
+        _respond(state, first, last, top, entries, k)
+        r = g = b = none
+        for i in range(first * WIDE, last * WIDE, WIDE):
+            response = load(state, WORK + i)
+            weight, alpha, before = _cover(state, i)
+            g_red, g_green, g_blue = load(state, RED + i), load(state, GREEN + i), load(state, BLUE + i)
+            own = multiply_add(g_red, red, multiply_add(g_green, green, g_blue * blue))
+            rest = load(state, REST + i) - weight * own
+            store(state, REST + i, rest)
+            h = response * (before * own - rest / (one - alpha))
+            store(state, WORK + i, where(at_least(none, weight), none, h))
+            r, g, b = multiply_add(weight, g_red, r), multiply_add(weight, g_green, g), multiply_add(weight, g_blue, b)
+        m = my = myy = none
+        ys = top
+        for i in range(first * WIDE, last * WIDE, WIDE):
+            h = load(state, WORK + i)
+            hy = h * ys
+            m, my, myy = m + h, my + hy, multiply_add(hy, ys, myy)
+            ys = ys + one
+        mx = m * xs
+        sums = totals(m, mx, my, mx * xs, my * xs, myy, r, g)
+        for moment in range(8):
+            gradients[k, moment] = lane(sums, moment)
+        gradients[k, 8], gradients[k, 9], gradients[k, 10] = total(b), _ZERO, _ZERO
+        if absolutely:
+            two, mixed = splat(np.float32(2)), splat(entries[k, 4])
+            u = multiply_add(two * splat(entries[k, 3]), xs, splat(entries[k, 1]))
+            v, bend = multiply_add(mixed, xs, splat(entries[k, 2])), two * splat(entries[k, 5])
+            along_u = along_v = none
+            ys = top
+            for i in range(first * WIDE, last * WIDE, WIDE):
+                h = load(state, WORK + i)
+                along_u = along_u + absolute(h * multiply_add(mixed, ys, u))
+                along_v = along_v + absolute(h * multiply_add(bend, ys, v))
+                ys = ys + one
+            gradients[k, 9], gradients[k, 10] = total(along_u) * scale, total(along_v) * scale
 
 
 @compiled()
 def _render_backward_worker(
     worker, workers, strip_order, ranges, rows, entries, ends, across, image, g_image, absolute, gradients
 ):
-    state = np.empty(PLANES * PIXELS, np.float32)
+    state = np.empty(STATE, np.float32)
     height, width = image.shape[1], image.shape[2]
     for turn in range(worker, len(strip_order), workers):
         strip = strip_order[turn]
         left, top = strip % across * WIDE, strip // across * TALL
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
         _place(state, wide, tall)
-        state[RED:] = 0
+        state[RED:X] = 0
         for y in range(tall):
             for x in range(wide):
                 pixel = y * WIDE + x

@@ -21,20 +21,11 @@ from numba import prange
 from legs_adapters.cpu.surfels_oracle import CUTOFF, FILTER_RADIUS, MIN_EXTENT
 from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import FARTHEST, MIN_ALPHA, NEAR, TILE
+from legs_loss.reference.rasterizer.geometry import quaternion_partials, rotation
+from legs_loss.reference.rasterizer.harmonics import direction, harmonics, harmonics_gradient
 from legs_loss.reference.rasterizer.intrinsics import prefetch
-from legs_loss.reference.rasterizer.projection import (
-    AHEAD,
-    BLOCK,
-    FAINTEST,
-    ceil,
-    direction,
-    floor,
-    harmonics,
-    harmonics_gradient,
-    quaternion_partials,
-    rotation,
-    tile_range,
-)
+from legs_loss.reference.rasterizer.projection import BLOCK, FAINTEST, ceil, floor, tile_range
+from legs_loss.reference.rasterizer.projection_backward import AHEAD
 
 # No promise that numbers are finite: a disc that is seen from its edge has a homography without inverse.
 CAREFUL = {"nsz", "contract"}
@@ -110,6 +101,13 @@ def _row(axes, long, short, mean, pixels, k):
 
 
 @compiled()
+def _rotation(quaternions, i):
+    w, x = np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1])
+    y, z = np.float64(quaternions[i, 2]), np.float64(quaternions[i, 3])
+    return rotation(w, x, y, z)
+
+
+@compiled()
 def _handed(homographies, i, k):
     k *= 3
     return np.float64(homographies[i, k]), np.float64(homographies[i, k + 1]), np.float64(homographies[i, k + 2])
@@ -123,7 +121,7 @@ def _shape(means, scales, quaternions, homographies, i, modifier, pose, pixels):
         x, y, w = _handed(homographies, i, 0), _handed(homographies, i, 1), _handed(homographies, i, 2)
         normal = 0.0, 0.0, 1.0
         return x, y, w, normal, -1.0
-    axes, _, _ = rotation(quaternions, i)
+    axes, _, _ = _rotation(quaternions, i)
     long, short = modifier * np.float64(scales[i, 0]), modifier * np.float64(scales[i, 1])
     x = _row(axes, long, short, mean, pixels, 0)
     y = _row(axes, long, short, mean, pixels, 1)
@@ -427,7 +425,7 @@ def _project_backward_block(
             mx += _across(gx, gy, gw, pixels, 0, 2)
             my += _across(gx, gy, gw, pixels, 1, 2)
             mz += _across(gx, gy, gw, pixels, 2, 2)
-            axes, q, _ = rotation(quaternions, i)
+            axes, q, _ = _rotation(quaternions, i)
             long, short = modifier * np.float64(scales[i, 0]), modifier * np.float64(scales[i, 1])
             a0, a1, a2 = (
                 _across(gx, gy, gw, pixels, 0, 0),

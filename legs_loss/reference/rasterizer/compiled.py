@@ -1,4 +1,4 @@
-"""The numba rasterizer: projection.py and strips.py as one differentiable function of torch."""
+"""The numba rasterizer: projection.py, strips.py and projection_backward.py as one differentiable function of torch."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from legs_loss.reference.conventions import DILATION, SQUARE, View
-from legs_loss.reference.rasterizer import projection, strips
+from legs_loss.reference.conventions import DILATION, SH_C0, SQUARE, View
+from legs_loss.reference.rasterizer import projection, projection_backward, strips
 
 Clip = Callable[..., None]
 
@@ -173,7 +173,7 @@ def draw(
 def attach(drawing: Drawing, tensors: Tensors) -> Tuple[Tensor, Tensor]:
     """A drawing as image [3, H, W] and radii int32 [N], with the gradient to the tensors it was drawn from."""
     # A colour is 1 / C0 of its constant harmonic, as the way back sees it.
-    sh = tensors.sh if tensors.colours is None else tensors.colours[:, None] / projection.SH_C0
+    sh = tensors.sh if tensors.colours is None else tensors.colours[:, None] / SH_C0
     return _Attach.apply(*tensors[:4], sh, tensors.covariances, tensors.viewspace, drawing)
 
 
@@ -212,7 +212,7 @@ class _Attach(torch.autograd.Function):
         )  # fmt: skip
         shapes = [array.shape for array in it.parameters] + [(len(it.radii), ctx.columns)]
         gradients = [torch.empty(shape) for shape in shapes]
-        projection.project_backward(
+        projection_backward.project_backward(
             *it.parameters, it.degree, *it.camera, it.splats, it.clamped, it.boxes, it.slots, it.first_slots,
             it.slot_rows, it.places, entry_gradients, np.array([width / 2, height / 2]),
             *[gradient.numpy() for gradient in gradients],

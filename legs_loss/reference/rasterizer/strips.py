@@ -23,7 +23,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from legs_loss.kernels.compiling import FAST, compiled
+from legs_loss.kernels.compiling import compiled
 from legs_loss.kernels.vectors import (
     absolute,
     as_floats,
@@ -137,14 +137,15 @@ def _find_rows_block(first, end, splats, boxes, slots, first_slots, across, slot
         if slots[i] == 0:
             continue
         u, v, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
-        determinant = 1 / splats[i, 9]
+        determinant = splats[i, 9]  # the covariance's: 1 / D below
         x0, y0, x1, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
         level = 2 * (splats[i, 5] - FAINTEST)
         # The ellipse's upper and lower edge over dx are (-B dx +- sqrt(C level - D dx^2)) / C, D = A C - B^2. Their
         # extreme points are at dx = summit and -summit, or, where the strip does not have them, at its nearer side.
-        wide = math.sqrt(level * c / determinant)
-        summit = -b * math.sqrt(level / (a * determinant))
-        tall, slope, bend = level / c, -b / c, determinant / (c * c)
+        level_d, inverse = level * determinant, 1 / c
+        wide = math.sqrt(level_d * c)
+        summit = -b * math.sqrt(level_d / a)
+        tall, slope, bend = level * inverse, -b * inverse, inverse * inverse / determinant
         slot = np.uint64(first_slots[i])
         for strip_y in range(y0 // TALL, (y1 - 1) // TALL + 1):
             top = strip_y * TALL
@@ -227,13 +228,37 @@ def _place(state, across, down):
         state[T + pixel] = _ONE if pixel % WIDE < across and pixel // WIDE < down else -_ONE
 
 
-@compiled(fastmath=FAST | {"reassoc"})
+@njit(inline="always")
+def _write(pixels, at, wide, values, state):
+    """Set a strip's row in an image, by way of WORK where the strip is cut off by the image's edge."""
+    if wide == WIDE:
+        store(pixels, at, values)
+    else:
+        store(state, WORK, values)
+        for x in range(wide):
+            pixels[at + x] = state[WORK + x]
+
+
+@njit(inline="always")
+def _read(pixels, at, wide, state):
+    """Return a strip's row in an image; what is beyond the image's edge is 0."""
+    if wide < WIDE:
+        store(state, WORK, splat(_ZERO))
+        for x in range(wide):
+            state[WORK + x] = pixels[at + x]
+        row = load(state, WORK)
+    else:
+        row = load(pixels, at)
+    return row
+
+
+@compiled()
 def _unfinished(state):
-    """Whether a pixel of the strip still takes colour."""
-    largest = -_ONE
-    for pixel in range(PIXELS):
-        largest = max(largest, state[T + pixel])
-    return largest > _ZERO
+    """Whether a pixel of the strip still takes colour: as a rule, already the first one does."""
+    for pixel in range(PIXELS):  # noqa: SIM110 (numba compiles no any() of a generator)
+        if state[T + pixel] > _ZERO:
+            return True
+    return False
 
 
 @njit(inline="always")
@@ -286,7 +311,7 @@ def _render_worker(
     worker, workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image
 ):
     state = np.empty(STATE, np.float32)
-    height, width = image.shape[1], image.shape[2]
+    height, width, pixels = image.shape[1], image.shape[2], image.reshape(-1)
     for turn in range(worker, len(strip_order), workers):
         strip = strip_order[turn]
         left, top = strip % across * WIDE, strip // across * TALL
@@ -300,12 +325,11 @@ def _render_worker(
             _blend(state, begin, end, rows, entries)
         ends[strip] = end
         for y in range(tall):
-            for x in range(wide):
-                pixel = y * WIDE + x
-                left_over = abs(state[T + pixel])
-                image[0, top + y, left + x] = state[RED + pixel] + left_over * background[0]
-                image[1, top + y, left + x] = state[GREEN + pixel] + left_over * background[1]
-                image[2, top + y, left + x] = state[BLUE + pixel] + left_over * background[2]
+            left_over = absolute(load(state, T + y * WIDE))
+            for channel in range(3):
+                colour = load(state, RED + channel * PIXELS + y * WIDE)
+                colour = multiply_add(left_over, splat(background[channel]), colour)
+                _write(pixels, (channel * height + top + y) * width + left, wide, colour, state)
 
 
 @compiled(parallel=True)
@@ -372,7 +396,7 @@ def _render_backward_worker(
     worker, workers, strip_order, ranges, rows, entries, ends, across, image, g_image, absolute, gradients
 ):
     state = np.empty(STATE, np.float32)
-    height, width = image.shape[1], image.shape[2]
+    height, width, pixels, g_pixels = image.shape[1], image.shape[2], image.reshape(-1), g_image.reshape(-1)
     for turn in range(worker, len(strip_order), workers):
         strip = strip_order[turn]
         left, top = strip % across * WIDE, strip // across * TALL
@@ -380,14 +404,13 @@ def _render_backward_worker(
         _place(state, wide, tall)
         state[RED:X] = 0
         for y in range(tall):
-            for x in range(wide):
-                pixel = y * WIDE + x
-                rest = _ZERO
-                for channel in range(3):
-                    gradient = g_image[channel, top + y, left + x]
-                    state[RED + channel * PIXELS + pixel] = gradient
-                    rest += gradient * image[channel, top + y, left + x]
-                state[REST + pixel] = rest
+            rest = splat(_ZERO)
+            for channel in range(3):
+                at = (channel * height + top + y) * width + left
+                gradient = _read(g_pixels, at, wide, state)
+                store(state, RED + channel * PIXELS + y * WIDE, gradient)
+                rest = multiply_add(gradient, _read(pixels, at, wide, state), rest)
+            store(state, REST + y * WIDE, rest)
         _blend_backward(state, ranges[strip], ends[strip], rows, entries, absolute, gradients)
         gradients[ends[strip] : ranges[strip + 1]] = 0
 

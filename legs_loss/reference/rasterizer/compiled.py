@@ -46,7 +46,7 @@ class Drawing(NamedTuple):
     A slot is a strip in a Gaussian's box of strips; an entry, one that it reaches, sorted by strip and depth.
     """
 
-    parameters: Tuple[np.ndarray, ...]  # means, scales, quaternions, opacities, sh, covariances
+    parameters: Tuple[Optional[np.ndarray], ...]  # means, scales, quaternions, opacities, sh, covariances
     degree: int
     camera: Tuple[np.ndarray, np.ndarray, np.ndarray]  # intrinsics, world to camera, the camera's centre
     splats: np.ndarray
@@ -108,16 +108,10 @@ def draw(
     """
     count = len(tensors.means)
     degree = degree if tensors.sh is not None else 0
+    sh = torch.zeros(count, 1, 3) if tensors.sh is None else tensors.sh
     parameters = tuple(
-        _array(torch.zeros(shape) if tensor is None else tensor)
-        for tensor, shape in (
-            (tensors.means, ()),
-            (tensors.scales, (0, 3)),
-            (tensors.quaternions, (0, 4)),
-            (tensors.opacities, ()),
-            (tensors.sh, (count, 1, 3)),
-            (tensors.covariances, (0, 6)),
-        )
+        None if tensor is None else _array(tensor)
+        for tensor in (tensors.means, tensors.scales, tensors.quaternions, tensors.opacities, sh, tensors.covariances)
     )
     size = np.array([view.width, view.height], np.int64)
     camera = (
@@ -210,12 +204,12 @@ class _Attach(torch.autograd.Function):
             numba.get_num_threads(), it.strip_order, it.ranges, it.rows, it.entries, it.ends, it.across, it.image,
             _array(g_image), ctx.columns == 4, entry_gradients,
         )  # fmt: skip
-        shapes = [array.shape for array in it.parameters] + [(len(it.radii), ctx.columns)]
-        gradients = [torch.empty(shape) for shape in shapes]
+        shapes = [None if array is None else array.shape for array in it.parameters] + [(len(it.radii), ctx.columns)]
+        gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
         projection_backward.project_backward(
             *it.parameters, it.degree, *it.camera, it.splats, it.clamped, it.boxes, it.slots, it.first_slots,
             it.slot_rows, it.places, entry_gradients, np.array([width / 2, height / 2]),
-            *[gradient.numpy() for gradient in gradients],
+            *[None if gradient is None else gradient.numpy() for gradient in gradients],
         )  # fmt: skip
         found = [gradient if wanted else None for gradient, wanted in zip(gradients, ctx.needs_input_grad)]
         return (*found, None)

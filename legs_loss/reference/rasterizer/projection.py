@@ -127,8 +127,7 @@ def _project_block(
 ):  # fmt: skip
     basis = np.empty(16, np.float32)
     coefficients = (degree + 1) * (degree + 1)
-    state, before_camera, count = np.empty(STATE), np.empty(BLOCK, np.int64), 0
-    handed = len(covariances) > 0
+    state, before_camera, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
     for i in range(np.uint64(first), np.uint64(end)):
         radii[i] = 0
         slots[i] = 0
@@ -138,20 +137,20 @@ def _project_block(
             continue
         depths[i] = np.float32(depth)
         state[MEAN, count], state[MEAN + 1, count], state[MEAN + 2, count] = x, y, z
-        if handed:
-            for k in range(6):
-                state[SHAPE + k, count] = covariances[i, k]
-        else:
+        if covariances is None:
             for k in range(3):
                 state[SHAPE + k, count] = scales[i, k]
             for k in range(4):
                 state[SHAPE + 3 + k, count] = quaternions[i, k]
+        else:
+            for k in range(6):
+                state[SHAPE + k, count] = covariances[i, k]
         before_camera[count] = i
         count += 1
-    if handed:
-        _covariances(count, intrinsics, pose, dilation, state)
-    else:
+    if covariances is None:
         _shapes(count, intrinsics, pose, dilation, state)
+    else:
+        _covariances(count, intrinsics, pose, dilation, state)
     for j in range(np.uint64(count)):
         i = np.uint64(before_camera[j])
         centre_x, centre_y = state[CENTRE, j], state[CENTRE + 1, j]
@@ -204,7 +203,7 @@ def project(
 ):  # fmt: skip
     """Fill, for each Gaussian: splat, depth, radius, which channels are clamped, box of strips, how many they are.
 
-    Shapes are `scales` and `quaternions`, or `covariances` [N, 6] (xx, xy, xz, yy, yz, zz); the others are [0, ...].
+    Shapes are `scales` and `quaternions`, or `covariances` [N, 6] (xx, xy, xz, yy, yz, zz); the others are None.
     """
     count = len(means)
     for block in prange((count + BLOCK - 1) // BLOCK):

@@ -154,18 +154,17 @@ def _project_backward_block(
 ):  # fmt: skip
     coefficients = (degree + 1) * (degree + 1)
     basis, g_basis = np.empty(16, np.float32), np.empty(16, np.float32)
-    state, drawn, count = np.empty(STATE), np.empty(BLOCK, np.int64), 0
-    handed = len(covariances) > 0
+    state, drawn, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
     for i in range(first, end):
         if i + AHEAD < end:
             _ask_for(first_slots[i + AHEAD], slots[i + AHEAD], slot_rows, places, entry_gradients)
         if slots[i] == 0:
             g_means[i] = 0
-            if handed:
-                g_covariances[i] = 0
-            else:
+            if covariances is None:
                 g_scales[i] = 0
                 g_quaternions[i] = 0
+            else:
+                g_covariances[i] = 0
             g_opacities[i] = 0
             g_sh[i] = 0
             g_view[i] = 0
@@ -173,30 +172,30 @@ def _project_backward_block(
         _collect(splats, boxes, i, slot_rows, places, first_slots[i], entry_gradients, state, count)
         for k in range(3):
             state[MEAN + k, count], state[CONIC + k, count] = means[i, k], splats[i, 2 + k]
-        if handed:
-            for k in range(6):
-                state[SHAPE + k, count] = covariances[i, k]
-        else:
+        if covariances is None:
             for k in range(3):
                 state[SHAPE + k, count] = scales[i, k]
             for k in range(4):
                 state[SHAPE + 3 + k, count] = quaternions[i, k]
+        else:
+            for k in range(6):
+                state[SHAPE + k, count] = covariances[i, k]
         drawn[count] = i
         count += 1
-    if handed:
-        _covariances_backward(count, intrinsics, pose, state)
-    else:
+    if covariances is None:
         _shapes_backward(count, intrinsics, pose, state)
+    else:
+        _covariances_backward(count, intrinsics, pose, state)
     for j in range(np.uint64(count)):
         i = np.uint64(drawn[j])
-        if handed:
-            for k in range(6):
-                g_covariances[i, k] = state[SHAPE + k, j]
-        else:
+        if covariances is None:
             for k in range(3):
                 g_scales[i, k] = state[SHAPE + k, j]
             for k in range(4):
                 g_quaternions[i, k] = state[SHAPE + 3 + k, j]
+        else:
+            for k in range(6):
+                g_covariances[i, k] = state[SHAPE + k, j]
         g_opacities[i, 0] = state[SUMS + POWER, j] / opacities[i, 0]
         g_view[i, 0], g_view[i, 1] = state[SUMS + U, j] * half[0], state[SUMS + V, j] * half[1]
         if g_view.shape[1] == 4:
@@ -226,7 +225,7 @@ def project_backward(
     splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients, half,
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
 ):  # fmt: skip
-    """Fill the gradients `g_...` of each Gaussian from those of its entries."""
+    """Fill the gradients `g_...` of each Gaussian from those of its entries; of what is None, there is none."""
     count = len(means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK

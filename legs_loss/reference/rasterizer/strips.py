@@ -337,7 +337,18 @@ def render(workers, strip_order, ranges, splats, owners, rows, entries, ends, ba
     """Fill the image, and for each strip its entries, up to the end of those that mattered."""
     for worker in prange(workers):
         _render_worker(
-            worker, workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image
+            np.int64(worker),
+            workers,
+            strip_order,
+            ranges,
+            splats,
+            owners,
+            rows,
+            entries,
+            ends,
+            background,
+            across,
+            image,
         )
 
 
@@ -420,5 +431,16 @@ def render_backward(workers, strip_order, ranges, rows, entries, ends, across, i
     """Fill the gradient of every entry; the absolute sums, if asked for."""
     for worker in prange(workers):
         _render_backward_worker(
-            worker, workers, strip_order, ranges, rows, entries, ends, across, image, g_image, absolute, gradients
+            np.int64(worker),
+            workers,
+            strip_order,
+            ranges,
+            rows,
+            entries,
+            ends,
+            across,
+            image,
+            g_image,
+            absolute,
+            gradients,
         )

@@ -137,19 +137,19 @@ def _project_block(
             continue
         depths[i] = np.float32(depth)
         state[MEAN, count], state[MEAN + 1, count], state[MEAN + 2, count] = x, y, z
-        if covariances is None:
+        if scales is not None:
             for k in range(3):
                 state[SHAPE + k, count] = scales[i, k]
             for k in range(4):
                 state[SHAPE + 3 + k, count] = quaternions[i, k]
-        else:
+        if covariances is not None:
             for k in range(6):
                 state[SHAPE + k, count] = covariances[i, k]
         before_camera[count] = i
         count += 1
-    if covariances is None:
+    if scales is not None:
         _shapes(count, intrinsics, pose, dilation, state)
-    else:
+    if covariances is not None:
         _covariances(count, intrinsics, pose, dilation, state)
     for j in range(np.uint64(count)):
         i = np.uint64(before_camera[j])

@@ -160,10 +160,10 @@ def _project_backward_block(
             _ask_for(first_slots[i + AHEAD], slots[i + AHEAD], slot_rows, places, entry_gradients)
         if slots[i] == 0:
             g_means[i] = 0
-            if covariances is None:
+            if scales is not None:
                 g_scales[i] = 0
                 g_quaternions[i] = 0
-            else:
+            if covariances is not None:
                 g_covariances[i] = 0
             g_opacities[i] = 0
             g_sh[i] = 0
@@ -172,28 +172,28 @@ def _project_backward_block(
         _collect(splats, boxes, i, slot_rows, places, first_slots[i], entry_gradients, state, count)
         for k in range(3):
             state[MEAN + k, count], state[CONIC + k, count] = means[i, k], splats[i, 2 + k]
-        if covariances is None:
+        if scales is not None:
             for k in range(3):
                 state[SHAPE + k, count] = scales[i, k]
             for k in range(4):
                 state[SHAPE + 3 + k, count] = quaternions[i, k]
-        else:
+        if covariances is not None:
             for k in range(6):
                 state[SHAPE + k, count] = covariances[i, k]
         drawn[count] = i
         count += 1
-    if covariances is None:
+    if scales is not None:
         _shapes_backward(count, intrinsics, pose, state)
-    else:
+    if covariances is not None:
         _covariances_backward(count, intrinsics, pose, state)
     for j in range(np.uint64(count)):
         i = np.uint64(drawn[j])
-        if covariances is None:
+        if scales is not None:
             for k in range(3):
                 g_scales[i, k] = state[SHAPE + k, j]
             for k in range(4):
                 g_quaternions[i, k] = state[SHAPE + 3 + k, j]
-        else:
+        if covariances is not None:
             for k in range(6):
                 g_covariances[i, k] = state[SHAPE + k, j]
         g_opacities[i, 0] = state[SUMS + POWER, j] / opacities[i, 0]

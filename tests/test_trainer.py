@@ -537,6 +537,22 @@ def test_legs_train(tiny_scene: Path, tmp_path: Path) -> None:
     assert resumed.stdout == done.stdout
 
 
+@pytest.mark.slow
+def test_a_process_that_compiles_and_one_that_loads_agree(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("numba")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    flags = ("--preset", "legs", "--iterations", 20, "-r", 2, "--threads", 1)
+    clouds = []
+    for name in ("compiles", "loads"):
+        done = command("train", tiny_scene, "--out", tmp_path / name, *flags)
+        assert done.returncode == 0, done.stderr
+        clouds.append((tmp_path / name / "point_cloud" / "iteration_20" / "point_cloud.ply").read_bytes())
+    assert list((tmp_path / "cache").rglob("*.nbi"))
+    assert clouds[0] == clouds[1]
+
+
 def mistaken(*arguments: str) -> Any:
     try:
         return main(arguments)

@@ -7,9 +7,10 @@ from typing import Any, Callable
 
 import numba
 
-# No NaN or infinity arises from checked input, and a * b + c may be one instruction. Sums keep their order, so that
-# a run repeats; the one loop that needs its sums split over the lanes of a register says so.
-FAST = {"nnan", "ninf", "nsz", "contract"}
+# No NaN or infinity arises from checked input. Sums keep their order, and a * b + c is rounded twice unless the code says
+# otherwise: where the compiler may choose, the process that compiles and the next one, which loads what was compiled,
+# can differ in the last bit.
+FAST = {"nnan", "ninf", "nsz"}
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -12,7 +12,7 @@ from legs_loss.kernels.compiling import compiled
 __all__ = ["update"]
 
 
-@compiled(fastmath={"contract"})
+@compiled(fastmath=False)
 def update(parameter, gradient, moment1, moment2, new1, new2, rate, correction, epsilon):
     """Update flat arrays of one type in place.
 

@@ -78,7 +78,7 @@ _BIAS, _MANTISSA = np.int32(127), np.int32(23)
 _ROUNDING = np.float32(3 << 22)  # added to a number, it leaves the nearest integer in the last bits
 
 
-@compiled(fastmath={"contract", "nnan", "ninf", "nsz"})
+@compiled()
 def exp2(x):
     """2^x for x <= 0, to 2e-7 relative; written out because a call to the library's would not vectorise."""
     x = max(x, _UNDERFLOW)
@@ -371,9 +371,9 @@ def _blend_backward(state, begin, end, rows, entries, absolutely, gradients):
             weight, alpha, before = _cover(state, i)
             g_red, g_green, g_blue = load(state, RED + i), load(state, GREEN + i), load(state, BLUE + i)
             own = multiply_add(g_red, red, multiply_add(g_green, green, g_blue * blue))
-            rest = load(state, REST + i) - weight * own
+            rest = multiply_add(none - weight, own, load(state, REST + i))
             store(state, REST + i, rest)
-            h = response * (before * own - rest / (one - alpha))
+            h = response * multiply_add(before, own, none - rest / (one - alpha))
             store(state, WORK + i, where(at_least(none, weight), none, h))
             r, g, b = multiply_add(weight, g_red, r), multiply_add(weight, g_green, g), multiply_add(weight, g_blue, b)
         m = my = myy = none

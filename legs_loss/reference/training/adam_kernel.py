@@ -14,7 +14,7 @@ BETA1, BETA2 = 0.9, 0.999
 _NEW1, _NEW2, _EPS = np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(1e-15)
 
 
-@compiled(fastmath={"contract"})
+@compiled(fastmath=False)
 def update(parameter, gradient, moment1, moment2, rates, correction):  # type: ignore[no-untyped-def]
     """Update flat float32 arrays in place; ``rates`` is one block of learning rates, which repeats.
 

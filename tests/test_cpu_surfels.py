@@ -242,6 +242,24 @@ class TestAgreement:
         expected, _, _, _ = run([means, scales, quaternions, opacities, sh], settings, "torch", torch.float64)
         torch.testing.assert_close(results[1][0], expected)
 
+    def test_a_ray_along_the_disc(self):
+        # At the column 31, p_z is 0 to the last bit; right of it the disc comes nearer, left of it it is behind.
+        rows = torch.tensor([[15.5, 0.0, 128.0, 0.0, 8.0, 88.0, 0.5, 0.0, 4.0]])
+        means, _, _, _, sh = scene(1)
+        results = []
+        for backend, dtype in (("numba", torch.float32), ("torch", torch.float64)):
+            given = rows.detach().to(dtype, copy=True).requires_grad_()
+            image, _, others = surfels.rasterize(
+                0 * means.to(dtype), None, torch.full((1, 1), 0.9, dtype=dtype), sh.to(dtype), None, None, None, given,
+                in_type(camera(), dtype), backend,
+            )  # fmt: skip
+            (image.sum() + others[:2].sum() + others[5:].sum()).backward()
+            results.append((torch.cat([image, others[:2], others[5:]]).double(), given.grad.double()))
+        (got, gradient), (expected, expected_gradient) = results
+        assert not got[3 + ALPHA, :, :32].any() and got[3 + ALPHA, :, 32].any()
+        torch.testing.assert_close(got, expected, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(gradient, expected_gradient, atol=1e-4, rtol=1e-4)
+
 
 def _turn_to(normal):
     """wxyz of the shortest turn from the z axis."""

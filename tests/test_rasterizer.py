@@ -388,16 +388,14 @@ def test_exp2():
     import numba
 
     from legs_loss.kernels.vectors import LANES, load, store
-    from legs_loss.reference.rasterizer.strips import exp2, exp2_lanes
+    from legs_loss.reference.rasterizer.strips import exp2
 
     @numba.njit
     def by_lanes(exponents, powers):
         for i in range(0, len(exponents), LANES):
-            store(powers, i, exp2_lanes(load(exponents, i)))
+            store(powers, i, exp2(load(exponents, i)))
 
     exponents = np.linspace(-30, 0, 3008, dtype=np.float32)
     powers = np.empty_like(exponents)
     by_lanes(exponents, powers)
-    one_by_one = np.array([exp2(exponent) for exponent in exponents], dtype=np.float64)
-    for got in (one_by_one, powers):
-        np.testing.assert_allclose(got, np.exp2(exponents.astype(np.float64)), rtol=5e-7)
+    np.testing.assert_allclose(powers, np.exp2(exponents.astype(np.float64)), rtol=5e-7)

@@ -3,7 +3,8 @@
 LLVM's own vectoriser gives up on loops that read more than a few rows: it cannot show in time that they do not overlap.
 Here the vectors are written down, and LLVM maps them to what the processor has (AVX, two halves of SSE or NEON).
 
-`+ - * /` and comparisons round as IEEE says, each by itself; `multiply_add` may round once.
+`+ - * /` and comparisons do as IEEE says, each by itself, but for what the caller's `fastmath` allows, whose flags they
+get; `multiply_add` may round once.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ from numba.extending import lower_builtin, models, register_model
 
 __all__ = [
     "LANES",
+    "above",
     "absolute",
     "as_floats",
     "as_integers",
     "at_least",
+    "equal",
     "halves_added",
     "lane",
     "load",
@@ -214,14 +217,29 @@ def maximum(typingctx, a, b):  # type: ignore[no-untyped-def]
     return float8(float8, float8), _choosing(">")
 
 
+def _comparing(comparison: str) -> Any:
+    def generate(context: Any, builder: Any, sig: Any, args: Sequence[Any]) -> Any:
+        return builder.fcmp_ordered(comparison, *args)
+
+    return generate
+
+
 @_intrinsic
 def at_least(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return in which lanes a >= b."""
+    return mask8(float8, float8), _comparing(">=")
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.fcmp_ordered(">=", *args)
 
-    return mask8(float8, float8), generate
+@_intrinsic
+def above(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return in which lanes a > b."""
+    return mask8(float8, float8), _comparing(">")
+
+
+@_intrinsic
+def equal(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return in which lanes a == b."""
+    return mask8(float8, float8), _comparing("==")
 
 
 @_intrinsic

@@ -11,26 +11,13 @@ from numba import prange
 from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from legs_loss.reference.rasterizer.projection import TALL, WIDE
-from legs_loss.reference.rasterizer.strips import exp2
+from legs_loss.reference.rasterizer.strips import PIXELS, STATE, WORK, place, reach, respond
 
 __all__ = ["COUNT", "DISTANCE", "FIELDS", "MOST", "VALUE", "WEIGHT", "contribute", "sensitivity"]
 
-PIXELS = WIDE * TALL
 COUNT, WEIGHT, VALUE, DISTANCE, MOST, FIELDS = 0, 1, 2, 3, 4, 5
 _MAX, _MIN, _LAST = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
-_ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
-
-
-@compiled()
-def _respond(rows, entries, k, work):
-    """Fill `work` with an entry's response at each pixel that it reaches; return its first row, and the one past it."""
-    e, gx, gy, a, b, c = entries[k, 0], entries[k, 1], entries[k, 2], entries[k, 3], entries[k, 4], entries[k, 5]
-    first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
-    middle = (np.float32(first) + np.float32(last) - _ONE) * _HALF
-    for i in range(first * WIDE, last * WIDE):
-        x, y = np.float32(i % WIDE) - np.float32((WIDE - 1) / 2), np.float32(i // WIDE) - middle
-        work[i] = exp2((a * x + (b * y + gx)) * x + ((c * y + gy) * y + e))
-    return first, last
+_ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @compiled()
@@ -38,15 +25,17 @@ def _strip(left, top, wide, tall, begin, end, splats, owners, rows, entries, val
     """Sums of one strip's entries, [entries, FIELDS]."""
     before, finished = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.bool_)
     largest, whose = np.zeros(PIXELS, np.float32), np.full(PIXELS, -1, np.int64)
-    work = np.empty(PIXELS, np.float32)
+    state = np.empty(STATE, np.float32)
+    place(state, wide, tall)
     for k in range(begin, end):
-        first, last = _respond(rows, entries, k, work)
+        first, last, top_row = reach(rows, k)
+        respond(state, first, last, top_row, entries, k)
         u, v = splats[owners[k], 0] - left, splats[owners[k], 1] - top
         count = weight = value = distance = 0.0
         for row in range(first, min(last, tall)):
             for column in range(wide):
                 i = row * WIDE + column
-                alpha = min(work[i], _MAX)
+                alpha = min(state[WORK + i], _MAX)
                 if finished[i] or alpha < _MIN:
                     continue
                 after = before[i] - alpha * before[i]
@@ -91,7 +80,8 @@ def contribute(across, ranges, ends, splats, owners, rows, entries, values, sums
 def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, g_image, squares):
     """For each entry of a strip, the sum over its pixels of the squared derivative by its alpha."""
     before, rest, g = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.float32), np.zeros((PIXELS, 3), np.float32)
-    work = np.empty(PIXELS, np.float32)
+    state = np.empty(STATE, np.float32)
+    place(state, wide, tall)
     for row in range(tall):
         for column in range(wide):
             for channel in range(3):
@@ -99,12 +89,13 @@ def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, g_
                 g[i, channel] = gradient
                 rest[i] += gradient * image[channel, top + row, left + column]
     for k in range(begin, end):
-        first, last = _respond(rows, entries, k, work)
+        first, last, top_row = reach(rows, k)
+        respond(state, first, last, top_row, entries, k)
         total = 0.0
         for row in range(first, min(last, tall)):
             for column in range(wide):
                 i = row * WIDE + column
-                alpha = min(work[i], _MAX)
+                alpha = min(state[WORK + i], _MAX)
                 if before[i] < _ZERO or alpha < _MIN:
                     continue
                 after = before[i] - alpha * before[i]

@@ -4,8 +4,8 @@ With the rows of a homography T = (x, y, w), the ray of the pixel (i, j) meets t
 
     p = (i w - x) x (j w - y) = x x y + i (y x w) + j (w x x),      (u, v) = p_xy / p_z,      depth = det T / p_z
 
-so p is linear in the pixel. It is worked out about the disc's centre and scaled so that p_z is 1 there. All of it in
-float64: the homography of a thin disc cancels badly in float32. The steps are those of surfels_oracle.py.
+so p is linear in the pixel. It is worked out about the disc's centre and divided by det T, so that depth = 1 / p_z. All
+of it in float64: the homography of a thin disc cancels badly in float32. The steps are those of surfels_oracle.py.
 """
 
 # mypy: ignore-errors
@@ -33,14 +33,14 @@ CAREFUL = {"nsz", "contract"}
 WIDE, TALL = 8, 16  # pixels: a strip of the image; its rows are one contiguous loop
 SLACK = 1e-6  # pixels^2: what an ellipse is widened by, against rounding
 
-# A splat, float64: p about the centre (constant, with i, with j; each three numbers), depth and centre in pixels,
-# opacity, colour, normal.
-P, DEPTH, CENTRE, OPACITY, COLOUR, NORMAL, SPLAT = 0, 9, 10, 12, 13, 16, 19
+# A splat, float64: p about the centre (constant, with i, with j; each three numbers), centre in pixels, the binary
+# logarithm of the opacity, colour, normal.
+P, CENTRE, OPACITY, COLOUR, NORMAL, SPLAT = 0, 9, 11, 12, 15, 18
 # How far a disc reaches, float64: the ellipse's centre, and a, b, c of its matrix [[a, b], [b, c]] (a < 0: everywhere);
 # the circle's centre, its radius.
 ELLIPSE, CIRCLE, REACH, EXTENT = 0, 5, 7, 8
-# An entry's gradient, float32: of p's nine numbers, of the depth by division, of the centre, of w's three by the
-# screen-space Gaussian's depth, of the logarithm of the opacity, of colour and normal.
+# An entry's gradient, float32: of p's nine numbers, of det T as a factor of the depth, of the centre, of w's three by
+# the screen-space Gaussian's depth, of the natural logarithm of the opacity, of colour and normal.
 G_DEPTH, G_CENTRE, G_DIRECT, G_OPACITY, G_COLOUR, G_NORMAL, GRADIENTS = 9, 10, 12, 15, 16, 19, 22
 
 
@@ -139,7 +139,7 @@ def _bent(x, y, w, u, v):
     """p about the centre, but for its scale: constant, along, down; the scale; and the centred rows."""
     centred_x, centred_y = _less(x, w, u), _less(y, w, v)
     constant, along, down = _cross(centred_x, centred_y), _cross(centred_y, w), _cross(w, centred_x)
-    return constant, along, down, w[2] / _dot(w, constant), centred_x, centred_y
+    return constant, along, down, 1 / _dot(w, constant), centred_x, centred_y
 
 
 @compiled(fastmath=CAREFUL)
@@ -210,7 +210,7 @@ def _project_block(
             splats[i, P + 3 + k] = along[k] * scale
             splats[i, P + 6 + k] = down[k] * scale
             splats[i, NORMAL + k] = turn * normal[k]
-        splats[i, DEPTH], splats[i, CENTRE], splats[i, CENTRE + 1], splats[i, OPACITY] = w[2], u, v, opacity
+        splats[i, CENTRE], splats[i, CENTRE + 1], splats[i, OPACITY] = u, v, math.log2(opacity)
         depths[i] = np.float32(depth)
 
 
@@ -344,7 +344,7 @@ def _rows_gradient(x, y, w, u, v, sums):
     ga = sums[0] * scale, sums[1] * scale, sums[2] * scale
     gb = sums[3] * scale, sums[4] * scale, sums[5] * scale
     gc = sums[6] * scale, sums[7] * scale, sums[8] * scale
-    gd = sums[G_DEPTH] * scale  # to det T
+    gd = sums[G_DEPTH] * scale
     gx = _less(_plus(_cross(centred_y, ga), _cross(gc, w)), along, -gd)
     gy = _less(_plus(_cross(ga, centred_x), _cross(w, gb)), down, -gd)
     gw = _less(_plus(_cross(gb, centred_y), _cross(centred_x, gc)), constant, -gd)

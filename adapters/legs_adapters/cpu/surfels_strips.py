@@ -1,8 +1,7 @@
 """The surfel rasterizer's work for each strip of the image: blending the discs that reach it, both ways.
 
-A strip's loop has three linear functions of the pixel, one division and an exponential (see surfels_projection.py).
-As in the reference's strips.py, the rows that a disc reaches are one contiguous loop, and all of a strip's state is one
-array, so that the compiler takes eight pixels at a time.
+A pixel takes three linear functions of its place, a division and an exponential (see surfels_projection.py). As in the
+reference's strips.py, a row of a strip fills one register, and all of a strip's state is one array.
 """
 
 # mypy: ignore-errors
@@ -13,60 +12,65 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
+from numba import njit, prange
 
 from legs_adapters.cpu.surfels_oracle import FAR
 from legs_adapters.cpu.surfels_projection import (
     CAREFUL,
     CENTRE,
     COLOUR,
-    DEPTH,
-    G_CENTRE,
-    G_COLOUR,
-    G_DEPTH,
-    G_DIRECT,
-    G_NORMAL,
-    G_OPACITY,
+    GRADIENTS,
     NORMAL,
     OPACITY,
+    SPLAT,
     TALL,
     WIDE,
     origin,
 )
 from legs_loss.kernels.compiling import compiled
-from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
+from legs_loss.kernels.vectors import (
+    above,
+    at_least,
+    equal,
+    load,
+    maximum,
+    minimum,
+    multiply_add,
+    splat,
+    store,
+    totals,
+    where,
+)
+from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, NEAR
 from legs_loss.reference.rasterizer.intrinsics import prefetch
-from legs_loss.reference.rasterizer.strips import exp2
-
-SUMMING = CAREFUL | {"reassoc"}
+from legs_loss.reference.rasterizer.strips import cover, exp2, reach
 
 PIXELS = WIDE * TALL
 AHEAD = 16  # entries whose memory is asked for while another is worked on
 CHECK = 16  # discs between two looks at whether a strip is finished
-FIELDS = 19  # of an entry, float32: as of a splat, with p about the strip's origin, and its centre from there
+FIELDS = SPLAT  # of an entry, float32: as of a splat, with p about the strip's origin, and its centre from there
 
-# Planes of a strip's state, PIXELS numbers each. T: transmittance, its sign turned once the pixel is finished.
-X, Y, T = 0, PIXELS, 2 * PIXELS
-# Forward: sums so far. M is minus NEAR FAR / ((FAR - NEAR) depth): the distortion's depth but for a constant, which
-# falls out of its differences and would only cost digits. It is linear in the pixel, as 1 / depth is.
-RED, NX, D, M1, M2, SPREAD, MEDIAN, WHICH = (k * PIXELS for k in (3, 6, 9, 10, 11, 12, 13, 14))
-ALPHA, Z, M = (k * PIXELS for k in (15, 16, 17))  # what one loop leaves for the next
-PLANES = 18
+# A strip's state, but for X in planes of PIXELS numbers. T: transmittance, its sign turned once the pixel is finished.
+X, T = 0, WIDE  # X: one row, its pixels' x
+# What one loop leaves for the next: a disc's response, depth and m = 1 / depth. Backward also where on the disc it is
+# met, by how much that falloff exceeds the screen's, and in the place of m the gradient to the depth.
+RESPONSE, Z, M, U, V, EXCESS = (WIDE + k * PIXELS for k in (1, 2, 3, 4, 5, 6))
+G_Z = M
+# Forward: sums so far. The distortion's depth is -_SCALE m but for a constant, which falls out of its differences and
+# would only cost digits. WHICH: the entry that the median depth is of, counted from 1.
+RED, NX, D, M1, M2, SPREAD, MEDIAN, WHICH = (WIDE + k * PIXELS for k in (4, 7, 10, 11, 12, 13, 14, 15))
+STATE = WIDE + 16 * PIXELS
 # Backward: the gradient of the pixel; E0 + m (E1 + m E2) is that of a weight by opacity, background and distortion;
-# REST: the gradient's product with all that is still to come. Without gradients to the other channels, only the first
-# and the last two lines.
-G_RED, E0, REST = (k * PIXELS for k in (3, 6, 7))
-G_NX, G_D, G_MEDIAN, E1, E2, MEDIAN_AT = (k * PIXELS for k in (8, 11, 12, 13, 14, 15))
-GZ, ZB, MB = (k * PIXELS for k in (16, 17, 18))
-H, INV, U, V, R = (k * PIXELS for k in (19, 20, 21, 22, 23))
-BACKWARD_PLANES = 24
+# REST: the gradient's product with all that is still to come. Without gradients to the other channels, only these.
+G_RED, E0, REST = (WIDE + k * PIXELS for k in (7, 10, 11))
+G_NX, G_D, G_MEDIAN, E1, E2, MEDIAN_AT = (WIDE + k * PIXELS for k in (12, 15, 16, 17, 18, 19))
+BACKWARD_STATE = WIDE + 20 * PIXELS
 
-_MAX, _MIN, _LAST, _NEAR = (np.float32(c) for c in (MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR))
+_MAX, _MIN, _NEAR = (np.float32(c) for c in (MAX_ALPHA, MIN_ALPHA, NEAR))
+_FARTHEST = np.float32(1e18)  # further away, a ray is parallel to the disc; of a number like this, the square is finite
 _ZERO, _HALF, _ONE, _TWO = (np.float32(c) for c in (0, 0.5, 1, 2))
 _LOG2 = np.float32(-0.5 / math.log(2))
 _SCALE = np.float32(FAR * NEAR / (FAR - NEAR))
-_BACK = np.float32(1 / _SCALE)
-_AWAY = np.float32(-1e-30)
 
 
 @compiled()
@@ -88,13 +92,13 @@ def _expand(begin, end, strip_x, strip_y, splats, owners, rows, entries):
 @compiled()
 def _place(state, across, down):
     """Pixel coordinates, full transmittance; pixels outside the image count as finished."""
+    for x in range(WIDE):
+        state[X + x] = x - (WIDE - 1) / 2
     for pixel in range(PIXELS):
-        x, y = pixel % WIDE, pixel // WIDE
-        state[X + pixel], state[Y + pixel] = x - (WIDE - 1) / 2, y
-        state[T + pixel] = _ONE if x < across and y < down else -_ONE
+        state[T + pixel] = _ONE if pixel % WIDE < across and pixel // WIDE < down else -_ONE
 
 
-@compiled(fastmath=SUMMING)
+@compiled(fastmath=CAREFUL | {"reassoc"})
 def _unfinished(state):
     largest = -_ONE
     for pixel in range(PIXELS):
@@ -102,64 +106,83 @@ def _unfinished(state):
     return largest > _ZERO
 
 
+@njit(inline="always")
+def _linear(entries, k, number, xs):
+    """One of p's three numbers: at the pixels of the middle row, and what it gains with each row."""
+    across, down = splat(entries[k, 3 + number]), splat(entries[k, 6 + number])
+    return multiply_add(across, xs, splat(entries[k, number])), down
+
+
+@njit(inline="always")
+def _meet(state, first, last, ys, entries, k, others, backward):
+    """Leave an entry's response, not yet held at its most, and where it is met; nothing where it is not."""
+    xs, none = load(state, X), splat(_ZERO)
+    pu, pu_down = _linear(entries, k, 0, xs)
+    pv, pv_down = _linear(entries, k, 1, xs)
+    pz, pz_down = _linear(entries, k, 2, xs)
+    dx, v, opacity = xs - splat(entries[k, CENTRE]), splat(entries[k, CENTRE + 1]), splat(entries[k, OPACITY])
+    across = (dx + dx) * dx
+    for i in range(first * WIDE, last * WIDE, WIDE):
+        m = multiply_add(pz_down, ys, pz)
+        z = splat(_ONE) / m
+        su, sv, dy = multiply_add(pu_down, ys, pu) * z, multiply_add(pv_down, ys, pv) * z, ys - v
+        on_disc, on_screen = multiply_add(su, su, sv * sv), multiply_add(dy + dy, dy, across)
+        response = exp2(multiply_add(splat(_LOG2), minimum(on_disc, on_screen), opacity))  # the screen's, if one is NaN
+        met = at_least(z, splat(_NEAR)) & at_least(splat(_FARTHEST), z) & at_least(response, splat(_MIN))
+        store(state, RESPONSE + i, where(met, response, none))
+        store(state, Z + i, where(met, z, none))
+        if others:
+            store(state, M + i, where(met, m, none))
+        if backward:
+            store(state, U + i, where(met, su, none))
+            store(state, V + i, where(met, sv, none))
+            store(state, EXCESS + i, on_disc - on_screen)
+        ys = ys + splat(_ONE)
+
+
+@njit(inline="always")
+def _add(state, i, weight, value):
+    """Add to a row of a sum."""
+    store(state, i, multiply_add(weight, value, load(state, i)))
+
+
 @compiled(fastmath=CAREFUL)
 def _blend(state, start, begin, end, rows, entries):
     """Blend entries of a strip, whose first is `start`, in their order."""
+    none, one = splat(_ZERO), splat(_ONE)
     for k in range(begin, end):
-        a0, a1, a2 = entries[k, 0], entries[k, 1], entries[k, 2]
-        b0, b1, b2 = entries[k, 3], entries[k, 4], entries[k, 5]
-        c0, c1, c2 = entries[k, 6], entries[k, 7], entries[k, 8]
-        depth, u, v, opacity = entries[k, DEPTH], entries[k, CENTRE], entries[k, CENTRE + 1], entries[k, OPACITY]
-        red, green, blue = entries[k, COLOUR], entries[k, COLOUR + 1], entries[k, COLOUR + 2]
-        nx, ny, nz = entries[k, NORMAL], entries[k, NORMAL + 1], entries[k, NORMAL + 2]
-        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
-        middle = (np.float32(first) + np.float32(last) - _ONE) * _HALF
-        which, flat = np.float32(k - start), -_SCALE / depth
-        for i in range(first * WIDE, last * WIDE):
-            x, y = state[X + i], state[Y + i] - middle
-            p = a2 + b2 * x + c2 * y
-            p = p if p != _ZERO else _AWAY
-            inverse = _ONE / p
-            su, sv = (a0 + b0 * x + c0 * y) * inverse, (a1 + b1 * x + c1 * y) * inverse
-            on_disc = su * su + sv * sv
-            dx, dy = u - x, v - y
-            on_screen = _TWO * (dx * dx + dy * dy)
-            falloff = on_disc if on_disc <= on_screen else on_screen
-            z = depth * inverse
-            alpha = opacity * exp2(_LOG2 * falloff)
-            alpha = alpha if alpha <= _MAX else _MAX
-            alpha = alpha if alpha >= _MIN else _ZERO
-            met = z >= _NEAR
-            state[ALPHA + i] = alpha if met else _ZERO
-            state[Z + i], state[M + i] = z if met else _ZERO, flat * p if met else _ZERO
-        for i in range(first * WIDE, last * WIDE):
-            alpha, before, z, m = state[ALPHA + i], state[T + i], state[Z + i], state[M + i]
-            after = before - alpha * before
-            drawn = after >= _LAST  # false for a finished pixel too, whose transmittance is negative
-            weight = alpha * before if drawn else _ZERO
-            state[T + i] = after if drawn else -abs(before)
-            wm = weight * m
-            first_sum, second_sum = state[M1 + i], state[M2 + i]
-            state[SPREAD + i] += weight * second_sum + wm * (m * (_ONE - before) - _TWO * first_sum)
-            state[M1 + i] = first_sum + wm
-            state[M2 + i] = second_sum + wm * m
-            state[D + i] += weight * z
-            state[RED + i] += weight * red
-            state[RED + PIXELS + i] += weight * green
-            state[RED + 2 * PIXELS + i] += weight * blue
-            state[NX + i] += weight * nx
-            state[NX + PIXELS + i] += weight * ny
-            state[NX + 2 * PIXELS + i] += weight * nz
-            half = (weight > _ZERO) & (before > _HALF)
-            state[MEDIAN + i] = z if half else state[MEDIAN + i]
-            state[WHICH + i] = which if half else state[WHICH + i]
+        first, last, top = reach(rows, k)
+        red, green, blue = splat(entries[k, COLOUR]), splat(entries[k, COLOUR + 1]), splat(entries[k, COLOUR + 2])
+        nx, ny, nz = splat(entries[k, NORMAL]), splat(entries[k, NORMAL + 1]), splat(entries[k, NORMAL + 2])
+        which = splat(np.float32(k - start + 1))
+        _meet(state, first, last, top, entries, k, True, False)
+        for i in range(first * WIDE, last * WIDE, WIDE):
+            before, z, m = load(state, T + i), load(state, Z + i), load(state, M + i)
+            weight, after = cover(minimum(load(state, RESPONSE + i), splat(_MAX)), before)
+            store(state, T + i, after)
+            wm, first_sum, second_sum = weight * m, load(state, M1 + i), load(state, M2 + i)
+            _add(state, SPREAD + i, weight, second_sum)
+            _add(state, SPREAD + i, wm, m * (one - before) - (first_sum + first_sum))
+            store(state, M1 + i, first_sum + wm)
+            store(state, M2 + i, multiply_add(wm, m, second_sum))
+            _add(state, D + i, weight, z)
+            _add(state, RED + i, weight, red)
+            _add(state, RED + PIXELS + i, weight, green)
+            _add(state, RED + 2 * PIXELS + i, weight, blue)
+            _add(state, NX + i, weight, nx)
+            _add(state, NX + PIXELS + i, weight, ny)
+            _add(state, NX + 2 * PIXELS + i, weight, nz)
+            half = above(weight, none) & above(before, splat(_HALF))
+            # Neither is negative: without `maximum`, LLVM would make masked stores of these, slow on AMD's processors.
+            store(state, MEDIAN + i, where(half, z, maximum(none, load(state, MEDIAN + i))))
+            store(state, WHICH + i, where(half, which, maximum(none, load(state, WHICH + i))))
 
 
 @compiled(fastmath=CAREFUL)
 def _render_worker(
     worker, workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image, others, kept
 ):
-    state = np.empty(PLANES * PIXELS, np.float32)
+    state = np.empty(STATE, np.float32)
     height, width = image.shape[1], image.shape[2]
     for turn in range(worker, len(strip_order), workers):
         strip = strip_order[turn]
@@ -167,7 +190,6 @@ def _render_worker(
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
         _place(state, wide, tall)
         state[RED:] = 0
-        state[WHICH : WHICH + PIXELS] = -1
         end = ranges[strip]
         while end < ranges[strip + 1] and _unfinished(state):
             begin, end = end, min(end + CHECK, ranges[strip + 1])
@@ -182,7 +204,7 @@ def _render_worker(
                     image[channel, v, u] = state[RED + channel * PIXELS + i] + left_over * background[channel]
                     others[2 + channel, v, u] = state[NX + channel * PIXELS + i]
                 others[0, v, u], others[1, v, u] = state[D + i], _ONE - left_over
-                others[5, v, u], others[6, v, u] = state[MEDIAN + i], state[SPREAD + i]
+                others[5, v, u], others[6, v, u] = state[MEDIAN + i], _SCALE * _SCALE * state[SPREAD + i]
                 kept[0, v, u], kept[1, v, u], kept[2, v, u] = state[M1 + i], state[M2 + i], state[WHICH + i]
 
 
@@ -198,114 +220,83 @@ def render(
         )  # fmt: skip
 
 
-@compiled(fastmath=SUMMING)
+@compiled(fastmath=CAREFUL)
 def _blend_backward(state, begin, end, rows, entries, g_others, gradients):
     """As `_blend`, front to back again, filling each entry's gradient; `g_others` is None where there is none.
 
     dL/dalpha = T own - rest / (1 - alpha): `own` is the gradient of this disc's weight, `rest` the sum of weight times
     own over those behind it: what is left of the whole pixel's sum after those before.
     """
+    xs, none, one = load(state, X), splat(_ZERO), splat(_ONE)
     for k in range(begin, end):
-        a0, a1, a2 = entries[k, 0], entries[k, 1], entries[k, 2]
-        b0, b1, b2 = entries[k, 3], entries[k, 4], entries[k, 5]
-        c0, c1, c2 = entries[k, 6], entries[k, 7], entries[k, 8]
-        depth, u, v, opacity = entries[k, DEPTH], entries[k, CENTRE], entries[k, CENTRE + 1], entries[k, OPACITY]
-        red, green, blue = entries[k, COLOUR], entries[k, COLOUR + 1], entries[k, COLOUR + 2]
-        nx, ny, nz = entries[k, NORMAL], entries[k, NORMAL + 1], entries[k, NORMAL + 2]
-        first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
-        middle = (np.float32(first) + np.float32(last) - _ONE) * _HALF
-        which, flat = np.float32(k - begin), -_SCALE / depth
-        for i in range(first * WIDE, last * WIDE):
-            x, y = state[X + i], state[Y + i] - middle
-            p = a2 + b2 * x + c2 * y
-            p = p if p != _ZERO else _AWAY
-            inverse = _ONE / p
-            su, sv = (a0 + b0 * x + c0 * y) * inverse, (a1 + b1 * x + c1 * y) * inverse
-            on_disc = su * su + sv * sv
-            dx, dy = u - x, v - y
-            on_screen = _TWO * (dx * dx + dy * dy)
-            falloff = on_disc if on_disc <= on_screen else on_screen
-            z = depth * inverse
-            response = opacity * exp2(_LOG2 * falloff)
-            met = (z >= _NEAR) & (response >= _MIN)
-            state[H + i] = response if met else _ZERO
-            state[INV + i] = inverse if met else _ZERO
-            state[U + i], state[V + i] = su if met else _ZERO, sv if met else _ZERO
-            state[R + i] = on_disc - on_screen
+        first, last, top = reach(rows, k)
+        red, green, blue = splat(entries[k, COLOUR]), splat(entries[k, COLOUR + 1]), splat(entries[k, COLOUR + 2])
+        nx, ny, nz = splat(entries[k, NORMAL]), splat(entries[k, NORMAL + 1]), splat(entries[k, NORMAL + 2])
+        which = splat(np.float32(k - begin + 1))
+        _meet(state, first, last, top, entries, k, g_others is not None, True)
+        r = g = b = gnx = gny = gnz = go = none
+        for i in range(first * WIDE, last * WIDE, WIDE):
+            response, before = load(state, RESPONSE + i), load(state, T + i)
+            alpha = minimum(response, splat(_MAX))
+            weight, after = cover(alpha, before)
+            store(state, T + i, after)
+            g_red, g_green = load(state, G_RED + i), load(state, G_RED + PIXELS + i)
+            g_blue = load(state, G_RED + 2 * PIXELS + i)
+            own = multiply_add(g_red, red, multiply_add(g_green, green, g_blue * blue)) + load(state, E0 + i)
             if g_others is not None:
-                state[ZB + i], state[MB + i] = z if met else _ZERO, flat * p if met else _ZERO
-        r = g = b = gnx = gny = gnz = go = _ZERO
-        for i in range(first * WIDE, last * WIDE):
-            response, before = state[H + i], state[T + i]
-            alpha = response if response <= _MAX else _MAX
-            after = before - alpha * before
-            drawn = after >= _LAST
-            weight = alpha * before if drawn else _ZERO
-            state[T + i] = after if drawn else -abs(before)
-            g_red, g_green, g_blue = state[G_RED + i], state[G_RED + PIXELS + i], state[G_RED + 2 * PIXELS + i]
-            own = g_red * red + g_green * green + g_blue * blue + state[E0 + i]
-            if g_others is not None:
-                z, m = state[ZB + i], state[MB + i]
-                g_nx, g_ny, g_nz = state[G_NX + i], state[G_NX + PIXELS + i], state[G_NX + 2 * PIXELS + i]
-                e1, e2, g_depth = state[E1 + i], state[E2 + i], state[G_D + i]
-                own += (g_nx * nx + g_ny * ny + g_nz * nz) + g_depth * z + m * (e1 + m * e2)
-                # dm/dz = -m/z = m^2 / _SCALE
-                gz = weight * (g_depth + (e1 + _TWO * m * e2) * m * m * _BACK)
-                state[GZ + i] = gz + (state[G_MEDIAN + i] if state[MEDIAN_AT + i] == which else _ZERO)
-                gnx += weight * g_nx
-                gny += weight * g_ny
-                gnz += weight * g_nz
-            rest = state[REST + i] - weight * own
-            state[REST + i] = rest
-            h = response * (before * own - rest / (_ONE - alpha))
-            h = h if weight > _ZERO else _ZERO
-            state[H + i] = h
-            go += h
-            r += weight * g_red
-            g += weight * g_green
-            b += weight * g_blue
-        gradients[k, G_OPACITY] = go
-        gradients[k, G_COLOUR], gradients[k, G_COLOUR + 1], gradients[k, G_COLOUR + 2] = r, g, b
-        gradients[k, G_NORMAL], gradients[k, G_NORMAL + 1], gradients[k, G_NORMAL + 2] = gnx, gny, gnz
+                z, m, g_depth = load(state, Z + i), load(state, M + i), load(state, G_D + i)
+                g_nx, g_ny = load(state, G_NX + i), load(state, G_NX + PIXELS + i)
+                g_nz = load(state, G_NX + 2 * PIXELS + i)
+                e2 = m * load(state, E2 + i)
+                e = load(state, E1 + i) + e2
+                own = own + multiply_add(g_nx, nx, multiply_add(g_ny, ny, g_nz * nz))
+                own = own + multiply_add(g_depth, z, m * e)
+                g_z = weight * (g_depth - m * m * (e + e2))  # dm/dz = -m^2
+                median = where(equal(load(state, MEDIAN_AT + i), which), load(state, G_MEDIAN + i), none)
+                store(state, G_Z + i, g_z + median)
+                gnx, gny = multiply_add(weight, g_nx, gnx), multiply_add(weight, g_ny, gny)
+                gnz = multiply_add(weight, g_nz, gnz)
+            rest = load(state, REST + i) - weight * own
+            store(state, REST + i, rest)
+            h = response * (before * own - rest / (one - alpha))
+            h = where(above(weight, none), h, none)
+            store(state, RESPONSE + i, h)
+            go = go + h
+            r, g, b = multiply_add(weight, g_red, r), multiply_add(weight, g_green, g), multiply_add(weight, g_blue, b)
 
-        q0 = q1 = q2 = x0 = x1 = x2 = y0 = y1 = y2 = gd = gu = gv = w0 = w1 = w2 = _ZERO
-        for i in range(first * WIDE, last * WIDE):
-            x, y = state[X + i], state[Y + i] - middle
-            disc = state[R + i] <= _ZERO
-            inverse, su, sv = state[INV + i], state[U + i], state[V + i]
-            h = state[H + i] * inverse if disc else _ZERO
-            p0, p1 = -h * su, -h * sv
-            p2 = h * (su * su + sv * sv)
+        # Sums are stored eight at a time by the fields' numbers; where two stores meet, the later one has it right.
+        into = gradients[np.uint64(k)]
+        store(into, GRADIENTS - 8, totals(none, go, r, g, b, gnx, gny, gnz))
+
+        p0 = p1 = p2 = p0y = p1y = p2y = det = none
+        ys = top
+        for i in range(first * WIDE, last * WIDE, WIDE):
+            disc = at_least(none, load(state, EXCESS + i))
+            z, su, sv = load(state, Z + i), load(state, U + i), load(state, V + i)
+            hz = where(disc, load(state, RESPONSE + i), none) * z
+            to_u, to_v, to_z = hz * su, hz * sv, hz * multiply_add(su, su, sv * sv)
             if g_others is not None:
-                gz = state[GZ + i] * inverse if disc else _ZERO
-                p2 -= gz * state[ZB + i]
-                gd += gz
-            q0 += p0
-            q1 += p1
-            q2 += p2
-            x0 += p0 * x
-            x1 += p1 * x
-            x2 += p2 * x
-            y0 += p0 * y
-            y1 += p1 * y
-            y2 += p2 * y
-        gradients[k, 0], gradients[k, 1], gradients[k, 2] = q0, q1, q2
-        gradients[k, 3], gradients[k, 4], gradients[k, 5] = x0, x1, x2
-        gradients[k, 6], gradients[k, 7], gradients[k, 8] = y0, y1, y2
-        gradients[k, G_DEPTH] = gd
-        for i in range(first * WIDE, last * WIDE):
-            x, y = state[X + i], state[Y + i] - middle
-            screen = state[R + i] > _ZERO
-            h = state[H + i] if screen else _ZERO
-            gu += h * (x - u)
-            gv += h * (y - v)
+                gz = where(disc, load(state, G_Z + i), none) * z
+                to_z, det = to_z - gz * z, det + gz
+            p0, p1, p2 = p0 - to_u, p1 - to_v, p2 + to_z
+            p0y, p1y, p2y = p0y - to_u * ys, p1y - to_v * ys, multiply_add(to_z, ys, p2y)
+            ys = ys + one
+        store(into, 0, totals(p0, p1, p2, p0 * xs, p1 * xs, p2 * xs, p0y, p1y))
+
+        u, v = splat(entries[k, CENTRE]), splat(entries[k, CENTRE + 1])
+        gu = gv = w0 = w1 = w2 = none
+        ys = top
+        for i in range(first * WIDE, last * WIDE, WIDE):
+            screen = above(load(state, EXCESS + i), none)
+            h = where(screen, load(state, RESPONSE + i), none)
+            gu, gv = gu + h, multiply_add(h, ys - v, gv)
             if g_others is not None:
-                gz = state[GZ + i] if screen else _ZERO
-                w0 += gz * state[U + i]
-                w1 += gz * state[V + i]
-                w2 += gz
-        gradients[k, G_CENTRE], gradients[k, G_CENTRE + 1] = _TWO * gu, _TWO * gv
-        gradients[k, G_DIRECT], gradients[k, G_DIRECT + 1], gradients[k, G_DIRECT + 2] = w0, w1, w2
+                g_z = where(screen, load(state, G_Z + i), none)
+                w0, w1 = multiply_add(g_z, load(state, U + i), w0), multiply_add(g_z, load(state, V + i), w1)
+                w2 = w2 + g_z
+            ys = ys + one
+        gu, gv = (xs - u) * (gu + gu), gv + gv
+        store(into, 8, totals(p2y, det, gu, gv, w0, w1, w2, go))
 
 
 @compiled(fastmath=CAREFUL)
@@ -313,15 +304,14 @@ def _render_backward_worker(
     worker, workers, strip_order, ranges, rows, entries, ends, background, across, image, others, kept, g_image,
     g_others, gradients,
 ):  # fmt: skip
-    state = np.empty(BACKWARD_PLANES * PIXELS, np.float32)
+    state = np.empty(BACKWARD_STATE, np.float32)
     height, width = image.shape[1], image.shape[2]
     for turn in range(worker, len(strip_order), workers):
         strip = strip_order[turn]
         left, top = strip % across * WIDE, strip // across * TALL
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
         _place(state, wide, tall)
-        state[G_RED:GZ] = 0
-        state[MEDIAN_AT : MEDIAN_AT + PIXELS] = -1
+        state[G_RED:] = 0
         for y in range(tall):
             for x in range(wide):
                 i, v, u = y * WIDE + x, top + y, left + x
@@ -334,7 +324,7 @@ def _render_backward_worker(
                     constant -= gradient * background[channel]
                     rest += gradient * (image[channel, v, u] - background[channel])
                 if g_others is not None:
-                    spread, alpha = g_others[6, v, u], others[1, v, u]
+                    spread, alpha = _SCALE * _SCALE * g_others[6, v, u], others[1, v, u]
                     for channel in range(3):
                         state[G_NX + channel * PIXELS + i] = g_others[2 + channel, v, u]
                         rest += g_others[2 + channel, v, u] * others[2 + channel, v, u]
@@ -343,7 +333,7 @@ def _render_backward_worker(
                     state[MEDIAN_AT + i] = kept[2, v, u]
                     constant += g_others[1, v, u] + spread * kept[1, v, u]
                     rest += g_others[0, v, u] * others[0, v, u] + g_others[1, v, u] * alpha
-                    rest += _TWO * spread * others[6, v, u]
+                    rest += _TWO * g_others[6, v, u] * others[6, v, u]
                 state[E0 + i], state[REST + i] = constant, rest
         _blend_backward(state, ranges[strip], ends[strip], rows, entries, g_others, gradients)
         gradients[ends[strip] : ranges[strip + 1]] = 0

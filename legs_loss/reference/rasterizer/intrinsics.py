@@ -1,4 +1,4 @@
-"""Two instructions that Python has no words for: reading bits as another type, and asking for memory ahead of time."""
+"""An instruction that Python has no words for: asking for memory ahead of time."""
 
 from __future__ import annotations
 
@@ -8,16 +8,6 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
-
-
-@intrinsic
-def as_float(context: Any, bits: Any) -> Any:
-    """The float32 with the bits of an int32."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.FloatType())
-
-    return types.float32(types.int32), generate
 
 
 @intrinsic

@@ -41,7 +41,7 @@ from legs_loss.kernels.vectors import (
     where,
 )
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from legs_loss.reference.rasterizer.intrinsics import as_float, prefetch
+from legs_loss.reference.rasterizer.intrinsics import prefetch
 from legs_loss.reference.rasterizer.projection import BLOCK, FAINTEST, TALL, WIDE, origin
 
 PIXELS = WIDE * TALL
@@ -74,23 +74,12 @@ _P0, _P1, _P2, _P3, _P4, _P5 = (
     )
 )
 _UNDERFLOW = np.float32(-32)
-_BIAS, _MANTISSA = np.int32(127), np.int32(23)
+_MANTISSA = np.int32(23)
 _ROUNDING = np.float32(3 << 22)  # added to a number, it leaves the nearest integer in the last bits
 
 
-@compiled()
-def exp2(x):
-    """2^x for x <= 0, to 2e-7 relative; written out because a call to the library's would not vectorise."""
-    x = max(x, _UNDERFLOW)
-    whole = np.int32(x - _HALF)
-    f = x - np.float32(whole)
-    ff = f * f
-    fraction = (_P0 + _P1 * f) + ff * ((_P2 + _P3 * f) + ff * (_P4 + _P5 * f))  # in pairs: a shorter chain
-    return fraction * as_float((whole + _BIAS) << _MANTISSA)
-
-
 @njit(inline="always")
-def exp2_lanes(x):
+def exp2(x):
     """2^x for x <= 0 in each lane, to 2e-7 relative."""
     x = maximum(x, splat(_UNDERFLOW))
     rounded = x + splat(_ROUNDING)
@@ -220,7 +209,7 @@ def _expand(begin, end, strip_x, strip_y, splats, owners, rows, entries):
 
 
 @compiled()
-def _place(state, across, down):
+def place(state, across, down):
     """Pixel coordinates, full transmittance; pixels outside the image count as finished."""
     for x in range(WIDE):
         state[X + x] = x - (WIDE - 1) / 2
@@ -262,43 +251,49 @@ def _unfinished(state):
 
 
 @njit(inline="always")
-def _reach(rows, k):
+def reach(rows, k):
     """An entry's first row, the one past its last, and the first row's y, counted from the middle of them."""
     first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
     return first, last, splat((np.float32(first) - np.float32(last) + _ONE) * _HALF)
 
 
 @njit(inline="always")
-def _respond(state, first, last, ys, entries, k):
+def respond(state, first, last, ys, entries, k):
     """Leave an entry's alpha, not yet held at its most, in WORK; `ys`: the first row's."""
     xs = load(state, X)
     at_middle = multiply_add(multiply_add(splat(entries[k, 3]), xs, splat(entries[k, 1])), xs, splat(entries[k, 0]))
     slope, bend = multiply_add(splat(entries[k, 4]), xs, splat(entries[k, 2])), splat(entries[k, 5])
     for i in range(first * WIDE, last * WIDE, WIDE):
-        store(state, WORK + i, exp2_lanes(multiply_add(multiply_add(bend, ys, slope), ys, at_middle)))
+        store(state, WORK + i, exp2(multiply_add(multiply_add(bend, ys, slope), ys, at_middle)))
         ys = ys + splat(_ONE)
+
+
+@njit(inline="always")
+def cover(alpha, before):
+    """What a row's alpha takes from its transmittance `before`: the weight of the colour, and T after."""
+    none, weight = splat(_ZERO), alpha * before
+    after = before - weight
+    drawn = at_least(after, splat(_LAST))  # false for a finished pixel too, whose transmittance is negative
+    return where(drawn, weight, none), where(drawn, after, none - absolute(before))
 
 
 @njit(inline="always")
 def _cover(state, i):
     """Take a row's alpha in WORK from its transmittance: the weight of the colour, alpha as it counts, and T before."""
-    none = splat(_ZERO)
     alpha, before = minimum(load(state, WORK + i), splat(_MAX)), load(state, T + i)
-    alpha = where(at_least(alpha, splat(_MIN)), alpha, none)
-    weight = alpha * before
-    after = before - weight
-    drawn = at_least(after, splat(_LAST))  # false for a finished pixel too, whose transmittance is negative
-    store(state, T + i, where(drawn, after, none - absolute(before)))
-    return where(drawn, weight, none), alpha, before
+    alpha = where(at_least(alpha, splat(_MIN)), alpha, splat(_ZERO))
+    weight, after = cover(alpha, before)
+    store(state, T + i, after)
+    return weight, alpha, before
 
 
 @compiled()
 def _blend(state, begin, end, rows, entries):
     """Blend entries of a strip, in their order."""
     for k in range(begin, end):
-        first, last, top = _reach(rows, k)
+        first, last, top = reach(rows, k)
         red, green, blue = splat(entries[k, 6]), splat(entries[k, 7]), splat(entries[k, 8])
-        _respond(state, first, last, top, entries, k)
+        respond(state, first, last, top, entries, k)
         for i in range(first * WIDE, last * WIDE, WIDE):
             weight, _, _ = _cover(state, i)
             store(state, RED + i, multiply_add(weight, red, load(state, RED + i)))
@@ -316,7 +311,7 @@ def _render_worker(
         strip = strip_order[turn]
         left, top = strip % across * WIDE, strip // across * TALL
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        _place(state, wide, tall)
+        place(state, wide, tall)
         state[RED : RED + 3 * PIXELS] = 0
         end = ranges[strip]
         while end < ranges[strip + 1] and _unfinished(state):
@@ -362,9 +357,9 @@ def _blend_backward(state, begin, end, rows, entries, absolutely, gradients):
     xs, none, one = load(state, X), splat(_ZERO), splat(_ONE)
     scale = np.float32(1 / _LOG2E)
     for k in range(begin, end):
-        first, last, top = _reach(rows, k)
+        first, last, top = reach(rows, k)
         red, green, blue = splat(entries[k, 6]), splat(entries[k, 7]), splat(entries[k, 8])
-        _respond(state, first, last, top, entries, k)
+        respond(state, first, last, top, entries, k)
         r = g = b = none
         for i in range(first * WIDE, last * WIDE, WIDE):
             response = load(state, WORK + i)
@@ -412,7 +407,7 @@ def _render_backward_worker(
         strip = strip_order[turn]
         left, top = strip % across * WIDE, strip // across * TALL
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        _place(state, wide, tall)
+        place(state, wide, tall)
         state[RED:X] = 0
         for y in range(tall):
             rest = splat(_ZERO)

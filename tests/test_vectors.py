@@ -1,0 +1,63 @@
+"""Eight numbers at once: what the compiled code relies on that no result of a kernel would tell at once."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba")
+
+A = (1.0, 2.0, 3.0, math.nan, 5.0, math.nan, -0.0, math.inf)
+B = (2.0, 2.0, 1.0, 4.0, math.nan, math.nan, 0.0, math.inf)
+
+
+def by_lanes(operation, *rows):
+    """What an operation makes of rows of eight float32."""
+    import numba
+
+    from legs_loss.kernels.vectors import load, store
+
+    @numba.njit
+    def two(a, b, result):
+        store(result, 0, operation(load(a, 0), load(b, 0)))
+
+    result = np.empty(8, np.float32)
+    two(*(np.array(row, np.float32) for row in rows), result)
+    return result.tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("at_least", (0, 1, 1, 0, 0, 0, 1, 1)), ("above", (0, 0, 1, 0, 0, 0, 0, 0)), ("equal", (0, 1, 0, 0, 0, 0, 1, 1))],
+)
+def test_comparisons_are_false_of_a_nan(name, expected):
+    import numba
+
+    from legs_loss.kernels import vectors
+
+    compare, where, splat = getattr(vectors, name), vectors.where, vectors.splat
+
+    @numba.njit
+    def as_numbers(a, b):
+        return where(compare(a, b), splat(np.float32(1)), splat(np.float32(0)))
+
+    assert by_lanes(as_numbers, A, B) == list(expected)
+
+
+@pytest.mark.parametrize("name", ["minimum", "maximum"])
+def test_of_a_nan_the_second_is_taken(name):
+    import numba
+
+    from legs_loss.kernels import vectors
+
+    choose = getattr(vectors, name)
+
+    @numba.njit
+    def of_two(a, b):
+        return choose(a, b)
+
+    taken = by_lanes(of_two, A, B)
+    assert taken[3] == 4 and math.isnan(taken[4]) and math.isnan(taken[5])
+    assert taken[0] == {"minimum": 1, "maximum": 2}[name]

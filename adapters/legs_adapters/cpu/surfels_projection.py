@@ -28,7 +28,7 @@ from legs_loss.reference.rasterizer.projection import BLOCK, FAINTEST, ceil, flo
 from legs_loss.reference.rasterizer.projection_backward import AHEAD
 
 # No promise that numbers are finite: a disc that is seen from its edge has a homography without inverse.
-CAREFUL = {"nsz", "contract"}
+CAREFUL = {"nsz"}
 
 WIDE, TALL = 8, 16  # pixels: a strip of the image; its rows are one contiguous loop
 SLACK = 1e-6  # pixels^2: what an ellipse is widened by, against rounding

@@ -7,13 +7,13 @@ whose gradients are read and thrown away scores Gaussians. Only where something 
 from __future__ import annotations
 
 import re
-from typing import Dict, Iterator, List, Optional, Set, Tuple
+from typing import Dict, Iterable, Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
 
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import call_name, children, constant, word_set, words
+from legs_adapters.reading.syntax import call_name, children, constant, same, word_set, words
 from legs_adapters.reading.training import Training
 
 __all__ = ["Steps"]
@@ -30,7 +30,8 @@ _SCHEDULES = word_set("sched scheduler schedulers lr strategy profiler progress"
 _PLUMBING = word_set("torch optim adam params lr name eps self")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 _MAKES = {"optimizer", "optimiser", "optimizers", "optimisers"}
-_STEPS = word_set("step steps update optimize optimise optim")
+_STEPS = word_set("step steps update optimize optimise optim adam sgd")
+_SCENE = word_set("gaussian gaussians gs splat splats")
 _NOTHING = object()
 _DEPTH = 3
 
@@ -84,6 +85,9 @@ class Steps:
     def _words_of(self, function: Function, node: cst.CSTNode, depth: int) -> Set[str]:
         name = set(words(node.attr.value)) if isinstance(node, cst.Attribute) else set()
         found = name if name & _POSE else _spoken(node)  # gaussians.optimizer_cam moves cameras
+        handed = self._handed_in(function, node)
+        if handed is not None:
+            return handed
         for where, definition in self.program.lookup(function, node) or []:
             made = definition.value
             if definition.kind == "parameter" and depth < _DEPTH:
@@ -98,26 +102,53 @@ class Steps:
             if not _OPTIMISER.search(call_name(made)):
                 continue
             for arg in made.args:
-                found |= self._moved(where, arg.value)
-                if isinstance(arg.value, cst.Name):  # opt_params = [], then opt_params.append(...)
-                    for other in where.flow.definitions.get(arg.value.value, []):
-                        if other.kind == "mutate" or isinstance(other.value, cst.List):
-                            assert other.value is not None
-                            found |= self._moved(where, other.value)
+                found |= self._given(where, arg.value)
+        return found
+
+    def _handed_in(self, function: Function, node: cst.CSTNode) -> Optional[Set[str]]:
+        """The words in what ``model.setup(pose)`` made ``model.optimizer`` of, if of the model's own nothing learns."""
+        if not isinstance(node, cst.Attribute):
+            return None
+        place = f"self.{node.attr.value}"
+        found: Set[str] = set()
+        for call in function.flow.calls:
+            if not isinstance(call.func, cst.Attribute) or not same(call.func.value, node.value):
+                continue
+            for reference in self.program.resolve(function, call.func):
+                method = reference.target
+                if not isinstance(method, Function):
+                    continue
+                for made in method.flow.definitions.get(place, []):
+                    if not isinstance(made.value, cst.Call) or not _OPTIMISER.search(call_name(made.value)):
+                        continue
+                    moved = [word for arg in made.value.args for word in self._given(method, arg.value)]
+                    if "self" in moved:
+                        return None
+                    found.update(moved)
+        return found - _SCENE if found & _POSE else None
+
+    def _given(self, where: Function, node: cst.CSTNode) -> Set[str]:
+        """The words in an argument of an optimiser; of a list with a name also in what is added to it."""
+        found = self._moved(where, node)
+        if isinstance(node, cst.Name):  # opt_params = [], then opt_params.append(...)
+            for other in where.flow.definitions.get(node.value, []):
+                if other.kind == "mutate" or isinstance(other.value, cst.List):
+                    assert other.value is not None
+                    found |= self._moved(where, other.value)
         return found
 
     def _moved(self, where: Function, node: cst.CSTNode) -> Set[str]:
         """The words in what an optimiser is given; of ``model._rot`` those of the model's class, if it is a pose's."""
         found: Set[str] = set()
         held: Set[str] = set()
-        for part in _walk(node):
+        for part in _learning(node):
             if isinstance(part, cst.Attribute) and isinstance(part.value, cst.Name):
                 for reference in self.program.resolve(where, part.value):
                     spoken = set(words(getattr(reference.target, "name", "")))
                     if reference.kind == "instance" and spoken & _POSE:
                         found |= spoken & _POSE
                         held |= set(words(part.value.value))
-        return found | (_spoken(node) - held)
+        return found | (_words_in(_learning(node)) - held)
 
 
 def _handed_to(call: cst.Call) -> Set[str]:
@@ -140,20 +171,66 @@ def _is_step(call: cst.Call) -> bool:
 
 
 def _only_reads(scope: cst.CSTNode, calls: List[cst.Call]) -> bool:
-    """Whether the gradients are read and set to nothing after the last backward pass, and nothing can have stepped."""
+    """Whether the gradients are read and set to nothing after each backward pass, and nothing can have stepped."""
     last = max(i for i, call in enumerate(calls) if _is_backward(call))
     named = {word for call in calls for word in words(call_name(call))}
-    if "zero_grad" not in [call_name(call) for call in calls[last:]] or named & _STEPS:
+    if named & _STEPS:
         return False
-    return any(isinstance(part, cst.Attribute) and part.attr.value == "grad" for part in _walk(scope))
+    parts = list(_walk(scope))
+    again = isinstance(scope, (cst.For, cst.While)) and any(_empties(part) for part in parts)
+    if not again and "zero_grad" not in [call_name(call) for call in calls[last:]]:
+        return False
+    taken, asked = ({id(p) for part in parts if says(part) for p in _walk(part)} for says in (_takes, _asks))
+    read = {id(p) for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad"} - asked
+    return bool(read) and not read & taken
+
+
+def _empties(node: cst.CSTNode) -> bool:
+    """``xyz.grad = None``: in a loop each pass but the last loses its gradients, wherever in it that stands."""
+    if not isinstance(node, cst.Assign) or constant(node.value, _NOTHING) is not None:
+        return False
+    return any(isinstance(t.target, cst.Attribute) and t.target.attr.value == "grad" for t in node.targets)
+
+
+def _asks(node: cst.CSTNode) -> bool:
+    """``xyz.grad is not None``."""
+    return isinstance(node, cst.Comparison) or _empties(node)
+
+
+def _takes(node: cst.CSTNode) -> bool:
+    """A step by hand: ``xyz -= lr * xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``, ``xyz - lr * xyz.grad``."""
+    if isinstance(node, cst.AugAssign):
+        return isinstance(node.operator, cst.SubtractAssign)
+    if isinstance(node, cst.BinaryOperation):
+        return isinstance(node.operator, cst.Subtract)
+    return isinstance(node, cst.Call) and call_name(node).endswith("_")
+
+
+def _learning(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    """Yield the parts of what an optimiser is given, without groups that stay, ``{"params": [xyz], "lr": 0.0}``.
+
+    Of ``camera.parameters()`` that is the camera.
+    """
+    if isinstance(node, cst.Attribute) and node.attr.value in ("parameters", "named_parameters"):
+        yield from _learning(node.value)
+    elif not (isinstance(node, cst.Dict) and _stays(node)):
+        yield node
+        for child in children(node):
+            yield from _learning(child)
+
+
+def _stays(group: cst.Dict) -> bool:
+    entries = [entry for entry in group.elements if isinstance(entry, cst.DictElement)]
+    return any(constant(entry.key) == "lr" and constant(entry.value) == 0 for entry in entries)
 
 
 def _spoken(node: cst.CSTNode) -> Set[str]:
+    return _words_in(_walk(node))
+
+
+def _words_in(parts: Iterable[cst.CSTNode]) -> Set[str]:
     found: Set[str] = set()
-    stack = [node]
-    while stack:
-        part = stack.pop()
-        stack.extend(children(part))
+    for part in parts:
         if isinstance(part, cst.Name):
             found.update(words(part.value))
         elif isinstance(part, cst.SimpleString) and isinstance(constant(part), str):

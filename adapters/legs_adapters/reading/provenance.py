@@ -15,7 +15,7 @@ import libcst as cst
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Class, Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import arguments, call_name, code, constant, dotted, words
+from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, code, constant, dotted, words
 
 __all__ = ["View", "Views"]
 
@@ -57,9 +57,9 @@ class Views:
             return View(None, stored)
         if not self._still(function, holder, target, site):
             return View(None, f"{holder.value} may be another view by then")
-        overwritten = self._overwritten(function, holder.value, image.attr.value)
-        if overwritten is not None:
-            return View(None, overwritten)
+        doubt = _overwritten(function, holder.value, image.attr.value) or self._nameless(function, holder, set())
+        if doubt is not None:
+            return View(None, doubt)
         return View(f"{holder.value}.{_NAME}", f"{code(image)}, untouched")
 
     def _trace(
@@ -159,12 +159,46 @@ class Views:
             return f"{_NAME} is {_short(given[0])}"
         return None
 
-    @staticmethod
-    def _overwritten(function: Function, holder: str, attribute: str) -> Optional[str]:
-        place = f"{holder}.{attribute}"
-        for definition in function.flow.definitions.get(place, []):
-            return f"{place} is written here: {_short(definition.node)}"
+    def _nameless(self, function: Function, node: cst.CSTNode, seen: Set[int]) -> Optional[str]:
+        """Why the camera may have no name: one whose class stores none is added, ``stack.append(view)``."""
+        for definition in function.flow.reaching(node):
+            value = definition.value
+            if value is None or id(definition) in seen:
+                continue
+            seen.add(id(definition))
+            if definition.kind == "mutate" and isinstance(value, cst.Call):
+                for given in arguments(value)[0]:
+                    for reference in self.program.resolve(function, given):
+                        made = reference.target
+                        if reference.kind != "instance" or not isinstance(made, Class):
+                            continue
+                        if not any(each.stores(_NAME) for each in (made, *self.program.bases(made))):
+                            return f"{definition.place} also holds {made.name}s, which have no {_NAME}"
+                continue
+            found = self._nameless(function, list(attribute_chain(value))[-1], seen)
+            if found is not None:
+                return found
         return None
+
+
+def _overwritten(function: Function, holder: str, attribute: str) -> Optional[str]:
+    """Why the image may be another by then: it is written here, or the file puts others in their places."""
+    for definition in function.flow.definitions.get(f"{holder}.{attribute}", []):
+        return f"{holder}.{attribute} is written here: {_short(definition.node)}"
+    for scope in function.module.scopes(re.compile(rf"\.{attribute}\s*=[^=]").search):
+        for place, definitions in scope.flow.definitions.items():
+            if place.endswith(f".{attribute}") and not place.startswith("self."):
+                for definition in definitions:
+                    if definition.value is not None and not _of_same(definition.value, attribute):
+                        return f"{place} is written in this file: {_short(definition.node)}"
+    return None
+
+
+def _of_same(value: cst.CSTNode, attribute: str) -> bool:
+    """``None``, or what was stored before: ``camera.original_image_backup.cuda()``."""
+    parts = attribute_chain(value)
+    stored = any(isinstance(part, cst.Attribute) and part.attr.value.startswith(attribute) for part in parts)
+    return stored or constant(value, value) is None
 
 
 def _is_no_name(node: cst.CSTNode) -> bool:

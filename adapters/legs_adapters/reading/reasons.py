@@ -27,6 +27,10 @@ _RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid"
 _BUNDLES = {"ray_bundle", "ray_samples"}
 _FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
 _RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
+_TORCH = re.compile(r"^[ \t]*(import|from)[ \t]+torch", re.M)
+_OTHERS = re.compile(
+    r"^[ \t]*(import|from)[ \t]+(flax|jax|jittor|megengine|mindspore|mlx|paddle|tensorflow|tinygrad)\b", re.M
+)
 _EVALUATION = word_set(
     """
     eval evaluate evaluation test testing report reports metric metrics valid validate validation render
@@ -126,6 +130,8 @@ class Reasons:
     def _elsewhere(self, function: Function, form: Form) -> Optional[str]:
         """Why it is not the loss of a Gaussian model, going by the names of what is around it."""
         module = function.module
+        if _OTHERS.search(module.text) and not _TORCH.search(module.text):
+            return "not torch"
         if self._moves_poses(function, form.call):
             return "tracking"
         names = (function.name, *function.flow.conditions.get(id(form.call), ()))

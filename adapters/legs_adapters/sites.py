@@ -24,7 +24,7 @@ from legs_adapters.reading.provenance import View, Views
 from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
 from legs_adapters.reading.shared import is_huber, is_measured, shared_of, unchanged_at
-from legs_adapters.reading.syntax import call_name, code, words
+from legs_adapters.reading.syntax import call_name, code, same, walk_expressions, words
 from legs_adapters.reading.training import Training
 from legs_adapters.upstreams import registered
 
@@ -240,10 +240,21 @@ class _Finder:
             aside = tuple(shared.aside)
         elif shared is not None:
             return self._problem(function, form, place, f"{_short(form.node)} serves more than the loss", flipped)
-        last = is_channels_last(self.training, function, prediction, target)
+        last = self._is_channels_last(function, prediction, target)
         view = self.views.of(function, target, form.call)
         stands = (function.module.path, place.line, place.column, place.last_line)
         return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside)
+
+    def _is_channels_last(self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> bool:
+        """Whether the two lie so; or a photograph does that the same rendering is compared with elsewhere."""
+        others = [
+            form.second
+            for form in self.forms.of(function)
+            if form.first is not prediction
+            and same(form.first, prediction)
+            and _is_same_place(function, form.first, prediction)
+        ]
+        return any(is_channels_last(self.training, function, prediction, other) for other in (target, *others))
 
     def _uses(
         self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode
@@ -277,6 +288,12 @@ class _Finder:
         last = is_channels_last(self.training, function, form.first, form.second)
         advice = _advice(function, form, flipped, last)
         return Problem(module.path, place.line, module.lines.text(place.line), reason, advice)
+
+
+def _is_same_place(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
+    """Whether two expressions that are written alike are of the same values."""
+    names = [[part for part in walk_expressions(node) if isinstance(part, cst.Name)] for node in (first, second)]
+    return all(function.flow.reaching(one) == function.flow.reaching(other) for one, other in zip(*names))
 
 
 def _advice(function: Function, form: Form, flipped: bool, last: bool) -> str:

@@ -8,7 +8,17 @@ import libcst as cst
 
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Class, Function
-from legs_adapters.reading.syntax import arguments, call_name, constant, path_of, same, walk_expressions
+from legs_adapters.reading.syntax import (
+    arguments,
+    attribute_chain,
+    call_name,
+    constant,
+    dotted,
+    path_of,
+    same,
+    walk_expressions,
+    words,
+)
 from legs_adapters.reading.training import Training
 
 __all__ = ["is_channels_last"]
@@ -65,6 +75,10 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
             return [Vote(_LAST if after[-1:] == ["c"] else _FIRST, 3)]
         if call_name(node) in _LAST_RENDERERS:
             return [Vote(_LAST, 2)]
+        if call_name(node) in ("array", "asarray") and node.args and _is_picture(function, node.args[0].value):
+            return [Vote(_LAST, 3)]
+        if words(call_name(node)) == ("to", "tensor"):  # torchvision's: of a picture as of an array
+            return [Vote(_FIRST, 3)]
         if call_name(node) in ("reshape", "view", "flatten", "mv", "mm", "matmul"):
             return _shape_vote(node)
         inner: List[cst.CSTNode] = [node.func.value] if isinstance(node.func, cst.Attribute) else []
@@ -102,6 +116,20 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
                 for given in arguments(definition.value)[0]:
                     votes.extend(_votes(training, function, given, seen, depth + 1))
     return votes
+
+
+def _is_picture(function: Function, node: cst.CSTNode) -> bool:
+    """``Image.open(path).resize(size)``: what Pillow opens, which lies [H, W, C] as an array."""
+    for part in attribute_chain(node):
+        if isinstance(part, cst.Attribute) and dotted(part) == "Image.open":
+            return True
+        if isinstance(part, cst.Name):
+            made = function.flow.reaching(part)
+            opened = [
+                d.value for d in made if d.kind in ("assign", "with") and d.value is not None and d.value is not node
+            ]
+            return bool(made) and len(opened) == len(made) and all(_is_picture(function, value) for value in opened)
+    return False
 
 
 def _votes_of_callers(training: Training, function: Function, name: str, seen: Set[int], depth: int) -> List[Vote]:

@@ -216,7 +216,7 @@ class _Finder:
             return self._problem(function, form, place, why)
         flipped = bool(target_first)
         prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
-        if is_rows(function, pair.first) or is_rows(function, pair.second):
+        if is_rows(self.program, function, pair.first) or is_rows(self.program, function, pair.second):
             why = "the images are lists of pixels there, of which there is no weight map"
             return self._problem(function, form, place, why, flipped)
         if is_huber(self.training, function, form):
@@ -286,7 +286,8 @@ class _Finder:
     def _problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
         module = function.module
         last = is_channels_last(self.training, function, form.first, form.second)
-        advice = _advice(function, form, flipped, last)
+        rows = any(is_rows(self.program, function, side) for side in (form.first, form.second))
+        advice = _advice(form, flipped, last, rows)
         return Problem(module.path, place.line, module.lines.text(place.line), reason, advice)
 
 
@@ -296,13 +297,13 @@ def _is_same_place(function: Function, first: cst.CSTNode, second: cst.CSTNode) 
     return all(function.flow.reaching(one) == function.flow.reaching(other) for one, other in zip(*names))
 
 
-def _advice(function: Function, form: Form, flipped: bool, last: bool) -> str:
+def _advice(form: Form, flipped: bool, last: bool, rows: bool) -> str:
     """What to write by hand: the pictures themselves, where the form has lists of their pixels."""
     prediction, target = (form.second, form.first) if flipped else (form.first, form.second)
     whole, other = without_rows(prediction), without_rows(target)
     if whole is not prediction and other is not target:
         return f"legs_loss.l1_loss({_short(whole)}, {_short(other)}.reshape({_short(whole)}.shape), channels_last=True)"
-    if is_rows(function, prediction) or is_rows(function, target):
+    if rows:
         return "legs_loss.l1_loss(rendering, photograph), with the pictures before they became lists"
     settings = ", channels_last=True" if last else ""
     settings += ', reduction="none"' if form.reduction == "none" else ""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from typing import List, NamedTuple, Optional
+from typing import List, NamedTuple, Optional, Tuple
 
 import libcst as cst
 
 from legs_adapters.reading.l1 import Form
 from legs_adapters.reading.meaning import Meaning, Meanings
 from legs_adapters.reading.module import Function
+from legs_adapters.reading.program import Program
 from legs_adapters.reading.syntax import (
     arguments,
     attribute_chain,
@@ -154,24 +155,66 @@ def is_role(node: cst.CSTNode) -> bool:
     return isinstance(node, cst.Name) and all(role_of_words(word) is not None for word in words(node.value))
 
 
-def is_rows(function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
+def is_rows(program: Program, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
     """Whether an expression is a list of pixels, ``image.reshape(-1, 3)``: their neighbours are not known any more."""
     if depth > _DEPTH:
         return False
     if isinstance(node, cst.BinaryOperation):
-        return is_rows(function, node.left, depth + 1) or is_rows(function, node.right, depth + 1)
+        return any(is_rows(program, function, side, depth + 1) for side in (node.left, node.right))
     if isinstance(node, cst.Subscript):
-        return is_rows(function, node.value, depth + 1)
+        entries = _entries(program, function, node)
+        if entries:
+            return any(is_rows(program, where, value, depth + 1) for where, value in entries)
+        return is_rows(program, function, node.value, depth + 1)
     if isinstance(node, cst.Name):
-        found = list(function.flow.reaching(node))
-        if len(found) == 1 and found[0].kind == "assign" and found[0].value is not None:
-            return is_rows(function, found[0].value, depth + 1)
-    if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
-        if _to_rows(node):
+        found = [d for d in function.flow.reaching(node) if constant(d.value, d) is not None]
+        if any(_is_picked(d.value) for d in found if d.kind == "assign"):
             return True
+        added = [d.value for d in found if d.kind == "mutate" and isinstance(d.value, cst.Call)]
+        if added:  # crops = [], then crops.append(crop.flatten())
+            given = [value for call in added for value in arguments(call)[0]]
+            return any(is_rows(program, function, value, depth + 1) for value in given)
+        if len(found) == 1 and found[0].kind == "assign" and found[0].value is not None:
+            return is_rows(program, function, found[0].value, depth + 1)
+    if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
+        if _to_rows(node) or _flattens(node):
+            return True
+        if call_name(node) in ("cat", "concat") and node.args:
+            return is_rows(program, function, node.args[0].value, depth + 1)
         kept = call_name(node) in ("float", "cuda", "to", "clamp", "detach")
-        return kept and is_rows(function, node.func.value, depth + 1)
+        return kept and is_rows(program, function, node.func.value, depth + 1)
     return False
+
+
+def _entries(program: Program, function: Function, node: cst.Subscript) -> List[Tuple[Function, cst.CSTNode]]:
+    """What ``package["crops"]`` is in the dictionaries that the function returns which made the package."""
+    key, found = key_of(node), list(function.flow.reaching(node.value))
+    if not isinstance(key, str) or len(found) != 1 or not isinstance(found[0].value, cst.Call):
+        return []
+    made = [r.target for r in program.resolve(function, found[0].value.func) if not r.guess]
+    return [
+        (callee, element.value)
+        for callee in made
+        if isinstance(callee, Function)
+        for value in callee.flow.returns
+        if isinstance(value, cst.Dict)
+        for element in value.elements
+        if isinstance(element, cst.DictElement) and constant(element.key) == key
+    ]
+
+
+def _is_picked(node: Optional[cst.CSTNode]) -> bool:
+    """``image[mask > 0]``: the pixels of a mask."""
+    if not isinstance(node, cst.Subscript):
+        return False
+    return any(isinstance(e.slice, cst.Index) and isinstance(e.slice.value, cst.Comparison) for e in node.slice)
+
+
+def _flattens(node: cst.Call) -> bool:
+    """``image.flatten()``, ``image.reshape(-1)``."""
+    if call_name(node) in ("flatten", "ravel"):
+        return not node.args
+    return call_name(node) in ("reshape", "view") and [constant(value) for value in arguments(node)[0]] == [-1]
 
 
 def without_rows(node: cst.BaseExpression) -> cst.BaseExpression:

@@ -23,7 +23,7 @@ from legs_adapters.reading.program import Program
 from legs_adapters.reading.provenance import View, Views
 from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
-from legs_adapters.reading.shared import is_huber, is_measured, shared_of, unchanged_at
+from legs_adapters.reading.shared import is_asked, is_huber, is_measured, shared_of, unchanged_at
 from legs_adapters.reading.syntax import call_name, code, same, walk_expressions, words
 from legs_adapters.reading.training import Training
 from legs_adapters.upstreams import registered
@@ -102,7 +102,7 @@ class _Finder:
                 self.doubtful.append(self._doubt(function, form, place, verdict.reason))
             if self.by_hand and not chosen and not isinstance(verdict, Left):
                 verdict = self._left(function, place, "not chosen")
-            if not (isinstance(verdict, Left) and self._is_noise(form, verdict)):
+            if not (isinstance(verdict, Left) and self._is_noise(function, form, verdict)):
                 entries.append(((place.line, place.column), verdict))
         callables = [(entry.form, self._why_not_handed(entry)) for entry in self.handed.by_holder.get(function, ())]
         for call in function.flow.calls if registered.MENTIONED.search(function.text) else ():
@@ -132,7 +132,7 @@ class _Finder:
         pictures = "image" in (pair.a.kind, pair.b.kind)
         pictures = pictures or (function.name in _FORWARD and is_role(form.first) and is_role(form.second))
         roles = "target" in (pair.a.role, pair.b.role) or left.reason in ("distillation", "huber")
-        return pictures and roles and not same_root(form)
+        return pictures and roles and not same_root(form) and not is_asked(function, form)
 
     def _doubt(self, function: Function, form: Form, place: Place, reason: str) -> Problem:
         pair = pair_of(self.meanings, function, form)
@@ -158,12 +158,20 @@ class _Finder:
         why = "L1 and SSIM are one function here; with w, its weight of SSIM, they are two"
         return Problem(module.path, place.line, module.lines.text(place.line), why, advice)
 
-    def _is_noise(self, form: Form, left: Left) -> bool:
+    def _is_noise(self, function: Function, form: Form, left: Left) -> bool:
         """An absolute difference that is no loss: of angles, sizes, neighbouring pixels."""
         if form.callee is not None or form.reduction not in ("none", "wrapped"):
             return False
         trained = self.training.includes(form.node) and left.reason in _PICTURES and not same_root(form)
-        return not trained and left.reason not in ("definition", "tracking", "distillation", "huber")
+        if trained or left.reason in ("definition", "tracking", "distillation", "huber"):
+            return False
+        # Of a rendering and a photograph it is said all the same, where it may be that the trail was lost.
+        return left.reason != "untrained" or not self._compares_pictures(function, form)
+
+    def _compares_pictures(self, function: Function, form: Form) -> bool:
+        pair = pair_of(self.meanings, function, form)
+        pictures = pair.a.kind == pair.b.kind == "image" and {pair.a.role, pair.b.role} == {"render", "target"}
+        return pictures and not is_measured(function, form) and not is_asked(function, form)
 
     def _is_chosen(self, function: Function, place: Place) -> bool:
         path = function.module.path

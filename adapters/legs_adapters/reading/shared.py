@@ -12,7 +12,16 @@ from legs_adapters.reading.pair import makes_mask
 from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, walk_expressions
 from legs_adapters.reading.training import Training
 
-__all__ = ["Shared", "is_huber", "is_measured", "shared_of", "takes_no_gradient", "unchanged", "unchanged_at"]
+__all__ = [
+    "Shared",
+    "is_asked",
+    "is_huber",
+    "is_measured",
+    "shared_of",
+    "takes_no_gradient",
+    "unchanged",
+    "unchanged_at",
+]
 
 
 class Shared(NamedTuple):
@@ -94,6 +103,12 @@ def is_measured(function: Function, form: Form) -> bool:
         call_name(call) in ("item", "tolist") and any(part is form.node for part in attribute_chain(call))
         for call in function.flow.calls
     )
+
+
+def is_asked(function: Function, form: Form) -> bool:
+    """Whether a term is only compared with something, ``while abs(height - wanted) > 0.1``."""
+    parts = walk_expressions(function.body)
+    return any(isinstance(part, cst.Comparison) and part.left is form.node for part in parts)
 
 
 def _squared(node: cst.CSTNode) -> Optional[cst.CSTNode]:

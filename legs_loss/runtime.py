@@ -153,7 +153,8 @@ def l1_loss(
         prediction: the rendering, [C, H, W], [B, C, H, W], or with more axes in front, as the views of several
             scenes [B, V, C, H, W]; channels-last on request. Where it requires no gradient (evaluation,
             ``no_grad``) the result is ``torch.abs(prediction - target).mean()``, unweighted.
-        target: the photograph as this step supervises it, the same shape.
+        target: the photograph as this step supervises it, the same shape; of [C, H, W] beside [1, C, H, W] both are
+            taken for a batch of one, as ``torch.abs(prediction - target)`` takes them.
         view: the name of the view (for a batch: one a view), if the target is that view's own stored image. It lets
             maps from ``legs precompute`` be used; they are used only where the target's fingerprint says that they
             were made from it. Without a name, weights are remembered or computed.
@@ -190,6 +191,8 @@ def l1_loss(
         return _plain(prediction, target, mask, channels_last, reduction, own)
     if isinstance(target, Tensor) and target.dim() > 4 and prediction.shape == target.shape:
         return _in_one_batch(prediction, target, view, mask, channels_last, reduction, own)
+    if isinstance(target, Tensor) and prediction.dim() != target.dim():
+        prediction, target = _batch_of_one(prediction, target)
     check_pair(prediction, target)
     _check_layout(target, channels_last)
     if is_compiling():  # what the compiler traces has no memory: the weight becomes part of the graph
@@ -204,6 +207,13 @@ def l1_loss(
         else:
             weight = torch.stack([run.weight(target[i], name, channels_last) for i, name in enumerate(views)])
     return _weighted(prediction, target, weight, mask, channels_last, reduction, own)
+
+
+def _batch_of_one(prediction: Tensor, target: Tensor) -> Tuple[Tensor, Tensor]:
+    """Of a picture beside a batch of one picture, both as a batch; anything else as it is."""
+    if target.shape == (1, *prediction.shape):
+        return prediction.unsqueeze(0), target
+    return prediction, target.unsqueeze(0) if prediction.shape == (1, *target.shape) else target
 
 
 def _in_one_batch(

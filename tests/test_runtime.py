@@ -90,6 +90,20 @@ class TestWhenItWeights:
             torch.testing.assert_close(l1_loss(prediction, target, mask=mask), masked)
 
     @pytest.mark.parametrize("channels_last", [False, True])
+    def test_a_picture_beside_a_batch_of_one(self, channels_last):
+        prediction, target = pair(9, 8, 3) if channels_last else pair(3, 9, 8)
+        whole = l1_loss(prediction[None], target[None], channels_last=channels_last, reduction="none")
+        for sides in ((prediction, target[None]), (prediction[None], target)):
+            assert torch.equal(l1_loss(*sides, channels_last=channels_last, reduction="none"), whole)
+            torch.testing.assert_close(l1_loss(*sides, channels_last=channels_last), whole.mean())
+            own = l1_loss(*sides, channels_last=channels_last, own=lambda a, b: (a - b).abs().sum())
+            torch.testing.assert_close(own, whole.sum())
+            names = l1_loss(*sides, view="a", channels_last=channels_last)
+            torch.testing.assert_close(names, whole.mean())
+        with pytest.raises(LegsError, match="differ in shape"):
+            l1_loss(prediction, torch.stack([target, target]), channels_last=channels_last)
+
+    @pytest.mark.parametrize("channels_last", [False, True])
     def test_the_views_of_several_scenes(self, channels_last):
         prediction, target = pair(2, 3, 6, 5, 3) if channels_last else pair(2, 3, 3, 6, 5)
         one = l1_loss(prediction.flatten(0, 1), target.flatten(0, 1), channels_last=channels_last, reduction="none")

@@ -41,6 +41,7 @@ _RENDERERS = {
 _MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
+_LOADERS = {"loader", "dataloader"}
 _DEPTH = 40
 _BUDGET = 20000  # steps to answer one question: some code is one large knot
 
@@ -248,9 +249,16 @@ class Meanings:
             here = bool(function.flow.reaching(node))
             local = self._flow(function, node, depth) if here else self._of_forward(function, node.value, key, depth)
             role = role_of_words(key) or local.role
+            if role == "render" and not here and _is_asked_for(key) and _is_loaded(function, node.value, key):
+                role = "target"
             if role is None and not _BACKGROUND & set(words(key)):
                 role = self._role_of_holder(function, node.value, depth)
             return Meaning(_closer(kind_of_words(key), local.kind), role)
+        computed = _computed_key(function, node)
+        if computed is not None:  # which entry that is only the words in its key can say, or the holder's own name
+            name = root_of(node.value) if isinstance(node.value, (cst.Name, cst.Attribute)) else ""
+            kind = kind_of_words(computed) or kind_of_words(name)
+            return Meaning(kind, role_of_words(computed) or self._role_of_holder(function, node.value, depth))
         return self.of(function, node.value, depth)
 
     def _of_forward(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
@@ -391,6 +399,37 @@ def _formatted_key(node: cst.Subscript) -> Optional[str]:
     if len(node.slice) != 1 or not isinstance(element, cst.Index) or not isinstance(element.value, cst.FormattedString):
         return None
     return "_".join(p.value for p in element.value.parts if isinstance(p, cst.FormattedStringText)) or None
+
+
+def _computed_key(function: Function, node: cst.Subscript) -> Optional[str]:
+    """What is literal in the key of ``target["target_" + key]``; of ``pred[key]`` beside it, nothing."""
+    index = node.slice[0].slice
+    if len(node.slice) != 1 or not isinstance(index, cst.Index):
+        return None
+    if isinstance(index.value, cst.BinaryOperation):
+        return _added_text(index.value)
+    sums = [part for part in function.flow.expressions if isinstance(part, cst.BinaryOperation) and _added_text(part)]
+    known = any(same(side, index.value) for part in sums for side in (part.left, part.right))
+    return "" if known and isinstance(index.value, cst.Name) else None
+
+
+def _added_text(node: cst.BinaryOperation) -> Optional[str]:
+    """``target_`` of ``"target_" + key``."""
+    texts = [text for text in map(constant, (node.left, node.right)) if isinstance(text, str)]
+    return "_".join(texts) if texts and isinstance(node.operator, cst.Add) else None
+
+
+def _is_asked_for(key: str) -> bool:
+    """``images_output``: nothing but that it is what comes out says that it is a rendering."""
+    return all(role_of_words(word) != "render" or word in ("output", "outputs") for word in words(key))
+
+
+def _is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
+    """Whether a dictionary is what a data loader hands out, and the entry its own: nothing has rendered it."""
+    made = [d for d in function.flow.reaching(node) if d.kind != "store" or d.key in (None, key)]
+    sources = [part for d in made if d.kind == "element" and d.value is not None for part in walk_expressions(d.value)]
+    loaders = [part for part in sources if isinstance(part, cst.Name) and set(words(part.value)) & _LOADERS]
+    return bool(loaders) and all(d.kind == "element" for d in made)
 
 
 def _neighbours(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:

@@ -41,6 +41,7 @@ _RENDERERS = {
 _MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
+_OF_DIFFUSION = {"guidance_scale", "negative_prompt", "num_inference_steps", "strength"}  # of a picture that it paints
 _LOADERS = {"loader", "dataloader"}
 _DEPTH = 40
 _BUDGET = 20000  # steps to answer one question: some code is one large knot
@@ -330,6 +331,8 @@ class Meanings:
             key = constant(positional[0])
             role = role_of_words(key) or self._role_of_holder(function, base, depth)
             return Meaning(kind_of_words(key), role)
+        if "prompt" in keywords and _OF_DIFFUSION & set(keywords):
+            return Meaning("warp", None)
         if name == "where" and len(values) == 3:
             return _mix([self.of(function, value, depth) for value in values[1:]])
         if name in ("conv2d", "filter2d", "spatial_gradient") and values and "stride" not in keywords:

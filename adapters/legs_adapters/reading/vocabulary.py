@@ -23,8 +23,8 @@ _WORDS = {
         classes objects
     """,
     "warp": """
-        warp warped warping reproj reprojected reprojection pseudo virtual unseen sds diffusion inpaint inpainted edit
-        edited
+        warp warped warping reproj reprojected reprojection pseudo virtual unseen sds diffusion inpaint inpainted
+        outpaint outpainted edit edited
     """,
     "gradient": "grad gradient gradients edge edges laplacian sobel curv curvature hessian canny dx dy",
     "mask": """

@@ -224,7 +224,7 @@ class _Finder:
             return self._problem(function, form, place, why)
         flipped = bool(target_first)
         prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
-        if is_rows(self.program, function, pair.first) or is_rows(self.program, function, pair.second):
+        if is_rows(self.meanings, function, pair.first) or is_rows(self.meanings, function, pair.second):
             why = "the images are lists of pixels there, of which there is no weight map"
             return self._problem(function, form, place, why, flipped)
         if is_huber(self.training, function, form):
@@ -240,7 +240,7 @@ class _Finder:
         shared = shared_of(self.training, function, form)
         aside: Tuple[cst.Name, ...] = ()
         if shared is not None and not shared.trains:
-            return self._left(function, place, "weighting")
+            return self._left(function, place, "weighting" if self.training.touches(function) else "untrained")
         if shared is not None and shared.loss:
             form = form._replace(node=shared.loss[0], reduction="again")
             place = function.place(form.node)
@@ -294,7 +294,7 @@ class _Finder:
     def _problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
         module = function.module
         last = is_channels_last(self.training, function, form.first, form.second)
-        rows = any(is_rows(self.program, function, side) for side in (form.first, form.second))
+        rows = any(is_rows(self.meanings, function, side) for side in (form.first, form.second))
         advice = _advice(form, flipped, last, rows)
         return Problem(module.path, place.line, module.lines.text(place.line), reason, advice)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import List, NamedTuple, Optional, Tuple
+from typing import Iterable, List, NamedTuple, Optional, Tuple
 
 import libcst as cst
 
@@ -155,34 +155,32 @@ def is_role(node: cst.CSTNode) -> bool:
     return isinstance(node, cst.Name) and all(role_of_words(word) is not None for word in words(node.value))
 
 
-def is_rows(program: Program, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
+def is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
     """Whether an expression is a list of pixels, ``image.reshape(-1, 3)``: their neighbours are not known any more."""
+
+    def are(parts: Iterable[Tuple[Function, cst.CSTNode]]) -> bool:
+        return any(is_rows(meanings, where, part, depth + 1) for where, part in parts)
+
     if depth > _DEPTH:
         return False
     if isinstance(node, cst.BinaryOperation):
-        return any(is_rows(program, function, side, depth + 1) for side in (node.left, node.right))
+        return are([(function, node.left), (function, node.right)])
     if isinstance(node, cst.Subscript):
-        entries = _entries(program, function, node)
-        if entries:
-            return any(is_rows(program, where, value, depth + 1) for where, value in entries)
-        return is_rows(program, function, node.value, depth + 1)
+        return are(_entries(meanings.program, function, node) or [(function, node.value)])
     if isinstance(node, cst.Name):
         found = [d for d in function.flow.reaching(node) if constant(d.value, d) is not None]
-        if any(_is_picked(d.value) for d in found if d.kind == "assign"):
+        if any(d.kind == "assign" and _is_picked(meanings, function, d.value) for d in found):
             return True
         added = [d.value for d in found if d.kind == "mutate" and isinstance(d.value, cst.Call)]
         if added:  # crops = [], then crops.append(crop.flatten())
-            given = [value for call in added for value in arguments(call)[0]]
-            return any(is_rows(program, function, value, depth + 1) for value in given)
-        if len(found) == 1 and found[0].kind == "assign" and found[0].value is not None:
-            return is_rows(program, function, found[0].value, depth + 1)
+            return are((function, value) for call in added for value in arguments(call)[0])
+        return len(found) == 1 and found[0].kind == "assign" and are((function, d.value) for d in found if d.value)
     if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
         if _to_rows(node) or _flattens(node):
             return True
-        if call_name(node) in ("cat", "concat") and node.args:
-            return is_rows(program, function, node.args[0].value, depth + 1)
-        kept = call_name(node) in ("float", "cuda", "to", "clamp", "detach")
-        return kept and is_rows(program, function, node.func.value, depth + 1)
+        if call_name(node) in ("cat", "concat"):
+            return are((function, arg.value) for arg in node.args[:1])
+        return call_name(node) in ("float", "cuda", "to", "clamp", "detach") and are([(function, node.func.value)])
     return False
 
 
@@ -203,18 +201,17 @@ def _entries(program: Program, function: Function, node: cst.Subscript) -> List[
     ]
 
 
-def _is_picked(node: Optional[cst.CSTNode]) -> bool:
-    """``image[mask > 0]``: the pixels of a mask."""
-    if not isinstance(node, cst.Subscript):
-        return False
-    return any(isinstance(e.slice, cst.Index) and isinstance(e.slice.value, cst.Comparison) for e in node.slice)
+def _is_picked(meanings: Meanings, function: Function, node: Optional[cst.CSTNode]) -> bool:
+    """``image[:, mask]``: the pixels of a mask."""
+    return isinstance(node, cst.Subscript) and any(_is_mask(meanings, function, part) for part in node.slice)
 
 
 def _flattens(node: cst.Call) -> bool:
-    """``image.flatten()``, ``image.reshape(-1)``."""
-    if call_name(node) in ("flatten", "ravel"):
-        return not node.args
-    return call_name(node) in ("reshape", "view") and [constant(value) for value in arguments(node)[0]] == [-1]
+    """``image.flatten()``, ``image.reshape(3, -1)``, ``torch.masked_select(image, mask)``."""
+    if call_name(node) in ("reshape", "view"):
+        sizes = [constant(value) for value in arguments(node)[0]]
+        return -1 in sizes and len(sizes) < 3
+    return call_name(node) == "masked_select" or (call_name(node) in ("flatten", "ravel") and not node.args)
 
 
 def without_rows(node: cst.BaseExpression) -> cst.BaseExpression:

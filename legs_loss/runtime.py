@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Counts", "active", "configure", "counts", "l1_loss"]
 
-View = Union[str, Sequence[str], None]
+View = Union[str, int, Sequence[Union[str, int]], None]
 Own = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -155,9 +155,9 @@ def l1_loss(
             ``no_grad``) the result is ``torch.abs(prediction - target).mean()``, unweighted.
         target: the photograph as this step supervises it, the same shape; of [C, H, W] beside [1, C, H, W] both are
             taken for a batch of one, as ``torch.abs(prediction - target)`` takes them.
-        view: the name of the view (for a batch: one a view), if the target is that view's own stored image. It lets
-            maps from ``legs precompute`` be used; they are used only where the target's fingerprint says that they
-            were made from it. Without a name, weights are remembered or computed.
+        view: the name of the view, or its number (for a batch: one a view), if the target is that view's own stored
+            image. It lets maps from ``legs precompute`` be used; they are used only where the target's fingerprint says
+            that they were made from it. Without a name, weights are remembered or computed.
         mask: one value a pixel, zeroes the weight where it is 0.
         channels_last: where the channel stands.
         reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.
@@ -371,9 +371,9 @@ def _view_names(view: View, target: Tensor) -> Sequence[Optional[str]]:
     if view is None:
         return [None] * batch
     names: List[Any] = list(view) if isinstance(view, (list, tuple)) else [view]
-    if len(names) != batch or not all(isinstance(name, str) for name in names):
+    if len(names) != batch or not all(isinstance(name, (str, int)) for name in names):
         raise LegsError(f"view must be one name a view: target {list(target.shape)} holds {batch}, got {view!r}")
-    return names
+    return [str(name) for name in names]
 
 
 def _describe(config: Config) -> str:

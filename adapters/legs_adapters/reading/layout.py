@@ -77,8 +77,11 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
             return [Vote(_LAST, 2)]
         if call_name(node) in ("array", "asarray") and node.args and _is_picture(function, node.args[0].value):
             return [Vote(_LAST, 3)]
-        if words(call_name(node)) == ("to", "tensor"):  # torchvision's: of a picture as of an array
+        made = node.func if isinstance(node.func, cst.Call) else node
+        if words(call_name(made)) == ("to", "tensor"):  # torchvision's: of a picture as of an array
             return [Vote(_FIRST, 3)]
+        if {"transform", "transforms"} & set(words(call_name(node))):  # what it may do besides is not known
+            return []
         if call_name(node) in ("reshape", "view", "flatten", "mv", "mm", "matmul"):
             return _shape_vote(node)
         inner: List[cst.CSTNode] = [node.func.value] if isinstance(node.func, cst.Attribute) else []

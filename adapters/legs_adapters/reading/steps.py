@@ -180,7 +180,8 @@ def _only_reads(scope: cst.CSTNode, calls: List[cst.Call]) -> bool:
     again = isinstance(scope, (cst.For, cst.While)) and any(_empties(part) for part in parts)
     if not again and "zero_grad" not in [call_name(call) for call in calls[last:]]:
         return False
-    taken, asked = ({id(p) for part in parts if says(part) for p in _walk(part)} for says in (_takes, _asks))
+    asked = {id(p) for part in parts if _asks(part) for p in _walk(part)}
+    taken = {id(p) for part in parts for given in _taken(part) for p in _walk(given)}
     read = {id(p) for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad"} - asked
     return bool(read) and not read & taken
 
@@ -197,13 +198,14 @@ def _asks(node: cst.CSTNode) -> bool:
     return isinstance(node, cst.Comparison) or _empties(node)
 
 
-def _takes(node: cst.CSTNode) -> bool:
-    """A step by hand: ``xyz -= lr * xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``, ``xyz - lr * xyz.grad``."""
+def _taken(node: cst.CSTNode) -> List[cst.CSTNode]:
+    """What a step by hand takes: ``xyz -= lr * xyz.grad``, ``xyz - xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``."""
     if isinstance(node, cst.AugAssign):
-        return isinstance(node.operator, cst.SubtractAssign)
+        return [node.value] if isinstance(node.operator, cst.SubtractAssign) else []
     if isinstance(node, cst.BinaryOperation):
-        return isinstance(node.operator, cst.Subtract)
-    return isinstance(node, cst.Call) and call_name(node).endswith("_")
+        return [node.right] if isinstance(node.operator, cst.Subtract) else []
+    in_place = isinstance(node, cst.Call) and call_name(node).endswith("_")
+    return [child.value for child in children(node) if in_place and isinstance(child, cst.Arg)]
 
 
 def _learning(node: cst.CSTNode) -> Iterator[cst.CSTNode]:

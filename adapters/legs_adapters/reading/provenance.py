@@ -22,6 +22,7 @@ __all__ = ["View", "Views"]
 _MOVES = {"cuda", "to", "cpu", "float", "contiguous", "clone", "detach", "type"}
 _IMAGES = {"original_image", "image", "gt_image", "rgb", "original_rgb", "img", "image_tensor"}
 _NAME = "image_name"
+_OF_LISTS = {"copy", "pop", "popleft"}
 
 
 class View(NamedTuple):
@@ -175,7 +176,10 @@ class Views:
                         if not any(each.stores(_NAME) for each in (made, *self.program.bases(made))):
                             return f"{definition.place} also holds {made.name}s, which have no {_NAME}"
                 continue
-            found = self._nameless(function, list(attribute_chain(value))[-1], seen)
+            chain = list(attribute_chain(value))
+            if any(isinstance(part, cst.Attribute) and part.attr.value not in _OF_LISTS for part in chain):
+                continue  # scenes[0].getTrainCameras(): no more of that list
+            found = self._nameless(function, chain[-1], seen)
             if found is not None:
                 return found
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, Optional, Sequence, Union
 
 import numpy as np
@@ -145,12 +146,8 @@ def _check_values(tensors: Any, background: Tensor) -> None:
 
 
 def _finite(tensor: Tensor) -> bool:
-    # A sum is finite whenever everything is (overflow apart), and numpy's is far cheaper than a mask of the whole.
-    if tensor.dtype in (torch.float32, torch.float64):
-        with np.errstate(all="ignore"):
-            if np.isfinite(tensor.numpy().sum()):
-                return True
-    return bool(torch.isfinite(tensor).all())
+    # A sum is finite whenever everything is (overflow apart), and far cheaper than a mask of the whole.
+    return math.isfinite(float(tensor.sum())) or bool(torch.isfinite(tensor).all())
 
 
 def _check_camera(camera: Any) -> View:

@@ -122,8 +122,10 @@ def _flat(tensor: Tensor) -> np.ndarray:
 
 @lru_cache(maxsize=None)
 def _rates(name: str, columns: int) -> np.ndarray:
-    """The learning rate of every column, repeated to a block that is long enough to vectorise over."""
+    """The learning rate of every column, repeated to a block of whole vectors that is long enough to loop over."""
     rates = np.full(columns, RATES.get(name, 1.0), np.float32)
     if name == "sh":
         rates[:3], rates[3:] = COLOUR_RATE, COLOUR_RATE / 20
-    return np.tile(rates, -(-1024 // columns))
+    from legs_loss.reference.training.adam_kernel import LANES
+
+    return np.tile(rates, LANES * -(-128 // columns))

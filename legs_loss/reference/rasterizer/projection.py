@@ -64,6 +64,21 @@ def origin(strip_x, strip_y, rows):
     return strip_x * WIDE + 0.5 * (WIDE - 1), strip_y * TALL + 0.5 * ((rows & 255) + (rows >> 8) - 1)
 
 
+@compiled()
+def lay_out(means, scales, quaternions, covariances, i, state, j):
+    """Write a Gaussian's mean and shape to column `j` of a block's state."""
+    for k in range(3):
+        state[MEAN + k, j] = means[i, k]
+    if scales is not None:
+        for k in range(3):
+            state[SHAPE + k, j] = scales[i, k]
+        for k in range(4):
+            state[SHAPE + 3 + k, j] = quaternions[i, k]
+    if covariances is not None:
+        for k in range(6):
+            state[SHAPE + k, j] = covariances[i, k]
+
+
 @njit(inline="always")
 def _drawn(x, y, z, a, b, c, determinant, intrinsics, dilation):
     """What is kept of a splat: rows CENTRE to LARGEST of the state."""
@@ -136,15 +151,7 @@ def _project_block(
         if not depth > NEAR:
             continue
         depths[i] = np.float32(depth)
-        state[MEAN, count], state[MEAN + 1, count], state[MEAN + 2, count] = x, y, z
-        if scales is not None:
-            for k in range(3):
-                state[SHAPE + k, count] = scales[i, k]
-            for k in range(4):
-                state[SHAPE + 3 + k, count] = quaternions[i, k]
-        if covariances is not None:
-            for k in range(6):
-                state[SHAPE + k, count] = covariances[i, k]
+        lay_out(means, scales, quaternions, covariances, i, state, count)
         before_camera[count] = i
         count += 1
     if scales is not None:

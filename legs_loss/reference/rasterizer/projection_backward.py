@@ -22,13 +22,13 @@ from legs_loss.reference.rasterizer.geometry import (
 )
 from legs_loss.reference.rasterizer.harmonics import direction, harmonics, harmonics_gradient
 from legs_loss.reference.rasterizer.intrinsics import prefetch
-from legs_loss.reference.rasterizer.projection import BLOCK, TALL, origin
+from legs_loss.reference.rasterizer.projection import BLOCK, MEAN, SHAPE, TALL, lay_out, origin
 
 AHEAD = 4  # how many Gaussians before their turn the gradients of their entries are asked for
 
-# Rows of a block's state: of each Gaussian the mean, the shape (scales and quaternion, or covariance), its splat's
-# conic, and the sums over its entries; in place of mean and shape, then, their gradients.
-MEAN, SHAPE, CONIC, SUMS = 0, 3, 10, 13
+# Rows of a block's state, behind mean and shape: its splat's conic, and the sums over its entries. In place of mean and
+# shape, then, their gradients.
+CONIC, SUMS = 10, 13
 U, V, A, POWER, RED, ABSOLUTE, END = 0, 1, 2, 5, 6, 9, 11  # of the sums: to u, v, A, B, C, power, r, g, b, |u|, |v|
 STATE = SUMS + END, BLOCK + 8  # see projection.py
 
@@ -170,16 +170,9 @@ def _project_backward_block(
             g_view[i] = 0
             continue
         _collect(splats, boxes, i, slot_rows, places, first_slots[i], entry_gradients, state, count)
+        lay_out(means, scales, quaternions, covariances, i, state, count)
         for k in range(3):
-            state[MEAN + k, count], state[CONIC + k, count] = means[i, k], splats[i, 2 + k]
-        if scales is not None:
-            for k in range(3):
-                state[SHAPE + k, count] = scales[i, k]
-            for k in range(4):
-                state[SHAPE + 3 + k, count] = quaternions[i, k]
-        if covariances is not None:
-            for k in range(6):
-                state[SHAPE + k, count] = covariances[i, k]
+            state[CONIC + k, count] = splats[i, 2 + k]
         drawn[count] = i
         count += 1
     if scales is not None:

@@ -1,4 +1,4 @@
-"""Adam in one pass over memory: many times as fast as torch's operations one by one."""
+"""Adam in one pass over memory, eight numbers at a time: LLVM makes no vectors of a loop over five arrays."""
 
 from __future__ import annotations
 

@@ -131,11 +131,20 @@ def quaternion_gradient(g, q, length):
 
 
 @njit(inline="always")
-def conic_gradient(a, b, c, ga, gb, gc):
-    """From the gradient to a conic Q to that of the covariance's three numbers: -Q G Q, G its symmetric matrix."""
-    p00, p01 = a * ga + 0.5 * b * gb, 0.5 * a * gb + b * gc
-    p10, p11 = b * ga + 0.5 * c * gb, 0.5 * b * gb + c * gc
-    return -(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)
+def centre_gradient(a, b, c, mx, my):
+    """From the first moments of h = dL/dpower about a splat's centre to the gradient of the centre.
+
+    The power is -d^t Q d / 2, d a pixel's place from the centre and Q the conic: Q times the moments.
+    """
+    return a * mx + b * my, b * mx + c * my
+
+
+@njit(inline="always")
+def covariance_gradient(a, b, c, mxx, mxy, myy):
+    """From the second moments, a matrix M, to the gradient of the covariance's three numbers: Q M Q / 2."""
+    p00, p01 = a * mxx + b * mxy, a * mxy + b * myy
+    p10, p11 = b * mxx + c * mxy, b * mxy + c * myy
+    return 0.5 * (p00 * a + p01 * b), 0.5 * (p00 * b + p01 * c), 0.5 * (p10 * b + p11 * c)
 
 
 @njit(inline="always")

@@ -10,7 +10,8 @@ from numba import prange
 
 from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.rasterizer.geometry import (
-    conic_gradient,
+    centre_gradient,
+    covariance_gradient,
     linearised,
     mean_gradient,
     numbers,
@@ -29,7 +30,8 @@ AHEAD = 4  # how many Gaussians before their turn the gradients of their entries
 # Rows of a block's state, behind mean and shape: its splat's conic, and the sums over its entries. In place of mean and
 # shape, then, their gradients.
 CONIC, SUMS = 10, 13
-U, V, A, POWER, RED, ABSOLUTE, END = 0, 1, 2, 5, 6, 9, 11  # of the sums: to u, v, A, B, C, power, r, g, b, |u|, |v|
+# Of the sums: moments of h about the splat's centre (h; hx, hy; hxx, hxy, hyy), red, green, blue, two absolute ones.
+POWER, FIRST, SECOND, RED, ABSOLUTE, END = 0, 1, 3, 6, 9, 11
 STATE = SUMS + END, BLOCK + 8  # see projection.py
 
 
@@ -48,30 +50,32 @@ def _collect(splats, boxes, i, slot_rows, places, slot, gradients, state, j):
     A row of `gradients` holds the moments of h = dL/dpower about its origin: h, hx, hy, hxx, hxy, hyy; then red, green,
     blue, and the two absolute sums.
     """
-    u, v, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
-    gu = gv = ga = gb = gc = power = red = green = blue = absolute_u = absolute_v = 0.0
+    u, v = splats[i, 0], splats[i, 1]
+    m = mx = my = mxx = mxy = myy = red = green = blue = absolute_u = absolute_v = 0.0
     for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
         for strip_x in range(boxes[i, 0], boxes[i, 2]):
             if slot_rows[slot] != 0:
-                k = places[slot]
+                k = np.uint64(places[slot])
                 h, hx, hy = np.float64(gradients[k, 0]), np.float64(gradients[k, 1]), np.float64(gradients[k, 2])
                 x, y = origin(strip_x, strip_y, slot_rows[slot])
                 x -= u
                 y -= v
-                gu += (a * x + b * y) * h + a * hx + b * hy
-                gv += (b * x + c * y) * h + b * hx + c * hy
-                ga -= 0.5 * (gradients[k, 3] + x * (2 * hx + x * h))
-                gb -= gradients[k, 4] + x * hy + y * (hx + x * h)
-                gc -= 0.5 * (gradients[k, 5] + y * (2 * hy + y * h))
-                power += h
+                about_x, about_y = hx + x * h, hy + y * h
+                m += h
+                mx += about_x
+                my += about_y
+                mxx += gradients[k, 3] + x * (hx + about_x)
+                mxy += gradients[k, 4] + x * hy + y * about_x
+                myy += gradients[k, 5] + y * (hy + about_y)
                 red += gradients[k, 6]
                 green += gradients[k, 7]
                 blue += gradients[k, 8]
                 absolute_u += gradients[k, 9]
                 absolute_v += gradients[k, 10]
             slot += 1
-    state[SUMS, j], state[SUMS + 1, j], state[SUMS + 2, j], state[SUMS + 3, j], state[SUMS + 4, j] = gu, gv, ga, gb, gc
-    state[SUMS + 5, j], state[SUMS + 6, j], state[SUMS + 7, j], state[SUMS + 8, j] = power, red, green, blue
+    state[SUMS, j], state[SUMS + 1, j], state[SUMS + 2, j] = m, mx, my
+    state[SUMS + 3, j], state[SUMS + 4, j], state[SUMS + 5, j] = mxx, mxy, myy
+    state[SUMS + 6, j], state[SUMS + 7, j], state[SUMS + 8, j] = red, green, blue
     state[SUMS + 9, j], state[SUMS + 10, j] = absolute_u, absolute_v
 
 
@@ -82,7 +86,9 @@ def _shapes_backward(count, intrinsics, pose, state):
         x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
         t = linearised(x, y, z, intrinsics, pose)
         a, b, c = state[CONIC, j], state[CONIC + 1, j], state[CONIC + 2, j]
-        s00, s01, s11 = conic_gradient(a, b, c, state[SUMS + A, j], state[SUMS + A + 1, j], state[SUMS + A + 2, j])
+        gu, gv = centre_gradient(a, b, c, state[SUMS + FIRST, j], state[SUMS + FIRST + 1, j])
+        mxx, mxy, myy = state[SUMS + SECOND, j], state[SUMS + SECOND + 1, j], state[SUMS + SECOND + 2, j]
+        s00, s01, s11 = covariance_gradient(a, b, c, mxx, mxy, myy)
         # The scaled axes U S, U = T R: 2 G U S.
         r, q, length = rotation(state[SHAPE + 3, j], state[SHAPE + 4, j], state[SHAPE + 5, j], state[SHAPE + 6, j])
         u = times_rotation(t, r)
@@ -109,7 +115,7 @@ def _shapes_backward(count, intrinsics, pose, state):
             e3 * r[3] + e4 * r[4] + e5 * r[5],
             e3 * r[6] + e4 * r[7] + e5 * r[8],
         )
-        gx, gy, gz = mean_gradient(x, y, z, state[SUMS + U, j], state[SUMS + V, j], g_t, intrinsics, pose)
+        gx, gy, gz = mean_gradient(x, y, z, gu, gv, g_t, intrinsics, pose)
         state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j] = gx, gy, gz
 
 
@@ -120,7 +126,9 @@ def _covariances_backward(count, intrinsics, pose, state):
         x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
         t = linearised(x, y, z, intrinsics, pose)
         a, b, c = state[CONIC, j], state[CONIC + 1, j], state[CONIC + 2, j]
-        s00, s01, s11 = conic_gradient(a, b, c, state[SUMS + A, j], state[SUMS + A + 1, j], state[SUMS + A + 2, j])
+        gu, gv = centre_gradient(a, b, c, state[SUMS + FIRST, j], state[SUMS + FIRST + 1, j])
+        mxx, mxy, myy = state[SUMS + SECOND, j], state[SUMS + SECOND + 1, j], state[SUMS + SECOND + 2, j]
+        s00, s01, s11 = covariance_gradient(a, b, c, mxx, mxy, myy)
         v = (
             state[SHAPE, j],
             state[SHAPE + 1, j],
@@ -142,7 +150,7 @@ def _covariances_backward(count, intrinsics, pose, state):
             2 * (s00 * u[0] + s01 * u[3]), 2 * (s00 * u[1] + s01 * u[4]), 2 * (s00 * u[2] + s01 * u[5]),
             2 * (s01 * u[0] + s11 * u[3]), 2 * (s01 * u[1] + s11 * u[4]), 2 * (s01 * u[2] + s11 * u[5]),
         )  # fmt: skip
-        gx, gy, gz = mean_gradient(x, y, z, state[SUMS + U, j], state[SUMS + V, j], g_t, intrinsics, pose)
+        gx, gy, gz = mean_gradient(x, y, z, gu, gv, g_t, intrinsics, pose)
         state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j] = gx, gy, gz
 
 
@@ -190,7 +198,9 @@ def _project_backward_block(
             for k in range(6):
                 g_covariances[i, k] = state[SHAPE + k, j]
         g_opacities[i, 0] = state[SUMS + POWER, j] / opacities[i, 0]
-        g_view[i, 0], g_view[i, 1] = state[SUMS + U, j] * half[0], state[SUMS + V, j] * half[1]
+        a, b, c = state[CONIC, j], state[CONIC + 1, j], state[CONIC + 2, j]
+        gu, gv = centre_gradient(a, b, c, state[SUMS + FIRST, j], state[SUMS + FIRST + 1, j])
+        g_view[i, 0], g_view[i, 1] = gu * half[0], gv * half[1]
         if g_view.shape[1] == 4:
             g_view[i, 2], g_view[i, 3] = state[SUMS + ABSOLUTE, j] * half[0], state[SUMS + ABSOLUTE + 1, j] * half[1]
 

@@ -12,9 +12,20 @@ import math
 from typing import Any, Callable, Dict, NamedTuple, Tuple
 
 import numpy as np
+from numba import njit
 
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.vectors import LANES, halves_added, load, load_bytes, splat, store
+from legs_loss.kernels.vectors import (
+    LANES,
+    halves_added,
+    load,
+    load_bytes,
+    maximum,
+    minimum,
+    splat,
+    store_bytes,
+    without_fourths,
+)
 
 __all__ = ["resized", "resized_as"]
 
@@ -54,14 +65,13 @@ def resized(image: Any, size: Tuple[int, int]) -> np.ndarray:
     (width, height), (columns, rows) = image.size, size
     across, down = _taps(width, columns), _taps(height, rows)
     weights, first = _in_pairs(across, width)
-    narrow = np.empty((height, columns * _DEPTH), np.uint8)
-    sums = np.empty(len(first) * _DEPTH, np.int32)
+    narrow = np.empty((height, 3 * columns + LANES), np.uint8)
     for top in range(0, height, _STRIP):
         strip = image.crop((0, top, width, min(top + _STRIP, height)))
         pixels = np.frombuffer(strip.tobytes("raw", "RGBX"), np.uint8)
-        _across(pixels, weights.reshape(-1), first, narrow[top : top + _STRIP], sums)
+        _across(pixels, strip.height, weights.reshape(-1), first, narrow[top:].reshape(-1), narrow.shape[1])
     out = np.empty((rows, columns, 3), np.uint8)
-    _down(narrow, *down, sums[: columns * _DEPTH], out)
+    _down(narrow.reshape(-1), narrow.shape[1], *down, out.reshape(-1))
     return out
 
 
@@ -113,36 +123,46 @@ def _in_pairs(taps: _Taps, length: int) -> Tuple[np.ndarray, np.ndarray]:
 
 
 @compiled(fastmath=False)
-def _across(pixels, weights, first, out, sums):  # type: ignore[no-untyped-def]
-    rows, columns = out.shape[0], first.size
+def _across(pixels, rows, weights, first, out, apart):  # type: ignore[no-untyped-def]
+    """Make rows of pixels narrower, the results `apart` from one another. Two pixels of two rows share a loop."""
+    columns = first.size
     stride, reach = pixels.size // rows, weights.size // columns
-    for i in range(rows):
+    for i in range(0, rows, 2):
+        below = min(i + 1, rows - 1)
+        step = (below - i) * stride
         for j in range(0, columns, 2):
-            left, right = splat(_ZERO), splat(_ZERO)
-            left_at, right_at = i * stride + first[j] * _DEPTH, i * stride + first[j + 1] * _DEPTH
+            left, right = i * stride + first[j] * _DEPTH, i * stride + first[j + 1] * _DEPTH
+            left0, right0, left1, right1 = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
             for k in range(0, reach, LANES):
-                left = left + load_bytes(pixels, left_at + k) * load(weights, j * reach + k)
-                right = right + load_bytes(pixels, right_at + k) * load(weights, (j + 1) * reach + k)
-            store(sums, j * _DEPTH, halves_added(left, right))
-        row = out[i]
-        for j in range(row.size):
-            row[j] = _rounded(sums[j])
+                weight = load(weights, j * reach + k)
+                left0 = left0 + load_bytes(pixels, left + k) * weight
+                left1 = left1 + load_bytes(pixels, left + step + k) * weight
+                weight = load(weights, (j + 1) * reach + k)
+                right0 = right0 + load_bytes(pixels, right + k) * weight
+                right1 = right1 + load_bytes(pixels, right + step + k) * weight
+            # Six bytes that count; the next pixels overwrite the others.
+            store_bytes(out, i * apart + 3 * j, without_fourths(_rounded(halves_added(left0, right0))))
+            store_bytes(out, below * apart + 3 * j, without_fourths(_rounded(halves_added(left1, right1))))
 
 
 @compiled(fastmath=False)
-def _down(image, first, count, weights, sums, out):  # type: ignore[no-untyped-def]
+def _down(image, apart, first, count, weights, out):  # type: ignore[no-untyped-def]
+    """Make fewer rows of those that lie `apart` in an image."""
+    breadth = out.size // first.size
     for i in range(first.size):
-        sums[:] = _ZERO
-        for k in range(count[i]):
-            weight, row = weights[i, k], image[first[i] + k]
-            for j in range(row.size):
-                sums[j] += np.int32(row[j]) * weight
-        row = out[i].reshape(-1)
-        for j in range(out.shape[1]):
-            for channel in range(3):
-                row[3 * j + channel] = _rounded(sums[_DEPTH * j + channel])
+        for start in range(0, breadth, 2 * LANES):
+            j = min(start, breadth - 2 * LANES)
+            at = first[i] * apart + j
+            left, right = splat(_ZERO), splat(_ZERO)
+            for k in range(count[i]):
+                weight = splat(weights[i, k])
+                left = left + load_bytes(image, at + k * apart) * weight
+                right = right + load_bytes(image, at + k * apart + LANES) * weight
+            store_bytes(out, i * breadth + j, _rounded(left))
+            store_bytes(out, i * breadth + j + LANES, _rounded(right))
 
 
-@compiled(fastmath=False, inline="always")
-def _rounded(sum):  # type: ignore[no-untyped-def]
-    return min(max((sum + _HALF) >> _BITS, _ZERO), _MOST)
+@njit(inline="always")
+def _rounded(sums):  # type: ignore[no-untyped-def]
+    whole = (sums + splat(_HALF)) >> splat(_BITS)
+    return minimum(maximum(whole, splat(_ZERO)), splat(_MOST))

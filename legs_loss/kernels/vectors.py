@@ -40,9 +40,11 @@ __all__ = [
     "splat",
     "square_root",
     "store",
+    "store_bytes",
     "total",
     "totals",
     "where",
+    "without_fourths",
 ]
 
 LANES = 8
@@ -92,6 +94,7 @@ for _symbol, _kind, _instruction in (
     (operator.add, integer8, "add"),
     (operator.mul, integer8, "mul"),
     (operator.lshift, integer8, "shl"),
+    (operator.rshift, integer8, "ashr"),
     (operator.and_, mask8, "and_"),
 ):
     _operator(_symbol, _kind, _instruction)
@@ -152,6 +155,20 @@ def store(typingctx, array, index, value):  # type: ignore[no-untyped-def]
 
 
 @_intrinsic
+def store_bytes(typingctx, array, index, value):  # type: ignore[no-untyped-def]
+    """Set array[index : index + 8] of a contiguous uint8 array to the low bytes of int32. Nothing checks the bounds."""
+    if not (_is_row(array, types.uint8) and isinstance(index, types.Integer) and value == integer8):
+        return None
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        bytes_ = builder.trunc(args[2], _BYTES)
+        builder.store(bytes_, _address(context, builder, sig.args[0], _BYTES, *args[:2]), align=1)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, integer8), generate
+
+
+@_intrinsic
 def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
     """Ask for the cache line of array[index] ahead of time. An index beyond the array does no harm."""
     if not (_is_row(array, types.float32) and isinstance(index, types.Integer)):
@@ -200,7 +217,8 @@ def multiply_add(typingctx, a, b, c):  # type: ignore[no-untyped-def]
 
 def _choosing(comparison: str) -> Any:
     def generate(context: Any, builder: Any, sig: Any, args: Sequence[Any]) -> Any:
-        return builder.select(builder.fcmp_ordered(comparison, *args), *args)
+        compare = builder.fcmp_ordered if sig.return_type == float8 else builder.icmp_signed
+        return builder.select(compare(comparison, *args), *args)
 
     return generate
 
@@ -208,13 +226,13 @@ def _choosing(comparison: str) -> Any:
 @_intrinsic
 def minimum(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return the smaller value of each lane; b's, where either is a NaN."""
-    return float8(float8, float8), _choosing("<")
+    return a(a, a), _choosing("<")
 
 
 @_intrinsic
 def maximum(typingctx, a, b):  # type: ignore[no-untyped-def]
     """Return the larger value of each lane; b's, where either is a NaN."""
-    return float8(float8, float8), _choosing(">")
+    return a(a, a), _choosing(">")
 
 
 def _comparing(comparison: str) -> Any:
@@ -322,6 +340,17 @@ def halves_added(typingctx, a, b):  # type: ignore[no-untyped-def]
         return builder.add(*(builder.shuffle_vector(*args, ir.Constant(_INTEGERS, half)) for half in (lower, upper)))
 
     return integer8(integer8, integer8), generate
+
+
+@_intrinsic
+def without_fourths(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return of two times four values the first three each, side by side, and two more of no meaning."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        nothing = ir.Constant(_INTEGERS, ir.Undefined)
+        return builder.shuffle_vector(args[0], nothing, ir.Constant(_INTEGERS, [0, 1, 2, 4, 5, 6, 7, 7]))
+
+    return integer8(integer8), generate
 
 
 @_intrinsic

@@ -140,7 +140,8 @@ class Reasons:
         if len(said) > 1 and said[0] in _NOT_TRAINING and not {"loss", "losses"} & set(said[1:]):
             return "evaluation"
         folders, _, file = module.path.rpartition("/")
-        if (words(file)[:1] and words(file)[0] in _EVALUATING) or set(folders.split("/")) & _EVALUATING:
+        evaluates = (words(file)[:1] and words(file)[0] in _EVALUATING) or set(folders.split("/")) & _EVALUATING
+        if evaluates and not self.steps.trains_its_own(function):
             return "evaluation"
         if set(words(function.name)) & _WARPED:
             return "synthetic"

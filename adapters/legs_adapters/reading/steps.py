@@ -69,6 +69,23 @@ class Steps:
         # At a module's top nobody else can take the step.
         return "scoring" if stepped or function.parent is None else None
 
+    def trains_its_own(self, function: Function) -> bool:
+        """Whether it makes a Gaussian model and steps that model's optimiser: training, wherever the file lies."""
+        steps = [call.func for call in function.flow.calls if _is_step(call)]
+        stepped = [step.value for step in steps if isinstance(step, cst.Attribute)]
+        return any(
+            isinstance(optimiser, cst.Attribute)
+            and optimiser.attr.value in _MAKES
+            and isinstance(optimiser.value, cst.Name)
+            and self._made_here(function, optimiser.value)
+            for optimiser in stepped
+        )
+
+    def _made_here(self, function: Function, model: cst.Name) -> bool:
+        """``gaussians = GaussianModel(3)``, whatever is stored in it then."""
+        made = [definition.value for definition in function.flow.reaching(model) if definition.kind != "store"]
+        return bool(made) and all(isinstance(v, cst.Call) and set(words(call_name(v))) & _SCENE for v in made)
+
     def _of_callers(self, function: Function, depth: int) -> Optional[str]:
         sites = self.training.sites.get(function, [])
         if not sites or depth >= _DEPTH:

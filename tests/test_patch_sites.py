@@ -98,7 +98,7 @@ def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path)
             "from torch import nn\n\n\n"
             "class MaskedL1(nn.Module):\n    def __init__(self):\n        super().__init__()\n"
             '        self.l1_loss = nn.L1Loss(reduction="none")\n\n    def forward(self, pred, target, mask):\n'
-            "        return self.l1_loss(pred, target) * mask\n"
+            "        return self.l1_loss(pred, target) * mask + self.ssim(pred, target)\n"
         ),
         "train.py": (
             "from gaussian_renderer import render\nfrom losses import MaskedL1\n\n\ndef training(scene, gaussians):\n"

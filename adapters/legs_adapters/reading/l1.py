@@ -522,7 +522,7 @@ def _only_differences(program: Program, function: Function, a: str, b: str, dept
 def _l1_reference(program: Program, reference: Reference, node: cst.Call, depth: int) -> bool:
     if reference.kind == "function" and isinstance(reference.target, Function):
         return own_shape(program, reference.target, node, depth + 1) is not None
-    return reference.kind == "external" and _reference_shape(program, reference, node) is not None
+    return reference.kind in ("external", "made by") and _reference_shape(program, reference, node) is not None
 
 
 def _is_l1_function(program: Program, function: Function, node: cst.BaseExpression, depth: int) -> bool:

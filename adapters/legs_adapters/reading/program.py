@@ -31,6 +31,8 @@ _COMMON = word_set(
 _DEPTH = 12
 _MADE = ("instance", "made by")
 _MOVES = {"cuda", "cpu", "to", "half", "float", "double", "eval", "train", "requires_grad_"}  # give the module itself
+# Give what does as the module that they are given does.
+_WRAPS = {"DataParallel", "DistributedDataParallel", "DDP", "compile", "convert_sync_batchnorm", "prepare"}
 
 
 class Reference(NamedTuple):
@@ -62,7 +64,11 @@ class Program:
         self._modules: Dict[str, Optional[Module]] = {}
         self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
         self._defined: Dict[str, List[str]] = {}
+        self._ending: Dict[str, List[str]] = {}  # by the last name of what is imported of them
         for source in self.sources.values():
+            path = PurePosixPath(source.path)
+            last = path.parent.name if path.name == "__init__.py" else path.stem
+            self._ending.setdefault(last, []).append(source.path)
             for name in set(_DEFINED.findall(source.text)):
                 self._defined.setdefault(name, []).append(source.path)
 
@@ -127,6 +133,9 @@ class Program:
                 moved = [ref for ref in self.resolve(function, node.func.value, depth + 1) if ref.kind in _MADE]
                 if moved:
                     return moved
+            wrapped = self._wrapped(function, node, 0, depth + 1)
+            if wrapped:
+                return wrapped
             made = self.resolve(function, node.func, depth + 1)
             instances = [Reference("instance", ref.target) for ref in made if ref.kind == "class"]
             instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
@@ -174,11 +183,21 @@ class Program:
         if definition.kind == "parameter" and definition.value is not None:
             return self.resolve(where, definition.value, depth)
         if definition.kind == "element" and definition.index is not None and isinstance(definition.value, cst.Call):
+            wrapped = self._wrapped(where, definition.value, definition.index, depth)
+            if wrapped:
+                return wrapped
             return self._returned(self.resolve(where, definition.value.func, depth), definition.index, depth)
         return []
 
+    def _wrapped(self, function: Function, node: cst.Call, index: int, depth: int) -> List[Reference]:
+        """``DataParallel(model)``, ``model, optimizer = accelerator.prepare(model, optimizer)``."""
+        given = arguments(node)[0] if call_name(node) in _WRAPS else []
+        if index >= len(given):
+            return []
+        return [ref for ref in self.resolve(function, given[index], depth + 1) if ref.kind == "instance"]
+
     def _returned(self, made: List[Reference], index: Optional[int], depth: int) -> List[Reference]:
-        """``render = get_renderer(kind)``: the functions that functions return, or one of those in a tuple."""
+        """What functions return, or one of those in a tuple: ``render = get_renderer(kind)``, ``net = get_model()``."""
         found: List[Reference] = []
         for ref in made:
             if ref.kind != "function" or ref.guess or not isinstance(ref.target, Function) or depth > _DEPTH:
@@ -189,11 +208,11 @@ class Program:
                     if not isinstance(value, cst.Tuple) or index >= len(value.elements):
                         continue
                     part = value.elements[index].value
-                if isinstance(part, (cst.Name, cst.Attribute, cst.Subscript, cst.Lambda)):
+                if isinstance(part, (cst.Name, cst.Attribute, cst.Subscript, cst.Lambda, cst.Call)):
                     found.extend(
                         r
                         for r in self.resolve(ref.target, part, depth + 1)
-                        if r.kind in ("function", "lambda") and not r.guess
+                        if r.kind in ("function", "lambda", "instance") and not r.guess
                     )
         return _unique(found)
 
@@ -234,6 +253,9 @@ class Program:
             return [Reference("module", inside)]
         if isinstance(base, Module):
             return []
+        beside = self._on_path(module, _from(node), name) if _from(node) and not node.relative else None
+        if beside is not None:
+            return self._global(beside, name, depth + 1)
         return [Reference("external", f"{_from(node)}.{name}" if _from(node) else name)]
 
     def _find_module(self, module: Module, node: cst.ImportFrom) -> Optional[Module]:
@@ -257,9 +279,18 @@ class Program:
                     return self.module(path)
         if level or not inner:
             return None
-        # Scripts put folders on sys.path: the one file whose path ends so is it.
-        ends = [p for p in self.sources if p.endswith((f"/{inner}.py", f"/{inner}/__init__.py"))]
-        return self.module(ends[0]) if len(ends) == 1 and "/" in inner else None
+        # Scripts put folders on sys.path: the one file whose path ends so is it, or the one nearest by.
+        known = self._ending.get(inner.rpartition("/")[2], []) if "/" in inner else []
+        ends = _nearest(module.path, [p for p in known if p.endswith((f"/{inner}.py", f"/{inner}/__init__.py"))])
+        return self.module(ends[0]) if len(ends) == 1 else None
+
+    def _on_path(self, module: Module, stem: str, name: str) -> Optional[Module]:
+        """``from base import Trainer``: the nearest ``base.py`` that defines a Trainer, if a script can have put it
+        on sys.path."""
+        defines = re.compile(rf"^(?:class|def)[ \t]+{re.escape(name)}\b", re.M)
+        ends = [p for p in self._ending.get(stem, []) if defines.search(self.sources[p].text)]
+        ends = _nearest(module.path, ends)
+        return self.module(ends[0]) if len(ends) == 1 else None
 
     # -- attributes
 
@@ -419,6 +450,13 @@ class Program:
             for argument in arguments(value)[1].values():
                 references.extend(self.resolve(where, argument, depth))
         return references
+
+
+def _nearest(path: str, others: List[str]) -> List[str]:
+    """Return those that share the most folders with a path."""
+    here = PurePosixPath(path).parents
+    shared = [len(set(here) & set(PurePosixPath(other).parents)) for other in others]
+    return [other for other, count in zip(others, shared) if count == max(shared)]
 
 
 def _order(definition: Definition) -> int:

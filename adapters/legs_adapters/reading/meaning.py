@@ -109,7 +109,10 @@ class Meanings:
 
     def _of(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
         if isinstance(node, cst.Name):
-            return self._named(node.value, self._flow(function, node, depth))
+            flow = self._flow(function, node, depth)
+            if flow.kind == "image" and kind_of_words(node.value) == "gradient" and _is_cropped(function, node):
+                return flow  # colors_grad = colors[:, :, :half]: the part that gets gradients
+            return self._named(node.value, flow)
         if isinstance(node, cst.Attribute):
             return self._attribute(function, node, depth)
         if isinstance(node, cst.Subscript):
@@ -433,6 +436,15 @@ def _is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
     sources = [part for d in made if d.kind == "element" and d.value is not None for part in walk_expressions(d.value)]
     loaders = [part for part in sources if isinstance(part, cst.Name) and set(words(part.value)) & _LOADERS]
     return bool(loaders) and all(d.kind == "element" for d in made)
+
+
+def _is_cropped(function: Function, node: cst.Name) -> bool:
+    """Whether a name stands for a part of a picture, ``image[:, :half]``, and for nothing else."""
+    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
+    return len(made) == len(function.flow.reaching(node)) and all(
+        isinstance(value, cst.Subscript) and all(isinstance(part.slice, cst.Slice) for part in value.slice)
+        for value in made
+    )
 
 
 def _neighbours(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:

@@ -29,7 +29,7 @@ _FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|rad
 _RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
 _TORCH = re.compile(r"^[ \t]*(import|from)[ \t]+torch", re.M)
 _OTHERS = re.compile(
-    r"^[ \t]*(import|from)[ \t]+(flax|jax|jittor|megengine|mindspore|mlx|paddle|tensorflow|tinygrad)\b", re.M
+    r"^[ \t]*(import|from)[ \t]+(drjit|flax|jax|jittor|megengine|mindspore|mlx|paddle|tensorflow|tinygrad)\b", re.M
 )
 _EVALUATION = word_set(
     """
@@ -75,6 +75,8 @@ class Reasons:
         trained = trained or self._called_by_framework(function)
         if not trained or self._without_grad(function, form):
             return self._why_untrained(function, form)
+        if _OTHERS.search(function.module.text) and not _TORCH.search(function.module.text):
+            return "not torch"
         if "image" not in (pair.a.kind, pair.b.kind) and not are_counterparts(form):
             return "unknown"
         if same_root(form):
@@ -130,8 +132,6 @@ class Reasons:
     def _elsewhere(self, function: Function, form: Form) -> Optional[str]:
         """Why it is not the loss of a Gaussian model, going by the names of what is around it."""
         module = function.module
-        if _OTHERS.search(module.text) and not _TORCH.search(module.text):
-            return "not torch"
         if self._moves_poses(function, form.call):
             return "tracking"
         names = (function.name, *function.flow.conditions.get(id(form.call), ()))

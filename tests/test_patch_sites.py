@@ -109,4 +109,4 @@ def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path)
         ),
     }
     (problem,) = plan(checkout(tmp_path, texts)).findings.problems
-    assert problem.advice == "legs_loss.l1_loss(pred, target, own=self.l1_loss)"
+    assert problem.advice == "legs_loss.l1_loss(pred, target, own=self.l1_loss), in a copy of MaskedL1 for train.py:9"

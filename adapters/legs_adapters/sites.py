@@ -236,7 +236,9 @@ class _Finder:
             if use is not None and all(other is not None for other, _ in uses):
                 return self._left(function, place, use)
             if use is not None:  # its body cannot be both
-                return self._problem(function, form, place, f"{function.name} also serves {use} at {where}", flipped)
+                why = f"{function.name} also serves {use} at {where}"
+                problem = self._problem(function, form, place, why, flipped)
+                return problem._replace(advice=problem.advice + _in_a_copy(function, uses))
         shared = shared_of(self.training, function, form)
         aside: Tuple[cst.Name, ...] = ()
         if shared is not None and not shared.trains:
@@ -271,11 +273,14 @@ class _Finder:
         found: List[Tuple[Optional[str], Optional[str], str]] = []
         if not isinstance(target, cst.Name):
             return []
-        for caller, call in self.training.sites.get(function, []):
+        calls = self.training.sites.get(function, [])
+        for caller, call in sorted(calls, key=lambda site: (site[0].module.path, site[0].place(site[1]).line)):
             photograph = function.given(call, target.value)
             rendering = function.given(call, prediction.value) if isinstance(prediction, cst.Name) else None
             if photograph is not None:
                 meanings = [self.meanings.of(caller, node) for node in (rendering, photograph) if node is not None]
+                if meanings[-1].role is None and _detaches(photograph):  # which no photograph needs
+                    meanings[-1] = meanings[-1]._replace(role="render")
                 where = f"{caller.module.path}:{caller.place(call).line}"
                 found.append((meanings[0].kind, self.reasons.use(caller, call, meanings), where))
         pictures = any(kind == "image" for kind, _, _ in found)
@@ -322,6 +327,18 @@ def _advice(form: Form, flipped: bool, last: bool, rows: bool) -> str:
         extras = ", ".join(_short(extra.with_changes(comma=cst.MaybeSentinel.DEFAULT)) for extra in form.extras)
         settings += f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
     return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{settings})"
+
+
+def _detaches(node: cst.CSTNode) -> bool:
+    return any(isinstance(part, cst.Call) and call_name(part) == "detach" for part in walk_expressions(node))
+
+
+def _in_a_copy(function: Function, uses: Sequence[Tuple[Optional[str], str]]) -> str:
+    """Where to write it, for a function that some calls need as it is."""
+    owner = function.owner if function.name in _FORWARD else None
+    calls = [where for use, where in uses if use is None]
+    shown = ", ".join(calls[:3]) + (f" and {len(calls) - 3} more" if len(calls) > 3 else "")
+    return f", in a copy of {owner.name if owner else function.name} for {shown}" if calls else ""
 
 
 def _is_torch(callee: cst.BaseExpression) -> bool:

@@ -11,9 +11,10 @@ from typing import Dict, Iterable, Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
 
+from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import call_name, children, constant, same, word_set, words
+from legs_adapters.reading.syntax import call_name, children, constant, dotted, same, word_set, words
 from legs_adapters.reading.training import Training
 
 __all__ = ["Steps"]
@@ -105,7 +106,7 @@ class Steps:
         handed = self._handed_in(function, node)
         if handed is not None:
             return handed
-        for where, definition in self.program.lookup(function, node) or []:
+        for where, definition in self.program.lookup(function, node) or self._stored(function, node):
             made = definition.value
             if definition.kind == "parameter" and depth < _DEPTH:
                 for caller in self.program.mentioning(where.name, called=True):
@@ -121,6 +122,13 @@ class Steps:
             for arg in made.args:
                 found |= self._given(where, arg.value)
         return found
+
+    def _stored(self, function: Function, node: cst.CSTNode) -> List[Tuple[Function, Definition]]:
+        """What the methods of its class store in ``self.optimizer``."""
+        owner = self.program.owner_of(function)
+        if owner is None or not isinstance(node, cst.Attribute) or dotted(node.value) != "self":
+            return []
+        return owner.stores(node.attr.value)
 
     def _handed_in(self, function: Function, node: cst.CSTNode) -> Optional[Set[str]]:
         """The words in what ``model.setup(pose)`` made ``model.optimizer`` of, if of the model's own nothing learns."""

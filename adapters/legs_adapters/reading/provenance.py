@@ -22,6 +22,7 @@ __all__ = ["View", "Views"]
 _MOVES = {"cuda", "to", "cpu", "float", "contiguous", "clone", "detach", "type"}
 _IMAGES = {"original_image", "image", "gt_image", "rgb", "original_rgb", "img", "image_tensor"}
 _NAME = "image_name"
+_DEPTH = 4
 _OF_LISTS = {"copy", "pop", "popleft"}
 
 
@@ -147,8 +148,8 @@ class Views:
 
     def _named(self) -> Optional[str]:
         """Why what the cameras get as a name is none of a photograph, if it is none wherever they are made."""
-        given = [
-            keywords[_NAME]
+        makers = [
+            (function, keywords[_NAME])
             for name in {camera.name for camera in self._cameras or ()}
             for function in self.program.mentioning(name, called=True)
             for call in function.flow.calls
@@ -156,9 +157,17 @@ class Views:
             for keywords in (arguments(call)[1],)
             if _NAME in keywords
         ]
+        given = [value for function, value in makers if self._is_used(function)] or [value for _, value in makers]
         if given and all(_is_no_name(value) for value in given):
             return f"{_NAME} is {_short(given[0])}"
         return None
+
+    def _is_used(self, function: Function, depth: int = 0) -> bool:
+        """Whether something can lead to a function: not to what a fork has kept of the codebase that it is made of."""
+        if function.owner is not None or function.parent is None or depth > _DEPTH:
+            return True
+        callers = [caller for caller in self.program.mentioning(function.name) if _calls(caller, function)]
+        return any(self._is_used(caller, depth + 1) for caller in callers)
 
     def _nameless(self, function: Function, node: cst.CSTNode, seen: Set[int]) -> Optional[str]:
         """Why the camera may have no name: one whose class stores none is added, ``stack.append(view)``."""
@@ -183,6 +192,14 @@ class Views:
             if found is not None:
                 return found
         return None
+
+
+def _calls(caller: Function, function: Function) -> bool:
+    """Whether it calls a function of this name, or hands it on."""
+    if caller is function:
+        return False
+    read = [part.value for part in caller.flow.reads]
+    return function.name in read or any(call_name(call) == function.name for call in caller.flow.calls)
 
 
 def _overwritten(function: Function, holder: str, attribute: str) -> Optional[str]:

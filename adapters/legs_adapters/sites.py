@@ -126,7 +126,7 @@ class _Finder:
         known = ("untrained", "unknown", "distillation", "other", "huber")
         if not (in_module or by_callers or left.reason in known):
             return False
-        if is_measured(function, form):
+        if is_measured(function, form) or self.reasons.evaluates(function):
             return False
         pair = pair_of(self.meanings, function, form)
         pictures = "image" in (pair.a.kind, pair.b.kind)

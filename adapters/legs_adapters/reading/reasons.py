@@ -129,6 +129,10 @@ class Reasons:
         owner = self.program.owner_of(function)
         return owner.name if owner is not None else ""
 
+    def evaluates(self, function: Function) -> bool:
+        """Whether its class says that it evaluates: ``TestLoss``."""
+        return bool(set(words(self._class_of(function))) & _EVALUATING)
+
     def _elsewhere(self, function: Function, form: Form) -> Optional[str]:
         """Why it is not the loss of a Gaussian model, going by the names of what is around it."""
         module = function.module
@@ -191,7 +195,9 @@ class Reasons:
         for _ in range(2):
             queue = [caller for callee in queue for caller in self._callers(callee)]
             names.extend(queue)
-        spoken = {word for f in names for word in (*words(f.name), *words(f.module.path.rsplit("/", 1)[-1]))}
+        said = [self._class_of(function)]
+        said += [part for f in names for part in (f.name, f.module.path.rsplit("/", 1)[-1])]
+        spoken = {word for part in said for word in words(part)}
         if spoken & _SCORING:
             return "scoring"
         if spoken & _EVALUATION or self._without_grad(function, form):

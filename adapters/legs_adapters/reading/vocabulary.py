@@ -21,6 +21,7 @@ _WORDS = {
         feature features feat feats semantic semantics sem language lang clip dino dinov2 lseg sam embedding embeddings
         latent latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors
         classes objects wavelet wavelets haar dwt fft rfft dct census
+        stokes aolp dolp
     """,
     "warp": """
         warp warped warping reproj reprojected reprojection pseudo virtual unseen sds diffusion inpaint inpainted

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from legs_adapters.patch import plan
+from legs_adapters.reading import l1
 from legs_adapters.reading.repo import decode
 
 from tests.patching_support import NAMES, checkout, expected, files
@@ -90,6 +91,20 @@ def test_a_value_with_very_many_ways_to_come_about_is_followed_once(tmp_path):
     texts["train.py"] = before + branches + line + after
     found = plan(checkout(tmp_path, texts))
     assert [site.view.text for site in found.findings.sites] == ["viewpoint_cam.image_name"]
+
+
+def test_functions_that_call_each_other_are_each_looked_into_once(tmp_path, monkeypatch):
+    names = [f"l1_of_{k}" for k in range(8)]
+    bodies = {name: "".join(f"    total += {other}(a, b)\n" for other in names if other != name) for name in names}
+    functions = "".join(f"def {name}(a, b, total=0):\n{body}    return total\n\n\n" for name, body in bodies.items())
+    texts = files("inria")
+    texts["utils/loss_utils.py"] += f"\n\n{functions}def mean_of(a, b):\n    return l1_loss(a, b) + l1_of_0(a, b)\n"
+    texts["train.py"] = texts["train.py"].replace("l1_loss", "mean_of")
+    looked_into = []
+    meets = l1._meet_in_differences
+    monkeypatch.setattr(l1, "_meet_in_differences", lambda *args: looked_into.append(args[1]) or meets(*args))
+    plan(checkout(tmp_path, texts))
+    assert len(looked_into) == len(set(looked_into)) >= len(names)
 
 
 def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path):

@@ -464,20 +464,31 @@ def _truth(node: cst.BaseExpression, known: Dict[str, object]) -> Optional[bool]
 
 def _only_differences(program: Program, function: Function, a: str, b: str, depth: int) -> bool:
     """Return whether a function is an L1 of its first two parameters: they meet in differences, and in no other way."""
+    if function not in program.only_differences:
+        program.only_differences[function] = False  # what asks for itself on the way
+        program.only_differences[function] = _meet_in_differences(program, function, a, b, depth)
+    return program.only_differences[function]
+
+
+def _meet_in_differences(program: Program, function: Function, a: str, b: str, depth: int) -> bool:
     assert isinstance(function.node, cst.FunctionDef)
     nodes: List[cst.CSTNode] = []
     for statement in function.body.body:
         nodes.extend(walk_expressions(statement))
-    allowed: Set[int] = set()
+    pairs, allowed = _picked_pairs(function, nodes, a, b)
     absolute = False
     changed: List[Tuple[str, cst.CSTNode, cst.BaseExpression]] = []
+
+    def mirrored(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:
+        return any(_mirrored(left, right, *pair) for pair in pairs)
+
     for node in nodes:
         if isinstance(node, cst.BinaryOperation):
             if isinstance(node.operator, (cst.Power,)):
                 return False
             if isinstance(node.operator, cst.Multiply) and constant(node.right, 1) == 0:
                 allowed.update(id(n) for n in walk_expressions(node))
-            if isinstance(node.operator, cst.Subtract) and _mirrored(node.left, node.right, a, b):
+            if isinstance(node.operator, cst.Subtract) and mirrored(node.left, node.right):
                 allowed.update(id(n) for n in walk_expressions(node))
         elif isinstance(node, cst.Call):
             name = call_name(node)
@@ -488,7 +499,7 @@ def _only_differences(program: Program, function: Function, a: str, b: str, dept
             absolute = absolute or _is_abs(node)
             positional = arguments(node)[0]
             spread = any(arg.star == "*" for arg in node.args)
-            pair = len(positional) >= 2 and not spread and _mirrored(positional[0], positional[1], a, b)
+            pair = len(positional) >= 2 and not spread and mirrored(positional[0], positional[1])
             if pair and (
                 any(_l1_reference(program, r, node, depth) for r in program.resolve(function, node.func))
                 or any(_is_l1_function(program, function, value, depth) for value in positional[2:])
@@ -515,8 +526,33 @@ def _only_differences(program: Program, function: Function, a: str, b: str, dept
             return False
         for part in (target, value, other_target, other_value):
             allowed.update(id(n) for n in walk_expressions(part))
-    names = [node for node in nodes if isinstance(node, cst.Name) and node.value in (a, b)]
+    compared = {name for pair in pairs for name in pair}
+    names = [node for node in nodes if isinstance(node, cst.Name) and node.value in compared]
     return bool(names) and all(id(node) in allowed for node in names)
+
+
+def _picked_pairs(
+    function: Function, nodes: List[cst.CSTNode], a: str, b: str
+) -> Tuple[List[Tuple[str, str]], Set[int]]:
+    """The two parameters and what is picked alike out of them, ``x = a[:, mask]``, ``y = b[:, mask]``.
+
+    Returns:
+        Those pairs of names, and the ids of the assignments' parts.
+    """
+    pairs, parts = [(a, b)], set()
+    picked: List[Tuple[str, cst.Assign]] = []
+    for node in nodes:
+        if isinstance(node, cst.Assign) and len(node.targets) == 1 and isinstance(node.value, cst.Subscript):
+            target = node.targets[0].target
+            if isinstance(target, cst.Name) and len(function.flow.definitions.get(target.value, [])) == 1:
+                picked.append((target.value, node))
+    for (one, first), (other, second) in zip(picked, picked[1:]):
+        of = [node.value.value for node in (first, second) if isinstance(node.value, cst.Subscript)]
+        texts = [code(part) for part in of]
+        if sorted(texts) == sorted([a, b]) and _mirrored(first.value, second.value, a, b):
+            pairs.append((one, other) if texts[0] == a else (other, one))
+            parts |= {id(part) for node in (first, second) for part in walk_expressions(node)}
+    return pairs, parts
 
 
 def _l1_reference(program: Program, reference: Reference, node: cst.Call, depth: int) -> bool:

@@ -55,12 +55,14 @@ class Program:
 
     Attributes:
         prospects: which texts can lead to an L1.
+        only_differences: of which functions it is known whether they are an L1 of their first two parameters.
     """
 
     def __init__(self, sources: Iterable[Source]) -> None:
         self.sources: Dict[str, Source] = {source.path: source for source in sources}
         self._unreadable: Dict[str, Unreadable] = {}
         self.prospects = Prospects(source.text for source in self.sources.values())
+        self.only_differences: Dict[Function, bool] = {}
         self._modules: Dict[str, Optional[Module]] = {}
         self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
         self._defined: Dict[str, List[str]] = {}
@@ -227,7 +229,7 @@ class Program:
             return _unique(references)
         for node in module.top.flow.imports:
             if isinstance(node, cst.ImportFrom) and isinstance(node.names, cst.ImportStar):
-                other = self._find_module(module, node)
+                other = self.imported_from(module, node)
                 if isinstance(other, Module) and other is not module:
                     found = self._global(other, name, depth + 1)
                     if found:
@@ -243,7 +245,7 @@ class Program:
             found = self.find_module(module, full, 0)
             return [Reference("module", found)] if isinstance(found, Module) else [Reference("external", full)]
         assert isinstance(node, cst.ImportFrom)
-        base = self._find_module(module, node)
+        base = self.imported_from(module, node)
         inside = self.find_module(module, ((_from(node) + ".") if _from(node) else "") + name, len(node.relative))
         if isinstance(base, Module):
             found_names = self._global(base, name, depth + 1)
@@ -258,7 +260,8 @@ class Program:
             return self._global(beside, name, depth + 1)
         return [Reference("external", f"{_from(node)}.{name}" if _from(node) else name)]
 
-    def _find_module(self, module: Module, node: cst.ImportFrom) -> Optional[Module]:
+    def imported_from(self, module: Module, node: cst.ImportFrom) -> Optional[Module]:
+        """Return the checkout's module that ``from ... import`` in another takes from."""
         return self.find_module(module, _from(node), len(node.relative))
 
     def find_module(self, module: Module, name: str, level: int) -> Optional[Module]:
@@ -431,7 +434,7 @@ class Program:
         alias, node = definition.node, definition.value
         if not isinstance(node, cst.ImportFrom) or not isinstance(alias, cst.ImportAlias):
             return []
-        base = self._find_module(where.module, node)
+        base = self.imported_from(where.module, node)
         if base is None:
             return []
         references: List[Reference] = []

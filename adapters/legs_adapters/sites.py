@@ -128,6 +128,8 @@ class _Finder:
             return False
         if is_measured(function, form) or self.reasons.evaluates(function):
             return False
+        if left.reason == "distillation" and (_detaches(form.first) or _detaches(form.second)):
+            return False
         pair = pair_of(self.meanings, function, form)
         pictures = "image" in (pair.a.kind, pair.b.kind)
         pictures = pictures or (function.name in _FORWARD and is_role(form.first) and is_role(form.second))

@@ -21,7 +21,7 @@ _KEEPS = word_set(
     """
 )
 _MODULES = word_set("torch np numpy")
-_MESH_RASTERIZER = "nvdiffrast."
+_MESH_RASTERIZERS = ("nvdiffrast.", "kaolin.render.", "pytorch3d.renderer")
 
 
 def is_rendering(function: Function, node: cst.CSTNode) -> bool:
@@ -33,14 +33,23 @@ def is_rendering(function: Function, node: cst.CSTNode) -> bool:
 def is_of_mesh(program: Program, function: Function, node: cst.CSTNode) -> bool:
     """Whether a value can have come out of a rasterizer of triangles, or is sampled from their texture."""
     return any(
-        _draws_mesh(maker)
-        or any(
-            reference.kind == "external" and str(reference.target).startswith(_MESH_RASTERIZER)
-            for reference in program.resolve(function, maker.func)
-        )
+        _draws_mesh(maker) or _rasterizes_mesh(program, function, maker, 0)
         for maker in _makers(function, node, set())
         if maker is not None
     )
+
+
+def _rasterizes_mesh(program: Program, function: Function, call: cst.Call, depth: int) -> bool:
+    """Whether a call is of a rasterizer of triangles, or of a method that calls one."""
+    for reference in program.resolve(function, call.func):
+        if reference.kind in ("external", "made by") and str(reference.target).startswith(_MESH_RASTERIZERS):
+            return True
+        callee = reference.target
+        if depth == 0 and isinstance(callee, Function) and not reference.guess:
+            draws = [inner for inner in callee.flow.calls if "raster" in call_name(inner).lower()]
+            if draws and all(_rasterizes_mesh(program, callee, inner, depth + 1) for inner in draws):
+                return True
+    return False
 
 
 def _draws_mesh(call: cst.Call) -> bool:

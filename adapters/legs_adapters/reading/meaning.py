@@ -39,6 +39,8 @@ _RENDERERS = {
     "render", "rendering", "rasterize", "rasterization", "rasterizer", "renderer", "raster", "splat", "splatting",
 }  # fmt: skip
 _MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
+_NUMBERS = {"int", "float", "len", "bool"}
+_EXTREMES = {"max", "min", "amax", "amin"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
 _OF_DIFFUSION = {"guidance_scale", "negative_prompt", "num_inference_steps", "strength"}  # of a picture that it paints
@@ -300,7 +302,7 @@ class Meanings:
             if name_role is not None:
                 return name_role
             if found & DATA and not self._is_rendered(function, node):
-                return "target"  # a camera may have been anywhere before
+                return self._given_role(function, node) or "target"  # a camera may have been anywhere before
             return self._flow(function, node, depth + 1).role
         if isinstance(node, cst.Attribute):
             role = role_of_words(node.attr.value)
@@ -312,6 +314,15 @@ class Meanings:
         if isinstance(node, cst.Subscript):
             return self._role_of_holder(function, node.value, depth + 1)
         return self.of(function, node, depth).role
+
+    def _given_role(self, function: Function, node: cst.Name) -> Optional[str]:
+        """The role of a parameter ``data`` that is given ``data["render_results"]`` wherever training calls it."""
+        if {definition.kind for definition in function.flow.reaching(node)} != {"parameter"}:
+            return None
+        given = [function.given(call, node.value) for _, call in self.training.sites.get(function, [])]
+        keys = [key_of(value) for value in given if isinstance(value, cst.Subscript)]
+        said = [isinstance(key, str) and bool(set(words(key)) & _RENDERERS) for key in keys]
+        return "render" if said and all(said) and len(said) == len(given) else None
 
     @staticmethod
     def _is_rendered(function: Function, node: cst.Name) -> bool:
@@ -336,6 +347,14 @@ class Meanings:
             return Meaning(kind_of_words(key), role)
         if "prompt" in keywords and _OF_DIFFUSION & set(keywords):
             return Meaning("warp", None)
+        if (base is None and name in _NUMBERS) or (base is not None and name == "item"):
+            return _UNKNOWN
+        if name in _EXTREMES and (base is not None or positional):
+            of, axes = (positional[0], positional[1:]) if module or base is None else (base, positional)
+            meaning = self.of(function, of, depth)
+            if meaning.kind == "image" and ("dim" in keywords or isinstance(constant(axes[0] if axes else None), int)):
+                return meaning._replace(kind="parameter")  # the brightest channel of a photograph: a prior
+            return meaning
         if name == "where" and len(values) == 3:
             return _mix([self.of(function, value, depth) for value in values[1:]])
         if name in ("conv2d", "filter2d", "spatial_gradient") and values and "stride" not in keywords:

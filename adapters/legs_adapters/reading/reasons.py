@@ -15,7 +15,16 @@ from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, of_r
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.shared import takes_no_gradient
 from legs_adapters.reading.steps import Steps
-from legs_adapters.reading.syntax import attribute_chain, call_name, code, constant, walk_expressions, word_set, words
+from legs_adapters.reading.syntax import (
+    arguments,
+    attribute_chain,
+    call_name,
+    code,
+    constant,
+    walk_expressions,
+    word_set,
+    words,
+)
 from legs_adapters.reading.training import Training
 
 __all__ = ["Reasons"]
@@ -79,7 +88,7 @@ class Reasons:
             return "not torch"
         if "image" not in (pair.a.kind, pair.b.kind) and not are_counterparts(form):
             return "unknown"
-        if same_root(form):
+        if same_root(form) or any(self._is_number(function, side, 0) for side in (form.first, form.second)):
             return "regulariser"
         if _is_leaf(function, form.first) or _is_leaf(function, form.second):
             return "untrained"
@@ -97,6 +106,26 @@ class Reasons:
         ):
             return "weighting"
         return self._elsewhere(function, form) or self.steps.purpose(function, form.call)
+
+    def _is_number(self, function: Function, node: cst.CSTNode, depth: int) -> bool:
+        """Whether a side is one number made of a picture, ``image.mean()``."""
+        if isinstance(node, cst.Call):
+            positional, keywords, _ = arguments(node)
+            base = node.func.value if isinstance(node.func, cst.Attribute) else None
+            own = base is not None and not (isinstance(base, cst.Name) and base.value == "torch")
+            of = base if own else positional[0] if positional else None
+            if call_name(node) in ("mean", "sum", "std", "var", "median"):
+                return of is not None and not keywords and len(positional) == (0 if own else 1)
+            moved = call_name(node) in ("detach", "clamp", "clip", "cuda", "to", "float")
+            return moved and of is not None and self._is_number(function, of, depth)
+        if isinstance(node, cst.BinaryOperation):
+            for side, other in ((node.left, node.right), (node.right, node.left)):
+                if self._is_number(function, side, depth) and self.meanings.of(function, other).kind != "image":
+                    return True
+        if isinstance(node, cst.Name) and depth < 3:
+            made = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
+            return len(made) == 1 and self._is_number(function, made[0], depth + 1)
+        return False
 
     def _of_model(self, function: Function, target: cst.CSTNode) -> bool:
         """Whether a target is what the Gaussians themselves have: ``self.get_radiances.gather(1, index)``."""
@@ -224,7 +253,7 @@ class Reasons:
             if current in seen:
                 continue
             seen.add(current)
-            if self._speaks_of_splats(current.module.path):
+            if self._speaks_of_splats(current.module.path) or self._takes_splats(current.module):
                 return True
             queue.extend(caller for caller, _ in self.training.sites.get(current, []))
         return False
@@ -241,6 +270,15 @@ class Reasons:
         folder = module.path.rpartition("/")[0]
         near = [path for path in self.program.sources if rendered or not folder or path.startswith(folder + "/")]
         return any(self._speaks_of_splats(path) for path in near)
+
+    def _takes_splats(self, module: Module) -> bool:
+        """Whether a file imports something Gaussian, ``GazeGaussianNet``, from one that speaks of splats."""
+        for node in module.top.flow.imports:
+            if isinstance(node, cst.ImportFrom) and "gaussian" in code(node).lower():
+                found = self.program.imported_from(module, node)
+                if found is not None and self._speaks_of_splats(found.path):
+                    return True
+        return False
 
     def _speaks_of_splats(self, path: str) -> bool:
         if path not in self._splats:

@@ -41,7 +41,7 @@ _WORDS = {
     """,
     "image": """
         image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering
-        renderings pixel pixels photo photos picture pbr comp frame frames
+        renderings pixel pixels photo photos picture pbr comp frame frames thermal thermals
     """,
 }
 KINDS = tuple(_WORDS)

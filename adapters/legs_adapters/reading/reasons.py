@@ -123,7 +123,7 @@ class Reasons:
                 if self._is_number(function, side, depth) and self.meanings.of(function, other).kind != "image":
                     return True
         if isinstance(node, cst.Name) and depth < 3:
-            made = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
+            made = [d.value for d in function.flow.reaching(node) if d.kind == "assign" and d.value is not None]
             return len(made) == 1 and self._is_number(function, made[0], depth + 1)
         return False
 

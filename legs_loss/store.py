@@ -40,6 +40,7 @@ VERSION = 1
 _STAGING = ".writing-"
 _LOCK = ".lock"
 _FILE_NAME = re.compile(r"[0-9a-z_]+-[0-9a-f]{16}\.npy")
+_PIECE = 1 << 20  # bytes; for larger ones Linux may look for larger free pages, which took six times as long
 _REPAIR = "run legs precompute again to repair it"
 
 
@@ -183,11 +184,15 @@ class StoreWriter:
             entries = {entry.key: entry for entry in self.entries()}
             before = {entry.file for entry in entries.values()}
             for entry in staged:
+                # Here, not where it was written: nobody waits for the disk but who commits.
+                _sync(self.staging / entry.file)
                 os.replace(str(self.staging / entry.file), str(self.path / entry.file))
                 entries[entry.key] = entry
             _write(self.staging / MANIFEST, _manifest(entries.values()))
+            _sync(self.staging / MANIFEST)
             os.replace(str(self.staging / MANIFEST), str(self.path / MANIFEST))
-            _sync_folder(self.path)
+            if os.name == "posix":  # elsewhere a folder cannot be opened
+                _sync(self.path)
             for file in before - {entry.file for entry in entries.values()}:
                 _remove(self.path / file)
 
@@ -327,18 +332,17 @@ def _npy(array: np.ndarray) -> Tuple[bytes, memoryview]:
 def _write(path: Path, *parts: Union[bytes, memoryview]) -> None:
     with open(str(path), "wb") as file:
         for part in parts:
-            file.write(part)
-        file.flush()
-        os.fsync(file.fileno())
+            for start in range(0, len(part), _PIECE):
+                file.write(part[start : start + _PIECE])
 
 
-def _sync_folder(folder: Path) -> None:
-    if os.name == "posix":  # elsewhere a folder cannot be opened
-        descriptor = os.open(str(folder), os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+def _sync(path: Path) -> None:
+    """Wait until a file, or which files a folder has, is on the disk."""
+    descriptor = os.open(str(path), os.O_RDWR if path.is_file() else os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _remove(path: Path) -> None:

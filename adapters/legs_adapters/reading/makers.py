@@ -60,7 +60,7 @@ def _draws_mesh(call: cst.Call) -> bool:
 
 def _renders(call: cst.Call) -> bool:
     name = call_name(call)
-    return words(name)[:1] == ("render",) and role_of_words(name) == "render"
+    return words(name)[:1] in (("render",), ("rendering",)) and role_of_words(name) == "render"
 
 
 def _makers(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> List[Optional[cst.Call]]:
@@ -75,7 +75,8 @@ def _makers(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> 
     seen.add(id(node))
     if isinstance(node, cst.Name):
         definitions = sorted(function.flow.reaching(node), key=lambda d: d.order)
-        parts = [_value(definition) for definition in definitions]
+        filled = any(definition.kind == "mutate" for definition in definitions)
+        parts = [_value(definition) for definition in definitions if not (filled and _is_empty(definition.value))]
         return [maker for part in parts for maker in _makers(function, part, seen)] if parts else [None]
     if isinstance(node, (cst.Subscript, cst.Attribute)):
         part = node.attr.value if isinstance(node, cst.Attribute) else str(key_of(node))
@@ -92,9 +93,16 @@ def _makers(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> 
     return [node if isinstance(node, cst.Call) else None]
 
 
+def _is_empty(node: Optional[cst.CSTNode]) -> bool:
+    return isinstance(node, cst.List) and not node.elements
+
+
 def _value(definition: Definition) -> Optional[cst.CSTNode]:
     """What is assigned, or what a loop goes over."""
     value = definition.value
+    if definition.kind == "mutate" and isinstance(value, cst.Call):  # renderings.append(image)
+        given = arguments(value)[0]
+        return given[0] if call_name(value) == "append" and given else None
     if definition.kind == "element" and isinstance(value, cst.Call):
         given, index = arguments(value)[0], definition.index
         if call_name(value) == "enumerate" and given:

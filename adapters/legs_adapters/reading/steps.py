@@ -65,10 +65,33 @@ class Steps:
                     return "evaluation"
                 return None
             here = {id(call) for call, _ in inside}
-            if _only_reads(scope, [call for call in function.flow.calls if id(call) in here]):
+            if self._is_stepped_later(function, node, here, calls):
+                continue
+            asked = [call for call in function.flow.calls if id(call) in here]
+            if _only_reads(scope, asked, self._nobody_steps(function, 0)):
                 return "scoring"
         # At a module's top nobody else can take the step.
         return "scoring" if stepped or function.parent is None else None
+
+    @staticmethod
+    def _is_stepped_later(function: Function, node: cst.CSTNode, here: Set[int], calls: Dict[int, cst.Call]) -> bool:
+        """Whether a loop further out has a step, and no backward pass but these: one of a batch of views."""
+        around = list(_calls(function.body, node, calls))
+        other = [call for call, elsewhere in around if _is_backward(call) and not elsewhere and id(call) not in here]
+        return not other and any(_is_step(call) and not elsewhere for call, elsewhere in around)
+
+    def _nobody_steps(self, function: Function, depth: int) -> bool:
+        """Whether neither a function nor what calls it, as far as that is known, can step."""
+        if {word for call in function.flow.calls for word in words(call_name(call))} & _STEPS:
+            return False
+        if function.parent is None:
+            return True
+        callers = [
+            caller
+            for caller in self.program.mentioning(function.name, called=True)
+            if caller is not function and any(call_name(call) == function.name for call in caller.flow.calls)
+        ]
+        return bool(callers) and depth < _DEPTH and all(self._nobody_steps(c, depth + 1) for c in callers)
 
     def trains_its_own(self, function: Function) -> bool:
         """Whether it makes a Gaussian model and steps that model's optimiser: training, wherever the file lies."""
@@ -195,15 +218,18 @@ def _is_step(call: cst.Call) -> bool:
     return not _spoken(call.func.value) & _SCHEDULES
 
 
-def _only_reads(scope: cst.CSTNode, calls: List[cst.Call]) -> bool:
-    """Whether the gradients are read and set to nothing after each backward pass, and nothing can have stepped."""
+def _only_reads(scope: cst.CSTNode, calls: List[cst.Call], for_good: bool) -> bool:
+    """Whether the gradients are read after each backward pass, and nothing can have stepped.
+
+    They are set to nothing then; where nobody steps, ``for_good``, they need not be.
+    """
     last = max(i for i, call in enumerate(calls) if _is_backward(call))
     named = {word for call in calls for word in words(call_name(call))}
     if named & _STEPS:
         return False
     parts = list(_walk(scope))
     again = isinstance(scope, (cst.For, cst.While)) and any(_empties(part) for part in parts)
-    if not again and "zero_grad" not in [call_name(call) for call in calls[last:]]:
+    if not for_good and not again and "zero_grad" not in [call_name(call) for call in calls[last:]]:
         return False
     asked = {id(p) for part in parts if _asks(part) for p in _walk(part)}
     taken = {id(p) for part in parts for given in _taken(part) for p in _walk(given)}

@@ -26,6 +26,7 @@ from legs_adapters.reading.repo import Source
 from legs_adapters.reading.shared import is_asked, is_huber, is_measured, shared_of, unchanged_at
 from legs_adapters.reading.syntax import call_name, code, same, walk_expressions, words
 from legs_adapters.reading.training import Training
+from legs_adapters.reading.vocabulary import kind_of_words
 from legs_adapters.upstreams import registered
 
 __all__ = ["find"]
@@ -123,8 +124,9 @@ class _Finder:
         of_class = function.owner is not None and "loss" in words(function.name)
         in_module = left.reason == "definition" and (function.name in _FORWARD or of_class)
         by_callers = left.reason == "evaluation" and "loss" in words(function.name)  # some of whose names say so
-        known = ("untrained", "unknown", "distillation", "other", "huber")
-        if not (in_module or by_callers or left.reason in known):
+        known = left.reason in ("untrained", "unknown", "distillation", "other", "huber")
+        known = known or (left.reason == "synthetic" and not _says_warped(form))  # of some callers, perhaps
+        if not (in_module or by_callers or known):
             return False
         if is_measured(function, form) or self.reasons.evaluates(function):
             return False
@@ -329,6 +331,13 @@ def _advice(form: Form, flipped: bool, last: bool, rows: bool) -> str:
         extras = ", ".join(_short(extra.with_changes(comma=cst.MaybeSentinel.DEFAULT)) for extra in form.extras)
         settings += f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
     return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{settings})"
+
+
+def _says_warped(form: Form) -> bool:
+    """Whether a side itself speaks of a picture that is no photograph."""
+    parts = [*walk_expressions(form.first), *walk_expressions(form.second)]
+    said = [part.value for part in parts if isinstance(part, (cst.Name, cst.SimpleString))]
+    return any(kind_of_words(text) == "warp" for text in said)
 
 
 def _detaches(node: cst.CSTNode) -> bool:

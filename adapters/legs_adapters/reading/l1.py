@@ -9,7 +9,7 @@ import libcst as cst
 
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program, Reference
-from legs_adapters.reading.syntax import arguments, call_name, code, constant, walk_expressions
+from legs_adapters.reading.syntax import arguments, call_name, code, constant, key_of, walk_expressions
 
 __all__ = ["Form", "Forms", "forms", "is_l1_name", "own_shape"]
 
@@ -511,6 +511,9 @@ def _meet_in_differences(program: Program, function: Function, a: str, b: str, d
             allowed.update(id(n) for n in walk_expressions(node) if isinstance(n, cst.Name) and n.value == b)
         elif isinstance(node, cst.Attribute) and node.attr.value in _SHAPE_ONLY:
             allowed.add(id(node.value))
+        elif isinstance(node, cst.Subscript) and isinstance(node.value, cst.Name) and isinstance(key_of(node), str):
+            if node.value.value in (a, b):
+                return False  # what is compared is in them: no pictures themselves
         elif isinstance(node, (cst.Assign, cst.AugAssign)):
             # `a = a[mask]`, then `b = b[mask]`, is as good as a mask on the difference.
             targets = [t.target for t in node.targets] if isinstance(node, cst.Assign) else [node.target]

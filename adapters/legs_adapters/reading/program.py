@@ -191,9 +191,26 @@ class Program:
             return self._returned(self.resolve(where, definition.value.func, depth), definition.index, depth)
         return []
 
+    def handed(self, function: Function, node: cst.Name) -> List[Reference]:
+        """The modules that a parameter is given, ``model`` of ``train_epoch(model, loader)``."""
+        kinds = {definition.kind for definition in function.flow.reaching(node)}
+        if not function.name or kinds - {"store"} != {"parameter"}:
+            return []
+        return _unique(
+            reference
+            for caller in self.mentioning(function.name, called=True)
+            for call in caller.flow.calls
+            if caller is not function and call_name(call) == function.name
+            for value in [function.given(call, node.value)]
+            if value is not None
+            for reference in self.resolve(caller, value)
+            if reference.kind == "instance"
+        )
+
     def _wrapped(self, function: Function, node: cst.Call, index: int, depth: int) -> List[Reference]:
         """``DataParallel(model)``, ``model, optimizer = accelerator.prepare(model, optimizer)``."""
-        given = arguments(node)[0] if call_name(node) in _WRAPS else []
+        wraps = call_name(node) in _WRAPS or (dotted(node.func) or "").endswith("fabric.setup")
+        given = arguments(node)[0] if wraps else []
         if index >= len(given):
             return []
         return [ref for ref in self.resolve(function, given[index], depth + 1) if ref.kind == "instance"]

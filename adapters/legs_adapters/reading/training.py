@@ -166,7 +166,10 @@ class Training:
             if key in keywords:
                 self._push(function, keywords[key])
                 return
-        for reference in self.program.resolve(function, node.func):
+        references = self.program.resolve(function, node.func)
+        if not references and isinstance(node.func, cst.Name):
+            references = self.program.handed(function, node.func)
+        for reference in references:
             self._callee(function, node, reference, key)
         for arg in node.args:
             self._push(function, arg.value)

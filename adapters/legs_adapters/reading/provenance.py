@@ -15,7 +15,17 @@ import libcst as cst
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Class, Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, code, constant, dotted, words
+from legs_adapters.reading.syntax import (
+    arguments,
+    attribute_chain,
+    call_name,
+    code,
+    constant,
+    dotted,
+    loops_around,
+    walk_expressions,
+    words,
+)
 
 __all__ = ["View", "Views"]
 
@@ -23,6 +33,7 @@ _MOVES = {"cuda", "to", "cpu", "float", "contiguous", "clone", "detach", "type"}
 _IMAGES = {"original_image", "image", "gt_image", "rgb", "original_rgb", "img", "image_tensor"}
 _NAME = "image_name"
 _DEPTH = 4
+_NAMING = re.compile(rf"\b{_NAME}\s*=\s*{_NAME}\b")
 _OF_LISTS = {"copy", "pop", "popleft"}
 
 
@@ -160,6 +171,10 @@ class Views:
         given = [value for function, value in makers if self._is_used(function)] or [value for _, value in makers]
         if given and all(_is_no_name(value) for value in given):
             return f"{_NAME} is {_short(given[0])}"
+        for module in self.program.matching(_NAMING):
+            for function in module.scopes(_NAMING.search):
+                if self._is_used(function) and any(_names_again(function, call) for call in function.flow.calls):
+                    return f"{function.name} gives several images one {_NAME}"
         return None
 
     def _is_used(self, function: Function, depth: int = 0) -> bool:
@@ -200,6 +215,33 @@ def _calls(caller: Function, function: Function) -> bool:
         return False
     read = [part.value for part in caller.flow.reads]
     return function.name in read or any(call_name(call) == function.name for call in caller.flow.calls)
+
+
+def _names_again(function: Function, call: cst.Call) -> bool:
+    """``for frame in frames: ... CameraInfo(image=image, image_name=image_name)``, where the name is the camera's.
+
+    The image depends on what the innermost loop goes over, the name does not.
+    """
+    keywords = arguments(call)[1]
+    loops = loops_around(function.body, call)
+    if not loops or not isinstance(loops[0], cst.For) or not {"image", _NAME} <= set(keywords):
+        return False
+    turns = {name.value for name in walk_expressions(loops[0].target) if isinstance(name, cst.Name)}
+    return _depends(function, keywords["image"], turns, set()) and not _depends(function, keywords[_NAME], turns, set())
+
+
+def _depends(function: Function, node: cst.CSTNode, names: Set[str], seen: Set[int]) -> bool:
+    """Whether a value is made of what one of these names holds."""
+    for part in walk_expressions(node):
+        if isinstance(part, cst.Name):
+            if part.value in names:
+                return True
+            for definition in function.flow.reaching(part):
+                if id(definition) not in seen and definition.value is not None:
+                    seen.add(id(definition))
+                    if _depends(function, definition.value, names, seen):
+                        return True
+    return False
 
 
 def _overwritten(function: Function, holder: str, attribute: str) -> Optional[str]:

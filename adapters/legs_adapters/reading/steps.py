@@ -14,7 +14,7 @@ import libcst as cst
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import call_name, children, constant, dotted, same, word_set, words
+from legs_adapters.reading.syntax import call_name, children, constant, dotted, loops_around, same, word_set, words
 from legs_adapters.reading.training import Training
 
 __all__ = ["Steps"]
@@ -49,7 +49,7 @@ class Steps:
         calls = {id(call): call for call in function.flow.calls}
         if not any(_is_backward(call) for call in calls.values()):
             return self._of_callers(function, depth)
-        scopes = [*_loops_around(function.body, node), function.body]
+        scopes = [*loops_around(function.body, node), function.body]
         stepped = False
         for scope in scopes:
             inside = list(_calls(scope, node, calls))
@@ -289,18 +289,6 @@ def _words_in(parts: Iterable[cst.CSTNode]) -> Set[str]:
         elif isinstance(part, cst.SimpleString) and isinstance(constant(part), str):
             found.update(words(constant(part)))
     return found
-
-
-def _loops_around(root: cst.CSTNode, node: cst.CSTNode) -> List[cst.CSTNode]:
-    """Return the loops that an expression stands in, the innermost first."""
-    stack: List[Tuple[cst.CSTNode, Tuple[cst.CSTNode, ...]]] = [(root, ())]
-    while stack:
-        part, loops = stack.pop()
-        if part is node:
-            return list(reversed(loops))
-        inner = (*loops, part) if isinstance(part, (cst.For, cst.While)) else loops
-        stack.extend((child, inner) for child in children(part))
-    return []
 
 
 def _calls(scope: cst.CSTNode, node: cst.CSTNode, calls: Dict[int, cst.Call]) -> Iterator[Tuple[cst.Call, bool]]:

@@ -10,8 +10,8 @@ from typing import Any, Dict, FrozenSet, Iterator, List, Optional, Tuple
 import libcst as cst
 
 __all__ = [
-    "arguments", "attribute_chain", "call_name", "children", "code", "constant", "dotted", "key_of", "path_of", "same",
-    "strip_parens", "walk_expressions", "words",
+    "arguments", "attribute_chain", "call_name", "children", "code", "constant", "dotted", "key_of", "loops_around",
+    "path_of", "same", "strip_parens", "walk_expressions", "words",
 ]  # fmt: skip
 
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
@@ -164,6 +164,18 @@ def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
             child for child in children(node) if type(child) is not cst.FunctionDef and type(child) is not cst.ClassDef
         ]
         stack.extend(reversed(below))
+
+
+def loops_around(root: cst.CSTNode, node: cst.CSTNode) -> List[cst.CSTNode]:
+    """Return the loops that an expression stands in, the innermost first."""
+    stack: List[Tuple[cst.CSTNode, Tuple[cst.CSTNode, ...]]] = [(root, ())]
+    while stack:
+        part, loops = stack.pop()
+        if part is node:
+            return list(reversed(loops))
+        inner = (*loops, part) if isinstance(part, (cst.For, cst.While)) else loops
+        stack.extend((child, inner) for child in children(part))
+    return []
 
 
 def _is_node(kind: type) -> bool:

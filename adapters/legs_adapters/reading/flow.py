@@ -24,9 +24,9 @@ class Definition:
 
     Attributes:
         place: ``x``, ``self.x`` or ``losses['im']``.
-        kind: "assign", "augment" (``x += v``), "element" (of a loop, or of what is unpacked), "parameter", "import",
-            "function", "class", "mutate" (``x.append(v)``), "store" (``x[...] = v``, seen from ``x``), "with",
-            "inplace" (``x.mul_(v)``).
+        kind: "assign", "augment" (``x += v``), "element" (of a loop, or of what is unpacked), "part" (of such an
+            element that is unpacked in its turn), "parameter", "import", "function", "class", "mutate"
+            (``x.append(v)``), "store" (``x[...] = v``, seen from ``x``), "with", "inplace" (``x.mul_(v)``).
         node: the statement, parameter or expression that did it.
         value: where the value comes from, if that is an expression.
         index: which element of the value, where it is unpacked and known.
@@ -149,18 +149,21 @@ class Flow:
             elements = target.elements
             parts = value.elements if isinstance(value, (cst.Tuple, cst.List)) and kind == "assign" else None
             plain = not any(isinstance(element, cst.StarredElement) for element in elements)
+            # Of [a, b], c = f() neither a nor b is what f returns first: they are parts of that.
+            inner = "part" if kind == "element" and index is not None and not _counts(value) else "element"
             for i, element in enumerate(elements):
                 if parts is not None and plain and len(parts) == len(elements):
                     self._assign(env, element.value, parts[i].value, node)
                 else:
-                    self._assign(env, element.value, value, node, "element", i if plain else None)
+                    self._assign(env, element.value, value, node, inner, i if plain else None)
             return
         if isinstance(target, cst.StarredElement):
             self._assign(env, target.value, value, node, "element")
             return
         place = path_of(target)
         if place is not None:
-            self._bind(env, self._define(place, kind, node if kind != "element" else target, value, index))
+            unpacked = kind in ("element", "part")
+            self._bind(env, self._define(place, kind, target if unpacked else node, value, index))
         if isinstance(target, (cst.Attribute, cst.Subscript)):
             self._visit(target.value, env)
             if isinstance(target, cst.Subscript):
@@ -402,6 +405,11 @@ class Flow:
 
 def _statements(body: cst.BaseSuite | cst.Module) -> Sequence[cst.CSTNode]:
     return body.body
+
+
+def _counts(value: Optional[cst.CSTNode]) -> bool:
+    """``enumerate(...)``, ``zip(...)``: what a loop goes over in step with something."""
+    return isinstance(value, cst.Call) and call_name(value) in ("enumerate", "zip")
 
 
 def _parameters(parameters: cst.Parameters) -> Iterator[cst.Param]:

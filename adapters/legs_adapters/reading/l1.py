@@ -524,6 +524,9 @@ def _meet_in_differences(program: Program, function: Function, a: str, b: str, d
                 changed.append((taken[0], targets[0], node.value))
     if not absolute or len(changed) % 2:
         return False
+    beside = [each.value for value in function.flow.returns if isinstance(value, cst.Tuple) for each in value.elements]
+    if not all(function.depends(each, {a, b}) for each in beside):
+        return False  # return loss, mask
     for (one, target, value), (other, other_target, other_value) in zip(changed[::2], changed[1::2]):
         if {one, other} != {a, b} or not _mirrored(value, other_value, a, b):
             return False

@@ -173,6 +173,8 @@ class Meanings:
             meaning = self._element(function, value, definition.index, depth)
             beside = definition.index > 0 and role_of_words(definition.place) == "target"
             return meaning._replace(role=None) if beside else meaning  # image, gt_image = render(...)
+        if definition.kind == "part":
+            return Meaning(None, self.of(function, value, depth).role)
         if definition.kind in ("mutate", "inplace", "store"):
             inner = arguments(value)[0] if isinstance(value, cst.Call) and definition.kind != "store" else [value]
             return _mix([self.of(function, part, depth) for part in inner])

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from typing import Callable, Dict, Iterator, List, Optional, Sequence, Tuple
+from typing import Callable, Dict, Iterator, List, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
 from legs_adapters.reading.flow import Definition, Flow
 from legs_adapters.reading.parts import Cut, Lines, Part, Place, body_part, outline_part
 from legs_adapters.reading.repo import Source, Unreadable
-from legs_adapters.reading.syntax import arguments, dotted
+from legs_adapters.reading.syntax import arguments, children, dotted
 
 __all__ = ["Class", "Function", "Module", "parse"]
 
@@ -115,6 +115,22 @@ class Function:
             return keywords.get(parameter)
         position = self.parameters.index(parameter)
         return positional[position] if position < len(positional) else None
+
+    def depends(self, node: cst.CSTNode, names: Set[str]) -> bool:
+        """Whether an expression of its body is made of what one of these names holds, and not of its size alone."""
+        seen: Set[int] = set()
+        work: List[cst.CSTNode] = [node]
+        while work:
+            part = work.pop()
+            if isinstance(part, cst.Name):
+                if part.value in names:
+                    return True
+                new = [d for d in self.flow.reaching(part) if id(d) not in seen]
+                seen.update(id(definition) for definition in new)
+                work.extend(definition.value for definition in new if definition.value is not None)
+            elif not (isinstance(part, cst.Attribute) and part.attr.value in ("shape", "device", "dtype")):
+                work.extend(children(part))
+        return False
 
     @property
     def static(self) -> bool:

@@ -227,21 +227,7 @@ def _names_again(function: Function, call: cst.Call) -> bool:
     if not loops or not isinstance(loops[0], cst.For) or not {"image", _NAME} <= set(keywords):
         return False
     turns = {name.value for name in walk_expressions(loops[0].target) if isinstance(name, cst.Name)}
-    return _depends(function, keywords["image"], turns, set()) and not _depends(function, keywords[_NAME], turns, set())
-
-
-def _depends(function: Function, node: cst.CSTNode, names: Set[str], seen: Set[int]) -> bool:
-    """Whether a value is made of what one of these names holds."""
-    for part in walk_expressions(node):
-        if isinstance(part, cst.Name):
-            if part.value in names:
-                return True
-            for definition in function.flow.reaching(part):
-                if id(definition) not in seen and definition.value is not None:
-                    seen.add(id(definition))
-                    if _depends(function, definition.value, names, seen):
-                        return True
-    return False
+    return function.depends(keywords["image"], turns) and not function.depends(keywords[_NAME], turns)
 
 
 def _overwritten(function: Function, holder: str, attribute: str) -> Optional[str]:

@@ -275,6 +275,8 @@ class Training:
             return
         if definition.kind == "element":
             self._push(function, value, _ANY if definition.index is None else definition.index)
+        elif definition.kind == "part":
+            self._push(function, value)
         elif definition.kind in ("mutate", "inplace") and isinstance(value, cst.Call):
             for arg in value.args:
                 self._push(function, arg.value, key if call_name(value) == "update" else _ANY)

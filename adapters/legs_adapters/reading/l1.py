@@ -501,7 +501,7 @@ def _meet_in_differences(program: Program, function: Function, a: str, b: str, d
             spread = any(arg.star == "*" for arg in node.args)
             pair = len(positional) >= 2 and not spread and mirrored(positional[0], positional[1])
             if pair and (
-                any(_l1_reference(program, r, node, depth) for r in program.resolve(function, node.func))
+                any(_l1_reference(program, function, r, node, depth) for r in program.resolve(function, node.func))
                 or any(_is_l1_function(program, function, value, depth) for value in positional[2:])
             ):
                 allowed.update(id(n) for value in positional[:2] for n in walk_expressions(value))
@@ -561,7 +561,9 @@ def _picked_pairs(
     return pairs, parts
 
 
-def _l1_reference(program: Program, reference: Reference, node: cst.Call, depth: int) -> bool:
+def _l1_reference(program: Program, function: Function, reference: Reference, node: cst.Call, depth: int) -> bool:
+    if reference.kind == "made by" and function.name not in ("forward", "__call__"):
+        return False  # self.l1_loss(...) in a method of its name: there it is the term itself
     if reference.kind == "function" and isinstance(reference.target, Function):
         return own_shape(program, reference.target, node, depth + 1) is not None
     return reference.kind in ("external", "made by") and _reference_shape(program, reference, node) is not None

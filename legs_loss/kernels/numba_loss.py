@@ -281,7 +281,7 @@ def _tile(x, y, plane, size, edges, scales, weights, weight_width, state, gradie
                     source = plane + (row + k) * width + left + begin
                     weight = (row + k - top) * weight_width + begin
                     at = _WORK + k * 4 * _WORK_ROW + begin
-                    sums[0] += _errors(x, y, source, count, scales, weights, weight, state, at, gradient)
+                    sums[0] += _errors(x, y, source, width, count, scales, weights, weight, state, at, gradient)
 
 
 @compiled(fastmath=False)
@@ -422,7 +422,7 @@ def _sum(state, at, count):  # type: ignore[no-untyped-def]
 
 
 @compiled(fastmath=False)
-def _errors(x, y, source, count, scales, weights, weight, slopes, at, gradient):  # type: ignore[no-untyped-def]
+def _errors(x, y, source, width, count, scales, weights, weight, slopes, at, gradient):  # type: ignore[no-untyped-def]
     """Return the sum of a row's weighted errors; write the row of the gradient."""
     l1_scale, ssim_scale = scales
     l1, structural, one = splat(l1_scale), splat(ssim_scale), splat(_ONE)
@@ -435,6 +435,7 @@ def _errors(x, y, source, count, scales, weights, weight, slopes, at, gradient):
         w = load(weights, weight + j) if weighted else one
         sums = multiply_add(w, absolute(difference), sums)
         if wanted:
+            prefetch(gradient, source + j + _STEP * width)  # see _moments; writing waits as well
             mixed = multiply_add(v, load(slopes, at + j + 2 * _WORK_ROW), load(slopes, at + j))
             mixed = mixed - u * load(slopes, at + j + _WORK_ROW)
             store(gradient, source + j, multiply_add(structural, mixed, l1 * w * sign(difference)))

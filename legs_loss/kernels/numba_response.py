@@ -172,12 +172,23 @@ def _response_row(image, view, shape, row, left, right, settings, out, at):  # t
         return
     if left == 0:
         out[at] = _response_at(image, view, shape, row, 0, settings)
-    last = inner_right - LANES
-    for j in range(inner_left, last, LANES):
-        store(out, at + j - left, _responses(image, view, shape, row, j, settings))
-    store(out, at + last - left, _responses(image, view, shape, row, last, settings))  # it may overlap the one before
+    views, channels, height, width = shape
+    kind, side, middle, norm = settings
+    if kind == 0 and channels == 3:  # the paper's, of photographs: with constants it takes half as long
+        shape, settings = (views, 3, height, width), (0, side, middle, norm)
+        _inner_responses(image, view, shape, row, inner_left, inner_right, settings, out, at - left)
+    else:
+        _inner_responses(image, view, shape, row, inner_left, inner_right, settings, out, at - left)
     if right == width:
         out[at + right - 1 - left] = _response_at(image, view, shape, row, right - 1, settings)
+
+
+@njit(inline="always")
+def _inner_responses(image, view, shape, row, left, right, settings, out, at):  # type: ignore[no-untyped-def]
+    last = right - LANES
+    for j in range(left, last, LANES):
+        store(out, at + j, _responses(image, view, shape, row, j, settings))
+    store(out, at + last, _responses(image, view, shape, row, last, settings))  # it may overlap the one before
 
 
 @njit(inline="always")

@@ -31,7 +31,7 @@ __all__ = [
 ]  # fmt: skip
 
 _MASK_WORDS = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
-_RAYS = re.compile(r"(\b|_)rays?(_|\b)", re.I)
+_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
 _DEPTH = 4
 
 
@@ -146,7 +146,7 @@ def makes_mask(call: cst.Call) -> bool:
 
 
 def of_rays(form: Form) -> bool:
-    """Whether the names speak of rays: a batch of them is a list of colours, whatever it is called."""
+    """Whether the names speak of rays, or of a field that they go through: a list of colours, whatever it is called."""
     return any(_RAYS.search(code(node)) for node in (form.first, form.second))
 
 

@@ -26,6 +26,7 @@ from legs_adapters.reading.syntax import (
     words,
 )
 from legs_adapters.reading.training import Training
+from legs_adapters.reading.vocabulary import kind_of_words
 
 __all__ = ["Reasons"]
 
@@ -90,6 +91,8 @@ class Reasons:
             return "unknown"
         if same_root(form) or any(self._is_number(function, side, 0) for side in (form.first, form.second)):
             return "regulariser"
+        if _of_scanner(function, form):
+            return "features"
         if _is_leaf(function, form.first) or _is_leaf(function, form.second):
             return "untrained"
         target, other = (pair.first, pair.second) if swapped(pair.a, pair.b) else (pair.second, pair.first)
@@ -297,6 +300,25 @@ def _of_points(form: Form) -> bool:
     indexed = [node for node in (form.first, form.second) if isinstance(node, cst.Subscript)]
     names = [element.slice.value for node in indexed for element in node.slice if isinstance(element.slice, cst.Index)]
     return any(isinstance(name, cst.Name) and {"point", "points"} & set(words(name.value)) for name in names)
+
+
+def _of_scanner(function: Function, form: Form) -> bool:
+    """``scan[1:2]`` of a ``scan[2:3]`` that is called depth: a channel of what a laser sees, no photograph."""
+    scans = {name for part in _made_of(function, form) for name in [_one_channel_of(part)] if name is not None}
+    depths = [place for place in function.flow.definitions if scans and kind_of_words(place) == "depth"]
+    values = [definition.value for place in depths for definition in function.flow.definitions[place]]
+    return any(_one_channel_of(part) in scans for value in values if value for part in walk_expressions(value))
+
+
+def _one_channel_of(node: cst.CSTNode) -> Optional[str]:
+    """``scan`` of ``scan[1:2, ...]``."""
+    if not isinstance(node, cst.Subscript) or not isinstance(node.value, cst.Name):
+        return None
+    first = node.slice[0].slice
+    if not isinstance(first, cst.Slice):
+        return None
+    lower, upper = constant(first.lower), constant(first.upper)
+    return node.value.value if isinstance(lower, int) and upper == lower + 1 else None
 
 
 def _is_leaf(function: Function, node: cst.CSTNode) -> bool:

@@ -206,7 +206,7 @@ class Training:
 
     def _place(self, function: Function, node: cst.CSTNode, key: object) -> bool:
         definitions = self.program.lookup(function, node)
-        if isinstance(key, str) and isinstance(node, cst.Name):
+        if isinstance(node, cst.Name) and (isinstance(key, str) or _begins_empty(definitions)):
             self._filled_in(function, node, key)
         if definitions:
             for where, definition in definitions:
@@ -222,8 +222,8 @@ class Training:
                 self._push(function, node.value, "." + node.attr.value)
         return False
 
-    def _filled_in(self, function: Function, node: cst.Name, key: str) -> None:
-        """``self.compute(image, output)``, then ``output["loss"]``: the method put it there."""
+    def _filled_in(self, function: Function, node: cst.Name, key: object) -> None:
+        """``self.compute(image, output)``, then ``output["loss"]`` or all of it: the method put it there."""
         for call in function.flow.calls:
             positional, keywords, starred = arguments(call)
             named: List[Tuple[object, cst.BaseExpression]] = [*enumerate(positional), *keywords.items()]
@@ -239,7 +239,8 @@ class Training:
                     if isinstance(name, int) and name < len(names):
                         parameter = names[name]
                     stores = [d for d in callee.flow.definitions.get(parameter, []) if d.kind in ("store", "mutate")]
-                    stores += callee.flow.definitions.get(f"{parameter}[{key!r}]", [])
+                    if isinstance(key, str):
+                        stores += callee.flow.definitions.get(f"{parameter}[{key!r}]", [])
                     if stores:
                         sites = self.sites.setdefault(callee, [])
                         if (function, call) not in sites:
@@ -282,3 +283,9 @@ class Training:
                 self._push(function, arg.value, key if call_name(value) == "update" else _ANY)
         else:
             self._push(function, value, key)
+
+
+def _begins_empty(definitions: Optional[List[Tuple[Function, Definition]]]) -> bool:
+    """``losses = {}``: a dictionary that is filled before it is returned."""
+    values = [definition.value for _, definition in definitions or () if definition.kind == "assign"]
+    return bool(values) and all(isinstance(value, cst.Dict) and not value.elements for value in values)

@@ -14,10 +14,10 @@ import libcst as cst
 from legs_adapters.findings import Findings, Left, Problem, Site
 from legs_adapters.reading.handed import Handed, HandedOver
 from legs_adapters.reading.l1 import Form, Forms, own_shape
-from legs_adapters.reading.layout import is_channels_last
+from legs_adapters.reading.layout import is_channels_last, lies_last
 from legs_adapters.reading.meaning import Meanings
 from legs_adapters.reading.module import Function, Module
-from legs_adapters.reading.pair import is_role, is_rows, pair_of, same_root, swapped, without_rows
+from legs_adapters.reading.pair import is_role, is_rows, pair_of, picked_from, same_root, swapped, without_rows
 from legs_adapters.reading.parts import Place
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.provenance import View, Views
@@ -227,6 +227,10 @@ class _Finder:
             why = f"cannot tell which of {sides} is the rendering and which the photograph"
             return self._problem(function, form, place, why)
         flipped = bool(target_first)
+        picked = None if pair.selection else self._picked(function, form)
+        if picked is not None:
+            form = _of_whole_pictures(form, *picked)
+            pair = pair._replace(first=form.first, second=form.second)
         prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
         if is_rows(self.meanings, function, pair.first) or is_rows(self.meanings, function, pair.second):
             why = "the images are lists of pixels there, of which there is no weight map"
@@ -255,9 +259,24 @@ class _Finder:
         elif shared is not None:
             return self._problem(function, form, place, f"{_short(form.node)} serves more than the loss", flipped)
         last = self._is_channels_last(function, prediction, target)
+        last = last or (picked is not None and lies_last(function, picked[0]))
         view = self.views.of(function, target, form.call)
         stands = (function.module.path, place.line, place.column, place.last_line)
         return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside)
+
+    def _picked(self, function: Function, form: Form) -> Optional[Tuple[cst.Subscript, cst.Subscript]]:
+        """``image[:, mask]`` and ``photo[:, mask]`` of a form that compares names of theirs.
+
+        None where the names stand for anything else, or where image, photo or mask is another by then.
+        """
+        of_torch = form.callee is not None and _is_torch(form.callee) and not form.extras
+        if not form.direct or not (form.reduction in ("mean", "none") or (form.reduction == "own" and of_torch)):
+            return None
+        one, other = (picked_from(self.meanings, function, side) for side in (form.first, form.second))
+        if one is None or other is None or not unchanged_at(function, form.call, one, other):
+            return None
+        alike = re.sub(r"\s+", "", _index(one)) == re.sub(r"\s+", "", _index(other))
+        return (one, other) if alike else None
 
     def _is_channels_last(self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> bool:
         """Whether the two lie so; or a photograph does that the same rendering is compared with elsewhere."""
@@ -306,6 +325,16 @@ class _Finder:
         rows = any(is_rows(self.meanings, function, side) for side in (form.first, form.second))
         advice = _advice(form, flipped, last, rows)
         return Problem(module.path, place.line, module.lines.text(place.line), reason, advice)
+
+
+def _of_whole_pictures(form: Form, one: cst.Subscript, other: cst.Subscript) -> Form:
+    """The same of image and photo, its result indexed by the mask."""
+    form = form._replace(first=one.value, second=other.value, direct=False, selection=_index(one))
+    return form._replace(reduction="mean") if form.reduction == "own" else form
+
+
+def _index(node: cst.Subscript) -> str:
+    return code(node)[len(code(node.value)) :].strip()
 
 
 def _is_same_place(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:

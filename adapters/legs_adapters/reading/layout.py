@@ -21,7 +21,7 @@ from legs_adapters.reading.syntax import (
 )
 from legs_adapters.reading.training import Training
 
-__all__ = ["is_channels_last"]
+__all__ = ["is_channels_last", "lies_last"]
 
 _TO_LAST = {(1, 2, 0), (0, 2, 3, 1)}
 _TO_FIRST = {(2, 0, 1), (0, 3, 1, 2)}
@@ -44,6 +44,20 @@ def is_channels_last(training: Training, function: Function, *images: cst.CSTNod
     votes += _votes_of_callees(training, function, images)
     last, first = (sum(vote.strength for vote in votes if vote.axis == axis) for axis in (_LAST, _FIRST))
     return last > first
+
+
+def lies_last(function: Function, index: cst.CSTNode) -> bool:
+    """Whether a mask that pictures are indexed by was spread over channels that are last, ``m.repeat(1, 1, 1, 3)``."""
+    for part in walk_expressions(index):
+        if isinstance(part, cst.Name):
+            made = [definition.value for definition in function.flow.reaching(part)]
+            if any(value is not None and lies_last(function, value) for value in made if value is not index):
+                return True
+        if isinstance(part, cst.Call) and call_name(part) in ("repeat", "expand"):
+            sizes = [constant(value) for value in arguments(part)[0]]
+            if sizes[-1:] == [3] and len(sizes) in (3, 4) and set(sizes[:-1]) <= {1, -1}:
+                return True
+    return False
 
 
 def _without_factor(*images: cst.CSTNode) -> Tuple[cst.CSTNode, ...]:

@@ -26,8 +26,8 @@ from legs_adapters.reading.syntax import (
 from legs_adapters.reading.vocabulary import kind_of_words, role_of_words
 
 __all__ = [
-    "Pair", "are_counterparts", "is_detached", "is_role", "is_rows", "makes_mask", "of_rays", "pair_of", "same_root",
-    "swapped", "without_rows",
+    "Pair", "are_counterparts", "is_detached", "is_role", "is_rows", "makes_mask", "of_rays", "pair_of", "picked_from",
+    "same_root", "swapped", "without_rows",
 ]  # fmt: skip
 
 _MASK_WORDS = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
@@ -204,6 +204,14 @@ def _entries(program: Program, function: Function, node: cst.Subscript) -> List[
 def _is_picked(meanings: Meanings, function: Function, node: Optional[cst.CSTNode]) -> bool:
     """``image[:, mask]``: the pixels of a mask."""
     return isinstance(node, cst.Subscript) and any(_is_mask(meanings, function, part) for part in node.slice)
+
+
+def picked_from(meanings: Meanings, function: Function, node: cst.CSTNode) -> Optional[cst.Subscript]:
+    """``image[:, mask]``, for a name that stands for that and nothing else."""
+    found = function.flow.reaching(node) if isinstance(node, cst.Name) else ()
+    values = [definition.value for definition in found if definition.kind == "assign"]
+    value = values[0] if len(found) == len(values) == 1 else None
+    return value if isinstance(value, cst.Subscript) and _is_picked(meanings, function, value) else None
 
 
 def _flattens(node: cst.Call) -> bool:

@@ -7,7 +7,7 @@ from legs_adapters.patch import plan
 from legs_adapters.reading import l1
 from legs_adapters.reading.repo import decode
 
-from tests.patching_support import NAMES, checkout, expected, files
+from tests.patching_support import NAMES, checkout, expected, files, legs_patch
 
 
 def changed_lines(found, path):
@@ -105,6 +105,24 @@ def test_functions_that_call_each_other_are_each_looked_into_once(tmp_path, monk
     monkeypatch.setattr(l1, "_meet_in_differences", lambda *args: looked_into.append(args[1]) or meets(*args))
     plan(checkout(tmp_path, texts))
     assert len(looked_into) == len(set(looked_into)) >= len(names)
+
+
+def test_a_script_that_trains_without_a_site_is_named_beside_the_sites_of_others(tmp_path):
+    distils = (
+        "from gaussian_renderer import render\nfrom utils.loss_utils import l1_loss\n\n\n"
+        "def refine(scene, student, teacher):\n    for cam in scene:\n"
+        '        image, target = render(cam, student, 0, 0)["render"], render(cam, teacher, 0, 0)["render"]\n'
+        "        loss = l1_loss(image, target)\n        loss.backward()\n"
+    )
+    texts = files("inria")
+    texts["refine.py"] = distils
+    texts["train.py"] += distils.replace("def refine", "def refine_too")
+    found = plan(checkout(tmp_path, texts))
+    assert {site.path for site in found.findings.sites} == {"train.py"}
+    assert [(doubt.path, doubt.line) for doubt in found.findings.doubts] == [("refine.py", 8)]
+    done = legs_patch("--diff", tmp_path)
+    assert done.returncode == 0
+    assert "left, though its file trains: refine.py:8" in done.stderr
 
 
 def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path):

@@ -130,6 +130,7 @@ def _patch(args: argparse.Namespace) -> int:
             + _not_looked_into(root, args.exclude)
         )
     changes = bool(found.after) or settings is not None
+    _left_in_doubt(found.findings.doubts)
     if args.diff:
         print(as_json(found, []) if args.json else as_diff(found, _colour()), end="")
         return _left_to_the_user(problems)
@@ -207,6 +208,17 @@ def _left_to_the_user(problems: Sequence[Problem]) -> int:
             file=sys.stderr,
         )
     return 1 if problems else 0
+
+
+def _left_in_doubt(doubts: Sequence[Problem]) -> None:
+    """Say on stderr which lines were left although a file trains that nothing else of was weighted."""
+    for doubt in doubts:
+        print(
+            f"legs-patch: left, though its file trains: {doubt.path}:{doubt.line}: {doubt.reason}\n"
+            f"    {doubt.text}\n"
+            f"  if it is the loss between rendering and photograph, write there: {doubt.advice}",
+            file=sys.stderr,
+        )
 
 
 def _site(root: Path, text: str) -> Tuple[str, int]:

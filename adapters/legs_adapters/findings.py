@@ -73,11 +73,15 @@ class Problem(NamedTuple):
 
 
 class Findings(NamedTuple):
-    """All that was found; in the order of the files."""
+    """All that was found; in the order of the files.
+
+    ``doubts`` are of what was left in a file that trains, where nothing else is weighted: perhaps the loss after all.
+    """
 
     sites: List[Site]
     left: List[Left]
     problems: List[Problem]
+    doubts: List[Problem]
     patched: List[Left]
     unreadable: List[Unreadable]
     program: Program

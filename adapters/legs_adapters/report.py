@@ -58,6 +58,10 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
             {"file": e.path, "line": e.line, "code": e.text, "reason": e.reason, "advice": e.advice}
             for e in found.problems
         ],
+        "doubts": [
+            {"file": e.path, "line": e.line, "code": e.text, "reason": e.reason, "advice": e.advice}
+            for e in found.doubts
+        ],
         "unreadable": [{"file": e.path, "reason": e.reason} for e in found.unreadable],
         "would_change": sorted(plan.after),
         "wrote": list(wrote),

@@ -32,6 +32,7 @@ from legs_adapters.upstreams import registered
 __all__ = ["find"]
 
 _FORWARD = ("forward", "__call__")
+_NOT_OF_SPLATS = ("other", "definition")
 _PICTURES = {"depth", "normals", "features", "flow", "mask"}  # what else is compared in a training step
 _MAY_HAVE_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(")
 
@@ -56,7 +57,7 @@ class _Finder:
         self.reasons = Reasons(program, self.training, self.meanings)
         self.forms = Forms(program)
         self.handed = Handed(program, self.training, self.forms)
-        self.found = Findings([], [], [], [], [], program)
+        self.found = Findings([], [], [], [], [], [], program)
         self.doubtful: List[Problem] = []
 
     def run(self) -> Findings:
@@ -66,8 +67,18 @@ class _Finder:
             self.found.problems.extend(self.doubtful)
             quoted = {(problem.path, problem.line) for problem in self.doubtful}
             self.found.left[:] = [left for left in self.found.left if (left.path, left.line) not in quoted]
+        elif not self.by_hand:
+            self.found.doubts.extend(doubt for doubt in self.doubtful if self._trains_alone(doubt))
         self.found.unreadable.extend(self.program.unreadable[path] for path in sorted(self.program.unreadable))
         return self.found
+
+    def _trains_alone(self, doubt: Problem) -> bool:
+        """Whether its file trains something, in which nothing was weighted or quoted."""
+        settled = {site.path for site in self.found.sites} | {entry.path for entry in self.found.patched}
+        settled |= {problem.path for problem in self.found.problems}
+        trains = any(root.module.path == doubt.path for root in self.training.roots)
+        about = any(f"({word})" in doubt.reason for word in _NOT_OF_SPLATS)
+        return trains and not about and doubt.path not in settled
 
     def _module(self, module: Module) -> None:
         entries: List[Tuple[Tuple[int, int], Site | Left | Problem]] = []

@@ -17,6 +17,7 @@ import resource
 import statistics
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, Dict, List
 
@@ -47,7 +48,8 @@ def main() -> None:
                 cost = timed(run, scenes[few + args.photographs], args) - timed(run, scenes[few], args)
                 if i > 0:  # the first compiles, and fills the file cache
                     costs[name].append(1e3 * cost / args.photographs)
-        peak = worker_peak(scenes[few], args)
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:  # a process without other children
+            peak = pool.submit(worker_peak, scenes[few], args).result()
     result: Dict[str, Any] = {"workers": args.workers, "resolution": args.resolution, "photographs": args.photographs}
     for column, clock in enumerate(("", ", processors' time")):
         precomputing, decoding = (np.array(costs[name])[:, column] for name in ("precompute", "decode"))
@@ -94,16 +96,9 @@ def load(path: Path) -> None:
 
 
 def worker_peak(scene: Path, args: argparse.Namespace) -> int:
-    """Return the peak memory in bytes of a process that makes one map."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(_alone, (scene, args.resolution))
-
-
-def _alone(scene: Path, resolution: int) -> int:
-    with tempfile.TemporaryDirectory() as out:
-        precompute(read_scene(scene), out=out, resolution=resolution, workers=1)
-    with open("/proc/self/status", encoding="ascii") as file:
-        return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmHWM"))
+    """Return the peak memory in bytes of the larger one of the processes that make maps."""
+    compute(scene, args)
+    return 1024 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
 
 
 def draw(folder: Path, count: int) -> Path:

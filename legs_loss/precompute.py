@@ -36,7 +36,8 @@ __all__ = ["Report", "normalised_map", "precompute"]
 
 _COMMIT_SECONDS = 1.0
 _PATIENCE = 5.0  # seconds; a process that is killed leaves numba's semaphore behind, and Python warns
-_KEPT_BLOCKS = 8  # of 16 MiB
+# A photograph of up to 16 megapixels in one piece, which can be read where it is, and kept for the next one.
+_PILLOW = {"PILLOW_BLOCK_SIZE": "64m", "PILLOW_BLOCKS_MAX": "2"}
 _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 
 
@@ -266,15 +267,15 @@ def _kept_blocks() -> Iterator[None]:
 
     Mapping it anew took a quarter of the decoding. What the user has set stays.
     """
-    name = "PILLOW_BLOCKS_MAX"
-    if name in os.environ:
+    if any(name in os.environ for name in _PILLOW):
         yield
         return
-    os.environ[name] = str(_KEPT_BLOCKS)
+    os.environ.update(_PILLOW)
     try:
         yield
     finally:
-        del os.environ[name]
+        for name in _PILLOW:
+            del os.environ[name]
 
 
 def _work(connection: Any, job: _Job) -> None:

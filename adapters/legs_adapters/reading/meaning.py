@@ -114,6 +114,8 @@ class Meanings:
             flow = self._flow(function, node, depth)
             if flow.kind == "image" and kind_of_words(node.value) == "gradient" and _is_cropped(function, node):
                 return flow  # colors_grad = colors[:, :, :half]: the part that gets gradients
+            if flow.kind == "image" and kind_of_words(node.value) == "mask" and _is_masked(function, node):
+                return flow  # gt_mask_images = gt_image * mask
             return self._named(node.value, flow)
         if isinstance(node, cst.Attribute):
             return self._attribute(function, node, depth)
@@ -466,6 +468,14 @@ def _is_cropped(function: Function, node: cst.Name) -> bool:
         isinstance(value, cst.Subscript) and all(isinstance(part.slice, cst.Slice) for part in value.slice)
         for value in made
     )
+
+
+def _is_masked(function: Function, node: cst.Name) -> bool:
+    """Whether a name that speaks of an image, too, stands for a product and for nothing else."""
+    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
+    products = [v for v in made if isinstance(v, cst.BinaryOperation) and isinstance(v.operator, cst.Multiply)]
+    says_image = any(kind_of_words(word) == "image" for word in words(node.value))
+    return says_image and bool(made) and len(products) == len(made)
 
 
 def _neighbours(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:

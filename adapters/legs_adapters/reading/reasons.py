@@ -21,6 +21,7 @@ from legs_adapters.reading.syntax import (
     call_name,
     code,
     constant,
+    dotted,
     walk_expressions,
     word_set,
     words,
@@ -63,6 +64,8 @@ _WHY = {
     "gradient": "gradients", "parameter": "regulariser",
 }  # fmt: skip
 
+_MADE_UP = {f"torch.{name}{like}" for name in ("eye", "zeros", "ones", "full") for like in ("", "_like")}
+
 
 class Reasons:
     """Answers for one program."""
@@ -90,6 +93,8 @@ class Reasons:
         if "image" not in (pair.a.kind, pair.b.kind) and not are_counterparts(form):
             return "unknown"
         if same_root(form) or any(self._is_number(function, side, 0) for side in (form.first, form.second)):
+            return "regulariser"
+        if _is_made_up(function, form.first) or _is_made_up(function, form.second):
             return "regulariser"
         if _of_scanner(function, form):
             return "features"
@@ -319,6 +324,14 @@ def _one_channel_of(node: cst.CSTNode) -> Optional[str]:
         return None
     lower, upper = constant(first.lower), constant(first.upper)
     return node.value.value if isinstance(lower, int) and upper == lower + 1 else None
+
+
+def _is_made_up(function: Function, node: cst.CSTNode) -> bool:
+    """Whether a side is a tensor of constants, ``torch.eye(3)``, or a name for one that nothing is written to."""
+    if isinstance(node, cst.Name):
+        made = function.flow.reaching(node)
+        return len(made) == 1 and all(d.value is not None and _is_made_up(function, d.value) for d in made)
+    return isinstance(node, cst.Call) and dotted(node.func) in _MADE_UP
 
 
 def _is_leaf(function: Function, node: cst.CSTNode) -> bool:

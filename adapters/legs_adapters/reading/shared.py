@@ -89,6 +89,8 @@ def is_huber(training: Training, function: Function, form: Form) -> bool:
     for node in function.flow.expressions if form.reduction != "mean" else ():
         if isinstance(node, cst.Call) and call_name(node) == "where":
             parts = [part for arg in node.args for part in walk_expressions(arg.value)]
+            named = [value for part in parts if isinstance(part, cst.Name) for value in _values(function, part)]
+            parts += [part for value in named if value is not None for part in walk_expressions(value)]
             if any(_squared(part) is not None for part in parts) and reads_it(parts):
                 return True
         base = _squared(node)

@@ -155,6 +155,10 @@ class Views:
         for camera in self._cameras:
             if attribute in camera.methods and "property" in camera.methods[attribute].decorators:
                 return f"{attribute} is computed anew each time"
+            for method, _ in camera.stores(_NAME):
+                renames = method.name != "__init__" and _NAME in method.parameters
+                if renames and self.program.mentioning(method.name, called=True):
+                    return f"{method.name} gives a camera another {_NAME}"
         return self._named()
 
     def _named(self) -> Optional[str]:

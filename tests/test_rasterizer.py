@@ -115,7 +115,7 @@ class TestAgreement:
     def test_giant_needles(self):
         inputs = scene(20)
         inputs[1] = torch.tensor([[100.0, 1e-3, 1e-3]]).repeat(20, 1)
-        assert_agree(inputs, camera(), tolerance=1e-3)
+        assert_agree(inputs, camera())
 
     def test_dust(self):
         assert_agree(scene(300, smallest=1e-7, largest=1e-5), camera())
@@ -361,6 +361,16 @@ class TestErrors:
         view.width = 0
         with pytest.raises(LegsError, match="found 0x45"):
             rasterize(*scene(), view, BACKGROUND, 3)
+
+    def test_an_image_too_large_for_the_compiled_one(self):
+        pytest.importorskip("numba")
+        from legs_loss.reference.rasterizer import sorting
+
+        nothing = np.empty(0, np.float32), np.empty(0, np.int64)
+        firsts, reached = sorting.make_slots(np.empty((0, 4), np.int32), nothing[1], 32)
+        with pytest.raises(LegsError, match="2048 x 257 strips cannot be drawn"):  # 16384 x 8224 pixels
+            sorting.sort_entries(*nothing, firsts, reached, 2048, 257)
+        sorting.sort_entries(*nothing, firsts, reached, 2048, 256)
 
     def test_without_numba(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "numba", None)

@@ -61,3 +61,16 @@ def test_of_a_nan_the_second_is_taken(name):
     taken = by_lanes(of_two, A, B)
     assert taken[3] == 4 and math.isnan(taken[4]) and math.isnan(taken[5])
     assert taken[0] == {"minimum": 1, "maximum": 2}[name]
+
+
+def test_the_negative_turns_every_sign():
+    import numba
+
+    @numba.njit
+    def of_first(a, b):
+        return -a
+
+    turned = by_lanes(of_first, A, B)
+    assert turned[:3] == [-1, -2, -3] and turned[7] == -math.inf
+    assert math.copysign(1, turned[6]) == 1  # 0 - a would leave 0.0 of 0.0, and of -0.0
+    assert math.copysign(1, by_lanes(of_first, B, A)[6]) == -1

@@ -100,6 +100,18 @@ for _symbol, _kind, _instruction in (
     _operator(_symbol, _kind, _instruction)
 
 
+class _Negative(ConcreteTemplate):
+    cases = [signature(float8, float8)]
+
+
+infer_global(operator.neg)(_Negative)
+
+
+@lower_builtin(operator.neg, float8)
+def _negative(context: Any, builder: Any, sig: Any, args: Sequence[Any]) -> Any:
+    return builder.fneg(*args)
+
+
 def _is_row(array: Any, dtype: Any) -> bool:
     return isinstance(array, types.Array) and array.dtype == dtype and array.ndim == 1 and array.layout == "C"
 
@@ -390,6 +402,6 @@ def lane(typingctx, a, index):  # type: ignore[no-untyped-def]
 @njit(inline="always")
 def total(a):  # type: ignore[no-untyped-def]
     """Return the sum of the eight values, always added in the same order."""
-    return ((lane(a, 0) + lane(a, 1)) + (lane(a, 2) + lane(a, 3))) + (
-        (lane(a, 4) + lane(a, 5)) + (lane(a, 6) + lane(a, 7))
-    )
+    pairs = _pairs_added(a, a, 1)
+    fours = _pairs_added(pairs, pairs, 2)
+    return lane(_pairs_added(fours, fours, 4), 0)

@@ -18,7 +18,9 @@ from numba import prange
 
 from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import TILE
+from legs_loss.reference.rasterizer.geometry import conic
 from legs_loss.reference.rasterizer.projection import BLOCK, TALL, WIDE
+from legs_loss.reference.rasterizer.sorting import FIRST_SLOT, ROWS, STRIP, packed, unpacked
 
 __all__ = ["clip", "touches"]
 
@@ -68,8 +70,10 @@ def _slices(a, b, c, t, u0, v0, least, most, u_tiles, v_tiles, spans):
 
 
 @compiled()
-def _reach(x, y, a, b, c, opacity, mult, tiles, spans):
+def _reach(splats, i, opacity, mult, tiles, spans):
     """Which tiles a splat is drawn in: whether ``spans`` go by rows, the first and past the last of them, how many."""
+    x, y = splats[i, 0], splats[i, 1]
+    a, b, c = conic(splats[i, 2], splats[i, 3], splats[i, 4])
     t = mult * 2 * math.log(opacity * 255)
     disc = b * b - a * c
     if not (t > 0 and disc < 0):
@@ -91,32 +95,30 @@ def _reach(x, y, a, b, c, opacity, mult, tiles, spans):
 
 @compiled()
 def touches(splats, opacities, mult, tiles):
-    """Whether splats [N, 5], rows of u, v and the conic, are drawn in any tile, be it between its pixels."""
+    """Whether splats [N, 5], rows of centre and own coordinates, are drawn in any tile, be it between its pixels."""
     spans = np.empty((max(tiles[0], tiles[1]), 2), np.int64)
     found = np.zeros(len(splats), np.bool_)
     for i in range(len(splats)):
-        x, y, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
-        found[i] = _reach(x, y, a, b, c, opacities[i], mult, tiles, spans)[3] > 0
+        found[i] = _reach(splats, i, opacities[i], mult, tiles, spans)[3] > 0
     return found
 
 
 @compiled()
-def _clip_block(start, stop, splats, opacities, mult, tiles, boxes, slots, first_slots, slot_strips, slot_rows, radii):
+def _clip_block(start, stop, splats, opacities, mult, tiles, boxes, slots, firsts, reached, radii):
     spans = np.empty((max(tiles[0], tiles[1]), 2), np.int64)
     for i in range(start, stop):
         if slots[i] == 0:
             continue
-        x, y, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
-        by_rows, first, end, count = _reach(x, y, a, b, c, np.float64(opacities[i, 0]), mult, tiles, spans)
+        by_rows, first, end, count = _reach(splats, i, np.float64(opacities[i, 0]), mult, tiles, spans)
         if count == 0:
             radii[i] = 0
-        slot = first_slots[i]
+        slot = firsts[i, FIRST_SLOT]
         for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
             for strip_x in range(boxes[i, 0], boxes[i, 2]):
-                if slot_rows[slot] != 0:
+                if reached[slot, STRIP] >= 0:
                     # A strip is half a tile wide and two tiles tall.
                     tile_x, upper = strip_x * WIDE // TILE, strip_y * TALL // TILE
-                    row, last = slot_rows[slot] & 255, slot_rows[slot] >> 8
+                    row, last, band = unpacked(reached[slot, ROWS])
                     kept, kept_end = last, row
                     for tile_y in range(upper, min(upper + TALL // TILE, tiles[1])):
                         if by_rows:
@@ -128,18 +130,18 @@ def _clip_block(start, stop, splats, opacities, mult, tiles, boxes, slots, first
                             kept_end = max(kept_end, (tile_y - upper + 1) * TILE)
                     row, last = max(row, kept), min(last, kept_end)
                     if row < last:
-                        slot_rows[slot] = np.int32(row) | np.int32(last) << 8
+                        reached[slot, ROWS] = packed(row, last, band)
                     else:
-                        slot_rows[slot], slot_strips[slot] = 0, -1
+                        reached[slot, STRIP] = -1
                 slot += 1
 
 
 @compiled(parallel=True)
-def clip(splats, opacities, mult, tiles, boxes, slots, first_slots, slot_strips, slot_rows, radii):
+def clip(splats, opacities, mult, tiles, boxes, slots, firsts, reached, radii):
     """Take from every slot the rows outside the compact box; a Gaussian with slots and no tile gets radius 0.
 
     Args:
-        splats, boxes, slots, first_slots, slot_strips, slot_rows, radii: as the reference rasterizer has them after
+        splats, boxes, slots, firsts, reached, radii: as the reference rasterizer has them after
             `find_rows`.
         opacities: [N, 1].
         mult: the share of the squared distance.
@@ -149,6 +151,5 @@ def clip(splats, opacities, mult, tiles, boxes, slots, first_slots, slot_strips,
     for block in prange((count + BLOCK - 1) // BLOCK):
         start = block * BLOCK
         _clip_block(
-            start, min(start + BLOCK, count), splats, opacities, mult, tiles, boxes, slots, first_slots, slot_strips,
-            slot_rows, radii,
+            start, min(start + BLOCK, count), splats, opacities, mult, tiles, boxes, slots, firsts, reached, radii,
         )  # fmt: skip

@@ -11,6 +11,7 @@ from numba import prange
 from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from legs_loss.reference.rasterizer.projection import TALL, WIDE
+from legs_loss.reference.rasterizer.sorting import OWNER
 from legs_loss.reference.rasterizer.strips import PIXELS, STATE, WORK, place, reach, respond
 
 __all__ = ["COUNT", "DISTANCE", "FIELDS", "MOST", "VALUE", "WEIGHT", "contribute", "sensitivity"]
@@ -21,16 +22,16 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @compiled()
-def _strip(left, top, wide, tall, begin, end, splats, owners, rows, entries, values, sums):
+def _strip(left, top, wide, tall, begin, end, splats, draws, entries, values, sums):
     """Sums of one strip's entries, [entries, FIELDS]."""
     before, finished = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.bool_)
     largest, whose = np.zeros(PIXELS, np.float32), np.full(PIXELS, -1, np.int64)
     state = np.empty(STATE, np.float32)
     place(state, wide, tall)
     for k in range(begin, end):
-        first, last, top_row = reach(rows, k)
+        first, last, top_row = reach(draws, k)
         respond(state, first, last, top_row, entries, k)
-        u, v = splats[owners[k], 0] - left, splats[owners[k], 1] - top
+        u, v = splats[draws[k, OWNER], 0] - left, splats[draws[k, OWNER], 1] - top
         count = weight = value = distance = 0.0
         for row in range(first, min(last, tall)):
             for column in range(wide):
@@ -57,7 +58,7 @@ def _strip(left, top, wide, tall, begin, end, splats, owners, rows, entries, val
 
 
 @compiled(parallel=True)
-def contribute(across, ranges, ends, splats, owners, rows, entries, values, sums):
+def contribute(across, ranges, ends, splats, draws, entries, values, sums):
     """Fill sums [N, FIELDS], over the pixels that each Gaussian is blended into.
 
     COUNT: how many; WEIGHT: of transmittance times alpha; VALUE: of ``values`` [H, W] there; DISTANCE: from its centre,
@@ -68,16 +69,16 @@ def contribute(across, ranges, ends, splats, owners, rows, entries, values, sums
     for strip in prange(len(ends)):
         left, top = strip % across * WIDE, strip // across * TALL
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        _strip(left, top, wide, tall, ranges[strip], ends[strip], splats, owners, rows, entries, values, parts)
+        _strip(left, top, wide, tall, ranges[strip], ends[strip], splats, draws, entries, values, parts)
     sums[:] = 0
     for strip in range(len(ends)):
         for k in range(ranges[strip], ends[strip]):
             for field in range(FIELDS):
-                sums[owners[k], field] += parts[k, field]
+                sums[draws[k, OWNER], field] += parts[k, field]
 
 
 @compiled()
-def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, g_image, squares):
+def _sensitive_strip(left, top, wide, tall, begin, end, draws, entries, image, g_image, squares):
     """For each entry of a strip, the sum over its pixels of the squared derivative by its alpha."""
     before, rest, g = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.float32), np.zeros((PIXELS, 3), np.float32)
     state = np.empty(STATE, np.float32)
@@ -89,7 +90,7 @@ def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, g_
                 g[i, channel] = gradient
                 rest[i] += gradient * image[channel, top + row, left + column]
     for k in range(begin, end):
-        first, last, top_row = reach(rows, k)
+        first, last, top_row = reach(draws, k)
         respond(state, first, last, top_row, entries, k)
         total = 0.0
         for row in range(first, min(last, tall)):
@@ -111,7 +112,7 @@ def _sensitive_strip(left, top, wide, tall, begin, end, rows, entries, image, g_
 
 
 @compiled(parallel=True)
-def sensitivity(across, ranges, ends, splats, owners, rows, entries, image, g_image, sums):
+def sensitivity(across, ranges, ends, splats, draws, entries, image, g_image, sums):
     """Fill sums [N]: over pixels, of the squared derivative by a Gaussian's falloff there, `g_image` being the image's.
 
     Source: Speedy-Splat (Hanson et al. 2025).
@@ -121,9 +122,9 @@ def sensitivity(across, ranges, ends, splats, owners, rows, entries, image, g_im
     for strip in prange(len(ends)):
         left, top = strip % across * WIDE, strip // across * TALL
         wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        _sensitive_strip(left, top, wide, tall, ranges[strip], ends[strip], rows, entries, image, g_image, parts)
+        _sensitive_strip(left, top, wide, tall, ranges[strip], ends[strip], draws, entries, image, g_image, parts)
     sums[:] = 0
     for strip in range(len(ends)):
         for k in range(ranges[strip], ends[strip]):
-            opacity = np.exp(splats[owners[k], 5])
-            sums[owners[k]] += opacity * opacity * parts[k]
+            opacity = np.exp(splats[draws[k, OWNER], 5])
+            sums[draws[k, OWNER]] += opacity * opacity * parts[k]

@@ -114,7 +114,7 @@ class Drawn:
         plane = torch.zeros(view.height, view.width) if values is None else values.detach().to(torch.float32)
         sums = np.empty((len(self.radii), FIELDS))
         contribute(
-            drawing.across, drawing.ranges, drawing.ends, drawing.splats, drawing.owners, drawing.rows, drawing.entries,
+            drawing.across, drawing.ranges, drawing.ends, drawing.splats, drawing.draws, drawing.entries,
             plane.reshape(view.height, view.width).contiguous().numpy(), sums,
         )  # fmt: skip
         found = torch.from_numpy(sums).to(torch.float32)
@@ -138,7 +138,7 @@ def squared_slopes(drawing: compiled.Drawing, gradient: Tensor) -> Tensor:
 
     sums, it = np.empty(len(drawing.radii)), drawing
     g_image = gradient.detach().to(torch.float32).contiguous().numpy()
-    sensitivity(it.across, it.ranges, it.ends, it.splats, it.owners, it.rows, it.entries, it.image, g_image, sums)
+    sensitivity(it.across, it.ranges, it.ends, it.splats, it.draws, it.entries, it.image, g_image, sums)
     return torch.from_numpy(sums)
 
 

@@ -21,7 +21,7 @@ from legs_adapters.cpu.drawing import compensation, covariance, squared_slopes
 from legs_adapters.cpu.missing import attribute_guard, deferred_guard
 from legs_loss import LegsError
 from legs_loss.reference.conventions import MIN_ALPHA, NEAR, View
-from legs_loss.reference.rasterizer import compiled
+from legs_loss.reference.rasterizer import compiled, sorting
 
 BACKEND, MORTON, PPISP = "FasterGSCudaBackend", "MortonEncoding", "ppisp"
 SQUARE = math.sqrt(-2 * math.log(MIN_ALPHA)) + 0.01  # standard deviations: past them even opaque ones are not drawn
@@ -106,7 +106,7 @@ def _draw(function: str, raw: Sequence[Tensor], settings: _Settings) -> _Drawn:
             tensor.requires_grad_()
     drawing = compiled.draw(tensors, view, settings.bg_color.detach(), degree, footprint)
     visible = np.zeros(len(means), np.bool_)
-    visible[drawing.owners[: len(drawing.entries)]] = True
+    visible[drawing.draws[: len(drawing.entries), sorting.OWNER]] = True
     with torch.enable_grad():
         image, _ = compiled.attach(drawing, tensors)
     return _Drawn(image, tensors, size, torch.from_numpy(visible), alphas, drawing)

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from legs_adapters.cpu import surfels_projection, surfels_strips
 from legs_adapters.cpu.surfels_oracle import CHANNELS, to_pixels
-from legs_loss.reference.rasterizer.strips import order_by_depth, sort_slots
+from legs_loss.reference.rasterizer import sorting
 
 # Means, scales, quaternions, homographies, opacities, harmonics and colours; of those not given, an empty one.
 EMPTY = ((0, 3), (0, 2), (0, 4), (0, 9), (0, 1), (0, 1, 3), (0, 3))
@@ -46,29 +46,24 @@ class _Render(torch.autograd.Function):
             *parameters, *camera, width, height, splats, extents, depths, radii, clamped, boxes, slots
         )
 
-        # A slot is a strip in a disc's box of strips; an entry is the same, sorted by strip and depth.
-        first_slots, total = np.cumsum(slots) - slots, int(slots.sum())
         across, down = -(-width // surfels_projection.WIDE), -(-height // surfels_projection.TALL)
-        slot_strips, slot_rows, places, owners, rows = (np.empty(total, np.int32) for _ in range(5))
-        surfels_projection.find_rows(extents, boxes, slots, first_slots, across, slot_strips, slot_rows)
-        ranges = np.zeros(across * down + 1, np.int64)
-        order = order_by_depth(depths, slots)
-        sort_slots(order, slots, first_slots, slot_strips, slot_rows, ranges, places, owners, rows)
+        firsts, reached = sorting.make_slots(boxes, slots, surfels_projection.TALL)
+        surfels_projection.find_rows(extents, boxes, slots, firsts, across, reached)
+        ranges, draws, bands = sorting.sort_entries(depths, slots, firsts, reached, across, down)
 
         image, others = torch.empty(3, height, width), torch.empty(CHANNELS, height, width)
         kept, ends = np.empty((3, height, width), np.float32), np.empty(across * down, np.int64)
-        strip_order = np.argsort(-np.diff(ranges), kind="stable")  # the fullest first, dealt out to the workers in turn
         entries, background = np.empty((int(ranges[-1]), surfels_strips.FIELDS), np.float32), _array(settings.bg)
         surfels_strips.render(
-            numba.get_num_threads(), strip_order, ranges, splats, owners, rows, entries, ends, background, across,
-            image.numpy(), others.numpy(), kept,
+            numba.get_num_threads(), bands, across, ranges, splats, draws, entries, ends, background, image.numpy(),
+            others.numpy(), kept,
         )  # fmt: skip
 
         radii_tensor = torch.from_numpy(radii)
         ctx.mark_non_differentiable(radii_tensor)
         ctx.save_for_backward(image, others, *[tensor for tensor in given if tensor is not None])
-        ctx.discs = parameters, camera, (splats, clamped, boxes, slots, first_slots, slot_rows, places)
-        ctx.strips = (strip_order, ranges, rows, entries, ends, background, across), kept
+        ctx.discs = parameters, camera, (splats, clamped, firsts)
+        ctx.strips = (bands, across, ranges, draws, entries, ends, background), kept
         return image, others, radii_tensor
 
     @staticmethod
@@ -79,19 +74,19 @@ class _Render(torch.autograd.Function):
         image, others = (_array(tensor) for tensor in ctx.saved_tensors[:2])
         parameters, camera, discs = ctx.discs
         work, kept = ctx.strips
-        gradients = np.empty((len(work[3]), surfels_projection.GRADIENTS), np.float32)
+        sums = sorting.make_sums(discs[-1], surfels_projection.GRADIENTS)
         of_image = _array(torch.zeros(image.shape) if g_image is None else g_image)
         of_others = None if g_others is None else _array(g_others)
         if of_others is not None and not surfels_strips.matters(of_others, others):
             of_others = None
         surfels_strips.render_backward(
-            numba.get_num_threads(), *work, image, others, kept, of_image, of_others, gradients
+            numba.get_num_threads(), *work, image, others, kept, of_image, of_others, sums.reshape(-1)
         )
         results = [torch.empty(array.shape) for array in parameters]
         viewspace = torch.empty(len(parameters[0]), 3)
         half = np.array([image.shape[2] / 2, image.shape[1] / 2])
         surfels_projection.project_backward(
-            *parameters, *camera, half, *discs, gradients, *[result.numpy() for result in (*results, viewspace)]
+            *parameters, *camera, half, *discs, sums, *[result.numpy() for result in (*results, viewspace)]
         )
         wanted = ctx.needs_input_grad
         found = [result if wanted[2 + k] else None for k, result in enumerate(results)]

@@ -23,9 +23,17 @@ from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import FARTHEST, MIN_ALPHA, NEAR, TILE
 from legs_loss.reference.rasterizer.geometry import quaternion_partials, rotation
 from legs_loss.reference.rasterizer.harmonics import direction, harmonics, harmonics_gradient
-from legs_loss.reference.rasterizer.intrinsics import prefetch
 from legs_loss.reference.rasterizer.projection import BLOCK, FAINTEST, ceil, floor, tile_range
-from legs_loss.reference.rasterizer.projection_backward import AHEAD
+from legs_loss.reference.rasterizer.sorting import (
+    FIRST_SLOT,
+    FIRST_SUM,
+    ROWS,
+    STRIP,
+    band_at,
+    bands_across,
+    packed,
+    unpacked,
+)
 
 # No promise that numbers are finite: a disc that is seen from its edge has a homography without inverse.
 CAREFUL = {"nsz"}
@@ -268,49 +276,32 @@ def _rows(extents, i, left, right):
 
 
 @compiled()
-def find_rows(extents, boxes, slots, first_slots, across, slot_strips, slot_rows):
+def find_rows(extents, boxes, slots, firsts, across, reached):
     """Fill the slots, one for each strip in each disc's box: the strip, or -1, and its rows [first, end)."""
     for i in range(len(slots)):
         if slots[i] == 0:
             continue
-        slot = np.uint64(first_slots[i])
+        slot = np.uint64(firsts[i, FIRST_SLOT])
+        band, bands = -band_at(boxes[i, 0]), bands_across(boxes[i, 0], boxes[i, 2])
         for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
             top = strip_y * TALL
             highest, lowest = float(max(top, boxes[i, 1])), float(min(top + TALL, boxes[i, 3]) - 1)
             for strip_x in range(boxes[i, 0], boxes[i, 2]):
                 first, last = _rows(extents, i, strip_x * WIDE, strip_x * WIDE + (WIDE - 1))
                 row, end = math.ceil(max(first, highest)), math.floor(min(last, lowest)) + 1
-                slot_strips[slot], slot_rows[slot] = -1, 0
+                reached[slot, STRIP] = -1
                 if row < end:
-                    slot_strips[slot] = strip_y * across + strip_x
-                    slot_rows[slot] = np.int32(row - top) | np.int32(end - top) << 8
+                    reached[slot, STRIP] = strip_y * across + strip_x
+                    reached[slot, ROWS] = packed(row - top, end - top, band + band_at(strip_x))
                 slot += np.uint64(1)
+            band += bands
 
 
 @compiled()
 def origin(strip_x, strip_y, rows):
     """The pixel about which an entry is written: amid the rows that it reaches."""
-    return strip_x * WIDE + 0.5 * (WIDE - 1), strip_y * TALL + 0.5 * ((rows & 255) + (rows >> 8) - 1)
-
-
-@compiled()
-def _collect(i, splats, boxes, slot_rows, places, slot, gradients, sums):
-    """Sum a disc's gradients over its entries, in a fixed order, with p's about its centre."""
-    sums[:] = 0
-    for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
-        for strip_x in range(boxes[i, 0], boxes[i, 2]):
-            reached, e = slot_rows[slot], np.uint64(places[slot])
-            slot += 1
-            if reached == 0:
-                continue
-            x, y = origin(strip_x, strip_y, reached)
-            x -= splats[i, CENTRE]
-            y -= splats[i, CENTRE + 1]
-            for k in range(GRADIENTS):
-                sums[k] += gradients[e, k]
-            for k in range(3):
-                sums[3 + k] += x * gradients[e, k]
-                sums[6 + k] += y * gradients[e, k]
+    first, end, _ = unpacked(rows)
+    return strip_x * WIDE + 0.5 * (WIDE - 1), strip_y * TALL + 0.5 * (first + end - 1)
 
 
 @compiled()
@@ -361,7 +352,7 @@ def _across(gx, gy, gw, pixels, a, k):
 @compiled()
 def _project_backward_block(
     begin, end, means, scales, quaternions, homographies, opacities, sh, colours, degree, modifier, pose, pixels,
-    position, half, splats, clamped, boxes, slots, first_slots, slot_rows, places, gradients,
+    position, half, splats, clamped, firsts, gradients,
     g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours, g_view,
 ):  # fmt: skip
     handed = len(homographies) > 0
@@ -369,12 +360,7 @@ def _project_backward_block(
     basis, g_basis = np.empty(16, np.float32), np.empty(16, np.float32)
     sums = np.empty(GRADIENTS, np.float64)
     for i in range(begin, end):
-        if i + AHEAD < end:
-            first = first_slots[i + AHEAD]
-            for slot in range(first, first + min(slots[i + AHEAD], 16)):
-                if slot_rows[slot] != 0:
-                    prefetch(gradients, places[slot])
-        if slots[i] == 0:
+        if firsts[i, FIRST_SUM] == firsts[i + 1, FIRST_SUM]:
             g_means[i] = 0
             g_opacities[i] = 0
             g_view[i] = 0
@@ -388,7 +374,10 @@ def _project_backward_block(
             else:
                 g_sh[i] = 0
             continue
-        _collect(i, splats, boxes, slot_rows, places, first_slots[i], gradients, sums)
+        sums[:] = 0
+        for row in range(firsts[i, FIRST_SUM], firsts[i + 1, FIRST_SUM]):
+            for k in range(GRADIENTS):
+                sums[k] += gradients[row, k]
         g_opacities[i, 0] = sums[G_OPACITY] / opacities[i, 0]
         x, y, w, _, turn = _shape(means, scales, quaternions, homographies, i, modifier, pose, pixels)
         gx, gy, gw = _rows_gradient(x, y, w, splats[i, CENTRE], splats[i, CENTRE + 1], sums)
@@ -456,15 +445,15 @@ def _project_backward_block(
 @compiled(parallel=True)
 def project_backward(
     means, scales, quaternions, homographies, opacities, sh, colours, degree, modifier, pose, pixels, position, half,
-    splats, clamped, boxes, slots, first_slots, slot_rows, places, gradients,
+    splats, clamped, firsts, gradients,
     g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours, g_view,
 ):  # fmt: skip
-    """Fill the gradients `g_...` of each disc from those of its entries; those of what was not given stay empty."""
+    """Fill the gradients `g_...` of each disc from its sums in the bands; those of what was not given stay empty."""
     count = len(means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         begin = block * BLOCK
         _project_backward_block(
             begin, min(begin + BLOCK, count), means, scales, quaternions, homographies, opacities, sh, colours, degree,
-            modifier, pose, pixels, position, half, splats, clamped, boxes, slots, first_slots, slot_rows, places,
-            gradients, g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours, g_view,
+            modifier, pose, pixels, position, half, splats, clamped, firsts, gradients,
+            g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours, g_view,
         )  # fmt: skip

@@ -43,6 +43,7 @@ from legs_loss.kernels.vectors import (
 )
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, NEAR
 from legs_loss.reference.rasterizer.intrinsics import prefetch
+from legs_loss.reference.rasterizer.sorting import OWNER, ROWS, SUM
 from legs_loss.reference.rasterizer.strips import cover, exp2, reach
 
 PIXELS = WIDE * TALL
@@ -74,12 +75,12 @@ _SCALE = np.float32(FAR * NEAR / (FAR - NEAR))
 
 
 @compiled()
-def _expand(begin, end, strip_x, strip_y, splats, owners, rows, entries):
+def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
     """Write a strip's entries."""
     for e in range(np.uint64(begin), np.uint64(end)):
-        prefetch(splats, owners[min(np.int64(e) + AHEAD, len(owners) - 1)])
-        i = np.uint64(owners[e])
-        x, y = origin(strip_x, strip_y, rows[e])
+        prefetch(splats, draws[min(np.int64(e) + AHEAD, len(draws) - 1), OWNER])
+        i = np.uint64(draws[e, OWNER])
+        x, y = origin(strip_x, strip_y, draws[e, ROWS])
         x -= splats[i, CENTRE]
         y -= splats[i, CENTRE + 1]
         for k in range(3):
@@ -146,12 +147,18 @@ def _add(state, i, weight, value):
     store(state, i, multiply_add(weight, value, load(state, i)))
 
 
+@njit(inline="always")
+def _add_sums(sums, at, values):
+    """Add to eight sums side by side."""
+    store(sums, at, load(sums, at) + values)
+
+
 @compiled(fastmath=CAREFUL)
-def _blend(state, start, begin, end, rows, entries):
+def _blend(state, start, begin, end, draws, entries):
     """Blend entries of a strip, whose first is `start`, in their order."""
     none, one = splat(_ZERO), splat(_ONE)
     for k in range(begin, end):
-        first, last, top = reach(rows, k)
+        first, last, top = reach(draws, k)
         red, green, blue = splat(entries[k, COLOUR]), splat(entries[k, COLOUR + 1]), splat(entries[k, COLOUR + 2])
         nx, ny, nz = splat(entries[k, NORMAL]), splat(entries[k, NORMAL + 1]), splat(entries[k, NORMAL + 2])
         which = splat(np.float32(k - start + 1))
@@ -179,57 +186,52 @@ def _blend(state, start, begin, end, rows, entries):
 
 
 @compiled(fastmath=CAREFUL)
-def _render_worker(
-    worker, workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image, others, kept
-):
-    state = np.empty(STATE, np.float32)
+def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image, others, kept):
     height, width = image.shape[1], image.shape[2]
-    for turn in range(worker, len(strip_order), workers):
-        strip = strip_order[turn]
-        left, top = strip % across * WIDE, strip // across * TALL
-        wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        _place(state, wide, tall)
-        state[RED:] = 0
-        end = ranges[strip]
-        while end < ranges[strip + 1] and _unfinished(state):
-            begin, end = end, min(end + CHECK, ranges[strip + 1])
-            _expand(begin, end, strip % across, strip // across, splats, owners, rows, entries)
-            _blend(state, ranges[strip], begin, end, rows, entries)
-        ends[strip] = end
-        for y in range(tall):
-            for x in range(wide):
-                i, v, u = y * WIDE + x, top + y, left + x
-                left_over = abs(state[T + i])
-                for channel in range(3):
-                    image[channel, v, u] = state[RED + channel * PIXELS + i] + left_over * background[channel]
-                    others[2 + channel, v, u] = state[NX + channel * PIXELS + i]
-                others[0, v, u], others[1, v, u] = state[D + i], _ONE - left_over
-                others[5, v, u], others[6, v, u] = state[MEDIAN + i], _SCALE * _SCALE * state[SPREAD + i]
-                kept[0, v, u], kept[1, v, u], kept[2, v, u] = state[M1 + i], state[M2 + i], state[WHICH + i]
+    left, top = strip % across * WIDE, strip // across * TALL
+    wide, tall = min(WIDE, width - left), min(TALL, height - top)
+    _place(state, wide, tall)
+    state[RED:] = 0
+    end = ranges[strip]
+    while end < ranges[strip + 1] and _unfinished(state):
+        begin, end = end, min(end + CHECK, ranges[strip + 1])
+        _expand(begin, end, strip % across, strip // across, splats, draws, entries)
+        _blend(state, ranges[strip], begin, end, draws, entries)
+    ends[strip] = end
+    for y in range(tall):
+        for x in range(wide):
+            i, v, u = y * WIDE + x, top + y, left + x
+            left_over = abs(state[T + i])
+            for channel in range(3):
+                image[channel, v, u] = state[RED + channel * PIXELS + i] + left_over * background[channel]
+                others[2 + channel, v, u] = state[NX + channel * PIXELS + i]
+            others[0, v, u], others[1, v, u] = state[D + i], _ONE - left_over
+            others[5, v, u], others[6, v, u] = state[MEDIAN + i], _SCALE * _SCALE * state[SPREAD + i]
+            kept[0, v, u], kept[1, v, u], kept[2, v, u] = state[M1 + i], state[M2 + i], state[WHICH + i]
 
 
 @compiled(parallel=True, fastmath=CAREFUL)
-def render(
-    workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image, others, kept
-):  # fmt: skip
+def render(workers, bands, across, ranges, splats, draws, entries, ends, background, image, others, kept):
     """Fill the images; what the gradient needs of them; the entries, and in each strip the end of those that matter."""
     for worker in prange(workers):
-        _render_worker(
-            worker, workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image,
-            others, kept,
-        )  # fmt: skip
+        state = np.empty(STATE, np.float32)
+        for turn in range(worker, len(bands), workers):
+            for strip in range(bands[turn, 0], bands[turn, 1]):
+                _render_strip(
+                    strip, across, state, ranges, splats, draws, entries, ends, background, image, others, kept
+                )
 
 
 @compiled(fastmath=CAREFUL)
-def _blend_backward(state, begin, end, rows, entries, g_others, gradients):
-    """As `_blend`, front to back again, filling each entry's gradient; `g_others` is None where there is none.
+def _blend_backward(state, begin, end, draws, entries, g_others, sums):
+    """As `_blend`, front to back again, adding to the discs' sums; `g_others` is None where there is none.
 
     dL/dalpha = T own - rest / (1 - alpha): `own` is the gradient of this disc's weight, `rest` the sum of weight times
     own over those behind it: what is left of the whole pixel's sum after those before.
     """
     xs, none, one = load(state, X), splat(_ZERO), splat(_ONE)
     for k in range(begin, end):
-        first, last, top = reach(rows, k)
+        first, last, top = reach(draws, k)
         red, green, blue = splat(entries[k, COLOUR]), splat(entries[k, COLOUR + 1]), splat(entries[k, COLOUR + 2])
         nx, ny, nz = splat(entries[k, NORMAL]), splat(entries[k, NORMAL + 1]), splat(entries[k, NORMAL + 2])
         which = splat(np.float32(k - begin + 1))
@@ -264,10 +266,13 @@ def _blend_backward(state, begin, end, rows, entries, g_others, gradients):
             go = go + h
             r, g, b = multiply_add(weight, g_red, r), multiply_add(weight, g_green, g), multiply_add(weight, g_blue, b)
 
-        # Sums are stored eight at a time by the fields' numbers; where two stores meet, the later one has it right.
-        into = gradients[np.uint64(k)]
-        store(into, GRADIENTS - 8, totals(none, go, r, g, b, gnx, gny, gnz))
+        # Sums are added eight at a time by the fields' numbers; where two such meet, one of them adds nothing.
+        at = np.uint64(draws[k, SUM]) * np.uint64(GRADIENTS)
+        _add_sums(sums, at + np.uint64(GRADIENTS - 8), totals(none, go, r, g, b, gnx, gny, gnz))
 
+        # To p's numbers about the disc's centre.
+        u, v = splat(entries[k, CENTRE]), splat(entries[k, CENTRE + 1])
+        dx, top = xs - u, top - v
         p0 = p1 = p2 = p0y = p1y = p2y = det = none
         ys = top
         for i in range(first * WIDE, last * WIDE, WIDE):
@@ -281,75 +286,71 @@ def _blend_backward(state, begin, end, rows, entries, g_others, gradients):
             p0, p1, p2 = p0 - to_u, p1 - to_v, p2 + to_z
             p0y, p1y, p2y = p0y - to_u * ys, p1y - to_v * ys, multiply_add(to_z, ys, p2y)
             ys = ys + one
-        store(into, 0, totals(p0, p1, p2, p0 * xs, p1 * xs, p2 * xs, p0y, p1y))
+        _add_sums(sums, at, totals(p0, p1, p2, p0 * dx, p1 * dx, p2 * dx, p0y, p1y))
 
-        u, v = splat(entries[k, CENTRE]), splat(entries[k, CENTRE + 1])
         gu = gv = w0 = w1 = w2 = none
         ys = top
         for i in range(first * WIDE, last * WIDE, WIDE):
             screen = above(load(state, EXCESS + i), none)
             h = where(screen, load(state, RESPONSE + i), none)
-            gu, gv = gu + h, multiply_add(h, ys - v, gv)
+            gu, gv = gu + h, multiply_add(h, ys, gv)
             if g_others is not None:
                 g_z = where(screen, load(state, G_Z + i), none)
                 w0, w1 = multiply_add(g_z, load(state, U + i), w0), multiply_add(g_z, load(state, V + i), w1)
                 w2 = w2 + g_z
             ys = ys + one
-        gu, gv = (xs - u) * (gu + gu), gv + gv
-        store(into, 8, totals(p2y, det, gu, gv, w0, w1, w2, go))
+        gu, gv = dx * (gu + gu), gv + gv
+        _add_sums(sums, at + np.uint64(8), totals(p2y, det, gu, gv, w0, w1, w2, none))
 
 
 @compiled(fastmath=CAREFUL)
-def _render_backward_worker(
-    worker, workers, strip_order, ranges, rows, entries, ends, background, across, image, others, kept, g_image,
-    g_others, gradients,
-):  # fmt: skip
-    state = np.empty(BACKWARD_STATE, np.float32)
+def _render_backward_strip(
+    strip, across, state, ranges, draws, entries, ends, background, image, others, kept, g_image, g_others, sums
+):
     height, width = image.shape[1], image.shape[2]
-    for turn in range(worker, len(strip_order), workers):
-        strip = strip_order[turn]
-        left, top = strip % across * WIDE, strip // across * TALL
-        wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        _place(state, wide, tall)
-        state[G_RED:] = 0
-        for y in range(tall):
-            for x in range(wide):
-                i, v, u = y * WIDE + x, top + y, left + x
-                if others[1, v, u] == _ZERO:
-                    continue  # no disc to tell; 2DGS divides by this alpha, so that the gradient may be NaN here
-                constant = rest = _ZERO
+    left, top = strip % across * WIDE, strip // across * TALL
+    wide, tall = min(WIDE, width - left), min(TALL, height - top)
+    _place(state, wide, tall)
+    state[G_RED:] = 0
+    for y in range(tall):
+        for x in range(wide):
+            i, v, u = y * WIDE + x, top + y, left + x
+            if others[1, v, u] == _ZERO:
+                continue  # no disc to tell; 2DGS divides by this alpha, so that the gradient may be NaN here
+            constant = rest = _ZERO
+            for channel in range(3):
+                gradient = g_image[channel, v, u]
+                state[G_RED + channel * PIXELS + i] = gradient
+                constant -= gradient * background[channel]
+                rest += gradient * (image[channel, v, u] - background[channel])
+            if g_others is not None:
+                spread, alpha = _SCALE * _SCALE * g_others[6, v, u], others[1, v, u]
                 for channel in range(3):
-                    gradient = g_image[channel, v, u]
-                    state[G_RED + channel * PIXELS + i] = gradient
-                    constant -= gradient * background[channel]
-                    rest += gradient * (image[channel, v, u] - background[channel])
-                if g_others is not None:
-                    spread, alpha = _SCALE * _SCALE * g_others[6, v, u], others[1, v, u]
-                    for channel in range(3):
-                        state[G_NX + channel * PIXELS + i] = g_others[2 + channel, v, u]
-                        rest += g_others[2 + channel, v, u] * others[2 + channel, v, u]
-                    state[G_D + i], state[G_MEDIAN + i] = g_others[0, v, u], g_others[5, v, u]
-                    state[E1 + i], state[E2 + i] = -_TWO * spread * kept[0, v, u], spread * alpha
-                    state[MEDIAN_AT + i] = kept[2, v, u]
-                    constant += g_others[1, v, u] + spread * kept[1, v, u]
-                    rest += g_others[0, v, u] * others[0, v, u] + g_others[1, v, u] * alpha
-                    rest += _TWO * g_others[6, v, u] * others[6, v, u]
-                state[E0 + i], state[REST + i] = constant, rest
-        _blend_backward(state, ranges[strip], ends[strip], rows, entries, g_others, gradients)
-        gradients[ends[strip] : ranges[strip + 1]] = 0
+                    state[G_NX + channel * PIXELS + i] = g_others[2 + channel, v, u]
+                    rest += g_others[2 + channel, v, u] * others[2 + channel, v, u]
+                state[G_D + i], state[G_MEDIAN + i] = g_others[0, v, u], g_others[5, v, u]
+                state[E1 + i], state[E2 + i] = -_TWO * spread * kept[0, v, u], spread * alpha
+                state[MEDIAN_AT + i] = kept[2, v, u]
+                constant += g_others[1, v, u] + spread * kept[1, v, u]
+                rest += g_others[0, v, u] * others[0, v, u] + g_others[1, v, u] * alpha
+                rest += _TWO * g_others[6, v, u] * others[6, v, u]
+            state[E0 + i], state[REST + i] = constant, rest
+    _blend_backward(state, ranges[strip], ends[strip], draws, entries, g_others, sums)
 
 
 @compiled(parallel=True, fastmath=CAREFUL)
 def render_backward(
-    workers, strip_order, ranges, rows, entries, ends, background, across, image, others, kept, g_image, g_others,
-    gradients,
-):  # fmt: skip
-    """Fill the gradient of every entry; `g_others` may be None."""
+    workers, bands, across, ranges, draws, entries, ends, background, image, others, kept, g_image, g_others, sums
+):
+    """Add the gradient of every entry to its disc's sums, one array; `g_others` may be None."""
     for worker in prange(workers):
-        _render_backward_worker(
-            worker, workers, strip_order, ranges, rows, entries, ends, background, across, image, others, kept, g_image,
-            g_others, gradients,
-        )  # fmt: skip
+        state = np.empty(BACKWARD_STATE, np.float32)
+        for turn in range(worker, len(bands), workers):
+            for strip in range(bands[turn, 0], bands[turn, 1]):
+                _render_backward_strip(
+                    strip, across, state, ranges, draws, entries, ends, background, image, others, kept, g_image,
+                    g_others, sums,
+                )  # fmt: skip
 
 
 @compiled(fastmath=CAREFUL)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from legs_loss.reference.conventions import DILATION, SH_C0, SQUARE, View
-from legs_loss.reference.rasterizer import projection, projection_backward, strips
+from legs_loss.reference.rasterizer import projection, projection_backward, sorting, strips
 
 Clip = Callable[..., None]
 
@@ -52,16 +52,11 @@ class Drawing(NamedTuple):
     splats: np.ndarray
     radii: np.ndarray
     clamped: np.ndarray
-    boxes: np.ndarray
-    slots: np.ndarray
-    first_slots: np.ndarray
-    slot_rows: np.ndarray
-    places: np.ndarray
+    firsts: np.ndarray
     across: int
-    strip_order: np.ndarray  # the fullest first, dealt out to the workers in turn
+    bands: np.ndarray
     ranges: np.ndarray
-    owners: np.ndarray
-    rows: np.ndarray
+    draws: np.ndarray
     entries: np.ndarray
     ends: np.ndarray
     image: np.ndarray
@@ -83,8 +78,8 @@ class Drawing(NamedTuple):
     def blended(self, background: np.ndarray) -> Drawing:
         """Fill image, entries and ends."""
         strips.render(
-            numba.get_num_threads(), self.strip_order, self.ranges, self.splats, self.owners, self.rows, self.entries,
-            self.ends, background, self.across, self.image,
+            numba.get_num_threads(), self.bands, self.across, self.ranges, self.splats, self.draws, self.entries,
+            self.ends, background, self.image,
         )  # fmt: skip
         return self
 
@@ -104,7 +99,7 @@ def draw(
     """Draw; no gradient yet (see :func:`attach`).
 
     ``clip`` may take rows away before they are sorted: it is called with the view's tiles across and down, and with
-    splats, boxes, slots, first_slots, slot_strips, slot_rows and radii.
+    splats, boxes, slots, firsts, reached and radii.
     """
     count = len(tensors.means)
     degree = degree if tensors.sh is not None else 0
@@ -119,7 +114,7 @@ def draw(
         view.world_to_camera,
         view.position,
     )
-    splats = np.empty((count, 10))
+    splats = np.empty((count, 9))
     depths = np.empty(count, np.float32)
     radii = np.empty(count, np.int32)
     clamped = np.empty((count, 3), np.bool_)
@@ -130,17 +125,12 @@ def draw(
         splats[:, 6:9] = _array(tensors.colours)
         clamped[:] = False
 
-    first_slots = np.cumsum(slots) - slots
-    total = int(slots.sum())
-    slot_strips, slot_rows, places = (np.empty(total, np.int32) for _ in range(3))
+    firsts, reached = sorting.make_slots(boxes, slots, strips.TALL)
     across, down = -(-view.width // strips.WIDE), -(-view.height // strips.TALL)
-    strips.find_rows(splats, boxes, slots, first_slots, across, slot_strips, slot_rows)
+    projection.find_rows(splats, boxes, slots, firsts, across, reached)
     if clip is not None:
-        clip(np.array(view.tiles), splats, boxes, slots, first_slots, slot_strips, slot_rows, radii)
-    order = strips.order_by_depth(depths, slots)
-    ranges = np.zeros(across * down + 1, np.int64)
-    owners, rows = np.empty(total, np.int32), np.empty(total, np.int32)
-    strips.sort_slots(order, slots, first_slots, slot_strips, slot_rows, ranges, places, owners, rows)
+        clip(np.array(view.tiles), splats, boxes, slots, firsts, reached, radii)
+    ranges, draws, bands = sorting.sort_entries(depths, slots, firsts, reached, across, down)
     return Drawing(
         parameters=parameters,
         degree=degree,
@@ -148,16 +138,11 @@ def draw(
         splats=splats,
         radii=radii,
         clamped=clamped,
-        boxes=boxes,
-        slots=slots,
-        first_slots=first_slots,
-        slot_rows=slot_rows,
-        places=places,
+        firsts=firsts,
         across=across,
-        strip_order=np.argsort(-np.diff(ranges), kind="stable"),
+        bands=bands,
         ranges=ranges,
-        owners=owners,
-        rows=rows,
+        draws=draws,
         entries=np.empty((int(ranges[-1]), strips.FIELDS), np.float32),
         ends=np.empty(across * down, np.int64),
         image=np.empty((3, view.height, view.width), np.float32),
@@ -199,16 +184,17 @@ class _Attach(torch.autograd.Function):
         ctx.saved_tensors  # noqa: B018 (an error here is about a tensor that was changed)
         it: Drawing = ctx.drawing
         height, width = it.image.shape[1:]
-        entry_gradients = np.empty((len(it.entries), strips.MOMENTS), np.float32)
+        moments = strips.ABSOLUTE_MOMENTS if ctx.columns == 4 else strips.MOMENTS
+        sums = sorting.make_sums(it.firsts, moments)
         strips.render_backward(
-            numba.get_num_threads(), it.strip_order, it.ranges, it.rows, it.entries, it.ends, it.across, it.image,
-            _array(g_image), ctx.columns == 4, entry_gradients,
+            numba.get_num_threads(), it.bands, it.across, it.ranges, it.draws, it.entries, it.ends, it.image,
+            _array(g_image), moments, sums.reshape(-1),
         )  # fmt: skip
         shapes = [None if array is None else array.shape for array in it.parameters] + [(len(it.radii), ctx.columns)]
         gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
         projection_backward.project_backward(
-            *it.parameters, it.degree, *it.camera, it.splats, it.clamped, it.boxes, it.slots, it.first_slots,
-            it.slot_rows, it.places, entry_gradients, np.array([width / 2, height / 2]),
+            *it.parameters, it.degree, *it.camera, it.splats, it.clamped, it.firsts, sums,
+            np.array([width / 2, height / 2]),
             *[None if gradient is None else gradient.numpy() for gradient in gradients],
         )  # fmt: skip
         found = [gradient if wanted else None for gradient, wanted in zip(gradients, ctx.needs_input_grad)]

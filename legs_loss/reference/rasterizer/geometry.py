@@ -131,20 +131,34 @@ def quaternion_gradient(g, q, length):
 
 
 @njit(inline="always")
-def centre_gradient(a, b, c, mx, my):
-    """From the first moments of h = dL/dpower about a splat's centre to the gradient of the centre.
+def own_axes(a, b, determinant):
+    """A splat's own coordinates p x + q y and r x, x and y from its centre, in which its spread is 1 in all directions.
 
-    The power is -d^t Q d / 2, d a pixel's place from the centre and Q the conic: Q times the moments.
+    Their squares add up to -2 times its power: conic = L^t L, L = [[p, q], [r, 0]]. From the covariance's xx and xy.
     """
-    return a * mx + b * my, b * mx + c * my
+    inverse = 1 / math.sqrt(a * determinant)
+    return -b * inverse, a * inverse, 1 / math.sqrt(a)
 
 
 @njit(inline="always")
-def covariance_gradient(a, b, c, mxx, mxy, myy):
-    """From the second moments, a matrix M, to the gradient of the covariance's three numbers: Q M Q / 2."""
-    p00, p01 = a * mxx + b * mxy, a * mxy + b * myy
-    p10, p11 = b * mxx + c * mxy, b * mxy + c * myy
-    return 0.5 * (p00 * a + p01 * b), 0.5 * (p00 * b + p01 * c), 0.5 * (p10 * b + p11 * c)
+def conic(p, q, r):
+    """The conic's xx, xy and yy."""
+    return p * p + r * r, p * q, q * q
+
+
+@njit(inline="always")
+def centre_gradient(axes, m1, m2):
+    """From the first moments, by a splat's own coordinates, of dL/dpower to the gradient of its centre."""
+    p, q, r = axes
+    return p * m1 + r * m2, q * m1
+
+
+@njit(inline="always")
+def covariance_gradient(axes, m11, m12, m22):
+    """From the second moments, a matrix M, to the gradient of the covariance's three numbers: L^t M L / 2."""
+    p, q, r = axes
+    p1, q1 = p * m11 + r * m12, q * m11
+    return 0.5 * (p * p1 + r * (p * m12 + r * m22)), 0.5 * q * p1, 0.5 * q * q1
 
 
 @njit(inline="always")

@@ -1,8 +1,8 @@
 """The compiled rasterizer's work for each Gaussian: from three dimensions to a splat.
 
-A splat is a row of ten float64 numbers: centre (u, v) in pixels, conic (A, B, C), logarithm of the opacity, colour
-(r, g, b), and the determinant of its covariance. The determinant is a sum of squares (Cauchy-Binet), since a needle's
-a c - b b cancels to nothing.
+A splat is a row of nine float64 numbers: centre (u, v) in pixels, its own coordinates (p, q, r; see `own_axes`),
+logarithm of the opacity, colour (r, g, b). The determinant of its covariance is a sum of squares (Cauchy-Binet), since
+a needle's a c - b b cancels to nothing.
 
 The geometry of a block of Gaussians is computed four at a time: their numbers lie side by side, a row of `state` each.
 """
@@ -20,14 +20,17 @@ from numba import njit, prange
 from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import FARTHEST, MIN_ALPHA, NEAR, SQUARE, TILE
 from legs_loss.reference.rasterizer.geometry import (
+    conic,
     linearised,
     numbers,
+    own_axes,
     rotation,
     times_covariance,
     times_rotation,
     to_camera,
 )
 from legs_loss.reference.rasterizer.harmonics import direction, harmonics
+from legs_loss.reference.rasterizer.sorting import FIRST_SLOT, ROWS, STRIP, band_at, bands_across, packed, unpacked
 
 BLOCK = 512  # Gaussians that one thread takes at a time
 WIDE, TALL = 8, 32  # pixels: a strip of the image, see strips.py
@@ -61,7 +64,8 @@ def tile_range(centre, radius, tiles):
 @compiled()
 def origin(strip_x, strip_y, rows):
     """The pixel coordinates about which a splat's polynomial in a strip is written: amid the rows that it reaches."""
-    return strip_x * WIDE + 0.5 * (WIDE - 1), strip_y * TALL + 0.5 * ((rows & 255) + (rows >> 8) - 1)
+    first, end, _ = unpacked(rows)
+    return strip_x * WIDE + 0.5 * (WIDE - 1), strip_y * TALL + 0.5 * (first + end - 1)
 
 
 @compiled()
@@ -173,9 +177,8 @@ def _project_block(
         if right <= left or bottom <= top:
             continue
         radii[i] = np.int32(radius)
-        inverse = 1 / determinant
         splats[i, 0], splats[i, 1] = centre_x, centre_y
-        splats[i, 2], splats[i, 3], splats[i, 4] = c * inverse, -b * inverse, a * inverse
+        splats[i, 2], splats[i, 3], splats[i, 4] = own_axes(a, b, determinant)
 
         # Within the square's tiles, what the ellipse where alpha falls to MIN_ALPHA may reach.
         opacity = np.float64(opacities[i, 0])
@@ -200,7 +203,7 @@ def _project_block(
                 colour += basis[k] * sh[i, k, channel]
             clamped[i, channel] = colour < np.float32(0)
             splats[i, 6 + channel] = max(colour, np.float32(0))
-        splats[i, 5], splats[i, 9] = summit, determinant
+        splats[i, 5] = summit
 
 
 @compiled(parallel=True)
@@ -219,3 +222,48 @@ def project(
             first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, covariances, degree,
             intrinsics, pose, position, size, dilation, square, splats, depths, radii, clamped, boxes, slots,
         )  # fmt: skip
+
+
+@compiled()
+def _find_rows_block(first, end, splats, boxes, slots, firsts, across, reached):
+    for i in range(np.uint64(first), np.uint64(end)):
+        if slots[i] == 0:
+            continue
+        u, v, p, q, r = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
+        a, b, c = conic(p, q, r)
+        determinant = 1 / (q * r) ** 2  # the covariance's: 1 / D below
+        x0, y0, x1, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
+        level = 2 * (splats[i, 5] - FAINTEST)
+        # The ellipse's upper and lower edge over dx are (-B dx +- sqrt(C level - D dx^2)) / C, D = A C - B^2. Their
+        # extreme points are at dx = summit and -summit, or, where the strip does not have them, at its nearer side.
+        level_d, inverse = level * determinant, 1 / c
+        wide = math.sqrt(level_d * c)
+        summit = -b * math.sqrt(level_d / a)
+        tall, slope, bend = level * inverse, -b * inverse, inverse * inverse / determinant
+        slot = np.uint64(firsts[i, FIRST_SLOT])
+        band, bands = -band_at(x0), bands_across(x0, x1)
+        for strip_y in range(y0 // TALL, (y1 - 1) // TALL + 1):
+            top = strip_y * TALL
+            first_row, last_row = float(max(top, y0)), float(min(top + TALL, y1) - 1)
+            for strip_x in range(x0, x1):
+                near, far = max(strip_x * WIDE - u, -wide), min(strip_x * WIDE + (WIDE - 1) - u, wide)
+                reached[slot, STRIP] = -1
+                if near <= far:
+                    at = min(max(-summit, near), far)
+                    row = math.ceil(max(first_row, v + slope * at - math.sqrt(max(tall - bend * at * at, 0.0))))
+                    at = min(max(summit, near), far)
+                    end_row = math.floor(min(last_row, v + slope * at + math.sqrt(max(tall - bend * at * at, 0.0)))) + 1
+                    if row < end_row:
+                        reached[slot, STRIP] = strip_y * across + strip_x
+                        reached[slot, ROWS] = packed(row - top, end_row - top, band + band_at(strip_x))
+                slot += np.uint64(1)
+            band += bands
+
+
+@compiled(parallel=True)
+def find_rows(splats, boxes, slots, firsts, across, reached):
+    """Fill the slots, one for each strip in each Gaussian's box: the strip, or -1, and its rows."""
+    count = len(slots)
+    for block in prange((count + BLOCK - 1) // BLOCK):
+        first = block * BLOCK
+        _find_rows_block(first, min(first + BLOCK, count), splats, boxes, slots, firsts, across, reached)

@@ -9,6 +9,7 @@ import numpy as np
 from numba import prange
 
 from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.vectors import lane, load
 from legs_loss.reference.rasterizer.geometry import (
     centre_gradient,
     covariance_gradient,
@@ -22,61 +23,39 @@ from legs_loss.reference.rasterizer.geometry import (
     to_camera,
 )
 from legs_loss.reference.rasterizer.harmonics import direction, harmonics, harmonics_gradient
-from legs_loss.reference.rasterizer.intrinsics import prefetch
-from legs_loss.reference.rasterizer.projection import BLOCK, MEAN, SHAPE, TALL, lay_out, origin
+from legs_loss.reference.rasterizer.projection import BLOCK, MEAN, SHAPE, lay_out
+from legs_loss.reference.rasterizer.sorting import FIRST_SUM
+from legs_loss.reference.rasterizer.strips import ABSOLUTE_MOMENTS, UNIT
 
-AHEAD = 4  # how many Gaussians before their turn the gradients of their entries are asked for
+# Rows of a block's state, behind mean and shape: the splat's own coordinates; the sums of dL/dpower, of its first and
+# second moments by those coordinates, of the colour's gradient, and the two absolute ones. In place of mean and shape,
+# then, their gradients.
+AXES, POWER, FIRST, SECOND, COLOUR, ABSOLUTE = 10, 13, 14, 16, 19, 22
+STATE = 24, BLOCK + 8  # see projection.py
 
-# Rows of a block's state, behind mean and shape: its splat's conic, and the sums over its entries. In place of mean and
-# shape, then, their gradients.
-CONIC, SUMS = 10, 13
-# Of the sums: moments of h about the splat's centre (h; hx, hy; hxx, hxy, hyy), red, green, blue, two absolute ones.
-POWER, FIRST, SECOND, RED, ABSOLUTE, END = 0, 1, 3, 6, 9, 11
-STATE = SUMS + END, BLOCK + 8  # see projection.py
-
-
-@compiled()
-def _ask_for(first, count, slot_rows, places, gradients):
-    """Ask for the gradients of a Gaussian's slots, or of the first few of a giant's, ahead of `_collect`."""
-    for slot in range(first, first + min(count, 16)):
-        if slot_rows[slot] != 0:
-            prefetch(gradients, places[slot])
+LENGTH = 1 / UNIT  # of a step of 1 in an entry's coordinates, in the splat's own
 
 
 @compiled()
-def _collect(splats, boxes, i, slot_rows, places, slot, gradients, state, j):
-    """Sum a Gaussian's gradients over its slots, from `slot` on, into the state's column `j`, in a fixed order.
-
-    A row of `gradients` holds the moments of h = dL/dpower about its origin: h, hx, hy, hxx, hxy, hyy; then red, green,
-    blue, and the two absolute sums.
-    """
-    u, v = splats[i, 0], splats[i, 1]
-    m = mx = my = mxx = mxy = myy = red = green = blue = absolute_u = absolute_v = 0.0
-    for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
-        for strip_x in range(boxes[i, 0], boxes[i, 2]):
-            if slot_rows[slot] != 0:
-                k = np.uint64(places[slot])
-                h, hx, hy = np.float64(gradients[k, 0]), np.float64(gradients[k, 1]), np.float64(gradients[k, 2])
-                x, y = origin(strip_x, strip_y, slot_rows[slot])
-                x -= u
-                y -= v
-                about_x, about_y = hx + x * h, hy + y * h
-                m += h
-                mx += about_x
-                my += about_y
-                mxx += gradients[k, 3] + x * (hx + about_x)
-                mxy += gradients[k, 4] + x * hy + y * about_x
-                myy += gradients[k, 5] + y * (hy + about_y)
-                red += gradients[k, 6]
-                green += gradients[k, 7]
-                blue += gradients[k, 8]
-                absolute_u += gradients[k, 9]
-                absolute_v += gradients[k, 10]
-            slot += 1
-    state[SUMS, j], state[SUMS + 1, j], state[SUMS + 2, j] = m, mx, my
-    state[SUMS + 3, j], state[SUMS + 4, j], state[SUMS + 5, j] = mxx, mxy, myy
-    state[SUMS + 6, j], state[SUMS + 7, j], state[SUMS + 8, j] = red, green, blue
-    state[SUMS + 9, j], state[SUMS + 10, j] = absolute_u, absolute_v
+def _collect(first, end, sums, state, j):
+    """Sum a Gaussian's gradients over the bands of the image into the state's column `j`."""
+    total, blue, along_u, along_v = load(sums[first], 0), sums[first, 8], 0.0, 0.0
+    for k in range(np.uint64(first + 1), np.uint64(end)):
+        total = total + load(sums[k], 0)
+        blue += sums[k, 8]
+    if sums.shape[1] == ABSOLUTE_MOMENTS:
+        for k in range(np.uint64(first), np.uint64(end)):
+            along_u += sums[k, 9]
+            along_v += sums[k, 10]
+    state[POWER, j], state[FIRST, j], state[FIRST + 1, j] = (
+        lane(total, 0),
+        LENGTH * lane(total, 1),
+        LENGTH * lane(total, 2),
+    )
+    for k in range(3):
+        state[SECOND + k, j] = LENGTH**2 * lane(total, 3 + k)
+    state[COLOUR, j], state[COLOUR + 1, j], state[COLOUR + 2, j] = lane(total, 6), lane(total, 7), blue
+    state[ABSOLUTE, j], state[ABSOLUTE + 1, j] = LENGTH**2 * along_u, LENGTH**2 * along_v
 
 
 @compiled()
@@ -85,10 +64,9 @@ def _shapes_backward(count, intrinsics, pose, state):
     for j in range(np.uint64(count)):
         x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
         t = linearised(x, y, z, intrinsics, pose)
-        a, b, c = state[CONIC, j], state[CONIC + 1, j], state[CONIC + 2, j]
-        gu, gv = centre_gradient(a, b, c, state[SUMS + FIRST, j], state[SUMS + FIRST + 1, j])
-        mxx, mxy, myy = state[SUMS + SECOND, j], state[SUMS + SECOND + 1, j], state[SUMS + SECOND + 2, j]
-        s00, s01, s11 = covariance_gradient(a, b, c, mxx, mxy, myy)
+        axes = state[AXES, j], state[AXES + 1, j], state[AXES + 2, j]
+        gu, gv = centre_gradient(axes, state[FIRST, j], state[FIRST + 1, j])
+        s00, s01, s11 = covariance_gradient(axes, state[SECOND, j], state[SECOND + 1, j], state[SECOND + 2, j])
         # The scaled axes U S, U = T R: 2 G U S.
         r, q, length = rotation(state[SHAPE + 3, j], state[SHAPE + 4, j], state[SHAPE + 5, j], state[SHAPE + 6, j])
         u = times_rotation(t, r)
@@ -125,10 +103,9 @@ def _covariances_backward(count, intrinsics, pose, state):
     for j in range(np.uint64(count)):
         x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
         t = linearised(x, y, z, intrinsics, pose)
-        a, b, c = state[CONIC, j], state[CONIC + 1, j], state[CONIC + 2, j]
-        gu, gv = centre_gradient(a, b, c, state[SUMS + FIRST, j], state[SUMS + FIRST + 1, j])
-        mxx, mxy, myy = state[SUMS + SECOND, j], state[SUMS + SECOND + 1, j], state[SUMS + SECOND + 2, j]
-        s00, s01, s11 = covariance_gradient(a, b, c, mxx, mxy, myy)
+        axes = state[AXES, j], state[AXES + 1, j], state[AXES + 2, j]
+        gu, gv = centre_gradient(axes, state[FIRST, j], state[FIRST + 1, j])
+        s00, s01, s11 = covariance_gradient(axes, state[SECOND, j], state[SECOND + 1, j], state[SECOND + 2, j])
         v = (
             state[SHAPE, j],
             state[SHAPE + 1, j],
@@ -157,16 +134,14 @@ def _covariances_backward(count, intrinsics, pose, state):
 @compiled()
 def _project_backward_block(
     first, end, means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position,
-    splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients, half,
+    splats, clamped, firsts, sums, half,
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
 ):  # fmt: skip
     coefficients = (degree + 1) * (degree + 1)
     basis, g_basis = np.empty(16, np.float32), np.empty(16, np.float32)
     state, drawn, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
     for i in range(first, end):
-        if i + AHEAD < end:
-            _ask_for(first_slots[i + AHEAD], slots[i + AHEAD], slot_rows, places, entry_gradients)
-        if slots[i] == 0:
+        if firsts[i, FIRST_SUM] == firsts[i + 1, FIRST_SUM]:
             g_means[i] = 0
             if scales is not None:
                 g_scales[i] = 0
@@ -177,10 +152,10 @@ def _project_backward_block(
             g_sh[i] = 0
             g_view[i] = 0
             continue
-        _collect(splats, boxes, i, slot_rows, places, first_slots[i], entry_gradients, state, count)
+        _collect(firsts[i, FIRST_SUM], firsts[i + 1, FIRST_SUM], sums, state, count)
         lay_out(means, scales, quaternions, covariances, i, state, count)
         for k in range(3):
-            state[CONIC + k, count] = splats[i, 2 + k]
+            state[AXES + k, count] = splats[i, 2 + k]
         drawn[count] = i
         count += 1
     if scales is not None:
@@ -197,19 +172,19 @@ def _project_backward_block(
         if covariances is not None:
             for k in range(6):
                 g_covariances[i, k] = state[SHAPE + k, j]
-        g_opacities[i, 0] = state[SUMS + POWER, j] / opacities[i, 0]
-        a, b, c = state[CONIC, j], state[CONIC + 1, j], state[CONIC + 2, j]
-        gu, gv = centre_gradient(a, b, c, state[SUMS + FIRST, j], state[SUMS + FIRST + 1, j])
+        g_opacities[i, 0] = state[POWER, j] / opacities[i, 0]
+        axes = state[AXES, j], state[AXES + 1, j], state[AXES + 2, j]
+        gu, gv = centre_gradient(axes, state[FIRST, j], state[FIRST + 1, j])
         g_view[i, 0], g_view[i, 1] = gu * half[0], gv * half[1]
         if g_view.shape[1] == 4:
-            g_view[i, 2], g_view[i, 3] = state[SUMS + ABSOLUTE, j] * half[0], state[SUMS + ABSOLUTE + 1, j] * half[1]
+            g_view[i, 2], g_view[i, 3] = state[ABSOLUTE, j] * half[0], state[ABSOLUTE + 1, j] * half[1]
 
         # Colour: to the coefficients, and through the direction to the mean.
         dx, dy, dz, distance = direction(means, i, position)
         harmonics(degree, dx, dy, dz, basis)
-        red = np.float32(0) if clamped[i, 0] else np.float32(state[SUMS + RED, j])
-        green = np.float32(0) if clamped[i, 1] else np.float32(state[SUMS + RED + 1, j])
-        blue = np.float32(0) if clamped[i, 2] else np.float32(state[SUMS + RED + 2, j])
+        red = np.float32(0) if clamped[i, 0] else np.float32(state[COLOUR, j])
+        green = np.float32(0) if clamped[i, 1] else np.float32(state[COLOUR + 1, j])
+        blue = np.float32(0) if clamped[i, 2] else np.float32(state[COLOUR + 2, j])
         for k in range(coefficients):
             g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = basis[k] * red, basis[k] * green, basis[k] * blue
             g_basis[k] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
@@ -225,7 +200,7 @@ def _project_backward_block(
 @compiled(parallel=True)
 def project_backward(
     means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position,
-    splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients, half,
+    splats, clamped, firsts, sums, half,
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
 ):  # fmt: skip
     """Fill the gradients `g_...` of each Gaussian from those of its entries; of what is None, there is none."""
@@ -234,6 +209,6 @@ def project_backward(
         first = block * BLOCK
         _project_backward_block(
             first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, covariances, degree,
-            intrinsics, pose, position, splats, clamped, boxes, slots, first_slots, slot_rows, places, entry_gradients,
+            intrinsics, pose, position, splats, clamped, firsts, sums,
             half, g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
         )  # fmt: skip

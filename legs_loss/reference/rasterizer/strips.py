@@ -1,14 +1,16 @@
-"""The compiled rasterizer's work for each strip of the image: which splats reach it, and blending them, both ways.
+"""The compiled rasterizer's work for each strip of the image: blending the splats that reach it, both ways.
 
 A strip is 8 pixels wide and 32 tall: a row of it fills one register, and the rows that a splat reaches are one
 contiguous loop. (3DGS's own tiles of 16x16 matter to the result only where they cut off a splat; projection.py sees to
 that.) All of a strip's state is one array, a plane of 256 numbers each.
 
-Within a strip a splat is the polynomial
+Within a strip a splat is
 
-    log2(alpha) = e + gx x + gy y + a x^2 + b x y + c y^2        x, y in pixels from `origin`
+    log2(alpha) = e - (w1 + p x + q y)^2 - (w2 + r x)^2         x, y in pixels from `origin`
 
-whose coefficients are computed in float64: as precise for a needle a thousand pixels long as for a dot.
+in its own coordinates (geometry.py), of which the second is the same in all rows. They are computed in float64 and at
+most 4 or so where the splat is seen: so alpha, and the moments by these coordinates, are as precise for a needle a
+thousand pixels long as for a dot.
 
 Indices are unsigned where it counts: of any other, Python's rules for negative ones are looked after at every access.
 """
@@ -23,13 +25,13 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from legs_loss.kernels import vectors
 from legs_loss.kernels.compiling import compiled
 from legs_loss.kernels.vectors import (
     absolute,
     as_floats,
     as_integers,
     at_least,
-    lane,
     load,
     maximum,
     minimum,
@@ -42,13 +44,15 @@ from legs_loss.kernels.vectors import (
 )
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from legs_loss.reference.rasterizer.intrinsics import prefetch
-from legs_loss.reference.rasterizer.projection import BLOCK, FAINTEST, TALL, WIDE, origin
+from legs_loss.reference.rasterizer.projection import TALL, WIDE, origin
+from legs_loss.reference.rasterizer.sorting import OWNER, ROWS, SUM
 
 PIXELS = WIDE * TALL
 AHEAD = 16  # entries whose memory is asked for while another is worked on
 CHECK = 16  # splats between two looks at whether a strip is finished
-FIELDS = 9  # of an entry: e, gx, gy, a, b, c, red, green, blue
-MOMENTS = 11  # of an entry's gradient: h, hx, hy, hxx, hxy, hyy, red, green, blue, |u|, |v|
+FIELDS = 9  # of an entry: e, w1, p, q, w2, r, red, green, blue
+# Of a gradient: h = dL/dpower, its moments h w1, h w2, h w1^2, h w1 w2, h w2^2; red, green, blue; if wanted, |u|, |v|.
+MOMENTS, ABSOLUTE_MOMENTS = 9, 11
 
 # Planes of a strip's state. T: transmittance, its sign turned once the pixel is finished (or is outside the image).
 T = 0
@@ -61,6 +65,7 @@ STATE = X + WIDE
 _MAX, _MIN, _LAST = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _LOG2E = 1 / math.log(2)
+UNIT = math.sqrt(_LOG2E / 2)  # of the entries' own coordinates: log2(alpha) falls by the sum of their squares
 # 2^f on [-1/2, 1/2]: least relative error, 2e-7 with float32's rounding.
 _P0, _P1, _P2, _P3, _P4, _P5 = (
     np.float32(p)
@@ -92,116 +97,19 @@ def exp2(x):
     return as_floats(as_integers(fraction) + (as_integers(rounded) << splat(_MANTISSA)))
 
 
-# Which splats reach which strip
-
-
 @compiled()
-def order_by_depth(depths, slots):
-    """Indices of the Gaussians that are drawn, front to back; equal depths keep their order. A radix sort."""
-    bits, count = depths.view(np.uint32), 0
-    order = np.empty(len(slots), np.int32)
-    for i in range(len(slots)):
-        if slots[i] > 0:
-            order[count] = i
-            count += 1
-    order = order[:count]
-    other = np.empty_like(order)
-    for shift in (0, 11, 22):  # depths are positive: their bits, as integers, sort as they do
-        starts = np.zeros(2049, np.int64)
-        for i in order:
-            starts[((bits[i] >> shift) & 2047) + 1] += 1
-        for k in range(1, 2049):
-            starts[k] += starts[k - 1]
-        for i in order:
-            digit = (bits[i] >> shift) & 2047
-            other[starts[digit]] = i
-            starts[digit] += 1
-        order, other = other, order
-    return order
-
-
-@compiled()
-def _find_rows_block(first, end, splats, boxes, slots, first_slots, across, slot_strips, slot_rows):
-    for i in range(np.uint64(first), np.uint64(end)):
-        if slots[i] == 0:
-            continue
-        u, v, a, b, c = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
-        determinant = splats[i, 9]  # the covariance's: 1 / D below
-        x0, y0, x1, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
-        level = 2 * (splats[i, 5] - FAINTEST)
-        # The ellipse's upper and lower edge over dx are (-B dx +- sqrt(C level - D dx^2)) / C, D = A C - B^2. Their
-        # extreme points are at dx = summit and -summit, or, where the strip does not have them, at its nearer side.
-        level_d, inverse = level * determinant, 1 / c
-        wide = math.sqrt(level_d * c)
-        summit = -b * math.sqrt(level_d / a)
-        tall, slope, bend = level * inverse, -b * inverse, inverse * inverse / determinant
-        slot = np.uint64(first_slots[i])
-        for strip_y in range(y0 // TALL, (y1 - 1) // TALL + 1):
-            top = strip_y * TALL
-            first_row, last_row = float(max(top, y0)), float(min(top + TALL, y1) - 1)
-            for strip_x in range(x0, x1):
-                near, far = max(strip_x * WIDE - u, -wide), min(strip_x * WIDE + (WIDE - 1) - u, wide)
-                slot_strips[slot], slot_rows[slot] = -1, 0
-                if near <= far:
-                    at = min(max(-summit, near), far)
-                    row = math.ceil(max(first_row, v + slope * at - math.sqrt(max(tall - bend * at * at, 0.0))))
-                    at = min(max(summit, near), far)
-                    end_row = math.floor(min(last_row, v + slope * at + math.sqrt(max(tall - bend * at * at, 0.0)))) + 1
-                    if row < end_row:
-                        slot_strips[slot] = strip_y * across + strip_x
-                        slot_rows[slot] = np.int32(row - top) | np.int32(end_row - top) << 8
-                slot += np.uint64(1)
-
-
-@compiled(parallel=True)
-def find_rows(splats, boxes, slots, first_slots, across, slot_strips, slot_rows):
-    """Fill the slots, one for each strip in each Gaussian's box: the strip, or -1, and its rows."""
-    count = len(slots)
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        first = block * BLOCK
-        _find_rows_block(
-            first, min(first + BLOCK, count), splats, boxes, slots, first_slots, across, slot_strips, slot_rows
-        )
-
-
-@compiled()
-def sort_slots(order, slots, first_slots, slot_strips, slot_rows, ranges, places, owners, rows):
-    """Give each slot that reaches its strip a place among the entries: by strip, and in a strip by depth.
-
-    Fills where each strip's entries begin, each slot's place, and each entry's Gaussian and rows.
-    """
-    for strip in slot_strips:
-        if strip >= 0:
-            ranges[strip + 1] += 1
-    for strip in range(1, len(ranges)):
-        ranges[strip] += ranges[strip - 1]
-    cursors = ranges.copy()
-    for turn in range(len(order)):
-        prefetch(slot_strips, first_slots[order[min(turn + AHEAD, len(order) - 1)]])
-        owner = order[turn]
-        i = np.uint64(owner)
-        for slot in range(np.uint64(first_slots[i]), np.uint64(first_slots[i] + slots[i])):
-            strip = slot_strips[slot]
-            if strip >= 0:
-                at = np.uint64(strip)
-                place = np.uint64(cursors[at])
-                cursors[at] += 1
-                places[slot], owners[place], rows[place] = place, owner, slot_rows[slot]
-
-
-@compiled()
-def _expand(begin, end, strip_x, strip_y, splats, owners, rows, entries):
-    """Write the polynomials of a strip's entries."""
+def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
+    """Write a strip's entries."""
     for k in range(np.uint64(begin), np.uint64(end)):
-        prefetch(splats, owners[min(np.int64(k) + AHEAD, len(owners) - 1)])
-        i = np.uint64(owners[k])
-        a, b, c = splats[i, 2], splats[i, 3], splats[i, 4]
-        x, y = origin(strip_x, strip_y, rows[k])
+        prefetch(splats, draws[min(np.int64(k) + AHEAD, len(draws) - 1), OWNER])
+        i = np.uint64(draws[k, OWNER])
+        p, q, r = UNIT * splats[i, 2], UNIT * splats[i, 3], UNIT * splats[i, 4]
+        x, y = origin(strip_x, strip_y, draws[k, ROWS])
         x -= splats[i, 0]
         y -= splats[i, 1]
-        entries[k, 0] = _LOG2E * (splats[i, 5] - 0.5 * (a * x * x + c * y * y) - b * x * y)
-        entries[k, 1], entries[k, 2] = -_LOG2E * (a * x + b * y), -_LOG2E * (b * x + c * y)
-        entries[k, 3], entries[k, 4], entries[k, 5] = -0.5 * _LOG2E * a, -_LOG2E * b, -0.5 * _LOG2E * c
+        entries[k, 0] = _LOG2E * splats[i, 5]
+        entries[k, 1], entries[k, 2], entries[k, 3] = p * x + q * y, p, q
+        entries[k, 4], entries[k, 5] = r * x, r
         entries[k, 6], entries[k, 7], entries[k, 8] = splats[i, 6], splats[i, 7], splats[i, 8]
 
 
@@ -251,20 +159,28 @@ def _unfinished(state):
 
 
 @njit(inline="always")
-def reach(rows, k):
+def reach(draws, k):
     """An entry's first row, the one past its last, and the first row's y, counted from the middle of them."""
-    first, last = np.uint32(rows[k]) & 63, np.uint32(rows[k] >> 8) & 63
+    first, last = np.uint32(draws[k, ROWS]) & 63, np.uint32(draws[k, ROWS] >> 8) & 63
     return first, last, splat((np.float32(first) - np.float32(last) + _ONE) * _HALF)
+
+
+@njit(inline="always")
+def coordinates(state, entries, k):
+    """A splat's own coordinates along a row: the first at y = 0, what it gains with y, and the second."""
+    xs = load(state, X)
+    first = multiply_add(splat(entries[k, 2]), xs, splat(entries[k, 1]))
+    return first, splat(entries[k, 3]), multiply_add(splat(entries[k, 5]), xs, splat(entries[k, 4]))
 
 
 @njit(inline="always")
 def respond(state, first, last, ys, entries, k):
     """Leave an entry's alpha, not yet held at its most, in WORK; `ys`: the first row's."""
-    xs = load(state, X)
-    at_middle = multiply_add(multiply_add(splat(entries[k, 3]), xs, splat(entries[k, 1])), xs, splat(entries[k, 0]))
-    slope, bend = multiply_add(splat(entries[k, 4]), xs, splat(entries[k, 2])), splat(entries[k, 5])
+    along, down, across = coordinates(state, entries, k)
+    most = multiply_add(-across, across, splat(entries[k, 0]))
     for i in range(first * WIDE, last * WIDE, WIDE):
-        store(state, WORK + i, exp2(multiply_add(multiply_add(bend, ys, slope), ys, at_middle)))
+        w = multiply_add(down, ys, along)
+        store(state, WORK + i, exp2(multiply_add(-w, w, most)))
         ys = ys + splat(_ONE)
 
 
@@ -288,10 +204,10 @@ def _cover(state, i):
 
 
 @compiled()
-def _blend(state, begin, end, rows, entries):
+def _blend(state, begin, end, draws, entries):
     """Blend entries of a strip, in their order."""
     for k in range(begin, end):
-        first, last, top = reach(rows, k)
+        first, last, top = reach(draws, k)
         red, green, blue = splat(entries[k, 6]), splat(entries[k, 7]), splat(entries[k, 8])
         respond(state, first, last, top, entries, k)
         for i in range(first * WIDE, last * WIDE, WIDE):
@@ -302,62 +218,47 @@ def _blend(state, begin, end, rows, entries):
 
 
 @compiled()
-def _render_worker(
-    worker, workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image
-):
-    state = np.empty(STATE, np.float32)
+def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image):
     height, width, pixels = image.shape[1], image.shape[2], image.reshape(-1)
-    for turn in range(worker, len(strip_order), workers):
-        strip = strip_order[turn]
-        left, top = strip % across * WIDE, strip // across * TALL
-        wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        place(state, wide, tall)
-        state[RED : RED + 3 * PIXELS] = 0
-        end = ranges[strip]
-        while end < ranges[strip + 1] and _unfinished(state):
-            begin, end = end, min(end + CHECK, ranges[strip + 1])
-            _expand(begin, end, strip % across, strip // across, splats, owners, rows, entries)
-            _blend(state, begin, end, rows, entries)
-        ends[strip] = end
-        for y in range(tall):
-            left_over = absolute(load(state, T + y * WIDE))
-            for channel in range(3):
-                colour = load(state, RED + channel * PIXELS + y * WIDE)
-                colour = multiply_add(left_over, splat(background[channel]), colour)
-                _write(pixels, (channel * height + top + y) * width + left, wide, colour, state)
+    left, top = strip % across * WIDE, strip // across * TALL
+    wide, tall = min(WIDE, width - left), min(TALL, height - top)
+    place(state, wide, tall)
+    state[RED : RED + 3 * PIXELS] = 0
+    end = ranges[strip]
+    while end < ranges[strip + 1] and _unfinished(state):
+        begin, end = end, min(end + CHECK, ranges[strip + 1])
+        _expand(begin, end, strip % across, strip // across, splats, draws, entries)
+        _blend(state, begin, end, draws, entries)
+    ends[strip] = end
+    for y in range(tall):
+        left_over = absolute(load(state, T + y * WIDE))
+        for channel in range(3):
+            colour = load(state, RED + channel * PIXELS + y * WIDE)
+            colour = multiply_add(left_over, splat(background[channel]), colour)
+            _write(pixels, (channel * height + top + y) * width + left, wide, colour, state)
 
 
 @compiled(parallel=True)
-def render(workers, strip_order, ranges, splats, owners, rows, entries, ends, background, across, image):
+def render(workers, bands, across, ranges, splats, draws, entries, ends, background, image):
     """Fill the image, and for each strip its entries, up to the end of those that mattered."""
     for worker in prange(workers):
-        _render_worker(
-            np.int64(worker),
-            workers,
-            strip_order,
-            ranges,
-            splats,
-            owners,
-            rows,
-            entries,
-            ends,
-            background,
-            across,
-            image,
-        )
+        state = np.empty(STATE, np.float32)
+        for turn in range(worker, len(bands), workers):
+            for strip in range(bands[turn, 0], bands[turn, 1]):
+                _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image)
 
 
 @compiled()
-def _blend_backward(state, begin, end, rows, entries, absolutely, gradients):
-    """As `_blend`, front to back, filling the entries' gradients: moments of h = dL/dpower, and the colour's.
+def _blend_backward(state, begin, end, draws, entries, moments, sums):
+    """As `_blend`, front to back, adding to the owners' sums: moments of h = dL/dpower, and the colour's gradient.
 
     dL/dalpha = T (g . colour) - rest / (1 - alpha), where rest = g . (all the colour behind this splat): what is left
     of g . (the pixel's colour) after what came before. Nothing is carried from back to front.
     """
-    xs, none, one = load(state, X), splat(_ZERO), splat(_ONE)
-    scale = np.float32(1 / _LOG2E)
+    none, one = splat(_ZERO), splat(_ONE)
     for k in range(begin, end):
-        first, last, top = reach(rows, k)
+        vectors.prefetch(sums, np.uint64(draws[min(k + np.uint64(AHEAD), end - np.uint64(1)), SUM]) * moments)
+        first, last, top = reach(draws, k)
         red, green, blue = splat(entries[k, 6]), splat(entries[k, 7]), splat(entries[k, 8])
         respond(state, first, last, top, entries, k)
         r = g = b = none
@@ -371,71 +272,51 @@ def _blend_backward(state, begin, end, rows, entries, absolutely, gradients):
             h = response * multiply_add(before, own, none - rest / (one - alpha))
             store(state, WORK + i, where(at_least(none, weight), none, h))
             r, g, b = multiply_add(weight, g_red, r), multiply_add(weight, g_green, g), multiply_add(weight, g_blue, b)
-        m = my = myy = none
+        along, down, across = coordinates(state, entries, k)
+        to_u, p = splat(entries[k, 5]) * across, splat(entries[k, 2])
+        m = m1 = m11 = along_u = along_v = none
         ys = top
         for i in range(first * WIDE, last * WIDE, WIDE):
-            h = load(state, WORK + i)
-            hy = h * ys
-            m, my, myy = m + h, my + hy, multiply_add(hy, ys, myy)
+            h, w = load(state, WORK + i), multiply_add(down, ys, along)
+            hw = h * w
+            m, m1, m11 = m + h, m1 + hw, multiply_add(hw, w, m11)
+            if moments == ABSOLUTE_MOMENTS:
+                along_u, along_v = along_u + absolute(h * multiply_add(p, w, to_u)), along_v + absolute(hw)
             ys = ys + one
-        mx = m * xs
-        sums = totals(m, mx, my, mx * xs, my * xs, myy, r, g)
-        for moment in range(8):
-            gradients[k, moment] = lane(sums, moment)
-        gradients[k, 8], gradients[k, 9], gradients[k, 10] = total(b), _ZERO, _ZERO
-        if absolutely:
-            two, mixed = splat(np.float32(2)), splat(entries[k, 4])
-            u = multiply_add(two * splat(entries[k, 3]), xs, splat(entries[k, 1]))
-            v, bend = multiply_add(mixed, xs, splat(entries[k, 2])), two * splat(entries[k, 5])
-            along_u = along_v = none
-            ys = top
-            for i in range(first * WIDE, last * WIDE, WIDE):
-                h = load(state, WORK + i)
-                along_u = along_u + absolute(h * multiply_add(mixed, ys, u))
-                along_v = along_v + absolute(h * multiply_add(bend, ys, v))
-                ys = ys + one
-            gradients[k, 9], gradients[k, 10] = total(along_u) * scale, total(along_v) * scale
+        m2 = across * m
+        at = np.uint64(draws[k, SUM]) * moments
+        store(sums, at, load(sums, at) + totals(m, m1, m2, m11, across * m1, across * m2, r, g))
+        sums[at + 8] += total(b)
+        if moments == ABSOLUTE_MOMENTS:
+            sums[at + 9] += total(along_u)
+            sums[at + 10] += total(along_v) * entries[k, 3]
 
 
 @compiled()
-def _render_backward_worker(
-    worker, workers, strip_order, ranges, rows, entries, ends, across, image, g_image, absolute, gradients
-):
-    state = np.empty(STATE, np.float32)
+def _render_backward_strip(strip, across, state, ranges, draws, entries, ends, image, g_image, moments, sums):
     height, width, pixels, g_pixels = image.shape[1], image.shape[2], image.reshape(-1), g_image.reshape(-1)
-    for turn in range(worker, len(strip_order), workers):
-        strip = strip_order[turn]
-        left, top = strip % across * WIDE, strip // across * TALL
-        wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        place(state, wide, tall)
-        state[RED:X] = 0
-        for y in range(tall):
-            rest = splat(_ZERO)
-            for channel in range(3):
-                at = (channel * height + top + y) * width + left
-                gradient = _read(g_pixels, at, wide, state)
-                store(state, RED + channel * PIXELS + y * WIDE, gradient)
-                rest = multiply_add(gradient, _read(pixels, at, wide, state), rest)
-            store(state, REST + y * WIDE, rest)
-        _blend_backward(state, ranges[strip], ends[strip], rows, entries, absolute, gradients)
-        gradients[ends[strip] : ranges[strip + 1]] = 0
+    left, top = strip % across * WIDE, strip // across * TALL
+    wide, tall = min(WIDE, width - left), min(TALL, height - top)
+    place(state, wide, tall)
+    state[RED:X] = 0
+    for y in range(tall):
+        rest = splat(_ZERO)
+        for channel in range(3):
+            at = (channel * height + top + y) * width + left
+            gradient = _read(g_pixels, at, wide, state)
+            store(state, RED + channel * PIXELS + y * WIDE, gradient)
+            rest = multiply_add(gradient, _read(pixels, at, wide, state), rest)
+        store(state, REST + y * WIDE, rest)
+    _blend_backward(state, ranges[strip], ends[strip], draws, entries, moments, sums)
 
 
 @compiled(parallel=True)
-def render_backward(workers, strip_order, ranges, rows, entries, ends, across, image, g_image, absolute, gradients):
-    """Fill the gradient of every entry; the absolute sums, if asked for."""
+def render_backward(workers, bands, across, ranges, draws, entries, ends, image, g_image, moments, sums):
+    """Add the gradient of every entry to its Gaussian's sums; the absolute ones too, where there is room for them."""
     for worker in prange(workers):
-        _render_backward_worker(
-            np.int64(worker),
-            workers,
-            strip_order,
-            ranges,
-            rows,
-            entries,
-            ends,
-            across,
-            image,
-            g_image,
-            absolute,
-            gradients,
-        )
+        state = np.empty(STATE, np.float32)
+        for turn in range(worker, len(bands), workers):
+            for strip in range(bands[turn, 0], bands[turn, 1]):
+                _render_backward_strip(
+                    strip, across, state, ranges, draws, entries, ends, image, g_image, moments, sums
+                )

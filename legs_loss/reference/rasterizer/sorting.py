@@ -69,12 +69,13 @@ def make_sums(firsts, fields):
 
 @compiled()
 def _number(boxes, slots, tall, firsts):
-    slot = row = 0
+    slot, row, tall = 0, 0, np.uint32(tall)  # 32 bits are divided in half the time
     for i in range(len(slots)):
         firsts[i, FIRST_SLOT], firsts[i, FIRST_SUM] = slot, row
         if slots[i] > 0:
             slot += slots[i]
-            row += bands_across(boxes[i, 0], boxes[i, 2]) * ((boxes[i, 3] - 1) // tall + 1 - boxes[i, 1] // tall)
+            down = np.uint32(boxes[i, 3] - 1) // tall + 1 - np.uint32(boxes[i, 1]) // tall
+            row += bands_across(boxes[i, 0], boxes[i, 2]) * np.int64(down)
     firsts[len(slots), FIRST_SLOT], firsts[len(slots), FIRST_SUM] = slot, row
 
 
@@ -136,6 +137,7 @@ def _sort_slots(order, firsts, reached, ranges, draws):
         ranges[strip] += ranges[strip - 1]
     cursors = ranges.copy()
     for turn in range(len(order)):
+        prefetch(firsts, order[min(turn + 2 * AHEAD, len(order) - 1)])
         prefetch(reached, firsts[order[min(turn + AHEAD, len(order) - 1)], FIRST_SLOT])
         owner = order[turn]
         i = np.uint64(owner)

@@ -235,6 +235,13 @@ for threads in (2, 1, 2):
         second = torch.autograd.grad(image.square().sum(), leaves)
         assert all(torch.equal(a, b) for a, b in zip(first, second))
 
+    def test_after_the_way_back_nothing_is_kept(self):
+        leaves = [tensor.requires_grad_() for tensor in scene()]
+        image = rasterize(*leaves, camera(), BACKGROUND, 3).image
+        image.sum().backward()
+        with pytest.raises(RuntimeError, match="backward through the graph a second time"):
+            image.sum().backward()
+
 
 class TestInterface:
     def test_strided_input(self):

@@ -107,23 +107,22 @@ def unpacked(rows):
 def order_by_depth(depths, slots):
     """Indices of the splats that are drawn, front to back; equal depths keep their order. A radix sort."""
     bits, count = depths.view(np.uint32), 0
-    order = np.empty(len(slots), np.int32)
+    order, starts = np.empty(len(slots), np.int32), np.zeros((3, 2049), np.int64)
     for i in range(len(slots)):
         if slots[i] > 0:
             order[count] = i
             count += 1
+            for digit in range(3):  # depths are positive: their bits, as integers, sort as they do
+                starts[digit, (bits[i] >> 11 * digit & 2047) + 1] += 1
     order = order[:count]
     other = np.empty_like(order)
-    for shift in (0, 11, 22):  # depths are positive: their bits, as integers, sort as they do
-        starts = np.zeros(2049, np.int64)
-        for i in order:
-            starts[((bits[i] >> shift) & 2047) + 1] += 1
+    for digit in range(3):
         for k in range(1, 2049):
-            starts[k] += starts[k - 1]
+            starts[digit, k] += starts[digit, k - 1]
         for i in order:
-            digit = (bits[i] >> shift) & 2047
-            other[starts[digit]] = i
-            starts[digit] += 1
+            k = np.uint64(bits[i] >> 11 * digit & 2047)
+            other[starts[digit, k]] = i
+            starts[digit, k] += 1
         order, other = other, order
     return order
 

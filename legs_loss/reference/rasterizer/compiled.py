@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, NamedTuple, Optional, Tuple
+from typing import Any, Callable, Dict, NamedTuple, Optional, Tuple
 
 import numba
 import numpy as np
@@ -172,18 +172,19 @@ class _Attach(torch.autograd.Function):
         # The image that is handed out may be changed in place; the one of the way back may not.
         image, radii = torch.from_numpy(drawing.image.copy()), torch.from_numpy(drawing.radii)
         ctx.mark_non_differentiable(radii)
-        # So that torch sees if an input is changed, and lets go of the drawing's arrays as soon as the way back is done.
+        # So that torch sees if an input is changed, and lets go of the drawing's arrays when the way back is done.
         large = [name for name, value in drawing._asdict().items() if isinstance(value, np.ndarray) and name != "radii"]
         arrays = (torch.from_numpy(getattr(drawing, name)) for name in large)
         ctx.save_for_backward(means, scales, quaternions, opacities, sh, covariances, *arrays)
         ctx.columns = 2 if viewspace is None else viewspace.shape[1]
-        ctx.large, ctx.drawing = large, drawing._replace(**dict.fromkeys(large))
+        nothing: Dict[str, Any] = dict.fromkeys(large)
+        ctx.large, ctx.drawing = large, drawing._replace(**nothing)
         return image, radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor, _: Any) -> Tuple[Optional[Tensor], ...]:
-        arrays = [tensor.numpy() for tensor in ctx.saved_tensors[-len(ctx.large) :]]
+        arrays = (tensor.numpy() for tensor in ctx.saved_tensors[-len(ctx.large) :])
         it: Drawing = ctx.drawing._replace(**dict(zip(ctx.large, arrays)))
         height, width = it.image.shape[1:]
         moments = strips.ABSOLUTE_MOMENTS if ctx.columns == 4 else strips.MOMENTS

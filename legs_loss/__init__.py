@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from legs_loss.errors import LegsError
     from legs_loss.loss import LEGSLoss, legs_loss, weighted_l1
     from legs_loss.response import response
-    from legs_loss.runtime import configure, l1_loss
+    from legs_loss.runtime import configure, l1_loss, unweighted
     from legs_loss.spec import PRESETS, WeightSpec
     from legs_loss.ssim import d_ssim, ssim
     from legs_loss.weights import weight_map
@@ -37,6 +37,7 @@ _HOMES = {
     "register_curve": "curves",
     "response": "response",
     "ssim": "ssim",
+    "unweighted": "runtime",
     "weight_map": "weights",
     "weighted_l1": "loss",
 }
@@ -54,6 +55,7 @@ __all__ = [
     "register_curve",
     "response",
     "ssim",
+    "unweighted",
     "weight_map",
     "weighted_l1",
 ]

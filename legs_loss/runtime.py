@@ -14,7 +14,7 @@ import sys
 import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Callable, List, Optional, Sequence, Set, Tuple, Union
+from typing import TYPE_CHECKING, Any, Callable, List, Optional, Sequence, Set, Tuple, TypeVar, Union
 
 import torch
 from torch import Tensor
@@ -30,10 +30,11 @@ from legs_loss.weights import weight_from_response, weight_map
 if TYPE_CHECKING:
     from legs_loss.store import WeightStore
 
-__all__ = ["Counts", "active", "configure", "counts", "l1_loss"]
+__all__ = ["Counts", "active", "configure", "counts", "l1_loss", "unweighted"]
 
 View = Union[str, int, Sequence[Union[str, int]], None]
 Own = Callable[[Tensor, Tensor], Tensor]
+Result = TypeVar("Result")
 
 
 @dataclass
@@ -42,7 +43,7 @@ class Counts:
 
     Attributes:
         weighted: calls that trained with a weight.
-        plain: calls that returned the plain mean: no gradient asked for, beta 0, or LEGS_OFF.
+        plain: calls that returned the plain mean: no gradient asked for, beta 0, LEGS_OFF, or `unweighted`.
         remembered: weight maps taken from the memo, per view.
         stored: weight maps taken from the store.
         computed: weight maps computed from their target.
@@ -133,7 +134,15 @@ class _Run:
         return self._store
 
 
+class _Thread(threading.local):
+    """How many calls of `unweighted` functions a thread is in."""
+
+    def __init__(self) -> None:
+        self.unweighted = 0  # on the instance: torch.compile does not ask again what the class says
+
+
 _counts = Counts()
+_thread = _Thread()
 _run: Optional[_Run] = None
 _lock = threading.RLock()
 
@@ -184,7 +193,7 @@ def l1_loss(
         raise LegsError(f'reduction must be "mean" or "none", got {reduction!r}')
     if own is not None and (mask is not None or reduction != "mean"):
         raise LegsError("own= replaces mask= and reduction=: what it returns is returned")
-    if not (prediction.requires_grad and torch.is_grad_enabled()):
+    if _thread.unweighted or not (prediction.requires_grad and torch.is_grad_enabled()):
         return _plain(prediction, target, mask, channels_last, reduction, own)
     run = _current_run()
     if not run.config.active:
@@ -239,6 +248,33 @@ def _in_one_batch(
     images = folded(prediction), folded(target)
     loss = l1_loss(*images, view, masked, channels_last, reduction, None if own is None else theirs)
     return loss.reshape(shape) if reduction == "none" else loss
+
+
+def unweighted(function: Callable[..., Result]) -> Callable[..., Result]:
+    """Return a function that calls another, in which ``l1_loss`` is meanwhile plain, as with LEGS_OFF.
+
+    For a loss that compares a rendering with its photograph in one call and with another rendering in the next: in that
+    one nothing is to be weighted. Only this thread is concerned, and only until the call returns or raises.
+
+    Args:
+        function: what is to be called, a module too.
+
+    Example:
+        >>> def photometric(image, gt_image):
+        ...     return 0.8 * l1_loss(image, gt_image) + 0.2 * (image - gt_image).square().mean()
+        >>> image, other = torch.rand(3, 8, 8, requires_grad=True), torch.rand(3, 8, 8)
+        >>> unweighted(photometric)(image, other) < photometric(image, other)
+        tensor(True)
+    """
+
+    def plain(*args: Any, **kwargs: Any) -> Result:
+        _thread.unweighted += 1
+        try:
+            return function(*args, **kwargs)
+        finally:
+            _thread.unweighted -= 1
+
+    return plain
 
 
 def configure(

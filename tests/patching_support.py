@@ -12,7 +12,7 @@ from tests.support import legs_environment
 
 CASES = Path(__file__).resolve().parent / "patching"
 NAMES = sorted(path.stem for path in CASES.glob("*.txt") if path.stem != "common")
-_MARK = re.compile(r"^\s*# (weighted|left|error): (.*)$")
+_MARK = re.compile(r"^\s*# (weighted|plain|left|error): (.*)$")
 
 
 def files(name):

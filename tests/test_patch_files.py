@@ -496,6 +496,52 @@ class TestCommandLine:
         assert "simple_trainer.py" in content["would_change"]
         assert content["wrote"] == []
 
+    def test_calls_that_stay_plain_are_reported_and_undone(self, tmp_path, run):
+        root = checkout(tmp_path, files("bodies_of_two"))
+        before = snapshot(root)
+        content = json.loads(run("--json", root).stdout)
+        assert [(plain["file"], plain["line"], plain["reason"]) for plain in content["plain"]] == [
+            ("blurry.py", 14, "distillation"),
+            ("avatar.py", 15, "distillation"),
+            ("train.py", 15, "distillation"),
+            ("train.py", 17, "distillation"),
+            ("train.py", 23, "depth"),
+            ("slam.py", 7, "tracking"),
+        ]
+        assert content["plain"][0]["weighted_at"] == "blurry.py:8"
+        assert "slam.py" in content["wrote"]
+        again = run(root)
+        assert "nothing to do: it is patched" in again.stdout
+        assert "slam.py:8                is there  patched before" in again.stdout
+        assert run("--undo", root).returncode == 0
+        assert snapshot(root) == before
+
+    def test_calls_of_a_body_chosen_by_hand_stay_plain_too(self, tmp_path, run):
+        root = checkout(tmp_path, files("bodies_of_two"))
+        done = run("--site", "utils/photometric.py:17", root)
+        assert done.returncode == 0, done.stderr
+        assert "legs_loss.unweighted(rgb_loss)(" in (root / "slam.py").read_text()
+        assert "import legs_loss" not in (root / "train.py").read_text()
+
+    @pytest.mark.parametrize(
+        ("line", "arguments"),
+        [
+            (b"    return rgb_loss(a, b)\n", ["--exclude", "old"]),
+            (b"    print 'of old', rgb_loss(a, b)\n", []),
+            (b"    return rgb_loss(a, b)  # \xe9\n", []),
+        ],
+        ids=["excluded", "Python 2", "not UTF-8"],
+    )
+    def test_a_call_in_a_file_that_is_not_read_is_an_error(self, line, arguments, tmp_path, run):
+        texts = files("bodies_of_two")
+        texts["old/slam.py"] = b"from utils.photometric import rgb_loss\n\n\ndef old(a, b):\n" + line
+        root = checkout(tmp_path, texts)
+        before = snapshot(root)
+        done = run(*arguments, root)
+        assert done.returncode == 2
+        assert "rgb_loss also serves tracking at slam.py:7; what it serves at old/slam.py cannot be told" in done.stderr
+        assert snapshot(root) == before
+
     def test_a_site_by_hand(self, tmp_path, run):
         root = checkout(tmp_path, files("inria"))
         done = run("--site", "train.py:44", root)

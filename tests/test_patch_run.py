@@ -204,6 +204,17 @@ class TestAsPythonRunsIt:
         assert snapshot(root) == before
         assert "losses.py:13 is weighted in this run" in done.stderr
 
+    def test_calls_stay_plain_in_memory_too(self, tmp_path):
+        texts = files("bodies_of_two")
+        texts["run.py"] = "import inspect, slam\nprint(inspect.getsource(slam.tracking), slam.legs_loss.__name__)\n"
+        root = checkout(tmp_path, texts)
+        before = snapshot(root)
+        done = python("-m", "legs_loss", "run", "run.py", cwd=root)
+        assert done.returncode == 0, done.stderr
+        assert "loss = legs_loss.unweighted(rgb_loss)(render(" in done.stdout
+        assert "slam.py:7 stays plain in this run" in done.stderr
+        assert snapshot(root) == before
+
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 
 import pytest
 import torch
 import torch.nn.functional as F
 
-from legs_loss import LegsError, configure, l1_loss, runtime, weight_map
-from legs_loss.runtime import active
+from legs_loss import LegsError, configure, l1_loss, runtime, unweighted, weight_map
+from legs_loss.runtime import active, counts
 
 
 @pytest.fixture(autouse=True)
@@ -155,6 +156,72 @@ def test_evaluation_is_the_codebase_s_own_line_too(name):
     with torch.no_grad():
         assert torch.equal(patched(prediction, target), own(prediction, target))
     assert torch.equal(patched(prediction.detach(), target), own(prediction.detach(), target))
+
+
+class TestUnweighted:
+    """``unweighted(photometric)(a, b)``: one call of a function in which ``l1_loss`` is plain."""
+
+    @pytest.mark.parametrize("name", LINES)
+    def test_is_the_codebase_s_own_line_to_the_last_bit(self, name):
+        own, patched = LINES[name]
+        for shape in ((3, 33, 47), (1, 3, 50, 21)):
+            prediction, target = pair(*shape)
+            expected, found = own(prediction, target), unweighted(patched)(prediction, target)
+            assert torch.equal(found, expected)
+            assert torch.equal(gradient(0.3 * found, prediction), gradient(0.3 * expected, prediction))
+
+    def test_ends_with_the_call_and_counts_as_plain(self):
+        prediction, target = pair(3, 9, 8)
+        weighted, before = l1_loss(prediction, target), counts()
+        assert unweighted(l1_loss)(prediction, target) < weighted
+        assert torch.equal(l1_loss(prediction, target), weighted)
+        after = counts()
+        assert (after.plain - before.plain, after.weighted - before.weighted) == (1, 1)
+
+    def test_nests_and_ends_with_an_exception(self):
+        prediction, target = pair(3, 9, 8)
+
+        def twice():
+            with pytest.raises(LegsError):
+                unweighted(l1_loss)(prediction, target, reduction="sum")
+            return unweighted(l1_loss)(prediction, target), l1_loss(prediction, target)
+
+        weighted = l1_loss(prediction, target)
+        inner, outer = unweighted(twice)()
+        assert torch.equal(inner, outer)
+        assert inner < weighted
+        assert torch.equal(l1_loss(prediction, target), weighted)
+
+    def test_concerns_its_own_thread_alone(self):
+        prediction, target = pair(3, 9, 8)
+        weighted = l1_loss(prediction, target)
+        elsewhere = []
+
+        def meanwhile():
+            thread = threading.Thread(target=lambda: elsewhere.append(l1_loss(prediction, target)))
+            thread.start()
+            thread.join()
+
+        unweighted(meanwhile)()
+        assert torch.equal(elsewhere[0], weighted)
+
+    def test_takes_a_module_and_keywords(self):
+        class Photometric(torch.nn.Module):
+            def forward(self, image, gt_image, share=1.0):
+                return share * l1_loss(image, gt_image)
+
+        prediction, target = pair(3, 9, 8)
+        found = unweighted(Photometric())(prediction, gt_image=target, share=0.5)
+        assert torch.equal(found, 0.5 * torch.abs(prediction - target).mean())
+
+    @pytest.mark.slow
+    @pytest.mark.skipif(not hasattr(torch, "compile"), reason="this torch has no torch.compile")
+    def test_of_a_compiled_function(self):
+        compiled = torch.compile(lambda p, t: l1_loss(p, t))
+        prediction, target = pair(3, 16, 16)
+        torch.testing.assert_close(compiled(prediction, target), l1_loss(prediction, target))
+        torch.testing.assert_close(unweighted(compiled)(prediction, target), torch.abs(prediction - target).mean())
+        torch.testing.assert_close(compiled(prediction, target), l1_loss(prediction, target))
 
 
 class TestLayout:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Tuple
+from typing import Dict, List, NamedTuple, Tuple
 
 import libcst as cst
 
@@ -12,7 +12,27 @@ from legs_adapters.reading.program import Program
 from legs_adapters.reading.provenance import View
 from legs_adapters.reading.repo import Unreadable
 
-__all__ = ["Findings", "Left", "Problem", "Site"]
+__all__ = ["Findings", "Kept", "Left", "Problem", "Site"]
+
+
+class Kept(NamedTuple):
+    """A call that stays unweighted although the function it calls has a site in it.
+
+    Attributes:
+        path, line, text: where it stands, and what that line says.
+        reason: what it is for, in one word.
+        function: what is called.
+        call: all of it.
+        scope: the function that it stands in.
+    """
+
+    path: str
+    line: int
+    text: str
+    reason: str
+    function: str
+    call: cst.Call
+    scope: Function
 
 
 class Site(NamedTuple):
@@ -29,6 +49,7 @@ class Site(NamedTuple):
         view: the verdict on ``view=``.
         scope: the function that it stands in.
         aside: other reads of the same error map, which are not the loss and keep the plain one.
+        kept: calls of that function that are not the loss.
     """
 
     path: str
@@ -42,6 +63,7 @@ class Site(NamedTuple):
     view: View
     scope: Function
     aside: Tuple[cst.Name, ...] = ()
+    kept: Tuple[Kept, ...] = ()
 
     @property
     def function(self) -> str:
@@ -85,3 +107,8 @@ class Findings(NamedTuple):
     patched: List[Left]
     unreadable: List[Unreadable]
     program: Program
+
+    @property
+    def kept(self) -> Dict[Kept, Site]:
+        """The calls that stay unweighted, each with a site in the function that it calls."""
+        return {kept: site for site in self.sites for kept in site.kept}

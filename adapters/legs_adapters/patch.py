@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 from pathlib import Path
@@ -73,7 +74,7 @@ def plan(
             readable.append(source)
         else:
             unreadable.append(source)
-    findings = find(readable, by_hand)
+    findings = find(readable, by_hand, _unread(root, exclude, unreadable))
     findings.unreadable[:0] = unreadable
     for name, line in by_hand:
         if not any(site.path == name and site.named_by(line) for site in findings.sites) and not any(
@@ -86,12 +87,26 @@ def plan(
             raise LegsError(f"there is no L1 term at {name}:{line} that can be rewritten")
     edits: Dict[str, List[Edit]] = {}
     after: Dict[str, bytes] = {}
-    for name in sorted({site.path for site in findings.sites}):
+    for name in sorted({site.path for site in findings.sites} | {call.path for call in findings.kept}):
         source, module = findings.program.sources[name], findings.program.module(name)
         assert module is not None
-        edits[name] = rewrite(source, module, [site for site in findings.sites if site.path == name], in_place)
+        sites = [site for site in findings.sites if site.path == name]
+        kept = [call for call in findings.kept if call.path == name]
+        edits[name] = rewrite(source, module, sites, kept, in_place)
         after[name] = apply_edits(source.data, edits[name])
     return Plan(root, findings, edits, after, settings)
+
+
+def _unread(root: Path, exclude: Sequence[str], unreadable: Sequence[Unreadable]) -> Dict[str, str]:
+    """The text, by path, of what is excluded or no Python: the names in it may be of functions that are patched."""
+    paths = {entry.path for entry in unreadable}
+    if exclude:
+        paths |= set(walk(root)) - set(walk(root, exclude))
+    texts: Dict[str, str] = {}
+    for path in sorted(paths):
+        with contextlib.suppress(OSError):
+            texts[path] = (root / path).read_text(encoding="utf-8", errors="replace")
+    return texts
 
 
 def write(plan: Plan, force: bool = False) -> List[str]:

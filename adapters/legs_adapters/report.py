@@ -22,6 +22,9 @@ def as_table(plan: Plan) -> str:
     for site in found.sites:
         verdict = f"view={site.view.text}" if site.view.text else "no view="
         rows.append((site.path, site.line, "weighted", f"{verdict}: {site.view.reason}"))
+    for kept, site in found.kept.items():
+        why = f"{kept.reason}: {kept.function} is weighted at {site.path}:{site.line}, in this call it is not"
+        rows.append((kept.path, kept.line, "plain", why))
     rows += [(entry.path, entry.line, "is there", "patched before") for entry in found.patched]
     rows += [(entry.path, entry.line, "left", entry.reason) for entry in found.left]
     rows += [(entry.path, entry.line, "ERROR", entry.reason) for entry in found.problems]
@@ -51,6 +54,16 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
                 "channels_last": site.channels_last,
             }
             for site in found.sites
+        ],
+        "plain": [
+            {
+                "file": kept.path,
+                "line": kept.line,
+                "code": kept.text,
+                "reason": kept.reason,
+                "weighted_at": f"{site.path}:{site.line}",
+            }
+            for kept, site in found.kept.items()
         ],
         "left": [{"file": e.path, "line": e.line, "code": e.text, "reason": e.reason} for e in found.left],
         "patched": [{"file": e.path, "line": e.line, "code": e.text} for e in found.patched],

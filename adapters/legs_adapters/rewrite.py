@@ -3,6 +3,9 @@
     Ll1 = l1_loss(image, gt_image)
     Ll1 = legs_loss.l1_loss(image, gt_image, view=viewpoint_cam.image_name)
 
+    loss += photometric(image, other_image.detach(), opt)
+    loss += legs_loss.unweighted(photometric)(image, other_image.detach(), opt)
+
 An edit never changes the number of lines of the expression it replaces: comments and line breaks inside are kept.
 """
 
@@ -15,7 +18,7 @@ from typing import List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
 
-from legs_adapters.findings import Site
+from legs_adapters.findings import Kept, Site
 from legs_adapters.reading.module import Function, Module
 from legs_adapters.reading.repo import Source, decode
 from legs_adapters.reading.syntax import code, dotted
@@ -49,12 +52,15 @@ def apply_edits(data: bytes, edits: Sequence[Edit]) -> bytes:
     return b"".join([*parts, data[at:]])
 
 
-def rewrite(source: Source, module: Module, sites: Sequence[Site], in_place: bool = False) -> List[Edit]:
+def rewrite(
+    source: Source, module: Module, sites: Sequence[Site], kept: Sequence[Kept] = (), in_place: bool = False
+) -> List[Edit]:
     """Return the edits that give one file the LEGS loss.
 
     Args:
         source, module: the file, and its parsed form.
         sites: its sites.
+        kept: its calls that stay unweighted.
         in_place: put the import on a line that is there, so that every line keeps its number.
 
     Raises:
@@ -62,7 +68,8 @@ def rewrite(source: Source, module: Module, sites: Sequence[Site], in_place: boo
     """
     name, imported = _package_name(module)
     edits = [edit for site in sites for edit in _Text(source, site.scope).edits_for(site, name)]
-    if sites and not imported:
+    edits += [edit for call in kept for edit in _Text(source, call.scope).edits_around(call, name)]
+    if (sites or kept) and not imported:
         edits.append(_Text(source, module.top).import_edit(name, in_place))
     edits.sort()
     checked = decode(source.path, apply_edits(source.data, edits))
@@ -106,6 +113,12 @@ class _Text:
     def edit(self, start: int, end: int, after: str) -> Edit:
         start, end = start + self.shift, end + self.shift
         return Edit(start, end, self.source.data[start:end], after.encode("utf-8"))
+
+    # -- one call that stays unweighted
+
+    def edits_around(self, kept: Kept, name: str) -> List[Edit]:
+        start, end = self.span(kept.call.func, True)
+        return [self.edit(start, start, f"{name}.unweighted("), self.edit(end, end, ")")]
 
     # -- one site
 

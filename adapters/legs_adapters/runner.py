@@ -75,6 +75,8 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
     sources = {os.path.realpath(str(root / name)): data for name, data in found.after.items()}
     for site in found.findings.sites:
         print(f"legs-loss: {site.path}:{site.line} is weighted in this run", file=sys.stderr, flush=True)
+    for kept in found.findings.kept:
+        print(f"legs-loss: {kept.path}:{kept.line} stays plain in this run", file=sys.stderr, flush=True)
     return execute(str(script), arguments, sources, root if cpu else None)
 
 

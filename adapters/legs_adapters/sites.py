@@ -7,11 +7,11 @@ the tree (see flow, training, l1, meaning); what cannot be decided is a problem 
 from __future__ import annotations
 
 import re
-from typing import Iterable, List, Optional, Sequence, Tuple
+from typing import Iterable, List, Mapping, Optional, Sequence, Tuple
 
 import libcst as cst
 
-from legs_adapters.findings import Findings, Left, Problem, Site
+from legs_adapters.findings import Findings, Kept, Left, Problem, Site
 from legs_adapters.reading.handed import Handed, HandedOver
 from legs_adapters.reading.l1 import Form, Forms, own_shape
 from legs_adapters.reading.layout import is_channels_last, lies_last
@@ -26,25 +26,32 @@ from legs_adapters.reading.repo import Source
 from legs_adapters.reading.shared import is_asked, is_huber, is_measured, shared_of, unchanged_at
 from legs_adapters.reading.syntax import call_name, code, same, walk_expressions, words
 from legs_adapters.reading.training import Training
+from legs_adapters.reading.uses import Use, Uses, detaches
 from legs_adapters.reading.vocabulary import kind_of_words
 from legs_adapters.upstreams import registered
 
 __all__ = ["find"]
 
 _FORWARD = ("forward", "__call__")
+_PATCHED = ("legs_loss.l1_loss", "legs_loss.unweighted")
 _NOT_OF_SPLATS = ("other", "definition")
 _PICTURES = {"depth", "normals", "features", "flow", "mask"}  # what else is compared in a training step
-_MAY_HAVE_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(")
+_MAY_HAVE_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(|\bunweighted\(")
 
 
-def find(sources: Iterable[Source], by_hand: Sequence[Tuple[str, int]] = ()) -> Findings:
+def find(
+    sources: Iterable[Source],
+    by_hand: Sequence[Tuple[str, int]] = (),
+    unread: Optional[Mapping[str, str]] = None,
+) -> Findings:
     """Find the photometric terms of a checkout.
 
     Args:
         sources: its files.
         by_hand: (path, line) of L1 terms that are sites because the user says so; nothing else is a site then.
+        unread: by path, the text of files that are not to be looked at, or cannot be.
     """
-    return _Finder(Program(sources), by_hand).run()
+    return _Finder(Program(sources, unread), by_hand).run()
 
 
 class _Finder:
@@ -55,6 +62,7 @@ class _Finder:
         self.meanings = Meanings(program, self.training)
         self.views = Views(program)
         self.reasons = Reasons(program, self.training, self.meanings)
+        self.uses = Uses(program, self.training, self.meanings, self.reasons)
         self.forms = Forms(program)
         self.handed = Handed(program, self.training, self.forms)
         self.found = Findings([], [], [], [], [], [], program)
@@ -141,7 +149,7 @@ class _Finder:
             return False
         if is_measured(function, form) or self.reasons.evaluates(function):
             return False
-        if left.reason == "distillation" and (_detaches(form.first) or _detaches(form.second)):
+        if left.reason == "distillation" and (detaches(form.first) or detaches(form.second)):
             return False
         pair = pair_of(self.meanings, function, form)
         pictures = "image" in (pair.a.kind, pair.b.kind)
@@ -208,7 +216,7 @@ class _Finder:
         return "unknown" if reason is None and swapped(pair.a, pair.b) is not False else reason
 
     def _patched(self, function: Function) -> List[Left]:
-        """What refers to legs_loss.l1_loss already: calls, and names that it is given."""
+        """What refers to legs_loss already: calls, and names that it is given."""
         if "legs_loss" not in function.module.text:
             return []
         nodes: List[cst.CSTNode] = [call.func for call in function.flow.calls]
@@ -217,9 +225,7 @@ class _Finder:
         return [
             self._left(function, function.place(node), "patched")
             for node in nodes
-            if any(
-                r.kind == "external" and r.target == "legs_loss.l1_loss" for r in self.program.resolve(function, node)
-            )
+            if any(r.kind == "external" and r.target in _PATCHED for r in self.program.resolve(function, node))
         ]
 
     # -- one form
@@ -250,14 +256,17 @@ class _Finder:
             return self._left(function, place, "huber")
         if not form.direct and not unchanged_at(function, form.call, form.first, form.second):
             return self._problem(function, form, place, "the difference has a name of its own", flipped)
-        uses = self._uses(function, prediction, target)
-        for use, where in uses:
-            if use is not None and all(other is not None for other, _ in uses):
-                return self._left(function, place, use)
-            if use is not None:  # its body cannot be both
-                why = f"{function.name} also serves {use} at {where}"
-                problem = self._problem(function, form, place, why, flipped)
-                return problem._replace(advice=problem.advice + _in_a_copy(function, uses))
+        uses = self.uses.of(function, prediction, target)
+        others = [(use, use.purpose) for use in uses if use.purpose is not None]
+        if others and len(others) == len(uses):
+            return self._left(function, place, others[0][1])
+        unsettled = self.uses.unsettled(function, uses) if others else None
+        if unsettled is not None:  # its body cannot be both
+            first, purpose = others[0]
+            why = f"{function.name} also serves {purpose} at {first.where}"
+            why += f"; what it serves at {unsettled} cannot be told" if unsettled != first.where else ""
+            problem = self._problem(function, form, place, why, flipped)
+            return problem._replace(advice=problem.advice + _in_a_copy(function, uses))
         shared = shared_of(self.training, function, form)
         aside: Tuple[cst.Name, ...] = ()
         if shared is not None and not shared.trains:
@@ -273,7 +282,13 @@ class _Finder:
         last = last or (picked is not None and lies_last(function, picked[0]))
         view = self.views.of(function, target, form.call)
         stands = (function.module.path, place.line, place.column, place.last_line)
-        return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside)
+        kept = tuple(self._kept(function, *other) for other in others)
+        return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside, kept)
+
+    @staticmethod
+    def _kept(function: Function, use: Use, purpose: str) -> Kept:
+        module, line = use.caller.module, use.caller.place(use.call).line
+        return Kept(module.path, line, module.lines.text(line), purpose, _called(function), use.call, use.caller)
 
     def _picked(self, function: Function, form: Form) -> Optional[Tuple[cst.Subscript, cst.Subscript]]:
         """``image[:, mask]`` and ``photo[:, mask]`` of a form that compares names of theirs.
@@ -299,26 +314,6 @@ class _Finder:
             and _is_same_place(function, form.first, prediction)
         ]
         return any(is_channels_last(self.training, function, prediction, other) for other in (target, *others))
-
-    def _uses(
-        self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode
-    ) -> List[Tuple[Optional[str], str]]:
-        """What the calls of a function that compares two parameters are for, None for the loss, and where they are."""
-        found: List[Tuple[Optional[str], Optional[str], str]] = []
-        if not isinstance(target, cst.Name):
-            return []
-        calls = self.training.sites.get(function, [])
-        for caller, call in sorted(calls, key=lambda site: (site[0].module.path, site[0].place(site[1]).line)):
-            photograph = function.given(call, target.value)
-            rendering = function.given(call, prediction.value) if isinstance(prediction, cst.Name) else None
-            if photograph is not None:
-                meanings = [self.meanings.of(caller, node) for node in (rendering, photograph) if node is not None]
-                if meanings[-1].role is None and _detaches(photograph):  # which no photograph needs
-                    meanings[-1] = meanings[-1]._replace(role="render")
-                where = f"{caller.module.path}:{caller.place(call).line}"
-                found.append((meanings[0].kind, self.reasons.use(caller, call, meanings), where))
-        pictures = any(kind == "image" for kind, _, _ in found)
-        return [("something unknown" if pictures and kind is None else use, where) for kind, use, where in found]
 
     def _is_definition(self, function: Function, form: Form) -> bool:
         """Whether this is the body of the codebase's own L1 function, whose calls are what counts."""
@@ -380,16 +375,16 @@ def _says_warped(form: Form) -> bool:
     return any(kind_of_words(text) == "warp" for text in said)
 
 
-def _detaches(node: cst.CSTNode) -> bool:
-    return any(isinstance(part, cst.Call) and call_name(part) == "detach" for part in walk_expressions(node))
+def _called(function: Function) -> str:
+    """What a function is called by: of a ``forward`` the name of its class."""
+    return function.owner.name if function.owner is not None and function.name in _FORWARD else function.name
 
 
-def _in_a_copy(function: Function, uses: Sequence[Tuple[Optional[str], str]]) -> str:
+def _in_a_copy(function: Function, uses: Sequence[Use]) -> str:
     """Where to write it, for a function that some calls need as it is."""
-    owner = function.owner if function.name in _FORWARD else None
-    calls = [where for use, where in uses if use is None]
+    calls = [use.where for use in uses if use.purpose is None]
     shown = ", ".join(calls[:3]) + (f" and {len(calls) - 3} more" if len(calls) > 3 else "")
-    return f", in a copy of {owner.name if owner else function.name} for {shown}" if calls else ""
+    return f", in a copy of {_called(function)} for {shown}" if calls else ""
 
 
 def _is_torch(callee: cst.BaseExpression) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from pathlib import PurePosixPath
-from typing import Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
+from typing import Dict, Iterable, List, Mapping, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
@@ -52,13 +52,16 @@ class Program:
 
     Args:
         sources: the readable files.
+        unread: by path, the text of those that are not to be looked at, or cannot be: all that is asked of it is
+            whether it says a name.
 
     Attributes:
         prospects: which texts can lead to an L1.
         only_differences: of which functions it is known whether they are an L1 of their first two parameters.
     """
 
-    def __init__(self, sources: Iterable[Source]) -> None:
+    def __init__(self, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> None:
+        self.unread = unread or {}
         self.sources: Dict[str, Source] = {source.path: source for source in sources}
         self._unreadable: Dict[str, Unreadable] = {}
         self.prospects = Prospects(source.text for source in self.sources.values())

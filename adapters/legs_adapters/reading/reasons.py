@@ -86,7 +86,7 @@ class Reasons:
             return "regulariser"
         trained = self.training.includes(form.node) or self.training.includes(form.call)
         trained = trained or self._called_by_framework(function)
-        if not trained or self._without_grad(function, form):
+        if not trained or self.without_grad(function, form.call, form.node):
             return self._why_untrained(function, form)
         if _OTHERS.search(function.module.text) and not _TORCH.search(function.module.text):
             return "not torch"
@@ -215,9 +215,10 @@ class Reasons:
             f.name == "forward" and f.owner is not None and f not in self.training.sites for f in above
         )
 
-    def _without_grad(self, function: Function, form: Form) -> bool:
+    def without_grad(self, function: Function, *nodes: cst.CSTNode) -> bool:
+        """Whether expressions stand where no gradient is kept."""
         scope: Optional[Function] = function
-        if id(form.call) in function.flow.without_grad or id(form.node) in function.flow.without_grad:
+        if any(id(node) in function.flow.without_grad for node in nodes):
             return True
         while scope is not None:
             if set(scope.decorators) & {"no_grad", "inference_mode"}:
@@ -237,7 +238,7 @@ class Reasons:
         spoken = {word for part in said for word in words(part)}
         if spoken & _SCORING:
             return "scoring"
-        if spoken & _EVALUATION or self._without_grad(function, form):
+        if spoken & _EVALUATION or self.without_grad(function, form.call, form.node):
             return "evaluation"
         return "untrained"
 

@@ -551,6 +551,21 @@ class TestCommandLine:
         assert missing.returncode == 2
         assert "there is no L1 term at train.py:3" in missing.stderr
 
+    def test_a_function_that_is_settled_at_run_time_is_weighted_by_hand(self, tmp_path, run):
+        root = checkout(tmp_path, files("settled_at_run_time"))
+        before = snapshot(root)
+        line = (
+            files("settled_at_run_time")["train.py"].splitlines().index("        loss1 = loss_func(image, gt_image)")
+            + 1
+        )
+        done = run("--site", f"train.py:{line}", root)
+        assert done.returncode == 0, done.stderr
+        text = (root / "train.py").read_text()
+        assert "loss1 = legs_loss.l1_loss(image, gt_image, view=cam.image_name, own=loss_func)\n" in text
+        assert text.count("own=") == 1
+        assert run("--undo", root).returncode == 0
+        assert snapshot(root) == before
+
     def test_folders_that_are_not_entered_are_named_where_nothing_was_found(self, tmp_path, run):
         vendored = {f"third_party/gaussian-splatting/{path}": text for path, text in files("inria").items()}
         mentions = {path: "from losses import l1_loss\n" for path in ("extern/a/x.py", "tests/x.py", "venv/x.py")}

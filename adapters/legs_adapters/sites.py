@@ -7,7 +7,7 @@ the tree (see flow, training, l1, meaning); what cannot be decided is a problem 
 from __future__ import annotations
 
 import re
-from typing import Iterable, List, Mapping, Optional, Sequence, Tuple
+from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple, Union
 
 import libcst as cst
 
@@ -23,6 +23,7 @@ from legs_adapters.reading.program import Program
 from legs_adapters.reading.provenance import View, Views
 from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
+from legs_adapters.reading.run_time import STRUCTURAL, chosen_at_run_time
 from legs_adapters.reading.shared import is_asked, is_huber, is_measured, shared_of, unchanged_at
 from legs_adapters.reading.syntax import call_name, code, same, walk_expressions, words
 from legs_adapters.reading.training import Training
@@ -31,6 +32,8 @@ from legs_adapters.reading.vocabulary import kind_of_words
 from legs_adapters.upstreams import registered
 
 __all__ = ["find"]
+
+Entry = Tuple[Place, Union[Site, Left, Problem]]
 
 _FORWARD = ("forward", "__call__")
 _PATCHED = ("legs_loss.l1_loss", "legs_loss.unweighted")
@@ -89,10 +92,10 @@ class _Finder:
         return trains and not about and doubt.path not in settled
 
     def _module(self, module: Module) -> None:
-        entries: List[Tuple[Tuple[int, int], Site | Left | Problem]] = []
+        entries: List[Entry] = []
         patched: List[Left] = []
         try:
-            for function in module.scopes(self.program.prospects.of):
+            for function in module.scopes(lambda text: self.program.prospects.of(text) or STRUCTURAL.search(text)):
                 entries += self._entries(function)
                 patched += self._patched(function)
         except ValueError:
@@ -100,7 +103,7 @@ class _Finder:
             return
         if module.failure is not None:
             return
-        for _, entry in sorted(entries, key=lambda item: item[0]):
+        for _, entry in sorted(entries, key=lambda item: (item[0].line, item[0].column)):
             if isinstance(entry, Site):
                 self.found.sites.append(entry)
             elif isinstance(entry, Problem):
@@ -109,12 +112,19 @@ class _Finder:
                 self.found.left.append(entry)
         self.found.patched.extend(sorted(patched, key=lambda entry: entry.line))
 
-    def _entries(self, function: Function) -> List[Tuple[Tuple[int, int], Site | Left | Problem]]:
-        """What is to be said of each L1 in a function, by where it is."""
-        entries: List[Tuple[Tuple[int, int], Site | Left | Problem]] = []
+    def _entries(self, function: Function) -> Iterator[Entry]:
+        """What is to be said of each L1 in a function, with where it is."""
         # Elsewhere an L1 could only be one by a name of a name, and nothing trains on it.
-        worth = self.program.prospects.near(function.text) or self.training.touches(function)
-        for form in self.forms.of(function) if worth else ():
+        if self.program.prospects.near(function.text) or self.training.touches(function):
+            yield from self._of_forms(function)
+            if not self.by_hand:
+                yield from self._of_kernels(function)
+        if STRUCTURAL.search(function.text):
+            yield from self._of_chosen(function)
+        yield from self._of_callables(function)
+
+    def _of_forms(self, function: Function) -> Iterator[Entry]:
+        for form in self.forms.of(function):
             place = function.place(form.node)
             chosen = self._is_chosen(function, place)
             verdict = self._verdict(function, form, place, chosen)
@@ -123,20 +133,30 @@ class _Finder:
             if self.by_hand and not chosen and not isinstance(verdict, Left):
                 verdict = self._left(function, place, "not chosen")
             if not (isinstance(verdict, Left) and self._is_noise(function, form, verdict)):
-                entries.append(((place.line, place.column), verdict))
+                yield place, verdict
+
+    def _of_chosen(self, function: Function) -> Iterator[Entry]:
+        for form in chosen_at_run_time(self.program, self.training, function, self.forms.of(function)):
+            place = function.place(form.node)
+            if self._is_chosen(function, place):
+                yield place, self._verdict(function, form, place, True)
+            elif not self.by_hand:
+                yield place, self._of_any(function, form, place)
+
+    def _of_kernels(self, function: Function) -> Iterator[Entry]:
+        for call in function.flow.calls:
+            if self._is_kernel(function, call):
+                place = function.place(call)
+                yield place, self._of_kernel(function, call, place)
+
+    def _of_callables(self, function: Function) -> Iterator[Entry]:
         callables = [(entry.form, self._why_not_handed(entry)) for entry in self.handed.by_holder.get(function, ())]
         for call in function.flow.calls if registered.MENTIONED.search(function.text) else ():
             callables += [(form, None) for form in registered.forms_of(self.program, function, call)]
-        for call in function.flow.calls if worth and not self.by_hand else ():
-            if self._is_kernel(function, call):
-                place = function.place(call)
-                entries.append(((place.line, place.column), self._of_kernel(function, call, place)))
         for form, reason in callables:
             place = function.place(form.node)
             if not self.by_hand or self._is_chosen(function, place):
-                verdict = self._left(function, place, reason) if reason else self._callable(function, form, place)
-                entries.append(((place.line, place.column), verdict))
-        return entries
+                yield place, self._left(function, place, reason) if reason else self._callable(function, form, place)
 
     def _is_doubtful(self, function: Function, form: Form, left: Left) -> bool:
         """Whether a person should have a look at what was left, if nothing else is found."""
@@ -180,6 +200,15 @@ class _Finder:
         advice = f"(1 - w) * legs_loss.l1_loss({sides}) + w * legs_loss.d_ssim({sides})"
         why = "L1 and SSIM are one function here; with w, its weight of SSIM, they are two"
         return Problem(module.path, place.line, module.lines.text(place.line), why, advice)
+
+    def _of_any(self, function: Function, form: Form, place: Place) -> Left | Problem:
+        pair = pair_of(self.meanings, function, form)
+        reason = self.reasons.why(function, form, pair)
+        if reason is not None:
+            return self._left(function, place, reason)
+        assert form.callee is not None
+        why = f"{_short(form.callee)} is settled at run time, and may be no L1"
+        return self._problem(function, form, place, why, bool(swapped(pair.a, pair.b)))
 
     def _is_noise(self, function: Function, form: Form, left: Left) -> bool:
         """An absolute difference that is no loss: of angles, sizes, neighbouring pixels."""

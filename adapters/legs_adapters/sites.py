@@ -13,7 +13,7 @@ import libcst as cst
 
 from legs_adapters.findings import Findings, Kept, Left, Problem, Site
 from legs_adapters.reading.handed import Handed, HandedOver
-from legs_adapters.reading.l1 import Form, Forms, own_shape
+from legs_adapters.reading.l1 import Form, Forms, abs_argument, own_shape
 from legs_adapters.reading.layout import is_channels_last, lies_last
 from legs_adapters.reading.meaning import Meanings
 from legs_adapters.reading.module import Function, Module
@@ -212,7 +212,7 @@ class _Finder:
 
     def _is_noise(self, function: Function, form: Form, left: Left) -> bool:
         """An absolute difference that is no loss: of angles, sizes, neighbouring pixels."""
-        if form.callee is not None or form.reduction not in ("none", "wrapped"):
+        if form.callee is not None or form.reduction not in ("none", "wrapped", "signed"):
             return False
         trained = self.training.includes(form.node) and left.reason in _PICTURES and not same_root(form)
         if trained or left.reason in ("definition", "tracking", "distillation", "huber"):
@@ -283,6 +283,9 @@ class _Finder:
             return self._problem(function, form, place, why, flipped)
         if is_huber(self.training, function, form):
             return self._left(function, place, "huber")
+        if form.reduction == "signed":
+            why = f"the difference {_short(_difference(form))} was weighted where it was made, which l1_loss would lose"
+            return self._problem(function, form, place, why, flipped)
         if not form.direct and not unchanged_at(function, form.call, form.first, form.second):
             return self._problem(function, form, place, "the difference has a name of its own", flipped)
         uses = self.uses.of(function, prediction, target)
@@ -384,6 +387,10 @@ def _advice(form: Form, flipped: bool, last: bool, rows: bool) -> str:
     whole, other = without_rows(prediction), without_rows(target)
     if whole is not prediction and other is not target:
         return f"legs_loss.l1_loss({_short(whole)}, {_short(other)}.reshape({_short(whole)}.shape), channels_last=True)"
+    if form.reduction == "signed":
+        mean = ".mean()" if form.node is not form.call else ""
+        weight = f"legs_loss.weight_map({_short(target)}{', channels_last=True' if last else ''})"
+        return f"torch.abs({weight} * {_short(_difference(form))}){mean}"
     if rows:
         return "legs_loss.l1_loss(rendering, photograph), with the pictures before they became lists"
     settings = ", channels_last=True" if last else ""
@@ -395,6 +402,13 @@ def _advice(form: Form, flipped: bool, last: bool, rows: bool) -> str:
         extras = ", ".join(_short(extra.with_changes(comma=cst.MaybeSentinel.DEFAULT)) for extra in form.extras)
         settings += f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
     return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{settings})"
+
+
+def _difference(form: Form) -> cst.BaseExpression:
+    """What the absolute value is taken of."""
+    difference = abs_argument(form.call)
+    assert difference is not None
+    return difference
 
 
 def _says_warped(form: Form) -> bool:

@@ -11,7 +11,7 @@ from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program, Reference
 from legs_adapters.reading.syntax import arguments, call_name, code, constant, key_of, walk_expressions
 
-__all__ = ["Form", "Forms", "forms", "is_l1_name", "own_shape"]
+__all__ = ["Form", "Forms", "abs_argument", "forms", "is_l1_name", "own_shape"]
 
 _TORCH_L1 = re.compile(r"(^|\.)(torch\.nn\.functional|nn\.functional|functional)\.l1_loss$")
 _GSPLAT_L1 = re.compile(r"^gsplat\.losses\.l1_loss$")
@@ -38,7 +38,8 @@ class Form(NamedTuple):
         first, second: the two arguments, as written.
         reduction: "mean", "none" (an unreduced map), "own": what the codebase's function makes of it, "wrapped":
             an expression around the difference, "again": a map with another use, of which ``node`` is the read that
-            is the loss, or "callable" and "registered" for a function handed over by name.
+            is the loss, "signed": of a difference that a function made and weighted, or "callable" and "registered" for
+            a function handed over by name.
         callee: what is called, for a form that is a call of a function; None for ``abs``.
         extras: the call's further arguments.
         difference: the ``a - b``, for a form that is an absolute value.
@@ -70,7 +71,7 @@ def forms(program: Program, function: Function) -> List[Form]:
     for node in function.flow.expressions:
         if id(node) in inside or not isinstance(node, cst.Call):
             continue
-        form = _absolute(function, node) or _call(program, function, node)
+        form = _absolute(program, function, node) or _call(program, function, node)
         if form is not None:
             found.append(form)
             inside.add(id(form.call))
@@ -110,12 +111,12 @@ def _transformed(function: Function) -> Set[int]:
 # -- absolute values
 
 
-def _absolute(function: Function, node: cst.Call) -> Optional[Form]:
+def _absolute(program: Program, function: Function, node: cst.Call) -> Optional[Form]:
     reduction, inner = "none", node
     meant = _mean_of(node)
     if meant is not None:
         reduction, inner = "mean", meant
-    argument = _abs_argument(inner)
+    argument = abs_argument(inner)
     if argument is None:
         return None
     if isinstance(argument, cst.BinaryOperation) and isinstance(argument.operator, cst.Subtract):
@@ -136,7 +137,29 @@ def _absolute(function: Function, node: cst.Call) -> Optional[Form]:
             value = definitions[0].value
             if isinstance(value, cst.BinaryOperation) and isinstance(value.operator, cst.Subtract):
                 return Form(node, inner, value.left, value.right, reduction, None, (), value, False, selection)
+            if isinstance(value, cst.Call) and not selection and _returns_difference(program, function, value):
+                first, second = arguments(value)[0][:2]
+                return Form(node, inner, first, second, "signed")
     return None
+
+
+def _returns_difference(program: Program, function: Function, call: cst.Call) -> bool:
+    """``difference = relative(image, gt)``, where that is ``weight * (a - b)`` of its first two parameters."""
+    made = program.resolve(function, call.func)
+    if len(made) != 1 or made[0].guess or not isinstance(made[0].target, Function) or len(arguments(call)[0]) < 2:
+        return False
+    maker = made[0].target
+    if len(maker.flow.returns) != 1 or len(maker.parameters) < 2:
+        return False
+    value: Optional[cst.CSTNode] = maker.flow.returns[0]
+    if isinstance(value, cst.Name):
+        found = list(maker.flow.reaching(value))
+        value = found[0].value if len(found) == 1 and found[0].kind == "assign" else None
+    if not isinstance(value, cst.BinaryOperation) or not isinstance(value.operator, (cst.Multiply, cst.Divide)):
+        return False
+    sides = [side for side in (value.left, value.right) if isinstance(side, cst.BinaryOperation)]
+    compared = [{code(side.left), code(side.right)} for side in sides if isinstance(side.operator, cst.Subtract)]
+    return set(maker.parameters[:2]) in compared
 
 
 def _is_number(node: cst.CSTNode) -> bool:
@@ -154,7 +177,8 @@ def _mean_of(node: cst.Call) -> Optional[cst.Call]:
     return None
 
 
-def _abs_argument(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
+def abs_argument(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
+    """Return what an absolute value is taken of; None of what takes none."""
     if not isinstance(node, cst.Call) or not _is_abs(node):
         return None
     if isinstance(node.func, cst.Attribute) and not node.args:
@@ -323,7 +347,7 @@ def _shape_of(program: Program, function: Function, node: cst.CSTNode, a: str, b
     if not isinstance(node, cst.Call):
         return None
     meant = _mean_of(node)
-    argument = _abs_argument(meant if meant is not None else node)
+    argument = abs_argument(meant if meant is not None else node)
     if isinstance(argument, cst.BinaryOperation) and isinstance(argument.operator, cst.Subtract):
         if {code(argument.left).strip("() "), code(argument.right).strip("() ")} == {a, b}:
             return "mean" if meant is not None else "none"

@@ -25,7 +25,7 @@ from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
 from legs_adapters.reading.run_time import STRUCTURAL, chosen_at_run_time
 from legs_adapters.reading.shared import is_asked, is_huber, is_measured, shared_of, unchanged_at
-from legs_adapters.reading.syntax import call_name, code, same, walk_expressions, words
+from legs_adapters.reading.syntax import arguments, call_name, code, same, walk_expressions, words
 from legs_adapters.reading.training import Training
 from legs_adapters.reading.uses import Use, Uses, detaches
 from legs_adapters.reading.vocabulary import kind_of_words
@@ -150,7 +150,9 @@ class _Finder:
                 yield place, self._of_kernel(function, call, place)
 
     def _of_callables(self, function: Function) -> Iterator[Entry]:
-        callables = [(entry.form, self._why_not_handed(entry)) for entry in self.handed.by_holder.get(function, ())]
+        callables = [
+            (entry.form, self._why_not_handed(function, entry)) for entry in self.handed.by_holder.get(function, ())
+        ]
         for call in function.flow.calls if registered.MENTIONED.search(function.text) else ():
             callables += [(form, None) for form in registered.forms_of(self.program, function, call)]
         for form, reason in callables:
@@ -239,9 +241,12 @@ class _Finder:
         where = (function.module.path, place.line, place.column, place.line)
         return Site(*where, form, False, "", False, view, function)
 
-    def _why_not_handed(self, entry: HandedOver) -> Optional[str]:
+    def _why_not_handed(self, holder: Function, entry: HandedOver) -> Optional[str]:
         pair = pair_of(self.meanings, entry.caller, entry.form)
         reason = self.reasons.why(entry.caller, entry.form, pair)
+        if reason is None and entry.outer is not None:
+            given = [self.meanings.of(holder, value) for value in arguments(entry.outer)[0][:2]]
+            reason = self.reasons.use(holder, entry.outer, given) if given else "unknown"
         return "unknown" if reason is None and swapped(pair.a, pair.b) is not False else reason
 
     def _patched(self, function: Function) -> List[Left]:

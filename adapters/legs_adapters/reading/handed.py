@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Set
+from typing import Dict, List, NamedTuple, Optional, Set
 
 import libcst as cst
 
-from legs_adapters.reading.l1 import Form, Forms, own_shape
+from legs_adapters.reading.l1 import Form, Forms, is_l1_function, own_shape
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.training import Training
@@ -15,10 +15,14 @@ __all__ = ["Handed", "HandedOver"]
 
 
 class HandedOver(NamedTuple):
-    """A name handed over: the form to replace, and the function where it is called in the end."""
+    """A name handed over: the form to replace, and the function where it is called in the end.
+
+    ``outer`` is the call that hands it there, for one of a list: one function may be given pictures and depths so.
+    """
 
     form: Form
     caller: Function
+    outer: Optional[cst.Call] = None
 
 
 class Handed:
@@ -56,3 +60,21 @@ class Handed:
                     reduction = "callable" if shape == "mean" else "registered"
                     form = Form(value, call, call.args[0].value, call.args[1].value, reduction, value)
                     self.by_holder.setdefault(holder, []).append(HandedOver(form, caller))
+        for function in list(training.sites):
+            self._in_lists(program, training, function)
+
+    def _in_lists(self, program: Program, training: Training, function: Function) -> None:
+        """``on_crops(image, gt, [l1, perceptual])``, which calls ``losses[i](image, gt)``."""
+        for call in function.flow.calls:
+            table = call.func.value if isinstance(call.func, cst.Subscript) else None
+            if not isinstance(table, cst.Name) or len(call.args) != 2:
+                continue
+            if {definition.kind for definition in function.flow.reaching(table)} != {"parameter"}:
+                continue
+            for caller, outer in training.sites[function]:
+                given = function.given(outer, table.value)
+                for element in given.elements if isinstance(given, cst.List) else ():
+                    if is_l1_function(program, caller, element.value):
+                        sides = call.args[0].value, call.args[1].value
+                        form = Form(element.value, call, *sides, "registered", element.value)
+                        self.by_holder.setdefault(caller, []).append(HandedOver(form, function, outer))

@@ -526,7 +526,7 @@ def _meet_in_differences(program: Program, function: Function, a: str, b: str, d
             pair = len(positional) >= 2 and not spread and mirrored(positional[0], positional[1])
             if pair and (
                 any(_l1_reference(program, function, r, node, depth) for r in program.resolve(function, node.func))
-                or any(_is_l1_function(program, function, value, depth) for value in positional[2:])
+                or any(_is_handed_l1(program, function, value, depth) for value in positional[2:])
             ):
                 allowed.update(id(n) for value in positional[:2] for n in walk_expressions(value))
                 absolute = True
@@ -593,14 +593,21 @@ def _l1_reference(program: Program, function: Function, reference: Reference, no
     return reference.kind in ("external", "made by") and _reference_shape(program, reference, node) is not None
 
 
-def _is_l1_function(program: Program, function: Function, node: cst.BaseExpression, depth: int) -> bool:
+def _is_handed_l1(program: Program, function: Function, node: cst.BaseExpression, depth: int) -> bool:
     """Whether an argument is an L1 function itself, as in ``masked_loss(pred, gt, l1, mask=mask)``."""
-    if not isinstance(node, cst.Name):
-        return False
+    return isinstance(node, cst.Name) and is_l1_function(program, function, node, depth)
+
+
+def is_l1_function(program: Program, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
+    """Return whether an expression is an L1 function, torch's or the codebase's own."""
+
+    def is_l1(reference: Reference) -> bool:
+        if isinstance(reference.target, Function):
+            return not reference.guess and own_shape(program, reference.target, None, depth + 1) is not None
+        return reference.kind == "external" and _TORCH_L1.search(str(reference.target)) is not None
+
     references = program.resolve(function, node)
-    return bool(references) and all(
-        isinstance(r.target, Function) and own_shape(program, r.target, None, depth + 1) is not None for r in references
-    )
+    return bool(references) and all(map(is_l1, references))
 
 
 def _mirrored(left: cst.BaseExpression, right: cst.BaseExpression, a: str, b: str) -> bool:

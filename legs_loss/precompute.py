@@ -225,6 +225,11 @@ def _in_processes(job: _Job, tasks: Sequence[_Task], workers: int) -> Generator[
                 worker = crew.pop(connection)
                 try:
                     result = worker.connection.recv()
+                    if result is None:  # it compiled, see `_work`
+                        waiting.append(worker.task)
+                        worker.end(_PATIENCE)
+                        give(_Worker(job, compiles=False))
+                        continue
                 except (EOFError, OSError):
                     reason = f"{worker.task.view.path}: the process that read it was killed (out of memory?)"
                     result = _Result(worker.task.view.name, problem=reason)
@@ -245,10 +250,10 @@ class _Worker:
 
     task: _Task
 
-    def __init__(self, job: _Job) -> None:
+    def __init__(self, job: _Job, compiles: bool = True) -> None:
         context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, job), daemon=True)
+        self.process = context.Process(target=_work, args=(theirs, job, compiles), daemon=True)
         with kept_from_children(), _kept_blocks():
             self.process.start()
         theirs.close()
@@ -278,13 +283,42 @@ def _kept_blocks() -> Iterator[None]:
             del os.environ[name]
 
 
-def _work(connection: Any, job: _Job) -> None:
+def _work(connection: Any, job: _Job, compiles: bool) -> None:
+    """Make maps; first, where the first of them takes compiled code that has to be compiled, only that.
+
+    The compiler keeps nearly 200 MB to itself, so None is sent then: another process is to load what this one compiled.
+    """
     torch.set_num_threads(1)
     try:
+        task = connection.recv()
+        if compiles and _is_large(task.view.path) and _compiled_anew(job.spec):
+            connection.send(None)
+            return
         while True:
-            connection.send(_make(job, connection.recv()))
+            connection.send(_make(job, task))
+            task = connection.recv()
     except (EOFError, OSError):  # the parent has ended
         pass
+
+
+def _is_large(path: Path) -> bool:
+    with suppress(LegsError, OSError):
+        width, height = image_size(path)
+        return _compiles(3 * width * height)
+    return False
+
+
+def _compiled_anew(spec: WeightSpec) -> bool:
+    """Load the compiled code by a small picture, and say whether any of it was not on disk yet."""
+    from numba.core import event
+    from PIL import Image
+
+    from legs_loss.kernels.numba_resize import resized
+    from legs_loss.kernels.numba_response import photograph_response
+
+    with event.install_recorder("numba:compile") as compiled:
+        photograph_response(resized(Image.new("RGB", (64, 64)), (32, 32)), spec)
+    return bool(compiled.buffer)
 
 
 def _commit(writer: StoreWriter, staged: List[Entry]) -> None:

@@ -200,12 +200,14 @@ class Flow:
             outer = self._conditions
             self._conditions = outer + _true_names(node.test)
             taken = self._block(_statements(node.body), dict(env))
-            self._conditions = outer
-            if node.orelse is None:
-                return _join([taken, env])
+            self._conditions = outer + _true_names_else(node.test)
+            left: Optional[Env] = env
             if isinstance(node.orelse, cst.If):
-                return _join([taken, self._statement(node.orelse, dict(env))])
-            return _join([taken, self._block(_statements(node.orelse.body), dict(env))])
+                left = self._statement(node.orelse, dict(env))
+            elif node.orelse is not None:
+                left = self._block(_statements(node.orelse.body), dict(env))
+            self._conditions = outer
+            return _join([taken, left])
         if isinstance(node, (cst.For, cst.While)):
             return self._loop(node, env)
         if isinstance(node, cst.With):
@@ -437,6 +439,13 @@ def _true_names(test: cst.BaseExpression) -> Tuple[str, ...]:
         return _true_names(test.left) + _true_names(test.right)
     name = dotted(test)
     return () if name is None else (name.split(".")[-1],)
+
+
+def _true_names_else(test: cst.BaseExpression) -> Tuple[str, ...]:
+    """Return the names that are true where a test is not: of ``not tracking``: tracking."""
+    if isinstance(test, cst.UnaryOperation) and isinstance(test.operator, cst.Not):
+        return _true_names(test.expression)
+    return ()
 
 
 def _stops_gradients(node: cst.BaseExpression) -> bool:

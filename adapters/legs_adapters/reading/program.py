@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from pathlib import PurePosixPath
-from typing import Dict, Iterable, List, Mapping, NamedTuple, Optional, Set, Tuple
+from typing import Callable, Dict, Iterable, List, Mapping, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
@@ -69,6 +69,7 @@ class Program:
         self._modules: Dict[str, Optional[Module]] = {}
         self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
         self._defined: Dict[str, List[str]] = {}
+        self._together: Dict[str, Set[str]] = {}
         self._ending: Dict[str, List[str]] = {}  # by the last name of what is imported of them
         for source in self.sources.values():
             path = PurePosixPath(source.path)
@@ -284,6 +285,39 @@ class Program:
         """Return the checkout's module that ``from ... import`` in another takes from."""
         return self.find_module(module, _from(node), len(node.relative))
 
+    def together(self, module: Module) -> Set[str]:
+        """Return the paths of the files that run together with another: what is imported by whatever imports it.
+
+        What functions import, or is loaded by its name, is not seen.
+        """
+        if module.path not in self._together:
+            users = _closure([module], self._users)
+            self._together[module.path] = {found.path for found in _closure(users, self._imports)}
+        return self._together[module.path]
+
+    def _users(self, module: Module) -> List[Module]:
+        """The modules that import another."""
+        path = PurePosixPath(module.path)
+        name = path.parent.name if path.name == "__init__.py" else path.stem
+        return [other for other in self.matching(re.compile(rf"\b{name}\b")) if module in self._imports(other)]
+
+    def _imports(self, module: Module) -> List[Module]:
+        """The checkout's modules that a module imports."""
+        found: List[Optional[Module]] = []
+        for node in module.top.flow.imports:
+            assert isinstance(node, (cst.Import, cst.ImportFrom))
+            names = [] if isinstance(node.names, cst.ImportStar) else [dotted(alias.name) or "" for alias in node.names]
+            if isinstance(node, cst.ImportFrom):
+                stem, level = _from(node), len(node.relative)
+                base = self.imported_from(module, node)
+                found.append(base)
+                if base is None and stem and not level:
+                    found.extend(self._on_path(module, stem, name) for name in names)
+                found.extend(self.find_module(module, f"{stem}.{name}" if stem else name, level) for name in names)
+            else:
+                found.extend(self.find_module(module, name, 0) for name in names)
+        return [other for other in found if other is not None]
+
     def find_module(self, module: Module, name: str, level: int) -> Optional[Module]:
         """Return the checkout's module of this name, as seen from another; None where it is not the checkout's."""
         here = PurePosixPath(module.path).parent
@@ -473,6 +507,18 @@ class Program:
             for argument in arguments(value)[1].values():
                 references.extend(self.resolve(where, argument, depth))
         return references
+
+
+def _closure(modules: Iterable[Module], following: Callable[[Module], List[Module]]) -> List[Module]:
+    """Return the modules, and what follows from them, and from that."""
+    found: Dict[str, Module] = {}
+    work = list(modules)
+    while work:
+        module = work.pop()
+        if module.path not in found:
+            found[module.path] = module
+            work.extend(following(module))
+    return list(found.values())
 
 
 def _nearest(path: str, others: List[str]) -> List[str]:

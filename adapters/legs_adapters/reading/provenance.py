@@ -24,6 +24,7 @@ from legs_adapters.reading.syntax import (
     dotted,
     loops_around,
     walk_expressions,
+    word_set,
     words,
 )
 
@@ -35,6 +36,10 @@ _NAME = "image_name"
 _DEPTH = 4
 _NAMING = re.compile(rf"\b{_NAME}\s*=\s*{_NAME}\b")
 _OF_LISTS = {"copy", "pop", "popleft"}
+_OTHER_CAMERAS = re.compile(r"get(?!Train|Test)\w+Cam(era)?s$")
+_POSES = re.compile(r"\bcam_extrinsics\s*=")
+_NO_PHOTOGRAPHS = word_set("virtual pseudo fake warped")
+_PLACED = re.compile(r"\.source_path\s*=[^=]")  # in the settings that Inria's Scene reads
 
 
 class View(NamedTuple):
@@ -71,6 +76,7 @@ class Views:
         if not self._still(function, holder, target, site):
             return View(None, f"{holder.value} may be another view by then")
         doubt = _overwritten(function, holder.value, image.attr.value) or self._nameless(function, holder, set())
+        doubt = doubt or _of_no_photograph(function, site) or self._of_scenes_in_turn(function)
         if doubt is not None:
             return View(None, doubt)
         return View(f"{holder.value}.{_NAME}", f"{code(image)}, untouched")
@@ -188,6 +194,26 @@ class Views:
         callers = [caller for caller in self.program.mentioning(function.name) if _calls(caller, function)]
         return any(self._is_used(caller, depth + 1) for caller in callers)
 
+    def _of_scenes_in_turn(self, function: Function) -> Optional[str]:
+        """Why a name may be of several pictures: one run goes through several scenes, ``args.source_path = folder``."""
+        for module in self.program.matching(_PLACED):
+            for other in module.scopes(_PLACED.search):
+                definitions = [d for found in other.flow.definitions.values() for d in found]
+                placed = [d for d in definitions if d.place.endswith(".source_path") and _changes(other, d)]
+                if placed and module.path in self.program.together(function.module):
+                    return f"{other.name or module.path} reads several scenes, where names come again"
+        return None
+
+    def _reads_twice(self) -> bool:
+        """Whether a reader makes cameras of the same poses a second time, with the pictures of another folder."""
+        for module in self.program.matching(_POSES):
+            for function in module.scopes(_POSES.search):
+                read = [(call_name(call), arguments(call)[1].get("cam_extrinsics")) for call in function.flow.calls]
+                given = [(name, code(poses)) for name, poses in read if poses is not None]
+                if len(given) != len(set(given)):
+                    return True
+        return False
+
     def _nameless(self, function: Function, node: cst.CSTNode, seen: Set[int]) -> Optional[str]:
         """Why the camera may have no name: one whose class stores none is added, ``stack.append(view)``."""
         for definition in function.flow.reaching(node):
@@ -205,8 +231,12 @@ class Views:
                             return f"{definition.place} also holds {made.name}s, which have no {_NAME}"
                 continue
             chain = list(attribute_chain(value))
-            if any(isinstance(part, cst.Attribute) and part.attr.value not in _OF_LISTS for part in chain):
-                continue  # scenes[0].getTrainCameras(): no more of that list
+            asked = [part.attr.value for part in chain if isinstance(part, cst.Attribute)]
+            if not set(asked) <= _OF_LISTS:  # scenes[0].getTrainCameras(): no more of that list
+                others = [name for name in asked if _OTHER_CAMERAS.match(name)]
+                if others and self._reads_twice():
+                    return f"{others[0]} gives cameras with the names of others"
+                continue
             found = self._nameless(function, chain[-1], seen)
             if found is not None:
                 return found
@@ -219,6 +249,22 @@ def _calls(caller: Function, function: Function) -> bool:
         return False
     read = [part.value for part in caller.flow.reads]
     return function.name in read or any(call_name(call) == function.name for call in caller.flow.calls)
+
+
+def _of_no_photograph(function: Function, site: cst.CSTNode) -> Optional[str]:
+    """Why the cameras have none here: ``if camera.is_virtual:``."""
+    for name in function.flow.conditions.get(id(site), ()):
+        if _NO_PHOTOGRAPHS & set(words(name)):
+            return f"only where {name}"
+    return None
+
+
+def _changes(function: Function, definition: Definition) -> bool:
+    """Whether a value is another at each turn of a loop, or for each item of a dataset."""
+    loops = [loop for loop in loops_around(function.body, definition.node) if isinstance(loop, cst.For)]
+    turns = {part.value for loop in loops for part in walk_expressions(loop.target) if isinstance(part, cst.Name)}
+    turns |= set(function.parameters) if function.name == "__getitem__" else set()
+    return definition.value is not None and function.depends(definition.value, turns)
 
 
 def _names_again(function: Function, call: cst.Call) -> bool:

@@ -34,6 +34,7 @@ __all__ = ["Reasons"]
 _SPLATS = re.compile(
     r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_gaussian|render_pkg|3dgs|surfel", re.I
 )
+_GAUSSIANS = re.compile(r"splat|gaussians|gaussian_?(model|render|scene|raster)|diff_\w*raster|3dgs|surfel", re.I)
 _RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
 _BUNDLES = {"ray_bundle", "ray_samples"}
 _FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
@@ -262,10 +263,16 @@ class Reasons:
             if current in seen:
                 continue
             seen.add(current)
-            if self._speaks_of_splats(current.module.path) or self._takes_splats(current.module):
+            speaks = self._speaks_of_splats(current.module.path) or self._takes_splats(current.module)
+            if speaks and self._runs_with(function.module, current.module):
                 return True
             queue.extend(caller for caller, _ in self.training.sites.get(current, []))
         return False
+
+    def _runs_with(self, module: Module, other: Module) -> bool:
+        """Whether what a function is called by, going by names, can be: it runs with it, or is near it."""
+        near = other.path.split("/")[0] == module.path.split("/")[0] or "/" not in module.path
+        return near or other.path in self.program.together(module)
 
     def _rendered(self, module: Module, function: Function, form: Form) -> bool:
         """Whether the rendering says so itself, or files beside it do, where the file is not about rays."""
@@ -277,7 +284,12 @@ class Reasons:
             return False
         rendered = any(word.startswith(("render", "raster")) for word in names)
         folder = module.path.rpartition("/")[0]
-        near = [path for path in self.program.sources if rendered or not folder or path.startswith(folder + "/")]
+        near = [path for path in self.program.sources if not folder or path.startswith(folder + "/")]
+        if rendered and folder:  # of what, if no Gaussians are near? A mesh is rasterized, too
+            top = folder.split("/")[0] + "/"
+            together = self.program.together(module)
+            near = [path for path in self.program.sources if path.startswith(top) or path in together]
+            near = [path for path in near if _GAUSSIANS.search(self.program.sources[path].text)]
         return any(self._speaks_of_splats(path) for path in near)
 
     def _takes_splats(self, module: Module) -> bool:

@@ -13,7 +13,7 @@ from legs_adapters.reading.meaning import Meaning, Meanings
 from legs_adapters.reading.module import Function, Module
 from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, of_rays, same_root, swapped
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.shared import takes_no_gradient
+from legs_adapters.reading.shared import is_rescaled, takes_no_gradient
 from legs_adapters.reading.steps import Steps
 from legs_adapters.reading.syntax import (
     arguments,
@@ -108,10 +108,14 @@ class Reasons:
             return "distillation"
         if self._of_model(function, target):
             return "regulariser"
-        if is_detached(other) or any(
-            any(arg.value is form.node for arg in call.args)
-            and takes_no_gradient(self.training, function, call, form.node)
-            for call in function.flow.calls
+        if (
+            is_detached(other)
+            or is_rescaled(function, form)
+            or any(
+                any(arg.value is form.node for arg in call.args)
+                and takes_no_gradient(self.training, function, call, form.node)
+                for call in function.flow.calls
+            )
         ):
             return "weighting"
         return self._elsewhere(function, form) or self.steps.purpose(function, form.call)

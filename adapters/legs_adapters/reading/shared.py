@@ -17,6 +17,7 @@ __all__ = [
     "is_asked",
     "is_huber",
     "is_measured",
+    "is_rescaled",
     "shared_of",
     "takes_no_gradient",
     "unchanged",
@@ -97,6 +98,25 @@ def is_huber(training: Training, function: Function, form: Form) -> bool:
         if base is not None and training.includes(node) and reads_it(list(walk_expressions(base))):
             return True
     return False
+
+
+def is_rescaled(function: Function, form: Form) -> bool:
+    """Whether a map is only put between 0 and 1, ``(error - error.min()) / (error.max() - error.min())``: to cut at."""
+    reads = [read for read in function.flow.reads if form.node in _values(function, read)]
+    ranges = {id(part) for node in function.flow.expressions for part in _of_range(node)}
+    extremes = [call for call in function.flow.calls if call_name(call) in ("min", "max") and not call.args]
+    asked = {id(call.func.value): call_name(call) for call in extremes if isinstance(call.func, cst.Attribute)}
+    used = {asked.get(id(read), "range" if id(read) in ranges else "more") for read in reads}
+    return used == {"min", "max", "range"}
+
+
+def _of_range(node: cst.CSTNode) -> List[cst.CSTNode]:
+    """Return ``x`` of ``(x - low) / (high - low)``."""
+    if not isinstance(node, cst.BinaryOperation) or not isinstance(node.operator, cst.Divide):
+        return []
+    parts = [part for part in (node.left, node.right) if isinstance(part, cst.BinaryOperation)]
+    both = len(parts) == 2 and all(isinstance(part.operator, cst.Subtract) for part in parts)
+    return [parts[0].left] if both else []
 
 
 def is_measured(function: Function, form: Form) -> bool:

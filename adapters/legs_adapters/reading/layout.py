@@ -227,8 +227,8 @@ def _permuted(
         order, pattern, axis = _permutation(call), _pattern(call), _reduced(call)
         if order is None and pattern is None and axis is None:
             continue
-        subject = _before(_subject(call), order)
-        if subject is None or path_of(subject) != place:
+        subject = next((part for part in _before(_subject(call), order) if path_of(part) == place), None)
+        if subject is None:
             continue
         reaching = function.flow.reaching(subject)
         if reaching != definitions and not reaching & definitions:
@@ -243,19 +243,25 @@ def _permuted(
             yield Vote(_LAST if pattern.split("->")[0].split()[-1:] == ["c"] else _FIRST, 3)
 
 
-def _before(node: Optional[cst.CSTNode], order: Optional[Tuple[int, ...]]) -> Optional[cst.CSTNode]:
-    """Return ``x`` of what is permuted, ``x.clip(0, 1)[None]``: only an axis for the batch has come before x's own."""
-    while True:
+def _before(node: Optional[cst.CSTNode], order: Optional[Tuple[int, ...]]) -> List[cst.CSTNode]:
+    """Return ``x`` of what is permuted, ``x.clip(0, 1)[None]``: only an axis for the batch has come before x's own.
+
+    Of a product, ``x * mask``, each factor.
+    """
+    while node is not None:
         if isinstance(node, cst.Call) and call_name(node) in _KEEPS:
             node = _subject(node)
         elif isinstance(node, cst.Call) and call_name(node) == "unsqueeze" and order is not None:
             if constant(node.args[-1].value if node.args else None) != 0 or len(order) != 4:
-                return None
+                return []
             node = _subject(node)
         elif isinstance(node, cst.Subscript) and order is not None and len(order) == 4 and _is_batched(node):
             node = node.value
+        elif isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Multiply) and order is not None:
+            return [*_before(node.left, order), *_before(node.right, order)]
         else:
-            return node
+            return [node]
+    return []
 
 
 def _permutation(node: cst.Call) -> Optional[Tuple[int, ...]]:

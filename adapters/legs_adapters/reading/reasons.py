@@ -66,6 +66,9 @@ _WHY = {
 }  # fmt: skip
 
 _MADE_UP = {f"torch.{name}{like}" for name in ("eye", "zeros", "ones", "full") for like in ("", "_like")}
+_OF_LITERALS = {"torch.tensor", "torch.as_tensor", "torch.Tensor", "torch.FloatTensor"}
+_SHAPED = {"cuda", "to", "float", "view", "reshape", "unsqueeze", "expand", "expand_as", "repeat"}
+_DEPTH = 8
 
 
 class Reasons:
@@ -121,15 +124,16 @@ class Reasons:
         return self._elsewhere(function, form) or self.steps.purpose(function, form.call)
 
     def _is_number(self, function: Function, node: cst.CSTNode, depth: int) -> bool:
-        """Whether a side is one number made of a picture, ``image.mean()``."""
+        """Whether a side is one number made of a picture, ``image.mean()``, or one of each channel."""
         if isinstance(node, cst.Call):
             positional, keywords, _ = arguments(node)
             base = node.func.value if isinstance(node.func, cst.Attribute) else None
             own = base is not None and not (isinstance(base, cst.Name) and base.value == "torch")
             of = base if own else positional[0] if positional else None
             if call_name(node) in ("mean", "sum", "std", "var", "median"):
-                return of is not None and not keywords and len(positional) == (0 if own else 1)
-            moved = call_name(node) in ("detach", "clamp", "clip", "cuda", "to", "float")
+                axes = [*positional[0 if own else 1 :], *(keywords[key] for key in ("dim", "axis") if key in keywords)]
+                return of is not None and all(isinstance(constant(axis), tuple) for axis in axes)
+            moved = call_name(node) in ("detach", "clamp", "clip", "cuda", "to", "float", "sqrt")
             return moved and of is not None and self._is_number(function, of, depth)
         if isinstance(node, cst.BinaryOperation):
             for side, other in ((node.left, node.right), (node.right, node.left)):
@@ -137,7 +141,7 @@ class Reasons:
                     return True
         if isinstance(node, cst.Name) and depth < 3:
             made = [d.value for d in function.flow.reaching(node) if d.kind == "assign" and d.value is not None]
-            return len(made) == 1 and self._is_number(function, made[0], depth + 1)
+            return bool(made) and all(self._is_number(function, value, depth + 1) for value in made)
         return False
 
     def _of_model(self, function: Function, target: cst.CSTNode) -> bool:
@@ -343,12 +347,27 @@ def _one_channel_of(node: cst.CSTNode) -> Optional[str]:
     return node.value.value if isinstance(lower, int) and upper == lower + 1 else None
 
 
-def _is_made_up(function: Function, node: cst.CSTNode) -> bool:
-    """Whether a side is a tensor of constants, ``torch.eye(3)``, or a name for one that nothing is written to."""
-    if isinstance(node, cst.Name):
-        made = function.flow.reaching(node)
-        return len(made) == 1 and all(d.value is not None and _is_made_up(function, d.value) for d in made)
-    return isinstance(node, cst.Call) and dotted(node.func) in _MADE_UP
+def _is_made_up(function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
+    """Whether a side is a tensor of constants, ``torch.eye(3)``, ``torch.tensor([0, 0, 1])[:, None]``.
+
+    Or a name for one, or for one of several, that nothing is written to.
+    """
+    parts: List[Optional[cst.CSTNode]] = []
+    if isinstance(node, cst.Name) and constant(node) is None:
+        parts = [d.value if d.kind == "assign" else None for d in function.flow.reaching(node)]
+    elif isinstance(node, cst.IfExp):
+        parts = [node.body, node.orelse]
+    elif isinstance(node, cst.Subscript):
+        parts = [node.value]
+    elif not isinstance(node, cst.Call):
+        return constant(node) is not None
+    elif dotted(node.func) in _OF_LITERALS:
+        parts = [*arguments(node)[0][:1]]
+    elif isinstance(node.func, cst.Attribute) and call_name(node) in _SHAPED:
+        parts = [node.func.value]
+    else:
+        return dotted(node.func) in _MADE_UP
+    return depth < _DEPTH and bool(parts) and all(p is not None and _is_made_up(function, p, depth + 1) for p in parts)
 
 
 def _is_leaf(function: Function, node: cst.CSTNode) -> bool:

@@ -37,7 +37,7 @@ _WORDS = {
         grids plane planes pose poses deform deformation delta deltas residual means mean2d pts points point light
         lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds c2w w2c intrinsics
         extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints vertex vertices verts
-        bone bones smpl center centers knn kpt kpts keypoint keypoints
+        bone bones smpl center centers knn kpt kpts keypoint keypoints mu std
     """,
     "image": """
         image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering
@@ -73,6 +73,11 @@ DATA = word_set(
 def kind_of_words(name: str) -> Optional[str]:
     """Return the kind that a name speaks of; the more special where it has several."""
     spoken = words(name)
+    if "and" in spoken:  # of what image_and_depth holds the one is no depth, the other no image
+        at = spoken.index("and")
+        both = {kind_of_words("_".join(part)) for part in (spoken[:at], spoken[at + 1 :])}
+        if "image" in both and len(both - {None}) > 1:
+            return None
     if "no" in spoken[1:]:  # image_no_sh
         spoken = spoken[: spoken.index("no", 1)]
     said = [word for word in spoken if not word.isdigit() and word not in _HELD_IN | _WHICH]

@@ -64,9 +64,9 @@ class _Finder:
         self.training = Training(program)
         self.meanings = Meanings(program, self.training)
         self.views = Views(program)
-        self.reasons = Reasons(program, self.training, self.meanings)
-        self.uses = Uses(program, self.training, self.meanings, self.reasons)
         self.forms = Forms(program)
+        self.reasons = Reasons(program, self.training, self.meanings, self.forms)
+        self.uses = Uses(program, self.training, self.meanings, self.reasons)
         self.handed = Handed(program, self.training, self.forms)
         self.found = Findings([], [], [], [], [], [], program)
         self.doubtful: List[Problem] = []

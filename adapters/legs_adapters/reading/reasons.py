@@ -7,7 +7,8 @@ from typing import Dict, List, Optional, Sequence, Set
 
 import libcst as cst
 
-from legs_adapters.reading.l1 import Form
+from legs_adapters.reading.beside import is_always_the_same, is_another_map
+from legs_adapters.reading.l1 import Form, Forms
 from legs_adapters.reading.makers import is_of_mesh, is_rendering
 from legs_adapters.reading.meaning import Meaning, Meanings
 from legs_adapters.reading.module import Function, Module
@@ -74,10 +75,11 @@ _DEPTH = 8
 class Reasons:
     """Answers for one program."""
 
-    def __init__(self, program: Program, training: Training, meanings: Meanings) -> None:
+    def __init__(self, program: Program, training: Training, meanings: Meanings, forms: Forms) -> None:
         self.program = program
         self.training = training
         self.meanings = meanings
+        self.forms = forms
         self.steps = Steps(program, training)
         self._splats: Dict[str, bool] = {}
 
@@ -111,6 +113,8 @@ class Reasons:
             return "distillation"
         if self._of_model(function, target):
             return "regulariser"
+        if is_always_the_same(self.forms, function, form, other, target):
+            return "other"
         if (
             is_detached(other)
             or is_rescaled(function, form)
@@ -121,7 +125,10 @@ class Reasons:
             )
         ):
             return "weighting"
-        return self._elsewhere(function, form) or self.steps.purpose(function, form.call)
+        elsewhere = self._elsewhere(function, form)
+        if elsewhere is None and is_another_map(self.forms, function, form):
+            return "features"
+        return elsewhere or self.steps.purpose(function, form.call)
 
     def _is_number(self, function: Function, node: cst.CSTNode, depth: int) -> bool:
         """Whether a side is one number made of a picture, ``image.mean()``, or one of each channel."""

@@ -23,7 +23,7 @@ AHEAD = 16  # splats whose slots are asked for while another's are worked on
 
 FIRST_SLOT, FIRST_SUM = 0, 1  # where a splat's slots begin, and its rows of sums
 STRIP, ROWS = 0, 1  # of a slot: its strip, or -1 where the splat does not reach it, and its rows (see `packed`)
-OWNER, _, SUM = 0, 1, 2  # of an entry: its splat, its ROWS, and the row of sums that its gradient is added to
+OWNER, SUM = 0, 2  # of an entry: its splat, and, after its ROWS, the row of sums that its gradient is added to
 
 
 def make_slots(boxes, slots, tall):

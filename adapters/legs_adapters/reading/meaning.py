@@ -146,8 +146,9 @@ class Meanings:
         kind = kind_of_words(name)
         if kind == "image" and flow.kind == "feature":
             return Meaning("image", role_of_words(name) or flow.role)  # `rgb = outputs["features"]`: colours, there
-        if kind == "mask" and flow.kind == "flow":
-            return Meaning("mask", role_of_words(name) or flow.role)  # motion_masks, to be laid over a rendering
+        if kind == "mask" and flow.kind in ("flow", "depth"):
+            # motion_masks, alpha = depth_sil[1]: to be laid over a rendering
+            return Meaning("mask", role_of_words(name) or flow.role)
         kinds = [k for k in (kind, flow.kind) if k is not None]
         return Meaning(min(kinds, key=KINDS.index) if kinds else None, role_of_words(name) or flow.role)
 
@@ -207,7 +208,11 @@ class Meanings:
             if reference.kind == "function" and isinstance(reference.target, Function) and not reference.guess:
                 for value in reference.target.flow.returns:
                     if isinstance(value, cst.Tuple) and index < len(value.elements):
-                        found.append(self.of(reference.target, value.elements[index].value, depth))
+                        element = value.elements[index].value
+                        passed = _passed_on(reference.target, element)
+                        given = reference.target.given(call, passed) if passed is not None else None
+                        where, what = (reference.target, element) if given is None else (function, given)
+                        found.append(self.of(where, what, depth))
         return _mix(found)
 
     def _parameter(self, function: Function, definition: Definition, depth: int) -> Meaning:
@@ -415,6 +420,30 @@ class Meanings:
                 if found and all(m.kind is not None or m.role is not None for m in found):
                     return _mix(found)
         return None
+
+
+def _passed_on(function: Function, node: cst.CSTNode) -> Optional[str]:
+    """Return the parameter that an expression is, or is an element of, whichever way the function went."""
+    found: Set[Optional[str]] = set()
+    work, seen = [node], set()
+    while work:
+        part = work.pop()
+        while isinstance(part, cst.Subscript):
+            part = part.value
+        if not isinstance(part, cst.Name):
+            return None
+        for definition in function.flow.reaching(part):
+            value: Optional[cst.CSTNode] = definition.value
+            if definition.kind == "parameter":
+                found.add(definition.place)
+            elif definition.kind not in ("assign", "element") or value is None:
+                return None
+            elif id(definition) not in seen:
+                seen.add(id(definition))
+                if definition.kind == "element" and isinstance(value, cst.Tuple) and definition.index is not None:
+                    value = value.elements[definition.index].value
+                work.append(value)
+    return found.pop() if len(found) == 1 else None
 
 
 def _formatted_key(node: cst.Subscript) -> Optional[str]:

@@ -34,7 +34,7 @@ _MOVES = {"cuda", "to", "cpu", "float", "contiguous", "clone", "detach", "type"}
 _IMAGES = {"original_image", "image", "gt_image", "rgb", "original_rgb", "img", "image_tensor"}
 _NAME = "image_name"
 _DEPTH = 4
-_NAMING = re.compile(rf"\b{_NAME}\s*=\s*{_NAME}\b")
+_NAMING = re.compile(rf"\b{_NAME}\s*=(?!=)")
 _OF_LISTS = {"copy", "pop", "popleft"}
 _OTHER_CAMERAS = re.compile(r"get(?!Train|Test)\w+Cam(era)?s$")
 _POSES = re.compile(r"\bcam_extrinsics\s*=")

@@ -86,7 +86,7 @@ def kind_of_words(name: str) -> Optional[str]:
     kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF}
     if "image" in kinds:  # sky_rgb, render_sh
         kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF and word not in _OF_PICTURES}
-        if "base" in spoken:  # rendered_base_color
+        if "base" in spoken or "precomp" in spoken:  # rendered_base_color; colors_precomp, a colour for each Gaussian
             return "parameter"
     return min(kinds, key=KINDS.index) if kinds else None
 

@@ -182,17 +182,27 @@ def store_bytes(typingctx, array, index, value):  # type: ignore[no-untyped-def]
 
 @_intrinsic
 def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
-    """Ask for the cache line of array[index] ahead of time. An index beyond the array does no harm."""
-    if not (_is_row(array, types.float32) and isinstance(index, types.Integer)):
+    """Ask for array[index] of a contiguous array ahead of time: for the cache lines in which it begins and ends.
+
+    What is read in no order, or from rows far apart, costs a wait each; asked for in time, it costs nothing. An index
+    beyond the array does no harm: the processor ignores an address that it cannot read.
+    """
+    if not (isinstance(array, types.Array) and array.layout == "C" and isinstance(index, types.Integer)):
         return None
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        byte, integer = ir.IntType(8).as_pointer(), ir.IntType(32)
+        array_type, size = sig.args
+        values = context.make_array(array_type)(context, builder, args[0])
+        number, byte, integer = context.get_value_type(size), ir.IntType(8).as_pointer(), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [byte, integer, integer, integer])
         ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
         reading, keep, data_cache = integer(0), integer(3), integer(1)
-        builder.call(ask, [builder.bitcast(builder.gep(data, [args[1]]), byte), reading, keep, data_cache])
+        element = number(context.get_abi_sizeof(values.data.type.pointee))
+        row = element if array_type.ndim == 1 else builder.extract_value(values.strides, 0)
+        start = builder.add(builder.ptrtoint(values.data, number), builder.mul(row, args[1]))
+        ends = [start] if array_type.ndim == 1 else [start, builder.add(start, builder.sub(row, element))]
+        for address in ends:
+            builder.call(ask, [builder.inttoptr(address, byte), reading, keep, data_cache])
         return context.get_dummy_value()
 
     return types.void(array, types.intp), generate

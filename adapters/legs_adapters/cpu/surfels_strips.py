@@ -36,13 +36,13 @@ from legs_loss.kernels.vectors import (
     maximum,
     minimum,
     multiply_add,
+    prefetch,
     splat,
     store,
     totals,
     where,
 )
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, NEAR
-from legs_loss.reference.rasterizer.intrinsics import prefetch
 from legs_loss.reference.rasterizer.sorting import OWNER, ROWS, SUM
 from legs_loss.reference.rasterizer.strips import cover, exp2, reach
 

@@ -25,7 +25,6 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from legs_loss.kernels import vectors
 from legs_loss.kernels.compiling import compiled
 from legs_loss.kernels.vectors import (
     absolute,
@@ -36,6 +35,7 @@ from legs_loss.kernels.vectors import (
     maximum,
     minimum,
     multiply_add,
+    prefetch,
     splat,
     store,
     total,
@@ -43,7 +43,6 @@ from legs_loss.kernels.vectors import (
     where,
 )
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from legs_loss.reference.rasterizer.intrinsics import prefetch
 from legs_loss.reference.rasterizer.projection import TALL, WIDE, origin
 from legs_loss.reference.rasterizer.sorting import OWNER, ROWS, SUM
 
@@ -257,7 +256,7 @@ def _blend_backward(state, begin, end, draws, entries, moments, sums):
     """
     none, one = splat(_ZERO), splat(_ONE)
     for k in range(begin, end):
-        vectors.prefetch(sums, np.uint64(draws[min(k + np.uint64(AHEAD), end - np.uint64(1)), SUM]) * moments)
+        prefetch(sums, np.uint64(draws[min(k + np.uint64(AHEAD), end - np.uint64(1)), SUM]) * moments)
         first, last, top = reach(draws, k)
         red, green, blue = splat(entries[k, 6]), splat(entries[k, 7]), splat(entries[k, 8])
         respond(state, first, last, top, entries, k)

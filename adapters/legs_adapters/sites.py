@@ -13,7 +13,7 @@ import libcst as cst
 
 from legs_adapters.findings import Findings, Kept, Left, Problem, Site
 from legs_adapters.reading.handed import Handed, HandedOver
-from legs_adapters.reading.l1 import Form, Forms, abs_argument, own_shape
+from legs_adapters.reading.l1 import Form, Forms, abs_argument, is_l1_function, own_shape
 from legs_adapters.reading.layout import is_channels_last, lies_last
 from legs_adapters.reading.meaning import Meanings
 from legs_adapters.reading.module import Function, Module
@@ -122,6 +122,7 @@ class _Finder:
         if STRUCTURAL.search(function.text):
             yield from self._of_chosen(function)
         yield from self._of_callables(function)
+        self._look_at_names(function)
 
     def _of_forms(self, function: Function) -> Iterator[Entry]:
         for form in self.forms.of(function):
@@ -159,6 +160,25 @@ class _Finder:
             place = function.place(form.node)
             if not self.by_hand or self._is_chosen(function, place):
                 yield place, self._left(function, place, reason) if reason else self._callable(function, form, place)
+
+    def _look_at_names(self, function: Function) -> None:
+        """Note torch's L1 under a name that no call in sight uses: ``base = F.l1_loss``, for a function made here."""
+        known = {id(entry.form.node) for entry in self.handed.by_holder.get(function, ())}
+        known |= {id(value) for form in self.forms.of(function) for value in self._named(function, form)}
+        for definition in [each for found in function.flow.definitions.values() for each in found]:
+            value = definition.value
+            if definition.kind != "assign" or id(value) in known or not isinstance(value, (cst.Name, cst.Attribute)):
+                continue
+            if is_l1_function(self.program, function, value):
+                module, line = function.module, function.place(value).line
+                why = f"nothing shows where {definition.place} is called"
+                advice = f"legs_loss.l1_loss(rendering, photograph, own={_short(value)}), where it is called"
+                self.doubtful.append(Problem(module.path, line, module.lines.text(line), why, advice))
+
+    @staticmethod
+    def _named(function: Function, form: Form) -> List[Optional[cst.CSTNode]]:
+        """What the function that a form calls was given its name as."""
+        return [d.value for d in function.flow.reaching(form.callee)] if form.callee is not None else []
 
     def _is_doubtful(self, function: Function, form: Form, left: Left) -> bool:
         """Whether a person should have a look at what was left, if nothing else is found."""

@@ -174,6 +174,8 @@ class Meanings:
             return _mix([old, self.of(function, value, depth)])
         if definition.kind == "element" and definition.index is not None:
             meaning = self._element(function, value, definition.index, depth)
+            if _is_called_for_another(value, definition.place, meaning.kind):
+                meaning = meaning._replace(kind="image")  # flows, image = match_flow(image)
             beside = definition.index > 0 and role_of_words(definition.place) == "target"
             return meaning._replace(role=None) if beside else meaning  # image, gt_image = render(...)
         if definition.kind == "part":
@@ -366,7 +368,8 @@ class Meanings:
             return meaning
         if name == "where" and len(values) == 3:
             return _mix([self.of(function, value, depth) for value in values[1:]])
-        if name in ("conv2d", "filter2d", "spatial_gradient") and values and "stride" not in keywords:
+        filters = name in ("conv2d", "filter2d", "spatial_gradient") and values and "stride" not in keywords
+        if filters and not (len(positional) > 1 and _is_box(function, positional[1])):
             return Meaning("gradient", self.of(function, values[0], depth).role)
         if name in _JOIN and values:
             return self.of(function, values[0], depth)
@@ -420,6 +423,19 @@ class Meanings:
                 if found and all(m.kind is not None or m.role is not None for m in found):
                     return _mix(found)
         return None
+
+
+def _is_called_for_another(value: cst.CSTNode, place: str, kind: Optional[str]) -> bool:
+    """Whether the kind is only in a function's name, and the name of this one of its results says image."""
+    named = isinstance(value, cst.Call) and kind is not None and kind_of_words(call_name(value)) == kind
+    return named and kind != "image" and kind_of_words(place) == "image"
+
+
+def _is_box(function: Function, node: cst.CSTNode) -> bool:
+    """Whether a kernel is all ones, which blurs."""
+    found = function.flow.definitions.get(node.value, []) if isinstance(node, cst.Name) else []
+    made = [definition.value for definition in found if definition.kind == "assign"]
+    return bool(made) and all(isinstance(value, cst.Call) and call_name(value) == "ones" for value in made)
 
 
 def _passed_on(function: Function, node: cst.CSTNode) -> Optional[str]:

@@ -194,7 +194,8 @@ class Reasons:
         names = (function.name, *function.flow.conditions.get(id(form.call), ()))
         spoken = {word for name in names for word in words(name)}
         said = words(function.name)
-        if len(said) > 1 and said[0] in _NOT_TRAINING and not {"loss", "losses"} & set(said[1:]):
+        shows = len(said) > 1 and said[0] in _NOT_TRAINING and not {"loss", "losses"} & set(said[1:])
+        if shows and not self._is_of_training_step(function):
             return "evaluation"
         folders, _, file = module.path.rpartition("/")
         evaluates = (words(file)[:1] and words(file)[0] in _EVALUATING) or set(folders.split("/")) & _EVALUATING
@@ -213,6 +214,11 @@ class Reasons:
         if any(is_of_mesh(self.program, function, side) for side in (form.first, form.second)):
             return "other"
         return "other" if "eikonal" in module.text and _RAY_COLOURS.search(code(form.node)) else None
+
+    def _is_of_training_step(self, function: Function) -> bool:
+        """Whether it returns its part of a loss to functions that say that they train: ``render_batch``."""
+        callers = [caller for caller, _ in self.training.sites.get(function, [])]
+        return bool(callers) and all("train" in words(caller.name) for caller in callers)
 
     def _casts_rays(self, function: Function) -> bool:
         """Whether it is of a model that is asked for rays, ``get_outputs(self, ray_bundle)``: they make no picture."""

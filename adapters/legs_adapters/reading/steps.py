@@ -14,7 +14,17 @@ import libcst as cst
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import call_name, children, constant, dotted, loops_around, same, word_set, words
+from legs_adapters.reading.syntax import (
+    attribute_chain,
+    call_name,
+    children,
+    constant,
+    dotted,
+    loops_around,
+    same,
+    word_set,
+    words,
+)
 from legs_adapters.reading.training import Training
 
 __all__ = ["Steps"]
@@ -33,6 +43,7 @@ _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 _MAKES = {"optimizer", "optimiser", "optimizers", "optimisers"}
 _STEPS = word_set("step steps update optimize optimise optim adam sgd")
 _SCENE = word_set("gaussian gaussians gs splat splats")
+_READS = re.compile(r"\.grad\b(?!\s*=[^=])")
 _NOTHING = object()
 _DEPTH = 3
 
@@ -68,7 +79,10 @@ class Steps:
             if self._is_stepped_later(function, node, here, calls):
                 continue
             asked = [call for call in function.flow.calls if id(call) in here]
-            if _only_reads(scope, asked, self._nobody_steps(function, 0)):
+            for_good = self._nobody_steps(function, 0)
+            if _only_reads(scope, asked, for_good) or (for_good and self._read_by_callers(function)):
+                return "scoring"
+            if self._reads_its_own(function, scope):
                 return "scoring"
         # At a module's top nobody else can take the step.
         return "scoring" if stepped or function.parent is None else None
@@ -86,12 +100,33 @@ class Steps:
             return False
         if function.parent is None:
             return True
-        callers = [
+        callers = self._callers(function)
+        return bool(callers) and depth < _DEPTH and all(self._nobody_steps(c, depth + 1) for c in callers)
+
+    def _callers(self, function: Function) -> List[Function]:
+        return [
             caller
             for caller in self.program.mentioning(function.name, called=True)
             if caller is not function and any(call_name(call) == function.name for call in caller.flow.calls)
         ]
-        return bool(callers) and depth < _DEPTH and all(self._nobody_steps(c, depth + 1) for c in callers)
+
+    def _read_by_callers(self, function: Function) -> bool:
+        """Whether a caller also calls what reads gradients: ``accumulate(scene)``, then ``gaussians.prune(count)``."""
+        called = [
+            reference.target
+            for caller in self._callers(function)
+            for call in caller.flow.calls
+            for reference in self.program.resolve(caller, call.func)
+        ]
+        return any(isinstance(each, Function) and _READS.search(each.text) is not None for each in called)
+
+    def _reads_its_own(self, function: Function, scope: cst.CSTNode) -> bool:
+        """Whether the gradients that are read are of models made here, which nobody else gets to step on."""
+        roots = [list(attribute_chain(part))[-1] for part in _read(list(_walk(scope)))]
+        names = [root for root in roots if isinstance(root, cst.Name)]
+        given = {part.value for value in function.flow.returns for part in _walk(value) if isinstance(part, cst.Name)}
+        own = bool(roots) and len(names) == len(roots) and not given & {name.value for name in names}
+        return own and all(self._made_here(function, name) for name in names)
 
     def trains_its_own(self, function: Function) -> bool:
         """Whether it makes a Gaussian model and steps that model's optimiser: training, wherever the file lies."""
@@ -231,10 +266,15 @@ def _only_reads(scope: cst.CSTNode, calls: List[cst.Call], for_good: bool) -> bo
     again = isinstance(scope, (cst.For, cst.While)) and any(_empties(part) for part in parts)
     if not for_good and not again and "zero_grad" not in [call_name(call) for call in calls[last:]]:
         return False
+    return bool(_read(parts))
+
+
+def _read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
+    """The gradients that are read, ``xyz.grad``; none where a step by hand takes one of them."""
     asked = {id(p) for part in parts if _asks(part) for p in _walk(part)}
     taken = {id(p) for part in parts for given in _taken(part) for p in _walk(given)}
-    read = {id(p) for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad"} - asked
-    return bool(read) and not read & taken
+    read = [p for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in asked]
+    return [] if any(id(p) in taken for p in read) else read
 
 
 def _empties(node: cst.CSTNode) -> bool:

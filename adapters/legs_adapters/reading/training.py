@@ -18,7 +18,8 @@ _BACKWARD = re.compile(r"\b(manual_)?backward\s*\(")
 # Methods whose result a framework trains on: Lightning, nerfstudio.
 _HOOKS = {"training_step", "get_loss_dict", "get_train_loss_dict"}
 _HOOK = re.compile(r"def\s+(training_step|get_loss_dict|get_train_loss_dict)\s*\(")
-_CUT = {"item", "detach", "tolist", "numpy", "backward", "manual_backward"}
+_CUT = {"item", "detach", "tolist", "numpy", "backward", "manual_backward", "size", "numel", "dim"}
+_MEASURES = {"shape", "dtype", "device", "ndim"}  # of a tensor: nothing of its values
 _ANY = object()
 
 
@@ -122,7 +123,8 @@ class Training:
         if isinstance(node, cst.Call):
             self._call(function, node, key)
         elif isinstance(node, (cst.Name, cst.Attribute)):
-            self._place(function, node, key)
+            if not (isinstance(node, cst.Attribute) and node.attr.value in _MEASURES):
+                self._place(function, node, key)
         elif isinstance(node, cst.Subscript):
             if not self._place(function, node, key):
                 inner = key_of(node)

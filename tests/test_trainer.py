@@ -289,6 +289,7 @@ def test_scenes_that_cannot_be_trained_on_say_why(scene: Scene) -> None:
         ("sh_degree", 4),
         ("lambda_dssim", 1.5),
         ("l1_scale", -1.0),
+        ("position_lr_max_steps", 0),
         ("densify_grad_threshold", 0.0),
         ("max_gaussians", 0),
         ("spec", "leg"),
@@ -333,6 +334,24 @@ def test_training_learns_the_scene_and_repeats_bit_for_bit(scene: Scene, tmp_pat
     assert json.loads((tmp_path / "a" / "metrics.json").read_text()) == metrics
     assert TrainConfig.from_dict(json.loads((tmp_path / "a" / "cfg.json").read_text())) == config
     assert_equal(read_ply(tmp_path / "a" / "point_cloud" / "iteration_200" / "point_cloud.ply"), first.gaussians)
+
+
+@pytest.mark.parametrize(("steps", "last"), [(None, 1.6e-6), (3, 1.6e-6), (30000, 1.6e-4 * 0.01 ** (6 / 30000))])
+def test_the_rate_of_positions_falls_over_as_many_iterations_as_3dgs_would_take(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, steps: Optional[int], last: float
+) -> None:
+    rates: List[float] = []
+    step = Adam.step
+
+    def spy(adam: Adam, rate: float) -> None:
+        rates.append(rate)
+        step(adam, rate)
+
+    monkeypatch.setattr(Adam, "step", spy)
+    train(scene, TrainConfig(iterations=6, position_lr_max_steps=steps))
+    whole = extent(load_dataset(scene, PRESETS["legs"]).train)
+    assert rates[-1] == pytest.approx(whole * last, rel=1e-9)
+    assert rates[0] == pytest.approx(whole * 1.6e-4 * 0.01 ** (1 / (steps or 6)), rel=1e-9)
 
 
 def test_the_loss_is_legs_loss(scene: Scene) -> None:
@@ -469,6 +488,15 @@ def test_a_resumed_run_ends_bit_equal(scene: Scene, tmp_path: Path, at: int) -> 
     times = [(metrics.pop("seconds"), metrics.pop("processor_seconds")) for metrics in runs]
     assert whole.metrics == resumed.metrics == again.metrics
     assert times[1] == times[2]
+
+
+def test_a_run_of_before_a_setting_can_be_resumed(scene: Scene, tmp_path: Path) -> None:
+    run_until_killed(scene, tmp_path, SHORT, 20)
+    arrays, facts = read_checkpoint(tmp_path / CHECKPOINT)
+    del facts["config"]["position_lr_max_steps"]
+    write_checkpoint(tmp_path / CHECKPOINT, arrays, facts)
+    resumed = train(scene, SHORT, out=tmp_path, resume=True)
+    assert_equal(resumed.gaussians, train(scene, SHORT).gaussians)
 
 
 def test_a_checkpoint_of_another_run_is_refused(scene: Scene, tmp_path: Path) -> None:

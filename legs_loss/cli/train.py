@@ -52,6 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     settings.add_argument("--lambda_dssim", type=float, metavar="X", help="share of D-SSIM in the loss; default: 0.2")
     settings.add_argument("--l1_scale", type=float, metavar="X", help="multiplies the L1 term; default: 1")
     settings.add_argument(
+        "--position_lr_max_steps",
+        type=int,
+        metavar="N",
+        help="iterations over which the rate of positions falls; default: all; 3DGS: 30000",
+    )
+    settings.add_argument(
         "--densify_grad_threshold",
         type=float,
         metavar="X",
@@ -145,7 +151,7 @@ def _resumed(checkpoint: Path, given: Dict[str, Any]) -> TrainConfig:
 
     stored = read_checkpoint(checkpoint)[1]["config"]
     wanted = TrainConfig.from_dict(dict(stored, **given))
-    different = [name for name in given if wanted.as_dict()[name] != stored[name]]
+    different = [name for name in given if wanted.as_dict()[name] != stored.get(name)]
     if different:
         raise LegsError(
             f"{checkpoint.parent} holds a run with another {' and '.join(different)}: leave the flag out to go on with "

@@ -23,7 +23,7 @@ COLOUR_RATE = 2.5e-3  # of the constant harmonic; a twentieth of it for the othe
 
 
 def position_rate(progress: float, extent: float) -> float:
-    """The learning rate of positions when ``progress``, from 0 to 1, of the iterations is done.
+    """The learning rate of positions when ``progress``, from 0 to 1, of its way to the last is done.
 
     >>> position_rate(0.0, 2.0), round(position_rate(0.5, 2.0), 9)
     (0.00032, 3.2e-05)

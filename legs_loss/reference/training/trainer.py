@@ -67,6 +67,8 @@ class TrainConfig:
         sh_degree: of the colours, 0 to 3.
         lambda_dssim: the share of D-SSIM in the loss.
         l1_scale: multiplies the L1 term, weighted or not: for experiments.
+        position_lr_max_steps: the iterations over which the learning rate of positions falls to its last value; None:
+            all of them. 3DGS says 30000 whatever the run, so that positions keep moving to the end of a short one.
         densify_grad_threshold: a Gaussian whose mean view-space gradient reaches it is cloned or split. None chooses
             it by the size of the photographs, see :func:`default_threshold`.
         max_gaussians: a cap on their number, None for none.
@@ -80,6 +82,7 @@ class TrainConfig:
     sh_degree: int = 1
     lambda_dssim: float = 0.2
     l1_scale: float = 1.0
+    position_lr_max_steps: Optional[int] = None
     densify_grad_threshold: Optional[float] = None
     max_gaussians: Optional[int] = None
     white_background: bool = False
@@ -92,6 +95,11 @@ class TrainConfig:
             ("sh_degree", self.sh_degree in (0, 1, 2, 3), "0, 1, 2 or 3"),
             ("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "in [0, 1]"),
             ("l1_scale", 0.0 <= self.l1_scale < float("inf"), "at least 0"),
+            (
+                "position_lr_max_steps",
+                self.position_lr_max_steps is None or self.position_lr_max_steps >= 1,
+                "at least 1",
+            ),
             (
                 "densify_grad_threshold",
                 self.densify_grad_threshold is None or self.densify_grad_threshold > 0.0,
@@ -279,7 +287,7 @@ class _Run:
         arrays, facts = read_checkpoint(path)
         if facts["views"] != [view.name for view in data.train]:
             raise LegsError(f"{path}: this run was made from a scene with other views")
-        if facts["config"] != config.as_dict():
+        if TrainConfig.from_dict(facts["config"]) != config:
             raise LegsError(f"{path}: this run was made with other settings")
         run = cls(data, config, Adam.restore(arrays))
         run.iteration, run.clocks, run.order = facts["iteration"], np.array(facts["clocks"]), facts["order"]
@@ -346,7 +354,8 @@ class _Run:
         loss.backward()
         if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
             self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image))
-        self.adam.step(position_rate(self.iteration / self.config.iterations, self.extent))
+        steps = self.config.position_lr_max_steps or self.config.iterations
+        self.adam.step(position_rate(min(1.0, self.iteration / steps), self.extent))
         if self.iteration < self.schedule.densify_until:
             assert viewspace.grad is not None
             self.gradient_sum += viewspace.grad.norm(dim=1)  # 0 where it was not seen

@@ -12,6 +12,7 @@ from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple,
 import libcst as cst
 
 from legs_adapters.findings import Findings, Kept, Left, Problem, Site
+from legs_adapters.reading.beside import STRUCTURAL
 from legs_adapters.reading.handed import Handed, HandedOver
 from legs_adapters.reading.l1 import Form, Forms, abs_argument, is_l1_function, own_shape
 from legs_adapters.reading.layout import is_channels_last, lies_last
@@ -23,7 +24,7 @@ from legs_adapters.reading.program import Program
 from legs_adapters.reading.provenance import View, Views
 from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
-from legs_adapters.reading.run_time import STRUCTURAL, chosen_at_run_time
+from legs_adapters.reading.run_time import chosen_at_run_time
 from legs_adapters.reading.shared import is_asked, is_huber, is_measured, shared_of, unchanged_at
 from legs_adapters.reading.syntax import arguments, call_name, code, same, walk_expressions, words
 from legs_adapters.reading.training import Training

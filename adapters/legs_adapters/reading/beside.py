@@ -1,7 +1,8 @@
-"""What a step compares beside its photographs: maps that have a name of their own, a picture that never changes."""
+"""What a step compares beside its photographs: maps with a name of their own, a picture that never changes; SSIM."""
 
 from __future__ import annotations
 
+import re
 from typing import Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
@@ -9,6 +10,7 @@ import libcst as cst
 from legs_adapters.reading.l1 import Form, Forms
 from legs_adapters.reading.makers import is_rendering
 from legs_adapters.reading.module import Function
+from legs_adapters.reading.shared import unchanged_at
 from legs_adapters.reading.syntax import (
     attribute_chain,
     call_name,
@@ -16,13 +18,16 @@ from legs_adapters.reading.syntax import (
     dotted,
     key_of,
     loops_around,
+    same,
     walk_expressions,
     word_set,
     words,
 )
 from legs_adapters.reading.vocabulary import kind_of_words, role_of_words
 
-__all__ = ["is_always_the_same", "is_another_map"]
+__all__ = ["STRUCTURAL", "is_always_the_same", "is_another_map", "is_beside_ssim", "is_given"]
+
+STRUCTURAL = re.compile("ssim", re.I)
 
 _KEEPS = word_set("clamp clip clone contiguous cuda detach float permute squeeze to unsqueeze")
 _OF_VIEWS = word_set("batch cam camera cameras cams data frame frames item scene view views viewpoint viewpoints")
@@ -33,6 +38,18 @@ _OF_PHOTOGRAPHS = word_set(
     map tensor
     """
 )
+
+
+def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
+    """Whether an SSIM is taken of the same two: they are pictures, then, whatever else their names say."""
+    structural = [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
+    return any(is_given(function, call, first) and is_given(function, call, second) for call in structural)
+
+
+def is_given(function: Function, call: cst.Call, picture: cst.CSTNode) -> bool:
+    """Whether a call has a picture, or one with another axis, ``image.unsqueeze(0)``, among its arguments."""
+    parts = [part for arg in call.args for part in attribute_chain(arg.value)]
+    return any(same(part, picture) for part in parts) and unchanged_at(function, call, picture)
 
 
 def is_another_map(forms: Forms, function: Function, form: Form) -> bool:

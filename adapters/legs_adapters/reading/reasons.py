@@ -7,7 +7,7 @@ from typing import Dict, List, Optional, Sequence, Set
 
 import libcst as cst
 
-from legs_adapters.reading.beside import is_always_the_same, is_another_map
+from legs_adapters.reading.beside import is_always_the_same, is_another_map, is_beside_ssim
 from legs_adapters.reading.l1 import Form, Forms
 from legs_adapters.reading.makers import is_of_mesh, is_rendering
 from legs_adapters.reading.meaning import Meaning, Meanings
@@ -209,7 +209,8 @@ class Reasons:
         if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
             return "evaluation"
         about = self._about_splats(function) or self._rendered(module, function, form)
-        if not about or of_rays(form) or self._casts_rays(function):
+        rays = of_rays(form) or self._casts_rays(function)
+        if not about or (rays and not is_beside_ssim(function, form.first, form.second)):
             return "other"
         if any(is_of_mesh(self.program, function, side) for side in (form.first, form.second)):
             return "other"

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from typing import List, Optional, Sequence
 
 import libcst as cst
 
+from legs_adapters.reading.beside import STRUCTURAL, is_given
 from legs_adapters.reading.l1 import Form, is_l1_name
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.shared import unchanged_at
-from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, constant, key_of, same
+from legs_adapters.reading.syntax import arguments, call_name, constant, key_of, same
 from legs_adapters.reading.training import Training
 
-__all__ = ["STRUCTURAL", "chosen_at_run_time"]
+__all__ = ["chosen_at_run_time"]
 
 _BY_NAME = {"eval", "getattr"}
-STRUCTURAL = re.compile("ssim", re.I)
 
 
 def chosen_at_run_time(program: Program, training: Training, function: Function, known: Sequence[Form]) -> List[Form]:
@@ -35,17 +33,11 @@ def chosen_at_run_time(program: Program, training: Training, function: Function,
         if len(positional) != 2 or keywords or starred or not training.includes(call):
             continue
         first, second = positional
-        beside = any(_is_given(function, other, first) and _is_given(function, other, second) for other in structural)
+        beside = any(is_given(function, other, first) and is_given(function, other, second) for other in structural)
         settled = any(same(form.first, first) and same(form.second, second) for form in known)
         if beside and not settled and _is_looked_up(program, function, call):
             found.append(Form(call, call, first, second, "own", call.func))
     return found
-
-
-def _is_given(function: Function, call: cst.Call, picture: cst.CSTNode) -> bool:
-    """Whether a call has a picture, or one with another axis, ``image.unsqueeze(0)``, among its arguments."""
-    parts = [part for arg in call.args for part in attribute_chain(arg.value)]
-    return any(same(part, picture) for part in parts) and unchanged_at(function, call, picture)
 
 
 def _is_looked_up(program: Program, function: Function, call: cst.Call) -> bool:

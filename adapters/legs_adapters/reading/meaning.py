@@ -264,7 +264,7 @@ class Meanings:
             return Meaning("parameter", None)
         if isinstance(key, str):
             here = bool(function.flow.reaching(node))
-            local = self._flow(function, node, depth) if here else self._of_forward(function, node.value, key, depth)
+            local = self._flow(function, node, depth) if here else self._entry(function, node.value, key, depth)
             role = role_of_words(key) or local.role
             if role == "render" and not here and _is_asked_for(key) and _is_loaded(function, node.value, key):
                 role = "target"
@@ -277,6 +277,23 @@ class Meanings:
             kind = kind_of_words(computed) or kind_of_words(name)
             return Meaning(kind, role_of_words(computed) or self._role_of_holder(function, node.value, depth))
         return self.of(function, node.value, depth)
+
+    def _entry(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
+        """``package["photo"]``, which the codebase's own function put there, by name, before it returned them."""
+        made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
+        if len(made) != 1 or not isinstance(made[0], cst.Call):
+            return self._of_forward(function, node, key, depth)
+        makers = [ref.target for ref in self.program.resolve(function, made[0].func) if not ref.guess]
+        stored = [
+            (maker, definition.value)
+            for maker in makers
+            if isinstance(maker, Function)
+            for value in maker.flow.returns
+            if isinstance(value, cst.Name)
+            for definition in maker.flow.definitions.get(f"{value.value}[{key!r}]", [])
+            if definition.value is not None
+        ]
+        return _mix([self.of(maker, value, depth) for maker, value in stored])
 
     def _of_forward(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
         """``results["photo"]`` of a parameter, where the class's own ``forward`` returns such a dictionary."""

@@ -85,8 +85,9 @@ class Reasons:
 
     def why(self, function: Function, form: Form, pair: Pair) -> Optional[str]:
         """Return why a form is left; None where it is to be weighted."""
-        for meaning in (pair.a, pair.b):
-            if meaning.kind in _WHY:
+        for meaning, beside in ((pair.a, pair.b), (pair.b, pair.a)):
+            pictures = meaning.kind == "parameter" and beside.kind == "image"
+            if meaning.kind in _WHY and not (pictures and is_beside_ssim(function, form.first, form.second)):
                 return _WHY[meaning.kind]
         if constant(form.first) is not None or constant(form.second) is not None or _of_points(form):
             return "regulariser"

@@ -2,6 +2,7 @@
 
     python -m benchmarks                                      # all of them: an hour on a slow machine
     python -m benchmarks --parts loss-1 memory --json all.json
+    python -m benchmarks --parts gpu-800x533 gpu-1297x840     # on a machine with a GPU, where they are among all
 
 What is measured again replaces what the file has of it; the rest stays, so a long measurement may be divided, by parts
 or, with --only CONTENDER ..., by contenders: a row's ratio is always to ours of the same run.
@@ -20,6 +21,8 @@ import tempfile
 from pathlib import Path
 from typing import Any, Dict, List
 
+import torch
+
 HERE = Path(__file__).resolve().parent
 
 # A part: its script, and what it is called with.
@@ -37,18 +40,24 @@ PARTS: Dict[str, List[str]] = {
     "rasterizer-2": ["rasterizer.py", "--threads", "2"],
     "cpu-1": ["cpu.py", "--threads", "1"],
 }
+GPU = {
+    f"gpu-{size}": ["loss.py", "--device", "cuda", "--parts", "loss", "memory", "--size", size]
+    for size in ("800x533", "1297x840", "1600x1066", "3840x2160")
+}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART", help=", ".join(PARTS))
+    parts = {**PARTS, **GPU}
+    default = list(parts if torch.cuda.is_available() else PARTS)
+    parser.add_argument("--parts", nargs="+", choices=parts, default=default, metavar="PART", help=", ".join(parts))
     parser.add_argument("--json", default="benchmarks.json", help="the file of results (default: %(default)s)")
     args, extra = parser.parse_known_args()  # what is left is for the scripts: --rounds 3
     path = Path(args.json)
     results = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     failed = []
     for part in args.parts:
-        command = [PARTS[part][0], *PARTS[part][1:], *extra]
+        command = [*parts[part], *extra]
         print(f"\n== {part}: python benchmarks/{shlex.join(command)}", flush=True)
         found = measure(command)
         if found is None:

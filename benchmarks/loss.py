@@ -2,12 +2,15 @@
 
     python benchmarks/loss.py --threads 1 --size 1297x840
     python benchmarks/loss.py --parts growth
+    python benchmarks/loss.py --device cuda --parts loss memory   # fused-ssim too, where it is installed
 
 The contenders take turns in every round, on the same tensors and threads; a ratio is taken within a round, and the
 table shows the median and the least and greatest of them. On one thread the processor's own time counts. kornia,
 pytorch-msssim and torchmetrics are measured where they are installed. "3DGS" is Inria's l1_loss + ssim: |a - b|.mean()
 and legs_loss.ssim, which tests/test_ssim.py holds equal to theirs to the last bit. torch.compile compiles the reference
-before it is timed. Contenders of more than two seconds get three rounds.
+before it is timed. Contenders of more than two seconds get three rounds. On a GPU a time is that of ten steps between
+two events, the backend is Triton, and beside the table stands what the bytes that must move would take at the
+bandwidth of a copy.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ import torch
 from torch import Tensor
 
 from legs_loss import legs_loss, ssim, weight_map
-from legs_loss.kernels.backends import finding
+from legs_loss.kernels.backends import backend_for, finding
 from legs_loss.spec import PRESETS
 
 LAMBDA = 0.2
@@ -35,6 +38,10 @@ LEGS = PRESETS["legs"]
 GROWTH = ((400, 266), (800, 533), (1297, 840), (1600, 1066), (3840, 2160), (7680, 4320))
 SLOW_ROUNDS = 3
 TOO_LONG = 2.0  # seconds
+STEPS = 10  # between two events of a GPU
+COPIED = 1 << 28  # bytes
+# Bytes a value of RGB, and a pixel: prediction and target are read, the gradient is written; where weights come from.
+MUST_MOVE = {"LEGS, weights in the kernel": (16, 0), "LEGS, stored map": (12, 4), "3DGS by the kernel": (12, 0)}
 
 Contenders = Dict[str, Callable[[], Any]]
 
@@ -42,9 +49,13 @@ Contenders = Dict[str, Callable[[], Any]]
 def main() -> None:
     args = parse()
     if args.memory_of:  # a child: one contender in a process of its own
-        print(json.dumps(peak_memory(args.memory_of, args.size)))
+        print(json.dumps(peak_memory(args.memory_of, args.size, args.device)))
         return
-    result: Dict[str, Any] = {"machine": machine(), "threads": args.threads, "size": f"{args.size[0]}x{args.size[1]}"}
+    result: Dict[str, Any] = {
+        "machine": machine(args.device),
+        "threads": args.threads,
+        "size": f"{args.size[0]}x{args.size[1]}",
+    }
     for part in args.parts:
         result[part] = {"loss": loss, "weights": weights, "memory": memory, "growth": growth}[part](args)
     if args.json:
@@ -54,25 +65,50 @@ def main() -> None:
 
 
 def loss(args: argparse.Namespace) -> Any:
-    print(f"\nforward and backward, {args.size[0]}x{args.size[1]} RGB, threads: {args.threads}")
-    prediction, target = images(args.size)
+    print(f"\nforward and backward, {args.size[0]}x{args.size[1]} RGB, {where(args)}")
+    prediction, target = images(args.size, args.device)
     contenders = losses(prediction, target)
     if args.only:
         contenders = {name: contenders[name] for name in args.only}
-    return side_by_side(contenders, args.rounds, "LEGS, weights in the kernel")
+    table = side_by_side(contenders, args.rounds, "LEGS, weights in the kernel", args.device)
+    if args.device.type == "cuda":
+        at_bandwidth(table, args.size, args.device)
+    return table
+
+
+def where(args: argparse.Namespace) -> str:
+    return torch.cuda.get_device_name(args.device) if args.device.type == "cuda" else f"threads: {args.threads}"
+
+
+def at_bandwidth(table: Dict[str, Any], size: Tuple[int, int], device: torch.device) -> None:
+    """Add to the rows of ours, and print, what their bytes would take at the bandwidth of a copy."""
+    source = torch.empty(COPIED, dtype=torch.uint8, device=device)
+    copy = torch.empty_like(source)
+    seconds = statistics.median(timed(lambda: copy.copy_(source), device) for _ in range(9))
+    bandwidth = 2 * COPIED / seconds  # read and written
+    print(f"a copy moves {bandwidth / 1e9:.0f} GB/s")
+    for name, (of_value, of_pixel) in MUST_MOVE.items():
+        if name in table:
+            row, pixels = table[name], size[0] * size[1]
+            row["bytes"] = (3 * of_value + of_pixel) * pixels
+            least = 1e3 * row["bytes"] / bandwidth
+            row["ms at a copy's bandwidth"] = least
+            megabytes, share = row["bytes"] / 1e6, least / row["median ms"]
+            print(f"{name:<46} {megabytes:10.1f} MB   at that {least:.3f} ms, {share:.2f} of its time")
 
 
 def weights(args: argparse.Namespace) -> Any:
-    print(f"\nthe weights alone, {args.size[0]}x{args.size[1]} RGB, threads: {args.threads}")
-    _, target = images(args.size)
-    return side_by_side(weightings(target), args.rounds, "weight_map")
+    print(f"\nthe weights alone, {args.size[0]}x{args.size[1]} RGB, {where(args)}")
+    _, target = images(args.size, args.device)
+    return side_by_side(weightings(target), args.rounds, "weight_map", args.device)
 
 
 def memory(args: argparse.Namespace) -> Any:
     print(f"\npeak memory beyond the images, forward and backward, {args.size[0]}x{args.size[1]} RGB")
     found = {}
-    for name in args.only or losses(*images((32, 32))):
+    for name in args.only or losses(*images((32, 32), args.device)):
         command = [sys.executable, __file__, "--memory-of", name, "--threads", str(args.threads)]
+        command += ["--device", str(args.device)]
         command += ["--size", f"{args.size[0]}x{args.size[1]}"]
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:  # torch.compile does not take every shape everywhere
@@ -90,14 +126,14 @@ def growth(args: argparse.Namespace) -> Any:
     left = {"LEGS, weights in the kernel", "3DGS (torch)", "kornia SSIM + L1", "pytorch-msssim SSIM + L1"}
     found = []
     for size in GROWTH:
-        contenders = losses(*images(size))
+        contenders = losses(*images(size, args.device))
         for name in [name for name in contenders if name in left and (not args.only or name in args.only)]:
             row: Dict[str, Any] = {"size": f"{size[0]}x{size[1]}", "megapixels": size[0] * size[1] / 1e6, "name": name}
-            for threads in sorted({1, os.cpu_count() or 1}):
+            for threads in sorted({1, os.cpu_count() or 1}) if args.device.type == "cpu" else (1,):
                 set_threads(threads)
-                first = timed(contenders[name])
+                first = timed(contenders[name], args.device)
                 rounds = 1 if first > 1.0 else args.rounds
-                seconds = statistics.median(timed(contenders[name]) for _ in range(rounds))
+                seconds = statistics.median(timed(contenders[name], args.device) for _ in range(rounds))
                 row[f"ms on {threads}"] = 1e3 * seconds
                 row[f"ns a pixel on {threads}"] = 1e9 * seconds / (size[0] * size[1])
                 if seconds > TOO_LONG:
@@ -121,7 +157,8 @@ def losses(prediction: Tensor, target: Tensor) -> Contenders:
         return lambda image: (1.0 - LAMBDA) * l1(image) + LAMBDA * (1.0 - similarity(image))
 
     contenders: Dict[str, Callable[[Tensor], Tensor]] = {}
-    kernel = finding("numba", torch.device("cpu")).fused
+    backend = backend_for(prediction.device)
+    kernel = finding(backend, prediction.device).fused if backend != "torch" else None
     if kernel is not None:
         contenders["LEGS, weights in the kernel"] = lambda image: legs_loss(image, target, LEGS)
         contenders["LEGS, stored map"] = lambda image: legs_loss(image, target, weight=stored)
@@ -131,7 +168,8 @@ def losses(prediction: Tensor, target: Tensor) -> Contenders:
         + LAMBDA * (1.0 - ssim(image, target))
     )
     contenders["3DGS (torch)"] = mixed(lambda image: ssim(image, target))
-    contenders["3DGS (torch, oneDNN off)"] = contenders["3DGS (torch)"]
+    if not prediction.is_cuda:
+        contenders["3DGS (torch, oneDNN off)"] = contenders["3DGS (torch)"]
     contenders["LEGS by torch.compile"] = torch.compile(contenders["LEGS by torch"])
     try:
         import kornia
@@ -159,6 +197,15 @@ def losses(prediction: Tensor, target: Tensor) -> Contenders:
     except ImportError:
         pass
 
+    try:
+        from fused_ssim import fused_ssim
+
+        if prediction.is_cuda:
+            contenders["fused-ssim alone"] = lambda image: 1.0 - fused_ssim(image.unsqueeze(0), batched)
+            contenders["fused-ssim + L1"] = mixed(lambda image: fused_ssim(image.unsqueeze(0), batched))
+    except ImportError:
+        pass
+
     def step(name: str, function: Callable[[Tensor], Tensor]) -> Callable[[], None]:
         def run() -> None:
             prediction.grad = None
@@ -173,7 +220,7 @@ def losses(prediction: Tensor, target: Tensor) -> Contenders:
 def weightings(target: Tensor) -> Contenders:
     """Return each way to the weights of a photograph as a function."""
     found: Contenders = {"weight_map": lambda: weight_map(target, LEGS)}
-    if finding("numba", torch.device("cpu")).fused is not None:
+    if not target.is_cuda and finding("numba", target.device).fused is not None:
         from legs_loss.kernels.numba_response import extremes
 
         batch = target.unsqueeze(0).numpy()
@@ -193,12 +240,12 @@ def weightings(target: Tensor) -> Contenders:
     return found
 
 
-def side_by_side(contenders: Contenders, rounds: int, against: str) -> Any:
+def side_by_side(contenders: Contenders, rounds: int, against: str, device: torch.device) -> Any:
     """Time all contenders in turns; print and return medians and the ratios to one of them."""
     first = {}
     for name, step in list(contenders.items()):
         try:
-            first[name] = timed(step)  # compilation, and memory's first touch
+            first[name] = timed(step, device)  # compilation, and memory's first touch
         except Exception as error:  # torch.compile needs a C++ compiler and raises nearly anything
             print(f"{name}: it does not run here ({type(error).__name__}: {str(error).strip().splitlines()[0]})")
             del contenders[name]
@@ -206,7 +253,7 @@ def side_by_side(contenders: Contenders, rounds: int, against: str) -> Any:
     for i in range(rounds):
         for name, step in contenders.items():
             if i < SLOW_ROUNDS or first[name] < 2.0:
-                times[name].append(timed(step))
+                times[name].append(timed(step, device))
     table = {}
     against = against if against in times else next(iter(times))
     for name, seconds in times.items():
@@ -221,11 +268,19 @@ def side_by_side(contenders: Contenders, rounds: int, against: str) -> Any:
     return table
 
 
-def peak_memory(name: str, size: Tuple[int, int]) -> int:
-    """Return by how many bytes one step raises this process's peak (on Linux); a small one came first, to load all."""
-    losses(*images((64, 64)))[name]()
-    prediction, target = images(size)
+def peak_memory(name: str, size: Tuple[int, int], device: torch.device) -> int:
+    """Return by how many bytes one step raises this process's peak (on Linux); a small one came first, to load all.
+
+    Of a GPU it is the peak of what torch allocated there.
+    """
+    losses(*images((64, 64), device))[name]()
+    prediction, target = images(size, device)
     step = losses(prediction, target)[name]
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        allocated = torch.cuda.memory_allocated(device)
+        step()
+        return torch.cuda.max_memory_allocated(device) - allocated
     ctypes.CDLL(None).malloc_trim(0)  # what is free already would hide what the step takes
     with open("/proc/self/clear_refs", "w", encoding="ascii") as file:
         file.write("5")  # the peak counts from here
@@ -239,7 +294,7 @@ def peak() -> int:
         return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmHWM"))
 
 
-def images(size: Tuple[int, int]) -> Tuple[Tensor, Tensor]:
+def images(size: Tuple[int, int], device: torch.device) -> Tuple[Tensor, Tensor]:
     """Return a prediction that learns and a target: a picture of waves with noise, 8 bits deep as photographs are."""
     width, height = size
     generator = torch.Generator().manual_seed(0)
@@ -247,16 +302,25 @@ def images(size: Tuple[int, int]) -> Tuple[Tensor, Tensor]:
     waves = torch.stack([0.5 + 0.3 * torch.sin((k + 1) * x + torch.cos(y * (k + 1))) for k in range(3)])
     target = (waves + 0.05 * torch.randn(3, height, width, generator=generator)).clamp(0.0, 1.0)
     target = (255.0 * target).round() / 255.0
-    prediction = (0.9 * target + 0.05 * torch.rand(3, height, width, generator=generator)).requires_grad_()
-    return prediction, target
+    prediction = 0.9 * target + 0.05 * torch.rand(3, height, width, generator=generator)
+    return prediction.to(device).requires_grad_(), target.to(device)
 
 
-def timed(step: Callable[[], Any]) -> float:
+def timed(step: Callable[[], Any], device: torch.device) -> float:
     """Return the seconds of a step: on one thread the processor's own, which other people's work hardly changes."""
+    if device.type == "cuda":
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        torch.cuda.synchronize(device)
+        start.record()
+        for _ in range(STEPS):
+            step()
+        end.record()
+        end.synchronize()
+        return start.elapsed_time(end) / 1e3 / STEPS
     clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
-    start = clock()
+    before = clock()
     step()
-    return clock() - start
+    return clock() - before
 
 
 def set_threads(threads: int) -> None:
@@ -269,14 +333,16 @@ def set_threads(threads: int) -> None:
         pass
 
 
-def machine() -> Dict[str, str]:
+def machine(device: torch.device) -> Dict[str, str]:
     """Return what the numbers depend on."""
     name = platform.processor() or platform.machine()
     if os.path.exists("/proc/cpuinfo"):
         with open("/proc/cpuinfo", encoding="utf-8") as file:
             name = next((line.split(":")[1].strip() for line in file if line.startswith("model name")), name)
     versions = {"python": platform.python_version(), "torch": torch.__version__}
-    for package in ("numba", "kornia", "pytorch_msssim", "torchmetrics"):
+    if device.type == "cuda":
+        versions["gpu"], versions["cuda"] = torch.cuda.get_device_name(device), str(torch.version.cuda)
+    for package in ("numba", "triton", "fused_ssim", "kornia", "pytorch_msssim", "torchmetrics"):
         try:
             versions[package] = str(getattr(__import__(package), "__version__", "installed"))
         except ImportError:
@@ -288,12 +354,15 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="+", default=["loss", "weights", "memory", "growth"])
     parser.add_argument("--size", default="1297x840", type=lambda text: tuple(int(side) for side in text.split("x")))
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="cpu (the default) or cuda")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--json", help="write everything to this file")
     parser.add_argument("--only", nargs="+", help="measure only these contenders, in place of all")
     parser.add_argument("--memory-of", help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.device.type == "cuda" and not torch.cuda.is_available():
+        parser.error("torch finds no CUDA GPU here")
     set_threads(args.threads)
     return args
 

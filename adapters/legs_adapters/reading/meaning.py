@@ -279,7 +279,7 @@ class Meanings:
         return self.of(function, node.value, depth)
 
     def _entry(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
-        """``package["photo"]``, which the codebase's own function put there, by name, before it returned them."""
+        """``package["photo"]``, of a package that the codebase's own function filled and returned."""
         made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
         if len(made) != 1 or not isinstance(made[0], cst.Call):
             return self._of_forward(function, node, key, depth)
@@ -473,7 +473,9 @@ def _passed_on(function: Function, node: cst.CSTNode) -> Optional[str]:
                 return None
             elif id(definition) not in seen:
                 seen.add(id(definition))
-                if definition.kind == "element" and isinstance(value, cst.Tuple) and definition.index is not None:
+                if definition.kind == "element" and isinstance(value, cst.Tuple):
+                    if definition.index is None or definition.index >= len(value.elements):
+                        return None
                     value = value.elements[definition.index].value
                 work.append(value)
     return found.pop() if len(found) == 1 else None

@@ -43,7 +43,6 @@ _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 _MAKES = {"optimizer", "optimiser", "optimizers", "optimisers"}
 _STEPS = word_set("step steps update optimize optimise optim adam sgd")
 _SCENE = word_set("gaussian gaussians gs splat splats")
-_READS = re.compile(r"\.grad\b(?!\s*=[^=])")
 _NOTHING = object()
 _DEPTH = 3
 
@@ -112,13 +111,19 @@ class Steps:
 
     def _read_by_callers(self, function: Function) -> bool:
         """Whether a caller also calls what reads gradients: ``accumulate(scene)``, then ``gaussians.prune(count)``."""
+        called = self._called(function, *self._callers(function))
+        read = any("grad" in each.text and _read(list(_walk(each.body))) for each in called)
+        return read and not any(map(_steps, called))
+
+    def _called(self, *functions: Function) -> List[Function]:
+        """What functions call: a step may stand there under any name, ``gaussians.post_backward()``."""
         called = [
             reference.target
-            for caller in self._callers(function)
-            for call in caller.flow.calls
-            for reference in self.program.resolve(caller, call.func)
+            for function in functions
+            for call in function.flow.calls
+            for reference in self.program.resolve(function, call.func)
         ]
-        return any(isinstance(each, Function) and _READS.search(each.text) is not None for each in called)
+        return [each for each in called if isinstance(each, Function)]
 
     def _reads_its_own(self, function: Function, scope: cst.CSTNode) -> bool:
         """Whether the gradients that are read are of models made here, which nobody else gets to step on."""
@@ -126,7 +131,8 @@ class Steps:
         names = [root for root in roots if isinstance(root, cst.Name)]
         given = {part.value for value in function.flow.returns for part in _walk(value) if isinstance(part, cst.Name)}
         own = bool(roots) and len(names) == len(roots) and not given & {name.value for name in names}
-        return own and all(self._made_here(function, name) for name in names)
+        own = own and all(self._made_here(function, name) for name in names)
+        return own and not any(map(_steps, self._called(function)))
 
     def trains_its_own(self, function: Function) -> bool:
         """Whether it makes a Gaussian model and steps that model's optimiser: training, wherever the file lies."""
@@ -251,6 +257,10 @@ def _is_step(call: cst.Call) -> bool:
     if call_name(call) != "step" or not isinstance(call.func, cst.Attribute):
         return False
     return not _spoken(call.func.value) & _SCHEDULES
+
+
+def _steps(function: Function) -> bool:
+    return "step" in function.text and any(map(_is_step, function.flow.calls))
 
 
 def _only_reads(scope: cst.CSTNode, calls: List[cst.Call], for_good: bool) -> bool:

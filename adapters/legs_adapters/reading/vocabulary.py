@@ -11,7 +11,8 @@ __all__ = ["DATA", "KINDS", "kind_of_words", "role_of_words"]
 # The more special kinds first: a "depth image" is a depth.
 _WORDS = {
     "flow": """
-        flow flows motion motions optical velocity velocities coor coords coordinate coordinates trajectory track
+        flow flows motion motions optical velocity velocities coor coords coordinate coordinates track traj trajs
+        trajectory trajectories
     """,
     "normal": "normal normals nrm",
     "depth": """

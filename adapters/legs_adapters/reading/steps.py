@@ -260,6 +260,7 @@ def _is_step(call: cst.Call) -> bool:
 
 
 def _steps(function: Function) -> bool:
+    """Whether an optimiser steps in it. Its text may be its whole file's, so that only leads to a closer look."""
     return "step" in function.text and any(map(_is_step, function.flow.calls))
 
 

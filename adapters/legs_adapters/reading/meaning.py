@@ -11,6 +11,7 @@ from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Set, Tu
 
 import libcst as cst
 
+from legs_adapters.reading.entries import called_makers, forward_maker, stored, written
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
@@ -279,39 +280,13 @@ class Meanings:
         return self.of(function, node.value, depth)
 
     def _entry(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
-        """``package["photo"]``, of a package that the codebase's own function filled and returned."""
-        made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
-        if len(made) != 1 or not isinstance(made[0], cst.Call):
-            return self._of_forward(function, node, key, depth)
-        makers = [ref.target for ref in self.program.resolve(function, made[0].func) if not ref.guess]
-        stored = [
-            (maker, definition.value)
-            for maker in makers
-            if isinstance(maker, Function)
-            for value in maker.flow.returns
-            if isinstance(value, cst.Name)
-            for definition in maker.flow.definitions.get(f"{value.value}[{key!r}]", [])
-            if definition.value is not None
-        ]
-        return _mix([self.of(maker, value, depth) for maker, value in stored])
+        """``package["photo"]``, of a package that the codebase's own function made.
 
-    def _of_forward(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
-        """``results["photo"]`` of a parameter, where the class's own ``forward`` returns such a dictionary."""
-        forward = function.owner.methods.get("forward") if function.owner is not None else None
-        given = function.flow.reaching(node)
-        if forward is None or forward is function or not given or any(d.kind != "parameter" for d in given):
-            return _UNKNOWN
-        returned: List[Optional[cst.CSTNode]] = []
-        for value in forward.flow.returns:
-            returned += [d.value for d in forward.flow.reaching(value)] if isinstance(value, cst.Name) else [value]
-        stored = [
-            element.value
-            for value in returned
-            if isinstance(value, cst.Dict)
-            for element in value.elements
-            if isinstance(element, cst.DictElement) and constant(element.key) == key
-        ]
-        return _mix([self.of(forward, value, depth) for value in stored])
+        What a renderer writes into its dictionary has the names that the loss knows; inside, it is made of depths, too.
+        """
+        held = stored(called_makers(self.program, function, node), key)
+        held = held or written(forward_maker(function, node), key)
+        return _mix([self.of(maker, value, depth) for maker, value in held])
 
     @staticmethod
     def _default_key(function: Function, node: cst.Subscript) -> object:

@@ -7,10 +7,10 @@ from typing import Iterable, List, NamedTuple, Optional, Tuple
 
 import libcst as cst
 
+from legs_adapters.reading.entries import called_makers, written
 from legs_adapters.reading.l1 import Form
 from legs_adapters.reading.meaning import Meaning, Meanings
 from legs_adapters.reading.module import Function
-from legs_adapters.reading.program import Program
 from legs_adapters.reading.syntax import (
     arguments,
     attribute_chain,
@@ -166,7 +166,9 @@ def is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: in
     if isinstance(node, cst.BinaryOperation):
         return are([(function, node.left), (function, node.right)])
     if isinstance(node, cst.Subscript):
-        return are(_entries(meanings.program, function, node) or [(function, node.value)])
+        key = key_of(node)
+        makers = called_makers(meanings.program, function, node.value) if isinstance(key, str) else []
+        return are(written(makers, str(key)) or [(function, node.value)])
     if isinstance(node, cst.Name):
         found = [d for d in function.flow.reaching(node) if constant(d.value, d) is not None]
         if any(d.kind == "assign" and _is_picked(meanings, function, d.value) for d in found):
@@ -182,23 +184,6 @@ def is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: in
             return are((function, arg.value) for arg in node.args[:1])
         return call_name(node) in ("float", "cuda", "to", "clamp", "detach") and are([(function, node.func.value)])
     return False
-
-
-def _entries(program: Program, function: Function, node: cst.Subscript) -> List[Tuple[Function, cst.CSTNode]]:
-    """What ``package["crops"]`` is in the dictionaries that the function returns which made the package."""
-    key, found = key_of(node), list(function.flow.reaching(node.value))
-    if not isinstance(key, str) or len(found) != 1 or not isinstance(found[0].value, cst.Call):
-        return []
-    made = [r.target for r in program.resolve(function, found[0].value.func) if not r.guess]
-    return [
-        (callee, element.value)
-        for callee in made
-        if isinstance(callee, Function)
-        for value in callee.flow.returns
-        if isinstance(value, cst.Dict)
-        for element in value.elements
-        if isinstance(element, cst.DictElement) and constant(element.key) == key
-    ]
 
 
 def _is_picked(meanings: Meanings, function: Function, node: Optional[cst.CSTNode]) -> bool:

@@ -336,7 +336,7 @@ class _Finder:
             aside = tuple(shared.aside)
         elif shared is not None:
             return self._problem(function, form, place, f"{_short(form.node)} serves more than the loss", flipped)
-        last = self._is_channels_last(function, prediction, target)
+        last = self._is_channels_last(function, prediction, target, form.node)
         last = last or (picked is not None and lies_last(function, picked[0]))
         view = self.views.of(function, target, form.call)
         stands = (function.module.path, place.line, place.column, place.last_line)
@@ -362,7 +362,9 @@ class _Finder:
         alike = re.sub(r"\s+", "", _index(one)) == re.sub(r"\s+", "", _index(other))
         return (one, other) if alike else None
 
-    def _is_channels_last(self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> bool:
+    def _is_channels_last(
+        self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode, error: cst.CSTNode
+    ) -> bool:
         """Whether the two lie so; or a photograph does that the same rendering is compared with elsewhere."""
         others = [
             form.second
@@ -371,13 +373,14 @@ class _Finder:
             and same(form.first, prediction)
             and _is_same_place(function, form.first, prediction)
         ]
-        return any(is_channels_last(self.training, function, prediction, other) for other in (target, *others))
+        lie = (is_channels_last(self.training, function, prediction, other, error=error) for other in (target, *others))
+        return any(lie)
 
     def _is_definition(self, function: Function, form: Form) -> bool:
         """Whether this is the body of the codebase's own L1 function, whose calls are what counts."""
         if own_shape(self.program, function) is None:
             return False
-        calls = self.training.sites.get(function, [])
+        calls = self.training.sites.get(function) or self.meanings.calls_of(function)
         known = {id(f.call) for caller, _ in calls for f in self.forms.of(caller)}
         return function in self.handed.functions or all(
             id(call) in known or own_shape(self.program, caller) is not None for caller, call in calls

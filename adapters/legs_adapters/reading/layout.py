@@ -38,10 +38,17 @@ class Vote(NamedTuple):
     strength: int
 
 
-def is_channels_last(training: Training, function: Function, *images: cst.CSTNode) -> bool:
-    """Return whether the images are [H, W, C] or [B, H, W, C]; without a sign of it they are not."""
+def is_channels_last(
+    training: Training, function: Function, *images: cst.CSTNode, error: Optional[cst.CSTNode] = None
+) -> bool:
+    """Return whether the images are [H, W, C] or [B, H, W, C]; without a sign of it they are not.
+
+    ``error`` is what has been made of them, on which a mask may be laid.
+    """
     votes = [vote for image in _without_factor(*images) for vote in _votes(training, function, image, set(), 0)]
     votes += _votes_of_callees(training, function, images)
+    axes = [_added(function, factor) for factor in _factors_of(function, error)]
+    votes += [Vote(axis, 2) for axis in axes if axis is not None]
     last, first = (sum(vote.strength for vote in votes if vote.axis == axis) for axis in (_LAST, _FIRST))
     return last > first
 
@@ -70,6 +77,16 @@ def _without_factor(*images: cst.CSTNode) -> Tuple[cst.CSTNode, ...]:
                 if isinstance(factor, cst.Name) and same(factor, its):
                     return rest, others
     return images
+
+
+def _factors_of(function: Function, error: Optional[cst.CSTNode]) -> Iterator[cst.CSTNode]:
+    """Yield what an error map is multiplied by where it is made: ``error * mask``, ``error.mul(mask)``."""
+    for node in function.flow.expressions if error is not None else ():
+        if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Multiply):
+            if error in (node.left, node.right):
+                yield node.right if node.left is error else node.left
+        elif isinstance(node, cst.Call) and call_name(node) == "mul" and _subject(node) is error and node.args:
+            yield node.args[-1].value
 
 
 def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[int], depth: int) -> List[Vote]:
@@ -110,7 +127,7 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
         return votes
     if isinstance(node, cst.BinaryOperation):
         for side in (node.left, node.right):
-            axis = _added(side) if isinstance(side, cst.Subscript) else None
+            axis = _added(function, side)
             if axis is not None:
                 votes.append(Vote(axis, 2))
             else:
@@ -365,8 +382,15 @@ def _is_batched(node: cst.Subscript) -> bool:
     return parts[0] is None and all(part in (..., ":") for part in parts[1:])
 
 
-def _added(node: cst.Subscript) -> Optional[int]:
+def _added(function: Function, node: cst.CSTNode) -> Optional[int]:
     """Where the channels of an image are by the axes that are added to what is laid over it."""
+    if isinstance(node, cst.Name):
+        made = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
+        return _added(function, made[0]) if len(made) == 1 and isinstance(made[0], (cst.Call, cst.Subscript)) else None
+    if isinstance(node, cst.Call):
+        return _unsqueezed(node)
+    if not isinstance(node, cst.Subscript):
+        return None
     parts = _parts(node)
     if parts in ([None, None, ":"], [":", None, None, ":"]):
         return _LAST  # colour[None, None, :]
@@ -375,6 +399,16 @@ def _added(node: cst.Subscript) -> Optional[int]:
     if parts[-1] is None and (parts[0] is ... or parts[:2] == [":", ":"]):
         return _LAST  # mask[..., None]
     return _FIRST if parts in ([":", None], [":", None, ":", ":"]) else None  # mask[:, None]
+
+
+def _unsqueezed(node: cst.CSTNode) -> Optional[int]:
+    """``mask.unsqueeze(-1)``; of ``colour.unsqueeze(-1).unsqueeze(-1)`` they are first."""
+    count = 0
+    while isinstance(node, cst.Call) and call_name(node) == "unsqueeze" and isinstance(node.func, cst.Attribute):
+        if [constant(value) for value in arguments(node)[0]] != [-1]:
+            return None
+        node, count = node.func.value, count + 1
+    return {1: _LAST, 2: _FIRST}.get(count)
 
 
 def _parts(node: cst.Subscript) -> List[object]:

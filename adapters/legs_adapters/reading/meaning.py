@@ -45,6 +45,7 @@ _EXTREMES = {"max", "min", "amax", "amin"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
 _OF_DIFFUSION = {"guidance_scale", "negative_prompt", "num_inference_steps", "strength"}  # of a picture that it paints
+_COMPARED = {"image", "depth", "normal", "flow"}
 _LOADERS = {"loader", "dataloader"}
 _DEPTH = 40
 _BUDGET = 20000  # steps to answer one question: some code is one large knot
@@ -161,7 +162,10 @@ class Meanings:
         definitions = self.program.lookup(function, node)
         if definitions is None:
             return _UNKNOWN
-        return _mix([self._definition(where, definition, depth) for where, definition in definitions])
+        ways = [self._definition(where, definition, depth) for where, definition in definitions]
+        if Meaning("image", "target") in ways:  # a photograph, or what a setting puts into its place
+            ways = [meaning for meaning in ways if meaning.kind != "warp"]
+        return _mix(ways)
 
     def _definition(self, function: Function, definition: Definition, depth: int) -> Meaning:
         value = definition.value
@@ -223,14 +227,24 @@ class Meanings:
         if definition.place not in function.parameters:
             return _UNKNOWN
         found = []
-        for caller, call in (self.training.sites.get(function) or self._calls_of(function))[:12]:
+        for caller, call in (self.training.sites.get(function) or self.calls_of(function))[:12]:
             value = function.given(call, definition.place)
             if value is not None:
                 found.append(self.of(caller, value, depth))
         images = [meaning for meaning in found if meaning.kind == "image"]
-        return _mix(images or found)
+        given = _mix(images or found)
+        said = self._said_by_class(function)
+        return given if said is None else given._replace(kind=said)
 
-    def _calls_of(self, function: Function) -> List[Tuple[Function, cst.Call]]:
+    def _said_by_class(self, function: Function) -> Optional[str]:
+        """What a class's name says that its method is given, where one call in a base class serves several classes."""
+        owner = function.owner
+        if owner is None or not any(self.program.member(base, function.name) for base in self.program.bases(owner)):
+            return None
+        kind = kind_of_words(owner.name)
+        return kind if kind in _COMPARED else None
+
+    def calls_of(self, function: Function) -> List[Tuple[Function, cst.Call]]:
         """The calls of a function that training does not go through."""
         if function not in self._calls:
             self._calls[function] = [

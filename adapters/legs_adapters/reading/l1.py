@@ -513,6 +513,8 @@ def _meet_in_differences(program: Program, function: Function, a: str, b: str, d
             if isinstance(node.operator, cst.Multiply) and constant(node.right, 1) == 0:
                 allowed.update(id(n) for n in walk_expressions(node))
             if isinstance(node.operator, cst.Subtract) and mirrored(node.left, node.right):
+                if _is_made_by(program, function, node.left):
+                    return False  # edges(a) - edges(b): of what is made of the two
                 allowed.update(id(n) for n in walk_expressions(node))
         elif isinstance(node, cst.Call):
             name = call_name(node)
@@ -559,6 +561,12 @@ def _meet_in_differences(program: Program, function: Function, a: str, b: str, d
     compared = {name for pair in pairs for name in pair}
     names = [node for node in nodes if isinstance(node, cst.Name) and node.value in compared]
     return bool(names) and all(id(node) in allowed for node in names)
+
+
+def _is_made_by(program: Program, function: Function, node: cst.CSTNode) -> bool:
+    """Whether an expression calls a function of the codebase."""
+    calls = [part for part in walk_expressions(node) if isinstance(part, cst.Call)]
+    return any(r.kind == "function" and not r.guess for call in calls for r in program.resolve(function, call.func))
 
 
 def _picked_pairs(

@@ -45,7 +45,10 @@ _EXTREMES = {"max", "min", "amax", "amin"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
 _OF_DIFFUSION = {"guidance_scale", "negative_prompt", "num_inference_steps", "strength"}  # of a picture that it paints
+_GAUSSIANS = {"gaussians", "gaussian", "splats"}
+_CAMERAS = {"cam", "camera", "view", "viewpoint"}
 _COMPARED = {"image", "depth", "normal", "flow"}
+_STEPS_OR_DYNAMIC = {"dx", "dy"}
 _LOADERS = {"loader", "dataloader"}
 _DEPTH = 40
 _BUDGET = 20000  # steps to answer one question: some code is one large knot
@@ -118,7 +121,9 @@ class Meanings:
                 return flow  # colors_grad = colors[:, :, :half]: the part that gets gradients
             if flow.kind == "image" and kind_of_words(node.value) == "mask" and _is_masked(function, node):
                 return flow  # gt_mask_images = gt_image * mask
-            return self._named(node.value, flow)
+            meaning = self._named(node.value, flow)
+            blends = meaning.kind == "feature" and _is_taken_from_one(function, node)
+            return meaning._replace(kind="mask") if blends else meaning
         if isinstance(node, cst.Attribute):
             return self._attribute(function, node, depth)
         if isinstance(node, cst.Subscript):
@@ -146,6 +151,8 @@ class Meanings:
     @staticmethod
     def _named(name: str, flow: Meaning) -> Meaning:
         kind = kind_of_words(name)
+        if kind == "gradient" and flow.kind == "image" and set(words(name)) & _STEPS_OR_DYNAMIC:
+            return Meaning("image", role_of_words(name) or flow.role)  # dy_tensor = package["render_dy"]
         if kind == "image" and flow.kind == "feature":
             return Meaning("image", role_of_words(name) or flow.role)  # `rgb = outputs["features"]`: colours, there
         if kind == "mask" and flow.kind in ("flow", "depth"):
@@ -389,7 +396,7 @@ class Meanings:
         kind = kind_of_words(name)
         if "compute" in spoken and kind is None:
             spoken = spoken - {"compute"}
-        if spoken & _RENDERERS:
+        if spoken & _RENDERERS or (kind is None and _draws(values)):
             of_points = kind in (None, "parameter")  # points_to_render(...)
             return Meaning("image" if of_points else kind, "render")
         if kind is not None and kind not in ("image", "mask", "parameter"):
@@ -529,6 +536,24 @@ def _is_masked(function: Function, node: cst.Name) -> bool:
     products = [v for v in made if isinstance(v, cst.BinaryOperation) and isinstance(v.operator, cst.Multiply)]
     says_image = any(kind_of_words(word) == "image" for word in words(node.value))
     return says_image and bool(made) and len(products) == len(made)
+
+
+def _draws(values: List[cst.BaseExpression]) -> bool:
+    """Whether a function is given the Gaussians and a camera, ``imlsplat(gaussians, viewpoint_cam, background)``."""
+    names = [root_of(value) for value in values if isinstance(value, (cst.Name, cst.Attribute))]
+    spoken = [set(words(name)) for name in names]
+    return any(each & _GAUSSIANS for each in spoken) and any(each & _CAMERAS for each in spoken)
+
+
+def _is_taken_from_one(function: Function, node: cst.Name) -> bool:
+    """Whether ``1 - objects`` stands somewhere: whatever it is called, it is a mask."""
+    return any(
+        isinstance(part, cst.BinaryOperation)
+        and isinstance(part.operator, cst.Subtract)
+        and constant(part.left) == 1
+        and same(part.right, node)
+        for part in function.flow.expressions
+    )
 
 
 def _neighbours(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:

@@ -12,7 +12,7 @@ from legs_adapters.reading.l1 import Form, Forms
 from legs_adapters.reading.makers import is_of_mesh, is_rendering
 from legs_adapters.reading.meaning import Meaning, Meanings
 from legs_adapters.reading.module import Function, Module
-from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, of_rays, same_root, swapped
+from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, of_rays, picked_from, same_root, swapped
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.shared import is_rescaled, takes_no_gradient
 from legs_adapters.reading.steps import Steps
@@ -210,7 +210,8 @@ class Reasons:
         if {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}:
             return "evaluation"
         about = self._about_splats(function) or self._rendered(module, function, form)
-        rays = of_rays(form) or self._casts_rays(function)
+        picked = all(picked_from(self.meanings, function, side) for side in (form.first, form.second))
+        rays = (of_rays(form) and not picked) or self._casts_rays(function)
         if not about or (rays and not is_beside_ssim(function, form.first, form.second)):
             return "other"
         if any(is_of_mesh(self.program, function, side) for side in (form.first, form.second)):

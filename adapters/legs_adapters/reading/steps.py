@@ -81,6 +81,8 @@ class Steps:
             for_good = self._nobody_steps(function, 0)
             if _only_reads(scope, asked, for_good) or (for_good and self._read_by_callers(function)):
                 return "scoring"
+            if self._emptied_by_callers(function):
+                return "scoring"
             if self._reads_its_own(function, scope):
                 return "scoring"
         # At a module's top nobody else can take the step.
@@ -102,12 +104,39 @@ class Steps:
         callers = self._callers(function)
         return bool(callers) and depth < _DEPTH and all(self._nobody_steps(c, depth + 1) for c in callers)
 
+    def _calls_of(self, function: Function) -> Iterator[Tuple[Function, cst.Call]]:
+        """The calls of a function by its name, without those that are surely of another one with it."""
+        for caller in self.program.mentioning(function.name, called=True):
+            for call in caller.flow.calls if caller is not function else ():
+                if call_name(call) == function.name:
+                    known = [r.target for r in self.program.resolve(caller, call.func) if not r.guess]
+                    if not known or function in known:
+                        yield caller, call
+
     def _callers(self, function: Function) -> List[Function]:
-        return [
-            caller
-            for caller in self.program.mentioning(function.name, called=True)
-            if caller is not function and any(call_name(call) == function.name for call in caller.flow.calls)
-        ]
+        return list(dict.fromkeys(caller for caller, _ in self._calls_of(function)))
+
+    def _emptied_by_callers(self, function: Function) -> bool:
+        """Whether each caller has the gradients read, and sets them to nothing, before anything can step."""
+        calls = list(self._calls_of(function))
+        return bool(calls) and all(self._is_emptied_after(caller, call) for caller, call in calls)
+
+    def _is_emptied_after(self, caller: Function, call: cst.Call) -> bool:
+        """``accumulate(scene)``, then ``gaussians.prune(count)``, then ``optimizer.zero_grad()``."""
+        at = caller.place(call).last_line
+        after = sorted((caller.place(other).line, i) for i, other in enumerate(caller.flow.calls))
+        read = False
+        for line, i in after:
+            later = caller.flow.calls[i]
+            if line <= at:
+                continue
+            if call_name(later) == "zero_grad":
+                return read
+            called = [r.target for r in self.program.resolve(caller, later.func) if isinstance(r.target, Function)]
+            if set(words(call_name(later))) & _STEPS or any(map(_steps, called)):
+                return False
+            read = read or any("grad" in each.text and _read(list(_walk(each.body))) for each in called)
+        return False
 
     def _read_by_callers(self, function: Function) -> bool:
         """Whether a caller also calls what reads gradients: ``accumulate(scene)``, then ``gaussians.prune(count)``."""

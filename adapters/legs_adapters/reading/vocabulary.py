@@ -62,6 +62,7 @@ _RENDER = word_set(
 _LAID_OVER = word_set("mask masks valid weight weights diff error errors")
 _WHICH = word_set("first second third last left right front back")  # of several of a kind
 _OF_PICTURES = word_set("sky sh shs prior time dx dy")  # a mask, say, where nothing says that it is a picture
+_LIT_BY = {"light", "lights"}
 _HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
 DATA = word_set(
     """
@@ -86,6 +87,8 @@ def kind_of_words(name: str) -> Optional[str]:
         return "mask"  # of whatever: laid over an image, it leaves an image
     kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF}
     if "image" in kinds:  # sky_rgb, render_sh
+        if spoken[-1] in _LIT_BY and "image" in spoken:
+            spoken = spoken[:-1]  # original_image_train_light
         kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF and word not in _OF_PICTURES}
         if "base" in spoken or "precomp" in spoken:  # rendered_base_color; colors_precomp, a colour for each Gaussian
             return "parameter"

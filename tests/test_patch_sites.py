@@ -147,6 +147,7 @@ def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path)
     assert problem.advice == "legs_loss.l1_loss(pred, target, own=self.l1_loss), in a copy of MaskedL1 for train.py:9"
 
 
-def test_the_advice_for_a_difference_that_was_weighted_before_keeps_its_weight(tmp_path):
-    (problem,) = plan(checkout(tmp_path, files("signed_differences"))).findings.problems
-    assert problem.advice == "torch.abs(legs_loss.weight_map(gt_image) * value).mean()"
+def test_the_advice_for_a_difference_weights_it_where_its_absolute_value_is_taken(tmp_path):
+    weighted_before, taken = plan(checkout(tmp_path, files("signed_differences"))).findings.problems
+    assert weighted_before.advice == "torch.abs(legs_loss.weight_map(gt_image) * value).mean()"
+    assert taken.advice == "robust(legs_loss.weight_map(gt_image * cam.seen) * residual, cam.scale)"

@@ -312,6 +312,10 @@ class _Finder:
         if form.reduction == "signed":
             why = f"the difference {_short(_difference(form))} was weighted where it was made, which l1_loss would lose"
             return self._problem(function, form, place, why, flipped)
+        if form.reduction == "taken":
+            assert form.callee is not None
+            why = f"{_short(form.callee)} takes the absolute value of the difference"
+            return self._problem(function, form, place, why, flipped)
         if not form.direct and not unchanged_at(function, form.call, form.first, form.second):
             return self._problem(function, form, place, "the difference has a name of its own", flipped)
         uses = self.uses.of(function, prediction, target)
@@ -420,6 +424,9 @@ def _advice(form: Form, flipped: bool, last: bool, rows: bool) -> str:
         mean = ".mean()" if form.node is not form.call else ""
         weight = f"legs_loss.weight_map({_short(target)}{', channels_last=True' if last else ''})"
         return f"torch.abs({weight} * {_short(_difference(form))}){mean}"
+    if form.reduction == "taken":
+        weight = f"legs_loss.weight_map({_short(target)}{', channels_last=True' if last else ''})"
+        return _short(_with_weight(form, weight))
     if rows:
         return "legs_loss.l1_loss(rendering, photograph), with the pictures before they became lists"
     settings = ", channels_last=True" if last else ""
@@ -431,6 +438,13 @@ def _advice(form: Form, flipped: bool, last: bool, rows: bool) -> str:
         extras = ", ".join(_short(extra.with_changes(comma=cst.MaybeSentinel.DEFAULT)) for extra in form.extras)
         settings += f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
     return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{settings})"
+
+
+def _with_weight(form: Form, weight: str) -> cst.Call:
+    """``robust(weight * residual, config)``."""
+    first = form.call.args[0]
+    product = cst.parse_expression(f"{weight} * {_short(first.value)}")
+    return form.call.with_changes(args=(first.with_changes(value=product), *form.call.args[1:]))
 
 
 def _difference(form: Form) -> cst.BaseExpression:

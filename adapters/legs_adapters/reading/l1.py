@@ -38,8 +38,8 @@ class Form(NamedTuple):
         first, second: the two arguments, as written.
         reduction: "mean", "none" (an unreduced map), "own": what the codebase's function makes of it, "wrapped":
             an expression around the difference, "again": a map with another use, of which ``node`` is the read that
-            is the loss, "signed": of a difference that a function made and weighted, or "callable" and "registered" for
-            a function handed over by name.
+            is the loss, "signed": of a difference that a function made and weighted, "taken": of one that a function
+            takes the absolute value of, or "callable" and "registered" for a function handed over by name.
         callee: what is called, for a form that is a call of a function; None for ``abs``.
         extras: the call's further arguments.
         difference: the ``a - b``, for a form that is an absolute value.
@@ -72,6 +72,7 @@ def forms(program: Program, function: Function) -> List[Form]:
         if id(node) in inside or not isinstance(node, cst.Call):
             continue
         form = _absolute(program, function, node) or _call(program, function, node)
+        form = form or _of_difference(program, function, node)
         if form is not None:
             found.append(form)
             inside.add(id(form.call))
@@ -235,6 +236,26 @@ def _call(program: Program, function: Function, node: cst.Call) -> Optional[Form
         # The arguments that settled the shape; the call no longer needs them.
         extras = ()
     return Form(node, node, first, second, reduction, node.func, tuple(extras))
+
+
+def _of_difference(program: Program, function: Function, node: cst.Call) -> Optional[Form]:
+    """``robust(residual, config)`` of ``residual = image - gt``, where it makes its loss of ``residual.abs()``."""
+    given = arguments(node)[0][:1]
+    made = list(function.flow.reaching(given[0])) if given and isinstance(given[0], cst.Name) else []
+    value = made[0].value if len(made) == 1 and made[0].kind == "assign" else None
+    if not isinstance(value, cst.BinaryOperation) or not isinstance(value.operator, cst.Subtract):
+        return None
+    takers = [r.target for r in program.resolve(function, node.func) if r.kind == "function" and not r.guess]
+    known = [taker for taker in takers if isinstance(taker, Function) and _takes_absolute(taker)]
+    if len(takers) != 1 or not known:
+        return None
+    return Form(node, node, value.left, value.right, "taken", node.func, tuple(node.args[1:]), value, False)
+
+
+def _takes_absolute(function: Function) -> bool:
+    """Whether a function takes the absolute value of its first parameter, as it is."""
+    taken = [abs_argument(call) for call in function.flow.calls if function.parameters]
+    return any(_is_parameter(function, part) and code(part) == function.parameters[0] for part in taken if part)
 
 
 def _handed_on(program: Program, function: Function, node: cst.Call) -> List[Reference]:

@@ -27,7 +27,7 @@ _SAME = {
     "clamp_min", "clamp_max", "squeeze", "unsqueeze", "permute", "transpose", "view", "reshape", "flatten", "expand",
     "repeat", "requires_grad_", "mean", "pow", "flip", "T", "type_as", "movedim", "index_select", "masked_fill", "mul",
     "mul_", "add", "sub", "div", "div_", "nan_to_num", "round", "narrow", "view_as", "reshape_as", "copy", "cumsum",
-    "roll", "chunk", "split", "unbind", "select",
+    "roll", "chunk", "split", "sum", "unbind", "select",
 }  # fmt: skip
 _FIRST = {
     "clamp", "clip", "interpolate", "grid_sample", "pad", "permute", "squeeze", "unsqueeze", "flatten", "reshape",

@@ -66,6 +66,8 @@ _WHY = {
     "gradient": "gradients", "parameter": "regulariser",
 }  # fmt: skip
 
+# What a picture is made with, or masked by, may stand in its name; what has a depth's name is none.
+_LAID_OVER_PICTURES = {"parameter", "mask", "gradient", "feature"}
 _MADE_UP = {f"torch.{name}{like}" for name in ("eye", "zeros", "ones", "full") for like in ("", "_like")}
 _OF_LITERALS = {"torch.tensor", "torch.as_tensor", "torch.Tensor", "torch.FloatTensor"}
 _SHAPED = {"cuda", "to", "float", "view", "reshape", "unsqueeze", "expand", "expand_as", "repeat"}
@@ -86,7 +88,7 @@ class Reasons:
     def why(self, function: Function, form: Form, pair: Pair) -> Optional[str]:
         """Return why a form is left; None where it is to be weighted."""
         for meaning, beside in ((pair.a, pair.b), (pair.b, pair.a)):
-            pictures = meaning.kind == "parameter" and beside.kind == "image"
+            pictures = meaning.kind in _LAID_OVER_PICTURES and beside.kind == "image"
             if meaning.kind in _WHY and not (pictures and is_beside_ssim(function, form.first, form.second)):
                 return _WHY[meaning.kind]
         if constant(form.first) is not None or constant(form.second) is not None or _of_points(form):

@@ -283,7 +283,9 @@ def _is_backward(call: cst.Call) -> bool:
 
 
 def _is_step(call: cst.Call) -> bool:
-    if call_name(call) != "step" or not isinstance(call.func, cst.Attribute):
+    """``gaussians.optimizer.step()``, ``optimizers.optimizer_step_all()``."""
+    said = set(words(call_name(call)))
+    if not isinstance(call.func, cst.Attribute) or not (said == {"step"} or ("step" in said and said & _MAKES)):
         return False
     return not _spoken(call.func.value) & _SCHEDULES
 

@@ -12,7 +12,7 @@ from legs_adapters.reading.module import Function
 from legs_adapters.reading.pair import swapped
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.reasons import Reasons
-from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, walk_expressions
+from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, key_of, walk_expressions
 from legs_adapters.reading.training import Training
 
 __all__ = ["Use", "Uses", "detaches"]
@@ -46,6 +46,7 @@ class Uses:
     def of(self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> List[Use]:
         """What the calls of a function that compares two parameters of its own are for, as far as training goes."""
         found: List[Tuple[Use, Optional[str]]] = []
+        prediction, target = _whole(prediction), _whole(target)
         if not isinstance(target, cst.Name):
             return []
         calls = self.training.sites.get(function, [])
@@ -84,6 +85,13 @@ class Uses:
         several = len(self.training.sites.get(caller, ())) > 1
         given = [made for part in attribute_chain(node) for made in caller.flow.reaching(part)] if several else []
         return any(made.kind == "parameter" for made in given)
+
+
+def _whole(node: cst.CSTNode) -> cst.CSTNode:
+    """``gt`` of ``gt[:3]``; what a dictionary holds, ``batch["image"]``, is none of its parts."""
+    while isinstance(node, cst.Subscript) and not isinstance(key_of(node), str):
+        node = node.value
+    return node
 
 
 def _are_pair(meanings: Sequence[Meaning]) -> bool:

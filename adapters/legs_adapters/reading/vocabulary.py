@@ -16,13 +16,13 @@ _WORDS = {
     """,
     "normal": "normal normals nrm",
     "depth": """
-        depth depths disp disparity disparities invdepth inverse idepth zbuf lidar distortion dist monodepth midas
+        depth depths disp disparity disparities invdepth inverse idepth zbuf lidar distortion dist monodepth midas tof
     """,
     "feature": """
         feature features feat feats semantic semantics sem language lang clip dino dinov2 lseg sam embedding embeddings
         latent latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors
         classes objects wavelet wavelets haar dwt fft rfft dct census
-        stokes aolp dolp
+        stokes aolp dolp phasor phasors
     """,
     "warp": """
         warp warped warping reproj reprojected reprojection pseudo virtual unseen sds diffusion inpaint inpainted
@@ -62,7 +62,9 @@ _RENDER = word_set(
 _LAID_OVER = word_set("mask masks valid weight weights diff error errors")
 _WHICH = word_set("first second third last left right front back")  # of several of a kind
 _OF_PICTURES = word_set("sky sh shs prior time dx dy")  # a mask, say, where nothing says that it is a picture
+_PICTURES = {"image", "images", "img", "imgs", "photo", "photos", "frame", "frames"}
 _LIT_BY = {"light", "lights"}
+_OF_ONE = word_set("scale scales scaling scalings offset offsets center centers mean light lights")  # scaled or shifted
 _HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
 DATA = word_set(
     """
@@ -87,8 +89,10 @@ def kind_of_words(name: str) -> Optional[str]:
         return "mask"  # of whatever: laid over an image, it leaves an image
     kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF}
     if "image" in kinds:  # sky_rgb, render_sh
-        if spoken[-1] in _LIT_BY and "image" in spoken:
+        if spoken[-1] in _LIT_BY and "image" in spoken and _TARGET.intersection(spoken):
             spoken = spoken[:-1]  # original_image_train_light
+        if spoken[-1] in _PICTURES:
+            spoken = tuple(word for word in spoken if word not in _OF_ONE)  # offset_image, not image_offset
         kinds = {_KIND_OF[word] for word in spoken if word in _KIND_OF and word not in _OF_PICTURES}
         if "base" in spoken or "precomp" in spoken:  # rendered_base_color; colors_precomp, a colour for each Gaussian
             return "parameter"

@@ -12,12 +12,14 @@ from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple,
 import libcst as cst
 
 from legs_adapters.findings import Findings, Kept, Left, Problem, Site
+from legs_adapters.reading.absolute import abs_argument
 from legs_adapters.reading.beside import STRUCTURAL
 from legs_adapters.reading.handed import Handed, HandedOver
-from legs_adapters.reading.l1 import Form, Forms, abs_argument, is_l1_function, own_shape
+from legs_adapters.reading.l1 import Form, Forms
 from legs_adapters.reading.layout import is_channels_last, lies_last
 from legs_adapters.reading.meaning import Meanings
 from legs_adapters.reading.module import Function, Module
+from legs_adapters.reading.own import is_l1_function, own_shape
 from legs_adapters.reading.pair import is_role, is_rows, pair_of, picked_from, same_root, swapped, without_rows
 from legs_adapters.reading.parts import Place
 from legs_adapters.reading.program import Program

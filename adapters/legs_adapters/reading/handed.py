@@ -6,8 +6,9 @@ from typing import Dict, List, NamedTuple, Optional, Set
 
 import libcst as cst
 
-from legs_adapters.reading.l1 import Form, Forms, is_l1_function, own_shape
+from legs_adapters.reading.l1 import Form, Forms
 from legs_adapters.reading.module import Function
+from legs_adapters.reading.own import is_l1_function, own_shape
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.training import Training
 

@@ -11,7 +11,8 @@ from typing import List
 
 import libcst as cst
 
-from legs_adapters.reading.l1 import Form, is_l1_name
+from legs_adapters.reading.absolute import is_l1_name
+from legs_adapters.reading.l1 import Form
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.syntax import arguments, call_name, constant, dotted, words

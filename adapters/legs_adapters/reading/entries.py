@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Iterable, List, Tuple
+from typing import Iterable, List, Optional, Tuple
 
 import libcst as cst
 
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import constant
+from legs_adapters.reading.syntax import constant, same, walk_expressions, words
+from legs_adapters.reading.vocabulary import role_of_words
 
-__all__ = ["called_makers", "forward_maker", "stored", "written"]
+__all__ = [
+    "called_makers", "computed_key", "default_key", "formatted_key", "forward_maker", "is_asked_for", "is_loaded",
+    "stored", "written",
+]  # fmt: skip
+
+_LOADERS = {"loader", "dataloader"}
 
 _Entry = Tuple[Function, cst.CSTNode]  # a value, and the function that it stands in
 
@@ -61,3 +67,56 @@ def stored(makers: Iterable[Function], key: str) -> List[_Entry]:
         for definition in maker.flow.definitions.get(f"{each.value}[{key!r}]", [])
         if definition.value is not None
     ]
+
+
+def formatted_key(node: cst.Subscript) -> Optional[str]:
+    """Return what is literal in the key of ``outputs[f"image_{i}"]`` or ``outputs["color", i]``."""
+    element = node.slice[0].slice
+    values = [each.slice.value for each in node.slice if isinstance(each.slice, cst.Index)]
+    values += [each.value for value in values if isinstance(value, cst.Tuple) for each in value.elements]
+    texts = [text for text in map(constant, values) if isinstance(text, str)]
+    if texts:
+        return "_".join(texts)
+    if len(node.slice) != 1 or not isinstance(element, cst.Index) or not isinstance(element.value, cst.FormattedString):
+        return None
+    return "_".join(p.value for p in element.value.parts if isinstance(p, cst.FormattedStringText)) or None
+
+
+def computed_key(function: Function, node: cst.Subscript) -> Optional[str]:
+    """What is literal in the key of ``target["target_" + key]``; of ``pred[key]`` beside it, nothing."""
+    index = node.slice[0].slice
+    if len(node.slice) != 1 or not isinstance(index, cst.Index):
+        return None
+    if isinstance(index.value, cst.BinaryOperation):
+        return _added_text(index.value)
+    sums = [part for part in function.flow.expressions if isinstance(part, cst.BinaryOperation) and _added_text(part)]
+    known = any(same(side, index.value) for part in sums for side in (part.left, part.right))
+    return "" if known and isinstance(index.value, cst.Name) else None
+
+
+def default_key(function: Function, node: cst.Subscript) -> object:
+    """``preds[key]`` of a function with the parameter ``key="rgb"``."""
+    index = node.slice[0].slice
+    if len(node.slice) != 1 or not isinstance(index, cst.Index) or not isinstance(index.value, cst.Name):
+        return None
+    found = list(function.flow.reaching(index.value))
+    return constant(found[0].value) if len(found) == 1 and found[0].kind == "parameter" else None
+
+
+def is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
+    """Whether a dictionary is what a data loader hands out, and the entry its own: nothing has rendered it."""
+    made = [d for d in function.flow.reaching(node) if d.kind != "store" or d.key in (None, key)]
+    sources = [part for d in made if d.kind == "element" and d.value is not None for part in walk_expressions(d.value)]
+    loaders = [part for part in sources if isinstance(part, cst.Name) and set(words(part.value)) & _LOADERS]
+    return bool(loaders) and all(d.kind == "element" for d in made)
+
+
+def is_asked_for(key: str) -> bool:
+    """``images_output``: nothing but that it is what comes out says that it is a rendering."""
+    return all(role_of_words(word) != "render" or word in ("output", "outputs") for word in words(key))
+
+
+def _added_text(node: cst.BinaryOperation) -> Optional[str]:
+    """``target_`` of ``"target_" + key``."""
+    texts = [text for text in map(constant, (node.left, node.right)) if isinstance(text, str)]
+    return "_".join(texts) if texts and isinstance(node.operator, cst.Add) else None

@@ -11,11 +11,30 @@ from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Set, Tu
 
 import libcst as cst
 
-from legs_adapters.reading.entries import called_makers, forward_maker, stored, written
+from legs_adapters.reading.entries import (
+    called_makers,
+    computed_key,
+    default_key,
+    formatted_key,
+    forward_maker,
+    is_asked_for,
+    is_loaded,
+    stored,
+    written,
+)
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import arguments, call_name, constant, key_of, same, walk_expressions, words
+from legs_adapters.reading.signs import (
+    are_neighbours,
+    draws,
+    is_box,
+    is_cropped,
+    is_masked,
+    is_taken_from_one,
+    passed_on,
+)
+from legs_adapters.reading.syntax import arguments, call_name, constant, key_of, root_of, same, walk_expressions, words
 from legs_adapters.reading.training import Training
 from legs_adapters.reading.vocabulary import DATA, KINDS, kind_of_words, role_of_words
 
@@ -45,11 +64,8 @@ _EXTREMES = {"max", "min", "amax", "amin"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
 _OF_DIFFUSION = {"guidance_scale", "negative_prompt", "num_inference_steps", "strength"}  # of a picture that it paints
-_GAUSSIANS = {"gaussians", "gaussian", "splats"}
-_CAMERAS = {"cam", "camera", "view", "viewpoint"}
 _COMPARED = {"image", "depth", "normal", "flow"}
 _STEPS_OR_DYNAMIC = {"dx", "dy"}
-_LOADERS = {"loader", "dataloader"}
 _DEPTH = 40
 _BUDGET = 20000  # steps to answer one question: some code is one large knot
 
@@ -117,12 +133,12 @@ class Meanings:
     def _of(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
         if isinstance(node, cst.Name):
             flow = self._flow(function, node, depth)
-            if flow.kind == "image" and kind_of_words(node.value) == "gradient" and _is_cropped(function, node):
+            if flow.kind == "image" and kind_of_words(node.value) == "gradient" and is_cropped(function, node):
                 return flow  # colors_grad = colors[:, :, :half]: the part that gets gradients
-            if flow.kind == "image" and kind_of_words(node.value) == "mask" and _is_masked(function, node):
+            if flow.kind == "image" and kind_of_words(node.value) == "mask" and is_masked(function, node):
                 return flow  # gt_mask_images = gt_image * mask
             meaning = self._named(node.value, flow)
-            blends = meaning.kind == "feature" and _is_taken_from_one(function, node)
+            blends = meaning.kind == "feature" and is_taken_from_one(function, node)
             return meaning._replace(kind="mask") if blends else meaning
         if isinstance(node, cst.Attribute):
             return self._attribute(function, node, depth)
@@ -131,7 +147,7 @@ class Meanings:
         if isinstance(node, cst.Call):
             return self._call(function, node, depth)
         if isinstance(node, cst.BinaryOperation):
-            if isinstance(node.operator, cst.Subtract) and _neighbours(node.left, node.right):
+            if isinstance(node.operator, cst.Subtract) and are_neighbours(node.left, node.right):
                 return Meaning("gradient", self.of(function, node.left, depth).role)
             return _mix([self.of(function, node.left, depth), self.of(function, node.right, depth)])
         if isinstance(node, cst.Comparison):
@@ -223,7 +239,7 @@ class Meanings:
                 for value in reference.target.flow.returns:
                     if isinstance(value, cst.Tuple) and index < len(value.elements):
                         element = value.elements[index].value
-                        passed = _passed_on(reference.target, element)
+                        passed = passed_on(reference.target, element)
                         given = reference.target.given(call, passed) if passed is not None else None
                         where, what = (reference.target, element) if given is None else (function, given)
                         found.append(self.of(where, what, depth))
@@ -281,19 +297,19 @@ class Meanings:
         return Meaning(_closer(kind, local.kind), role)
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> Meaning:
-        key = key_of(node) or _formatted_key(node) or self._default_key(function, node)
+        key = key_of(node) or formatted_key(node) or default_key(function, node)
         if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in _PARAMETERS:
             return Meaning("parameter", None)
         if isinstance(key, str):
             here = bool(function.flow.reaching(node))
             local = self._flow(function, node, depth) if here else self._entry(function, node.value, key, depth)
             role = role_of_words(key) or local.role
-            if role == "render" and not here and _is_asked_for(key) and _is_loaded(function, node.value, key):
+            if role == "render" and not here and is_asked_for(key) and is_loaded(function, node.value, key):
                 role = "target"
             if role is None and not _BACKGROUND & set(words(key)):
                 role = self._role_of_holder(function, node.value, depth)
             return Meaning(_closer(kind_of_words(key), local.kind), role)
-        computed = _computed_key(function, node)
+        computed = computed_key(function, node)
         if computed is not None:  # which entry that is only the words in its key can say, or the holder's own name
             name = root_of(node.value) if isinstance(node.value, (cst.Name, cst.Attribute)) else ""
             kind = kind_of_words(computed) or kind_of_words(name)
@@ -308,15 +324,6 @@ class Meanings:
         held = stored(called_makers(self.program, function, node), key)
         held = held or written(forward_maker(function, node), key)
         return _mix([self.of(maker, value, depth) for maker, value in held])
-
-    @staticmethod
-    def _default_key(function: Function, node: cst.Subscript) -> object:
-        """``preds[key]`` of a function with the parameter ``key="rgb"``."""
-        index = node.slice[0].slice
-        if len(node.slice) != 1 or not isinstance(index, cst.Index) or not isinstance(index.value, cst.Name):
-            return None
-        found = list(function.flow.reaching(index.value))
-        return constant(found[0].value) if len(found) == 1 and found[0].kind == "parameter" else None
 
     def _role_of_holder(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[str]:
         """``outputs["rgb"]`` was rendered, ``batch["rgb"]`` and ``viewpoint.image`` were photographed."""
@@ -382,7 +389,7 @@ class Meanings:
         if name == "where" and len(values) == 3:
             return _mix([self.of(function, value, depth) for value in values[1:]])
         filters = name in ("conv2d", "filter2d", "spatial_gradient") and values and "stride" not in keywords
-        if filters and not (len(positional) > 1 and _is_box(function, positional[1])):
+        if filters and not (len(positional) > 1 and is_box(function, positional[1])):
             return Meaning("gradient", self.of(function, values[0], depth).role)
         if name in _JOIN and values:
             return self.of(function, values[0], depth)
@@ -396,7 +403,7 @@ class Meanings:
         kind = kind_of_words(name)
         if "compute" in spoken and kind is None:
             spoken = spoken - {"compute"}
-        if spoken & _RENDERERS or (kind is None and _draws(values)):
+        if spoken & _RENDERERS or (kind is None and draws(values)):
             of_points = kind in (None, "parameter")  # points_to_render(...)
             return Meaning("image" if of_points else kind, "render")
         if kind is not None and kind not in ("image", "mask", "parameter"):
@@ -442,128 +449,6 @@ def _is_called_for_another(value: cst.CSTNode, place: str, kind: Optional[str]) 
     """Whether the kind is only in a function's name, and the name of this one of its results says image."""
     named = isinstance(value, cst.Call) and kind is not None and kind_of_words(call_name(value)) == kind
     return named and kind != "image" and kind_of_words(place) == "image"
-
-
-def _is_box(function: Function, node: cst.CSTNode) -> bool:
-    """Whether a kernel is all ones, which blurs."""
-    found = function.flow.definitions.get(node.value, []) if isinstance(node, cst.Name) else []
-    made = [definition.value for definition in found if definition.kind == "assign"]
-    return bool(made) and all(isinstance(value, cst.Call) and call_name(value) == "ones" for value in made)
-
-
-def _passed_on(function: Function, node: cst.CSTNode) -> Optional[str]:
-    """Return the parameter that an expression is, or is an element of, whichever way the function went."""
-    found: Set[Optional[str]] = set()
-    work, seen = [node], set()
-    while work:
-        part = work.pop()
-        while isinstance(part, cst.Subscript):
-            part = part.value
-        if not isinstance(part, cst.Name):
-            return None
-        for definition in function.flow.reaching(part):
-            value: Optional[cst.CSTNode] = definition.value
-            if definition.kind == "parameter":
-                found.add(definition.place)
-            elif definition.kind not in ("assign", "element") or value is None:
-                return None
-            elif id(definition) not in seen:
-                seen.add(id(definition))
-                if definition.kind == "element" and isinstance(value, cst.Tuple):
-                    if definition.index is None or definition.index >= len(value.elements):
-                        return None
-                    value = value.elements[definition.index].value
-                work.append(value)
-    return found.pop() if len(found) == 1 else None
-
-
-def _formatted_key(node: cst.Subscript) -> Optional[str]:
-    """Return what is literal in the key of ``outputs[f"image_{i}"]`` or ``outputs["color", i]``."""
-    element = node.slice[0].slice
-    values = [each.slice.value for each in node.slice if isinstance(each.slice, cst.Index)]
-    values += [each.value for value in values if isinstance(value, cst.Tuple) for each in value.elements]
-    texts = [text for text in map(constant, values) if isinstance(text, str)]
-    if texts:
-        return "_".join(texts)
-    if len(node.slice) != 1 or not isinstance(element, cst.Index) or not isinstance(element.value, cst.FormattedString):
-        return None
-    return "_".join(p.value for p in element.value.parts if isinstance(p, cst.FormattedStringText)) or None
-
-
-def _computed_key(function: Function, node: cst.Subscript) -> Optional[str]:
-    """What is literal in the key of ``target["target_" + key]``; of ``pred[key]`` beside it, nothing."""
-    index = node.slice[0].slice
-    if len(node.slice) != 1 or not isinstance(index, cst.Index):
-        return None
-    if isinstance(index.value, cst.BinaryOperation):
-        return _added_text(index.value)
-    sums = [part for part in function.flow.expressions if isinstance(part, cst.BinaryOperation) and _added_text(part)]
-    known = any(same(side, index.value) for part in sums for side in (part.left, part.right))
-    return "" if known and isinstance(index.value, cst.Name) else None
-
-
-def _added_text(node: cst.BinaryOperation) -> Optional[str]:
-    """``target_`` of ``"target_" + key``."""
-    texts = [text for text in map(constant, (node.left, node.right)) if isinstance(text, str)]
-    return "_".join(texts) if texts and isinstance(node.operator, cst.Add) else None
-
-
-def _is_asked_for(key: str) -> bool:
-    """``images_output``: nothing but that it is what comes out says that it is a rendering."""
-    return all(role_of_words(word) != "render" or word in ("output", "outputs") for word in words(key))
-
-
-def _is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
-    """Whether a dictionary is what a data loader hands out, and the entry its own: nothing has rendered it."""
-    made = [d for d in function.flow.reaching(node) if d.kind != "store" or d.key in (None, key)]
-    sources = [part for d in made if d.kind == "element" and d.value is not None for part in walk_expressions(d.value)]
-    loaders = [part for part in sources if isinstance(part, cst.Name) and set(words(part.value)) & _LOADERS]
-    return bool(loaders) and all(d.kind == "element" for d in made)
-
-
-def _is_cropped(function: Function, node: cst.Name) -> bool:
-    """Whether a name stands for a part of a picture, ``image[:, :half]``, and for nothing else."""
-    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
-    return len(made) == len(function.flow.reaching(node)) and all(
-        isinstance(value, cst.Subscript) and all(isinstance(part.slice, cst.Slice) for part in value.slice)
-        for value in made
-    )
-
-
-def _is_masked(function: Function, node: cst.Name) -> bool:
-    """Whether a name that speaks of an image, too, stands for a product and for nothing else."""
-    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
-    products = [v for v in made if isinstance(v, cst.BinaryOperation) and isinstance(v.operator, cst.Multiply)]
-    says_image = any(kind_of_words(word) == "image" for word in words(node.value))
-    return says_image and bool(made) and len(products) == len(made)
-
-
-def _draws(values: List[cst.BaseExpression]) -> bool:
-    """Whether a function is given the Gaussians and a camera, ``imlsplat(gaussians, viewpoint_cam, background)``."""
-    names = [root_of(value) for value in values if isinstance(value, (cst.Name, cst.Attribute))]
-    spoken = [set(words(name)) for name in names]
-    return any(each & _GAUSSIANS for each in spoken) and any(each & _CAMERAS for each in spoken)
-
-
-def _is_taken_from_one(function: Function, node: cst.Name) -> bool:
-    """Whether ``1 - objects`` stands somewhere: whatever it is called, it is a mask."""
-    return any(
-        isinstance(part, cst.BinaryOperation)
-        and isinstance(part.operator, cst.Subtract)
-        and constant(part.left) == 1
-        and same(part.right, node)
-        for part in function.flow.expressions
-    )
-
-
-def _neighbours(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:
-    """``x[1:] - x[:-1]``: a picture's own slope."""
-    return isinstance(left, cst.Subscript) and isinstance(right, cst.Subscript) and same(left.value, right.value)
-
-
-def root_of(node: cst.Name | cst.Attribute) -> str:
-    """Return the last name of ``a.b``: b."""
-    return node.value if isinstance(node, cst.Name) else node.attr.value
 
 
 def _closer(word: Optional[str], flow: Optional[str]) -> Optional[str]:

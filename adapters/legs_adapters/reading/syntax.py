@@ -11,7 +11,7 @@ import libcst as cst
 
 __all__ = [
     "arguments", "attribute_chain", "call_name", "children", "code", "constant", "dotted", "key_of", "loops_around",
-    "path_of", "same", "strip_parens", "walk_expressions", "words",
+    "path_of", "root_of", "same", "strip_parens", "walk_expressions", "words",
 ]  # fmt: skip
 
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
@@ -102,6 +102,11 @@ def attribute_chain(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
             node = node.func
         else:
             return
+
+
+def root_of(node: cst.Name | cst.Attribute) -> str:
+    """Return the last name of ``a.b``: b."""
+    return node.value if isinstance(node, cst.Name) else node.attr.value
 
 
 def call_name(node: cst.Call) -> str:

@@ -64,6 +64,7 @@ _EXTREMES = {"max", "min", "amax", "amin"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
 _OF_DIFFUSION = {"guidance_scale", "negative_prompt", "num_inference_steps", "strength"}  # of a picture that it paints
+_LOSSES = {"loss", "losses", "criterion"}
 _COMPARED = {"image", "depth", "normal", "flow"}
 _STEPS_OR_DYNAMIC = {"dx", "dy"}
 _DEPTH = 40
@@ -260,9 +261,11 @@ class Meanings:
         return given if said is None else given._replace(kind=said)
 
     def _said_by_class(self, function: Function) -> Optional[str]:
-        """What a class's name says that its method is given, where one call in a base class serves several classes."""
+        """What a loss class's name says that its method is given, where one call in a base class serves several."""
         owner = function.owner
-        if owner is None or not any(self.program.member(base, function.name) for base in self.program.bases(owner)):
+        if owner is None or not set(words(owner.name)) & _LOSSES:
+            return None
+        if not any(self.program.member(base, function.name) for base in self.program.bases(owner)):
             return None
         kind = kind_of_words(owner.name)
         return kind if kind in _COMPARED else None

@@ -67,7 +67,7 @@ _WHY = {
 }  # fmt: skip
 
 # What a picture is made with, or masked by, may stand in its name; what has a depth's name is none.
-_LAID_OVER_PICTURES = {"parameter", "mask", "gradient", "feature"}
+_LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}
 _MADE_UP = {f"torch.{name}{like}" for name in ("eye", "zeros", "ones", "full") for like in ("", "_like")}
 _OF_LITERALS = {"torch.tensor", "torch.as_tensor", "torch.Tensor", "torch.FloatTensor"}
 _SHAPED = {"cuda", "to", "float", "view", "reshape", "unsqueeze", "expand", "expand_as", "repeat"}

@@ -55,6 +55,8 @@ class Handed:
                     references = program.resolve(holder, value)
                     if [r.target for r in references] != [function] or references[0].guess:
                         continue
+                    if not _is_read(holder, definition.place):
+                        continue
                     self.functions.add(function)
                     near = [(c, call) for c, call in unknown if c.module is holder.module] or unknown
                     caller, call = near[0]
@@ -79,3 +81,10 @@ class Handed:
                         sides = call.args[0].value, call.args[1].value
                         form = Form(element.value, call, *sides, "registered", element.value)
                         self.by_holder.setdefault(caller, []).append(HandedOver(form, function, outer))
+
+
+def _is_read(holder: Function, place: str) -> bool:
+    """Whether a function, or one in it, reads a name of its own; what has other names, others may read."""
+    if holder.parent is None or "." in place:
+        return True
+    return any(read.value == place for each in (holder, *holder.inner) for read in each.flow.reads)

@@ -14,6 +14,7 @@ import libcst as cst
 from legs_adapters.findings import Findings, Kept, Left, Problem, Site
 from legs_adapters.reading.absolute import abs_argument
 from legs_adapters.reading.beside import STRUCTURAL
+from legs_adapters.reading.calls import sure_calls
 from legs_adapters.reading.handed import Handed, HandedOver
 from legs_adapters.reading.l1 import Form, Forms
 from legs_adapters.reading.layout import is_channels_last, lies_last
@@ -386,7 +387,7 @@ class _Finder:
         """Whether this is the body of the codebase's own L1 function, whose calls are what counts."""
         if own_shape(self.program, function) is None:
             return False
-        calls = self.training.sites.get(function) or self.meanings.calls_of(function)
+        calls = self.training.sites.get(function) or list(sure_calls(self.program, function))
         known = {id(f.call) for caller, _ in calls for f in self.forms.of(caller)}
         return function in self.handed.functions or all(
             id(call) in known or own_shape(self.program, caller) is not None for caller, call in calls

@@ -1,4 +1,4 @@
-"""Every call of a function in a checkout; or where there may be one that cannot be seen."""
+"""The calls of a function in a checkout: those of its name, those that are surely its, or every one there can be."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from legs_adapters.reading.module import Class, Function, Module
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.syntax import attribute_chain, call_name, children, constant, path_of
 
-__all__ = ["Calls", "calls_of"]
+__all__ = ["Calls", "calls_of", "likely_calls", "sure_calls"]
 
 _CALLED = ("forward", "__call__")  # by calling the instance
 _METHODS = {"staticmethod", "classmethod"}  # decorators that hand a function to nobody
@@ -43,6 +43,30 @@ class _Mention(NamedTuple):
     def where(self) -> str:
         """Its file and line."""
         return _where(self.scope, self.node)
+
+
+def likely_calls(program: Program, function: Function) -> Iterator[Tuple[Function, cst.Call]]:
+    """Yield the calls of a function's name, without those that are surely of another one with it."""
+    for caller, call, known in _named(program, function):
+        if not known or function in known:
+            yield caller, call
+
+
+def sure_calls(program: Program, function: Function) -> Iterator[Tuple[Function, cst.Call]]:
+    """Yield the calls that are surely a function's, as far as its name is called in a dozen functions."""
+    for caller, call, known in _named(program, function, 12):
+        if function in known:
+            yield caller, call
+
+
+def _named(
+    program: Program, function: Function, most: Optional[int] = None
+) -> Iterator[Tuple[Function, cst.Call, List[object]]]:
+    """Yield the calls of a function's name elsewhere, each with its caller and with what it surely is of."""
+    for caller in program.mentioning(function.name, called=True)[:most]:
+        for call in caller.flow.calls if caller is not function else ():
+            if call_name(call) == function.name:
+                yield caller, call, [r.target for r in program.resolve(caller, call.func) if not r.guess]
 
 
 def calls_of(program: Program, function: Function) -> Calls:

@@ -11,6 +11,7 @@ from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Set, Tu
 
 import libcst as cst
 
+from legs_adapters.reading.calls import sure_calls
 from legs_adapters.reading.entries import (
     called_makers,
     computed_key,
@@ -251,7 +252,7 @@ class Meanings:
         if definition.place not in function.parameters:
             return _UNKNOWN
         found = []
-        for caller, call in (self.training.sites.get(function) or self.calls_of(function))[:12]:
+        for caller, call in (self.training.sites.get(function) or self._calls_of(function))[:12]:
             value = function.given(call, definition.place)
             if value is not None:
                 found.append(self.of(caller, value, depth))
@@ -270,16 +271,10 @@ class Meanings:
         kind = kind_of_words(owner.name)
         return kind if kind in _COMPARED else None
 
-    def calls_of(self, function: Function) -> List[Tuple[Function, cst.Call]]:
+    def _calls_of(self, function: Function) -> List[Tuple[Function, cst.Call]]:
         """The calls of a function that training does not go through."""
         if function not in self._calls:
-            self._calls[function] = [
-                (caller, call)
-                for caller in self.program.mentioning(function.name, called=True)[:12]
-                for call in caller.flow.calls
-                if call_name(call) == function.name
-                and any(ref.target is function and not ref.guess for ref in self.program.resolve(caller, call.func))
-            ]
+            self._calls[function] = list(sure_calls(self.program, function))
         return self._calls[function]
 
     def _attribute(self, function: Function, node: cst.Attribute, depth: int) -> Meaning:

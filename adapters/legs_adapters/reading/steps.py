@@ -11,6 +11,7 @@ from typing import Dict, Iterable, Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
 
+from legs_adapters.reading.calls import likely_calls
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
@@ -104,21 +105,12 @@ class Steps:
         callers = self._callers(function)
         return bool(callers) and depth < _DEPTH and all(self._nobody_steps(c, depth + 1) for c in callers)
 
-    def _calls_of(self, function: Function) -> Iterator[Tuple[Function, cst.Call]]:
-        """The calls of a function by its name, without those that are surely of another one with it."""
-        for caller in self.program.mentioning(function.name, called=True):
-            for call in caller.flow.calls if caller is not function else ():
-                if call_name(call) == function.name:
-                    known = [r.target for r in self.program.resolve(caller, call.func) if not r.guess]
-                    if not known or function in known:
-                        yield caller, call
-
     def _callers(self, function: Function) -> List[Function]:
-        return list(dict.fromkeys(caller for caller, _ in self._calls_of(function)))
+        return list(dict.fromkeys(caller for caller, _ in likely_calls(self.program, function)))
 
     def _emptied_by_callers(self, function: Function) -> bool:
         """Whether each caller has the gradients read, and sets them to nothing, before anything can step."""
-        calls = list(self._calls_of(function))
+        calls = list(likely_calls(self.program, function))
         return bool(calls) and all(self._is_emptied_after(caller, call) for caller, call in calls)
 
     def _is_emptied_after(self, caller: Function, call: cst.Call) -> bool:

@@ -21,15 +21,16 @@ from legs_adapters.reading.layout import is_channels_last, lies_last
 from legs_adapters.reading.meaning import Meanings
 from legs_adapters.reading.module import Function, Module
 from legs_adapters.reading.own import is_l1_function, own_shape
-from legs_adapters.reading.pair import is_role, is_rows, pair_of, picked_from, same_root, swapped, without_rows
+from legs_adapters.reading.pair import is_role, pair_of, same_root, swapped
 from legs_adapters.reading.parts import Place
+from legs_adapters.reading.picked import is_rows, picked_from, without_rows
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.provenance import View, Views
 from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
 from legs_adapters.reading.run_time import chosen_at_run_time
 from legs_adapters.reading.shared import is_asked, is_huber, is_measured, shared_of, unchanged_at
-from legs_adapters.reading.syntax import arguments, call_name, code, same, walk_expressions, words
+from legs_adapters.reading.syntax import arguments, call_name, code, dotted, same, walk_expressions, words
 from legs_adapters.reading.training import Training
 from legs_adapters.reading.uses import Use, Uses, detaches
 from legs_adapters.reading.vocabulary import kind_of_words
@@ -173,11 +174,17 @@ class _Finder:
             value = definition.value
             if definition.kind != "assign" or id(value) in known or not isinstance(value, (cst.Name, cst.Attribute)):
                 continue
-            if is_l1_function(self.program, function, value):
+            if is_l1_function(self.program, function, value) and not self._is_called(function, definition.place):
                 module, line = function.module, function.place(value).line
                 why = f"nothing shows where {definition.place} is called"
                 advice = f"legs_loss.l1_loss(rendering, photograph, own={_short(value)}), where it is called"
                 self.doubtful.append(Problem(module.path, line, module.lines.text(line), why, advice))
+
+    def _is_called(self, function: Function, place: str) -> bool:
+        """Whether ``self.loss`` is called by another method of its class."""
+        owner = self.program.owner_of(function)
+        methods = owner.methods.values() if owner is not None and place.startswith("self.") else ()
+        return any(dotted(call.func) == place for method in methods for call in method.flow.calls)
 
     @staticmethod
     def _named(function: Function, form: Form) -> List[Optional[cst.CSTNode]]:

@@ -9,6 +9,7 @@ import libcst as cst
 
 from legs_adapters.reading.l1 import Form, Forms
 from legs_adapters.reading.makers import is_rendering
+from legs_adapters.reading.meaning import Meaning
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.shared import unchanged_at
 from legs_adapters.reading.syntax import (
@@ -25,7 +26,7 @@ from legs_adapters.reading.syntax import (
 )
 from legs_adapters.reading.vocabulary import kind_of_words, role_of_words
 
-__all__ = ["STRUCTURAL", "is_always_the_same", "is_another_map", "is_beside_ssim", "is_given"]
+__all__ = ["STRUCTURAL", "is_always_the_same", "is_another_map", "is_beside_ssim", "is_given", "is_under_mask"]
 
 STRUCTURAL = re.compile("ssim", re.I)
 
@@ -44,6 +45,13 @@ def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) 
     """Whether an SSIM is taken of the same two: they are pictures, then, whatever else their names say."""
     structural = [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
     return any(is_given(function, call, first) and is_given(function, call, second) for call in structural)
+
+
+def is_under_mask(form: Form, side: cst.CSTNode, meaning: Meaning) -> bool:
+    """``l1_loss_masked(image, data["seg_im"], mask)``: the photograph under the mask that the L1 is given beside it."""
+    masked = form.callee is not None and {"mask", "masked"} & set(words(call_name(form.call))) and form.extras
+    name = side.value if isinstance(side, cst.Name) else str(key_of(side) or "")
+    return bool(masked) and meaning.kind == "mask" and any(kind_of_words(word) == "image" for word in words(name))
 
 
 def is_given(function: Function, call: cst.Call, picture: cst.CSTNode) -> bool:

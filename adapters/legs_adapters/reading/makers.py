@@ -9,7 +9,7 @@ import libcst as cst
 from legs_adapters.reading.flow import Definition
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import arguments, call_name, constant, key_of, word_set, words
+from legs_adapters.reading.syntax import arguments, call_name, code, constant, key_of, word_set, words
 from legs_adapters.reading.vocabulary import role_of_words
 
 __all__ = ["is_of_mesh", "is_rendering"]
@@ -49,7 +49,21 @@ def _rasterizes_mesh(program: Program, function: Function, call: cst.Call, depth
             draws = [inner for inner in callee.flow.calls if "raster" in call_name(inner).lower()]
             if draws and all(_rasterizes_mesh(program, callee, inner, depth + 1) for inner in draws):
                 return True
+            if not draws and _samples_texture(callee):
+                return True
     return False
+
+
+def _samples_texture(function: Function) -> bool:
+    """Whether what it returns is ``grid_sample(texture, uv)``."""
+    makers = [maker for value in function.flow.returns for maker in _makers(function, value, set())]
+    return bool(makers) and all(
+        maker is not None
+        and call_name(maker) == "grid_sample"
+        and len(arguments(maker)[0]) > 1
+        and "uv" in words(code(arguments(maker)[0][1]))
+        for maker in makers
+    )
 
 
 def _draws_mesh(call: cst.Call) -> bool:
@@ -85,6 +99,8 @@ def _makers(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> 
         return _makers(function, node.elt, seen)
     if isinstance(node, cst.BinaryOperation) and constant(node.right) is not None:
         return _makers(function, node.left, seen)
+    if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Multiply):  # image * mask
+        return [*_makers(function, node.left, seen), *_makers(function, node.right, seen)]
     if isinstance(node, cst.Call) and call_name(node) in _KEEPS:
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
         if base is None or (isinstance(base, cst.Name) and base.value in _MODULES):

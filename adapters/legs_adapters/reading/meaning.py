@@ -189,7 +189,7 @@ class Meanings:
             return _UNKNOWN
         ways = [self._definition(where, definition, depth) for where, definition in definitions]
         if Meaning("image", "target") in ways:  # a photograph, or what a setting puts into its place
-            ways = [meaning for meaning in ways if meaning.kind != "warp"]
+            ways = [meaning for meaning in ways if meaning.kind not in ("warp", "feature")]
         return _mix(ways)
 
     def _definition(self, function: Function, definition: Definition, depth: int) -> Meaning:
@@ -227,14 +227,15 @@ class Meanings:
             meaning = self.of(function, value, depth)
             if meaning.kind == "image" and index > 0:
                 return Meaning(None, meaning.role)
-            returned = self._returned(function, value, index, depth)
+            returned = self._returned(function, value, index, depth, by_name=meaning.kind == "image")
             return returned if returned.kind is not None else meaning
         if isinstance(value, (cst.Tuple, cst.List)) and index < len(value.elements):
             return self.of(function, value.elements[index].value, depth)
         meaning = self.of(function, value, depth)
         return Meaning(None, meaning.role)
 
-    def _returned(self, function: Function, call: cst.Call, index: int, depth: int) -> Meaning:
+    def _returned(self, function: Function, call: cst.Call, index: int, depth: int, by_name: bool) -> Meaning:
+        """What an element of a returned tuple is: of a renderer's, which may join a depth to its colours, by name."""
         found = []
         for reference in self.program.resolve(function, call.func):
             if reference.kind == "function" and isinstance(reference.target, Function) and not reference.guess:
@@ -244,7 +245,9 @@ class Meanings:
                         passed = passed_on(reference.target, element)
                         given = reference.target.given(call, passed) if passed is not None else None
                         where, what = (reference.target, element) if given is None else (function, given)
-                        found.append(self.of(where, what, depth))
+                        meaning = self.of(where, what, depth)
+                        says_image = isinstance(what, cst.Name) and kind_of_words(what.value) == "image"
+                        found.append(meaning._replace(kind="image") if by_name and says_image else meaning)
         return _mix(found)
 
     def _parameter(self, function: Function, definition: Definition, depth: int) -> Meaning:

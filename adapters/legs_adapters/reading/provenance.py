@@ -76,7 +76,8 @@ class Views:
         if not self._still(function, holder, target, site):
             return View(None, f"{holder.value} may be another view by then")
         doubt = _overwritten(function, holder.value, image.attr.value) or self._nameless(function, holder, set())
-        doubt = doubt or _of_no_photograph(function, site) or self._of_scenes_in_turn(function)
+        doubt = doubt or _of_no_photograph(function, site) or _told_apart(function, holder.value)
+        doubt = doubt or self._of_scenes_in_turn(function)
         if doubt is not None:
             return View(None, doubt)
         return View(f"{holder.value}.{_NAME}", f"{code(image)}, untouched")
@@ -256,6 +257,18 @@ def _of_no_photograph(function: Function, site: cst.CSTNode) -> Optional[str]:
     for name in function.flow.conditions.get(id(site), ()):
         if _NO_PHOTOGRAPHS & set(words(name)):
             return f"only where {name}"
+    return None
+
+
+def _told_apart(function: Function, holder: str) -> Optional[str]:
+    """Why a name alone may be of several pictures: ``masks[time, camera.image_name]`` asks for more."""
+    for node in walk_expressions(function.body):
+        if isinstance(node, cst.Subscript):
+            keys = [part.slice.value for part in node.slice if isinstance(part.slice, cst.Index)]
+            if len(keys) == 1 and isinstance(keys[0], cst.Tuple):
+                keys = [element.value for element in keys[0].elements]
+            if len(keys) > 1 and any(dotted(key) == f"{holder}.{_NAME}" for key in keys):
+                return f"{_short(node)} asks for more than the name"
     return None
 
 

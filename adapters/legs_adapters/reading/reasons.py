@@ -7,12 +7,13 @@ from typing import Dict, List, Optional, Sequence, Set
 
 import libcst as cst
 
-from legs_adapters.reading.beside import is_always_the_same, is_another_map, is_beside_ssim
+from legs_adapters.reading.beside import is_always_the_same, is_another_map, is_beside_ssim, is_under_mask
 from legs_adapters.reading.l1 import Form, Forms
 from legs_adapters.reading.makers import is_of_mesh, is_rendering
 from legs_adapters.reading.meaning import Meaning, Meanings
 from legs_adapters.reading.module import Function, Module
-from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, of_rays, picked_from, same_root, swapped
+from legs_adapters.reading.pair import Pair, are_counterparts, is_detached, of_rays, same_root, swapped
+from legs_adapters.reading.picked import picked_from
 from legs_adapters.reading.program import Program
 from legs_adapters.reading.shared import is_rescaled, takes_no_gradient
 from legs_adapters.reading.steps import Steps
@@ -87,9 +88,12 @@ class Reasons:
 
     def why(self, function: Function, form: Form, pair: Pair) -> Optional[str]:
         """Return why a form is left; None where it is to be weighted."""
-        for meaning, beside in ((pair.a, pair.b), (pair.b, pair.a)):
+        for meaning, side, beside in ((pair.a, pair.first, pair.b), (pair.b, pair.second, pair.a)):
             pictures = meaning.kind in _LAID_OVER_PICTURES and beside.kind == "image"
-            if meaning.kind in _WHY and not (pictures and is_beside_ssim(function, form.first, form.second)):
+            pictures = pictures and (
+                is_beside_ssim(function, form.first, form.second) or is_under_mask(form, side, meaning)
+            )
+            if meaning.kind in _WHY and not pictures:
                 return _WHY[meaning.kind]
         if constant(form.first) is not None or constant(form.second) is not None or _of_points(form):
             return "regulariser"

@@ -8,7 +8,7 @@ import libcst as cst
 
 from legs_adapters.reading.l1 import Form
 from legs_adapters.reading.module import Function
-from legs_adapters.reading.pair import makes_mask
+from legs_adapters.reading.picked import makes_mask
 from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, walk_expressions
 from legs_adapters.reading.training import Training
 

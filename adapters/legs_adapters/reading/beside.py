@@ -116,8 +116,12 @@ def _entry(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> O
         return None
     seen.add(id(node))
     if isinstance(node, cst.Name):
-        made = [d.value if d.kind == "assign" else None for d in function.flow.reaching(node)]
-        return _entry(function, made[0], seen) if len(made) == 1 else None
+        made = list(function.flow.reaching(node))
+        if len(made) == 1 and made[0].kind == "element":
+            return "", node.value  # of what a renderer returns together
+        return _entry(function, made[0].value, seen) if len(made) == 1 and made[0].kind == "assign" else None
+    if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Multiply):  # image * mask
+        return _entry(function, node.left, seen)
     if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) in _KEEPS:
         return _entry(function, node.func.value, seen)
     if isinstance(node, cst.Attribute):

@@ -61,6 +61,8 @@ _RENDERERS = {
 }  # fmt: skip
 _MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
 _NUMBERS = {"int", "float", "len", "bool"}
+_STATISTICS = {"histc", "histogram", "bincount", "entropy", "gram", "moments"}  # of a picture, no picture
+_MATCHED = {"match", "matching", "matched", "equalize", "equalized"}  # histogram_matching(image, photo) is one
 _EXTREMES = {"max", "min", "amax", "amin"}
 _JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
@@ -389,6 +391,8 @@ class Meanings:
             return meaning
         if name == "where" and len(values) == 3:
             return _mix([self.of(function, value, depth) for value in values[1:]])
+        if set(words(name)) & _STATISTICS and not set(words(name)) & _MATCHED and values:
+            return Meaning("feature", self.of(function, values[0], depth).role)
         filters = name in ("conv2d", "filter2d", "spatial_gradient") and values and "stride" not in keywords
         if filters and not (len(positional) > 1 and is_box(function, positional[1])):
             return Meaning("gradient", self.of(function, values[0], depth).role)

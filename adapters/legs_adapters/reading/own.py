@@ -131,7 +131,7 @@ def _meet_in_differences(program: Program, function: Function, a: str, b: str, d
 
     for node in nodes:
         if isinstance(node, cst.BinaryOperation):
-            if isinstance(node.operator, (cst.Power,)):
+            if isinstance(node.operator, cst.Power) and function.depends(node.left, {a, b}):
                 return False
             if isinstance(node.operator, cst.Multiply) and constant(node.right, 1) == 0:
                 allowed.update(id(n) for n in walk_expressions(node))

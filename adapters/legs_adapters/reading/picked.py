@@ -93,7 +93,7 @@ def is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: in
         added = [d.value for d in found if d.kind == "mutate" and isinstance(d.value, cst.Call)]
         if added:  # crops = [], then crops.append(crop.flatten())
             return are((function, value) for call in added for value in arguments(call)[0])
-        return len(found) == 1 and found[0].kind == "assign" and are((function, d.value) for d in found if d.value)
+        return are((function, d.value) for d in found if d.kind == "assign" and d.value is not None)
     if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
         if _to_rows(node) or _flattens(node):
             return True

@@ -343,9 +343,11 @@ class Program:
 
     def _on_path(self, module: Module, stem: str, name: str) -> Optional[Module]:
         """``from base import Trainer``: the nearest ``base.py`` that defines a Trainer, if a script can have put it
-        on sys.path."""
+        on sys.path; of a checkout that is a package itself also ``from its_name.base import Trainer``."""
         defines = re.compile(rf"^(?:class|def)[ \t]+{re.escape(name)}\b", re.M)
-        ends = [p for p in self._ending.get(stem, []) if defines.search(self.sources[p].text)]
+        own = stem.partition(".")[2].replace(".", "/") + ".py" if "__init__.py" in self.sources else ""
+        known = [own] if own in self.sources else self._ending.get(stem, [])
+        ends = [p for p in known if defines.search(self.sources[p].text)]
         ends = _nearest(module.path, ends)
         return self.module(ends[0]) if len(ends) == 1 else None
 

@@ -76,6 +76,7 @@ class Views:
         if not self._still(function, holder, target, site):
             return View(None, f"{holder.value} may be another view by then")
         doubt = _overwritten(function, holder.value, image.attr.value) or self._nameless(function, holder, set())
+        doubt = doubt or self._remade(function, holder, image.attr.value) or _of_several(function, holder, set())
         doubt = doubt or _of_no_photograph(function, site) or _told_apart(function, holder.value)
         doubt = doubt or self._of_scenes_in_turn(function)
         if doubt is not None:
@@ -205,6 +206,16 @@ class Views:
                     return f"{other.name or module.path} reads several scenes, where names come again"
         return None
 
+    def _remade(self, function: Function, holder: cst.Name, attribute: str) -> Optional[str]:
+        """Why the camera may be another than the one that has the name: ``view = scaled(camera, 0.5)``."""
+        for definition in function.flow.reaching(holder):
+            made = definition.value if definition.kind == "assign" else None
+            for reference in self.program.resolve(function, made.func) if isinstance(made, cst.Call) else ():
+                maker = reference.target
+                if isinstance(maker, Function) and re.search(rf"\.{attribute}\s*=[^=]", code(maker.body)):
+                    return f"{maker.name} gives it another {attribute}"
+        return None
+
     def _reads_twice(self) -> bool:
         """Whether a reader makes cameras of the same poses a second time, with the pictures of another folder."""
         for module in self.program.matching(_POSES):
@@ -258,6 +269,29 @@ def _of_no_photograph(function: Function, site: cst.CSTNode) -> Optional[str]:
         if _NO_PHOTOGRAPHS & set(words(name)):
             return f"only where {name}"
     return None
+
+
+def _of_several(function: Function, node: cst.CSTNode, seen: Set[int]) -> Optional[str]:
+    """Why names may come again: ``for scene in scenes: ... scene.getTrainCameras()``."""
+    for definition in function.flow.reaching(node):
+        if definition.value is None or id(definition) in seen:
+            continue
+        seen.add(id(definition))
+        root = list(attribute_chain(definition.value))[-1]
+        scenes = function.flow.reaching(root) if "getTrainCameras" in code(definition.value) else ()
+        if any(_is_turn(function, scene) for scene in scenes):
+            return f"{code(root)} is one of several, where names come again"
+        found = _of_several(function, root, seen)
+        if found is not None:
+            return found
+    return None
+
+
+def _is_turn(function: Function, definition: Definition) -> bool:
+    """Whether a name is what a loop goes over, or a part of that."""
+    loops = [loop for loop in loops_around(function.body, definition.node) if isinstance(loop, cst.For)]
+    named = any(definition.node is part for loop in loops for part in walk_expressions(loop.target))
+    return named or isinstance(definition.node, cst.For)
 
 
 def _told_apart(function: Function, holder: str) -> Optional[str]:

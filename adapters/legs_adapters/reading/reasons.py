@@ -72,6 +72,7 @@ _LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}
 _MADE_UP = {f"torch.{name}{like}" for name in ("eye", "zeros", "ones", "full") for like in ("", "_like")}
 _OF_LITERALS = {"torch.tensor", "torch.as_tensor", "torch.Tensor", "torch.FloatTensor"}
 _SHAPED = {"cuda", "to", "float", "view", "reshape", "unsqueeze", "expand", "expand_as", "repeat"}
+_JOINS = {"cat", "concat", "stack"}
 _DEPTH = 8
 
 
@@ -99,7 +100,7 @@ class Reasons:
             return "regulariser"
         trained = self.training.includes(form.node) or self.training.includes(form.call)
         trained = trained or self._called_by_framework(function)
-        if not trained or self.without_grad(function, form.call, form.node):
+        if not trained or self.without_grad(function, form.call, form.node) or self._asked_without_grad(function):
             return self._why_untrained(function, form)
         if _OTHERS.search(function.module.text) and not _TORCH.search(function.module.text):
             return "not torch"
@@ -183,7 +184,8 @@ class Reasons:
     def _moves_poses(self, function: Function, call: cst.Call) -> bool:
         names = (function.name, *function.flow.conditions.get(id(call), ()), self._class_of(function))
         spoken = [set(words(name)) for name in names]
-        return any(said & _POSE and not said & _MAPPING for said in spoken)
+        poses_of_tests = any({"test", "pose"} <= said for said in spoken)  # if config.test_opt_pose:
+        return poses_of_tests or any(said & _POSE and not said & _MAPPING for said in spoken)
 
     def _class_of(self, function: Function) -> str:
         owner = self.program.owner_of(function)
@@ -202,7 +204,7 @@ class Reasons:
         spoken = {word for name in names for word in words(name)}
         said = words(function.name)
         shows = len(said) > 1 and said[0] in _NOT_TRAINING and not {"loss", "losses"} & set(said[1:])
-        if shows and not self._is_of_training_step(function):
+        if shows and not self._is_of_training_step(function) and not self.steps.trains_its_own(function):
             return "evaluation"
         folders, _, file = module.path.rpartition("/")
         evaluates = (words(file)[:1] and words(file)[0] in _EVALUATING) or set(folders.split("/")) & _EVALUATING
@@ -258,6 +260,11 @@ class Reasons:
                 return True
             scope = scope.parent
         return False
+
+    def _asked_without_grad(self, function: Function) -> bool:
+        """Whether no caller keeps a gradient of it: an error map for the next step's mask."""
+        sites = self.training.sites.get(function, [])
+        return bool(sites) and all(self.without_grad(caller, call) for caller, call in sites)
 
     def _why_untrained(self, function: Function, form: Form) -> str:
         names, queue = [function], [function]
@@ -393,9 +400,14 @@ def _is_made_up(function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
 
 
 def _is_leaf(function: Function, node: cst.CSTNode) -> bool:
-    """``image = torch.tensor(array).requires_grad_()``: whose gradient is looked at, made by no rendering."""
+    """``image = torch.tensor(array).requires_grad_()``: whose gradient is looked at, made by no rendering.
+
+    ``torch.cat(images).requires_grad_()`` has those of the renderings.
+    """
     values = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
-    return any(isinstance(value, cst.Call) and call_name(value) == "requires_grad_" for value in values)
+    calls = [value for value in values if isinstance(value, cst.Call) and call_name(value) == "requires_grad_"]
+    asked = [call.func.value for call in calls if isinstance(call.func, cst.Attribute)]
+    return any(not (isinstance(base, cst.Call) and call_name(base) in _JOINS) for base in asked)
 
 
 def _made_of(function: Function, form: Form) -> List[cst.CSTNode]:

@@ -25,6 +25,9 @@ __all__ = [
 ]
 
 
+_SIZES = {"shape", "size", "dim", "ndim", "numel", "device", "dtype"}
+
+
 class Shared(NamedTuple):
     """The reads of an error map: the one to be weighted in its place; and those that are to keep the plain map.
 
@@ -62,7 +65,7 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
         for part in attribute_chain(call)
     } | function.flow.without_grad
     edited = _edited(function)
-    aside = [read for read in reads if read not in loss and id(read) not in logged | edited]
+    aside = [read for read in reads if read not in loss and id(read) not in logged | edited | _asked_for_size(function)]
     if not aside:
         return None
     if not loss:
@@ -150,6 +153,12 @@ def _edited(function: Function) -> Set[int]:
     changed: List[cst.CSTNode] = [d.node.target for d in changes if isinstance(d.node, cst.AugAssign)]
     changed += [d.value for d in changes if d.kind == "inplace" and d.value is not None]
     return {id(part) for node in changed for part in attribute_chain(node)}
+
+
+def _asked_for_size(function: Function) -> Set[int]:
+    """The ids of the names that are only asked how large they are: ``error.shape``, ``error.dim()``."""
+    parts = [part for part in walk_expressions(function.body) if isinstance(part, cst.Attribute)]
+    return {id(part.value) for part in parts if part.attr.value in _SIZES}
 
 
 def takes_no_gradient(training: Training, function: Function, call: cst.Call, given: cst.CSTNode) -> bool:

@@ -38,7 +38,7 @@ _MODEL = word_set(
     net network mlp scene deform anchor anchors primitives points parameters params variables
     """
 )
-_SCHEDULES = word_set("sched scheduler schedulers lr strategy profiler progress")
+_SCHEDULES = word_set("sched scheduler schedulers lr strategy profiler progress pbar tqdm bar")
 _PLUMBING = word_set("torch optim adam params lr name eps self")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 _MAKES = {"optimizer", "optimiser", "optimizers", "optimisers"}
@@ -98,7 +98,7 @@ class Steps:
 
     def _nobody_steps(self, function: Function, depth: int) -> bool:
         """Whether neither a function nor what calls it, as far as that is known, can step."""
-        if {word for call in function.flow.calls for word in words(call_name(call))} & _STEPS:
+        if _may_step(function.flow.calls):
             return False
         if function.parent is None:
             return True
@@ -125,7 +125,7 @@ class Steps:
             if call_name(later) == "zero_grad":
                 return read
             called = [r.target for r in self.program.resolve(caller, later.func) if isinstance(r.target, Function)]
-            if set(words(call_name(later))) & _STEPS or any(map(_steps, called)):
+            if _may_step([later]) or any(map(_steps, called)):
                 return False
             read = read or any("grad" in each.text and _read(list(_walk(each.body))) for each in called)
         return False
@@ -279,7 +279,16 @@ def _is_step(call: cst.Call) -> bool:
     said = set(words(call_name(call)))
     if not isinstance(call.func, cst.Attribute) or not (said == {"step"} or ("step" in said and said & _MAKES)):
         return False
-    return not _spoken(call.func.value) & _SCHEDULES
+    return not _is_of_schedule(call)
+
+
+def _may_step(calls: Iterable[cst.Call]) -> bool:
+    """Whether a call says that it steps, under whatever name: ``gaussians.update(opt)``; not ``pbar.update(1)``."""
+    return any(set(words(call_name(call))) & _STEPS and not _is_of_schedule(call) for call in calls)
+
+
+def _is_of_schedule(call: cst.Call) -> bool:
+    return isinstance(call.func, cst.Attribute) and bool(_spoken(call.func.value) & _SCHEDULES)
 
 
 def _steps(function: Function) -> bool:
@@ -293,8 +302,7 @@ def _only_reads(scope: cst.CSTNode, calls: List[cst.Call], for_good: bool) -> bo
     They are set to nothing then; where nobody steps, ``for_good``, they need not be.
     """
     last = max(i for i, call in enumerate(calls) if _is_backward(call))
-    named = {word for call in calls for word in words(call_name(call))}
-    if named & _STEPS:
+    if _may_step(calls):
         return False
     parts = list(_walk(scope))
     again = isinstance(scope, (cst.For, cst.While)) and any(_empties(part) for part in parts)

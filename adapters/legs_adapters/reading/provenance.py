@@ -290,8 +290,7 @@ def _of_several(function: Function, node: cst.CSTNode, seen: Set[int]) -> Option
 def _is_turn(function: Function, definition: Definition) -> bool:
     """Whether a name is what a loop goes over, or a part of that."""
     loops = [loop for loop in loops_around(function.body, definition.node) if isinstance(loop, cst.For)]
-    named = any(definition.node is part for loop in loops for part in walk_expressions(loop.target))
-    return named or isinstance(definition.node, cst.For)
+    return any(definition.node is part for loop in loops for part in walk_expressions(loop.target))
 
 
 def _told_apart(function: Function, holder: str) -> Optional[str]:

@@ -190,7 +190,8 @@ class Meanings:
         if definitions is None:
             return _UNKNOWN
         ways = [self._definition(where, definition, depth) for where, definition in definitions]
-        if Meaning("image", "target") in ways:  # a photograph, or what a setting puts into its place
+        photographs = [meaning for meaning in ways if meaning.role == "target" and meaning.kind in ("image", None)]
+        if photographs:  # or what a setting puts into their place
             ways = [meaning for meaning in ways if meaning.kind not in ("warp", "feature")]
         return _mix(ways)
 

@@ -112,6 +112,8 @@ class Reasons:
             return "regulariser"
         if _of_scanner(function, form):
             return "features"
+        if self._is_change(function, form.first) and self._is_change(function, form.second):
+            return "gradients"
         if _is_leaf(function, form.first) or _is_leaf(function, form.second):
             return "untrained"
         target, other = (pair.first, pair.second) if swapped(pair.a, pair.b) else (pair.second, pair.first)
@@ -158,6 +160,12 @@ class Reasons:
             made = [d.value for d in function.flow.reaching(node) if d.kind == "assign" and d.value is not None]
             return bool(made) and all(self._is_number(function, value, depth + 1) for value in made)
         return False
+
+    def _is_change(self, function: Function, node: cst.CSTNode) -> bool:
+        """``image_b - image_a``: how a picture changes, from view to view or under a filter."""
+        sides = (node.left, node.right) if isinstance(node, cst.BinaryOperation) else ()
+        changes = isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Subtract)
+        return changes and all(self.meanings.of(function, side).kind == "image" for side in sides)
 
     def _of_model(self, function: Function, target: cst.CSTNode) -> bool:
         """Whether a target is what the Gaussians themselves have: ``self.get_radiances.gather(1, index)``."""

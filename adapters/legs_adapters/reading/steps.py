@@ -335,8 +335,9 @@ def _taken(node: cst.CSTNode) -> List[cst.CSTNode]:
     """What a step by hand takes: ``xyz -= lr * xyz.grad``, ``xyz - xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``."""
     if isinstance(node, cst.AugAssign):
         return [node.value] if isinstance(node.operator, cst.SubtractAssign) else []
-    if isinstance(node, cst.BinaryOperation):
-        return [node.right] if isinstance(node.operator, cst.Subtract) else []
+    if isinstance(node, cst.BinaryOperation):  # xyz.grad - other.grad compares the two
+        of_grads = any(isinstance(p, cst.Attribute) and p.attr.value == "grad" for p in _walk(node.left))
+        return [node.right] if isinstance(node.operator, cst.Subtract) and not of_grads else []
     in_place = isinstance(node, cst.Call) and call_name(node).endswith("_")
     return [child.value for child in children(node) if in_place and isinstance(child, cst.Arg)]
 

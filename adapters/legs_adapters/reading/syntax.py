@@ -10,8 +10,8 @@ from typing import Any, Dict, FrozenSet, Iterator, List, Optional, Tuple
 import libcst as cst
 
 __all__ = [
-    "arguments", "attribute_chain", "call_name", "children", "code", "constant", "dotted", "key_of", "loops_around",
-    "path_of", "root_of", "same", "strip_parens", "walk_expressions", "words",
+    "arguments", "attribute_chain", "brief", "call_name", "children", "code", "constant", "dotted", "key_of",
+    "loops_around", "path_of", "root_of", "same", "strip_parens", "walk_expressions", "word_set", "words",
 ]  # fmt: skip
 
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
@@ -24,6 +24,12 @@ _FIELDS: Dict[type, Tuple[str, ...]] = {}
 def code(node: cst.CSTNode) -> str:
     """Return a node's source text, exactly."""
     return _EMPTY.code_for_node(node)
+
+
+def brief(node: cst.CSTNode) -> str:
+    """Return a node's source text on one line, cut at 60 characters: for a message."""
+    text = " ".join(code(node).split())
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def dotted(node: cst.CSTNode) -> Optional[str]:

@@ -8,7 +8,7 @@ from typing import Dict, List, Sequence, Tuple
 
 from legs_adapters.patch import Plan
 from legs_adapters.reading.repo import Source, decode
-from legs_adapters.reading.syntax import code
+from legs_adapters.reading.syntax import one_line
 
 __all__ = ["as_diff", "as_json", "as_table"]
 
@@ -48,7 +48,7 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
                 "line": site.line,
                 "column": site.column,
                 "function": site.function,
-                "code": " ".join(code(site.form.node).split()),
+                "code": one_line(site.form.node),
                 "view": site.view.text,
                 "view_reason": site.view.reason,
                 "channels_last": site.channels_last,

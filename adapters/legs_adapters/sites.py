@@ -30,7 +30,7 @@ from legs_adapters.reading.reasons import Reasons
 from legs_adapters.reading.repo import Source
 from legs_adapters.reading.run_time import chosen_at_run_time
 from legs_adapters.reading.shared import is_asked, is_huber, is_measured, shared_of, unchanged_at
-from legs_adapters.reading.syntax import arguments, call_name, code, dotted, same, walk_expressions, words
+from legs_adapters.reading.syntax import arguments, call_name, code, dotted, one_line, same, walk_expressions, words
 from legs_adapters.reading.training import Training
 from legs_adapters.reading.uses import Use, Uses, detaches
 from legs_adapters.reading.vocabulary import kind_of_words
@@ -177,7 +177,7 @@ class _Finder:
             if is_l1_function(self.program, function, value) and not self._is_called(function, definition.place):
                 module, line = function.module, function.place(value).line
                 why = f"nothing shows where {definition.place} is called"
-                advice = f"legs_loss.l1_loss(rendering, photograph, own={_short(value)}), where it is called"
+                advice = f"legs_loss.l1_loss(rendering, photograph, own={one_line(value)}), where it is called"
                 self.doubtful.append(Problem(module.path, line, module.lines.text(line), why, advice))
 
     def _is_called(self, function: Function, place: str) -> bool:
@@ -216,7 +216,7 @@ class _Finder:
         if not is_huber(self.training, function, form):
             return self._problem(function, form, place, f"nothing shows that this is the loss ({reason})", flipped)
         why = "this is a Huber loss: a weight in it would move its threshold"
-        target = _short(form.first if flipped else form.second)
+        target = one_line(form.first if flipped else form.second)
         advice = f"legs_loss.weight_map({target}) times the loss, before its mean"
         return self._problem(function, form, place, why)._replace(advice=advice)
 
@@ -229,7 +229,7 @@ class _Finder:
 
     def _of_kernel(self, function: Function, call: cst.Call, place: Place) -> Problem:
         module = function.module
-        sides = ", ".join(_short(arg.value) for arg in call.args[:2])
+        sides = ", ".join(one_line(arg.value) for arg in call.args[:2])
         advice = f"(1 - w) * legs_loss.l1_loss({sides}) + w * legs_loss.d_ssim({sides})"
         why = "L1 and SSIM are one function here; with w, its weight of SSIM, they are two"
         return Problem(module.path, place.line, module.lines.text(place.line), why, advice)
@@ -240,7 +240,7 @@ class _Finder:
         if reason is not None:
             return self._left(function, place, reason)
         assert form.callee is not None
-        why = f"{_short(form.callee)} is settled at run time, and may be no L1"
+        why = f"{one_line(form.callee)} is settled at run time, and may be no L1"
         return self._problem(function, form, place, why, bool(swapped(pair.a, pair.b)))
 
     def _is_noise(self, function: Function, form: Form, left: Left) -> bool:
@@ -305,7 +305,7 @@ class _Finder:
         if target_first is None and not by_hand:
             if not pair.speaks_of_images:
                 return self._left(function, place, "unknown")
-            sides = f"{_short(pair.first)} and {_short(pair.second)}"
+            sides = f"{one_line(pair.first)} and {one_line(pair.second)}"
             why = f"cannot tell which of {sides} is the rendering and which the photograph"
             return self._problem(function, form, place, why)
         flipped = bool(target_first)
@@ -320,11 +320,13 @@ class _Finder:
         if is_huber(self.training, function, form):
             return self._left(function, place, "huber")
         if form.reduction == "signed":
-            why = f"the difference {_short(_difference(form))} was weighted where it was made, which l1_loss would lose"
+            why = (
+                f"the difference {one_line(_difference(form))} was weighted where it was made, which l1_loss would lose"
+            )
             return self._problem(function, form, place, why, flipped)
         if form.reduction == "taken":
             assert form.callee is not None
-            why = f"{_short(form.callee)} takes the absolute value of the difference"
+            why = f"{one_line(form.callee)} takes the absolute value of the difference"
             return self._problem(function, form, place, why, flipped)
         if not form.direct and not unchanged_at(function, form.call, form.first, form.second):
             return self._problem(function, form, place, "the difference has a name of its own", flipped)
@@ -349,7 +351,7 @@ class _Finder:
         elif shared is not None and shared.aside:
             aside = tuple(shared.aside)
         elif shared is not None:
-            return self._problem(function, form, place, f"{_short(form.node)} serves more than the loss", flipped)
+            return self._problem(function, form, place, f"{one_line(form.node)} serves more than the loss", flipped)
         last = self._is_channels_last(function, prediction, target, form.node)
         last = last or (picked is not None and lies_last(function, picked[0]))
         view = self.views.of(function, target, form.call)
@@ -429,31 +431,34 @@ def _advice(form: Form, flipped: bool, last: bool, rows: bool) -> str:
     prediction, target = (form.second, form.first) if flipped else (form.first, form.second)
     whole, other = without_rows(prediction), without_rows(target)
     if whole is not prediction and other is not target:
-        return f"legs_loss.l1_loss({_short(whole)}, {_short(other)}.reshape({_short(whole)}.shape), channels_last=True)"
+        image, photo = one_line(whole), one_line(other)
+        return f"legs_loss.l1_loss({image}, {photo}.reshape({image}.shape), channels_last=True)"
     if form.reduction == "signed":
         mean = ".mean()" if form.node is not form.call else ""
-        weight = f"legs_loss.weight_map({_short(target)}{', channels_last=True' if last else ''})"
-        return f"torch.abs({weight} * {_short(_difference(form))}){mean}"
+        weight = f"legs_loss.weight_map({one_line(target)}{', channels_last=True' if last else ''})"
+        return f"torch.abs({weight} * {one_line(_difference(form))}){mean}"
     if form.reduction == "taken":
-        weight = f"legs_loss.weight_map({_short(target)}{', channels_last=True' if last else ''})"
-        return _short(_with_weight(form, weight))
+        weight = f"legs_loss.weight_map({one_line(target)}{', channels_last=True' if last else ''})"
+        return one_line(_with_weight(form, weight))
     if rows:
         return "legs_loss.l1_loss(rendering, photograph), with the pictures before they became lists"
     settings = ", channels_last=True" if last else ""
     settings += ', reduction="none"' if form.reduction == "none" else ""
     if form.callee is not None and form.reduction == "own" and not form.extras and not _is_torch(form.callee):
-        settings += f", own={_short(form.callee)}" if not flipped else f", own=lambda a, b: {_short(form.callee)}(b, a)"
+        settings += (
+            f", own={one_line(form.callee)}" if not flipped else f", own=lambda a, b: {one_line(form.callee)}(b, a)"
+        )
     if form.callee is not None and form.extras:
         first, second = ("b", "a") if flipped else ("a", "b")
-        extras = ", ".join(_short(extra.with_changes(comma=cst.MaybeSentinel.DEFAULT)) for extra in form.extras)
-        settings += f", own=lambda a, b: {_short(form.callee)}({first}, {second}, {extras})"
-    return f"legs_loss.l1_loss({_short(prediction)}, {_short(target)}{settings})"
+        extras = ", ".join(one_line(extra.with_changes(comma=cst.MaybeSentinel.DEFAULT)) for extra in form.extras)
+        settings += f", own=lambda a, b: {one_line(form.callee)}({first}, {second}, {extras})"
+    return f"legs_loss.l1_loss({one_line(prediction)}, {one_line(target)}{settings})"
 
 
 def _with_weight(form: Form, weight: str) -> cst.Call:
     """``robust(weight * residual, config)``."""
     first = form.call.args[0]
-    product = cst.parse_expression(f"{weight} * {_short(first.value)}")
+    product = cst.parse_expression(f"{weight} * {one_line(first.value)}")
     return form.call.with_changes(args=(first.with_changes(value=product), *form.call.args[1:]))
 
 
@@ -486,7 +491,3 @@ def _in_a_copy(function: Function, uses: Sequence[Use]) -> str:
 def _is_torch(callee: cst.BaseExpression) -> bool:
     """``F.l1_loss``, whose mean needs no ``own=``."""
     return re.search(r"(^|\.)(F|functional)\.l1_loss$", code(callee)) is not None
-
-
-def _short(node: cst.CSTNode) -> str:
-    return " ".join(code(node).split())

@@ -35,7 +35,17 @@ from legs_adapters.reading.signs import (
     is_taken_from_one,
     passed_on,
 )
-from legs_adapters.reading.syntax import arguments, call_name, constant, key_of, root_of, same, walk_expressions, words
+from legs_adapters.reading.syntax import (
+    JOINS,
+    arguments,
+    call_name,
+    constant,
+    key_of,
+    root_of,
+    same,
+    walk_expressions,
+    words,
+)
 from legs_adapters.reading.training import Training
 from legs_adapters.reading.vocabulary import DATA, KINDS, kind_of_words, role_of_words
 
@@ -64,7 +74,6 @@ _NUMBERS = {"int", "float", "len", "bool"}
 _STATISTICS = {"histc", "histogram", "bincount", "entropy", "gram", "moments"}  # of a picture, no picture
 _MATCHED = {"match", "matching", "matched", "equalize", "equalized"}  # histogram_matching(image, photo) is one
 _EXTREMES = {"max", "min", "amax", "amin"}
-_JOIN = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
 _BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
 _OF_DIFFUSION = {"guidance_scale", "negative_prompt", "num_inference_steps", "strength"}  # of a picture that it paints
 _LOSSES = {"loss", "losses", "criterion"}
@@ -397,7 +406,7 @@ class Meanings:
         filters = name in ("conv2d", "filter2d", "spatial_gradient") and values and "stride" not in keywords
         if filters and not (len(positional) > 1 and is_box(function, positional[1])):
             return Meaning("gradient", self.of(function, values[0], depth).role)
-        if name in _JOIN and values:
+        if name in JOINS and values:
             return self.of(function, values[0], depth)
         if base is not None and not module and name in _SAME:
             return self.of(function, base, depth)

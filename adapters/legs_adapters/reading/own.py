@@ -11,14 +11,13 @@ from legs_adapters.reading.absolute import TORCH_L1, abs_argument, is_abs, is_l1
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.program import Program, Reference
 from legs_adapters.reading.returned import known_arguments, returned
-from legs_adapters.reading.syntax import arguments, call_name, code, constant, key_of, walk_expressions
+from legs_adapters.reading.syntax import SIZES, arguments, call_name, code, constant, key_of, walk_expressions
 
 __all__ = ["is_l1_function", "own_shape", "shape_of_reference"]
 
 _GSPLAT_L1 = re.compile(r"^gsplat\.losses\.l1_loss$")
 _TORCH_MODULE = re.compile(r"(^|\.)L1Loss$")  # nerfstudio hands torch's on
 _SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)
-_SHAPE_ONLY = {"shape", "device", "dtype", "dim", "ndim", "size", "numel", "is_cuda"}
 _ASKING = {"isnan", "isfinite", "isinf", "zeros_like", "ones_like"}
 _AS_THAT = {"to", "type_as", "expand_as", "view_as", "reshape_as"}  # mask.to(prediction)
 # Decorators that return what the function returns.
@@ -158,7 +157,7 @@ def _meet_in_differences(program: Program, function: Function, a: str, b: str, d
         elif isinstance(node, cst.Comparison):
             # A mask made from the second, `gt != 0`: it is handed over as it is.
             allowed.update(id(n) for n in walk_expressions(node) if isinstance(n, cst.Name) and n.value == b)
-        elif isinstance(node, cst.Attribute) and node.attr.value in _SHAPE_ONLY:
+        elif isinstance(node, cst.Attribute) and node.attr.value in SIZES:
             allowed.add(id(node.value))
         elif isinstance(node, cst.Subscript) and isinstance(node.value, cst.Name) and isinstance(key_of(node), str):
             if node.value.value in (a, b):

@@ -18,6 +18,7 @@ from legs_adapters.reading.program import Program
 from legs_adapters.reading.shared import is_rescaled, takes_no_gradient
 from legs_adapters.reading.steps import Steps
 from legs_adapters.reading.syntax import (
+    JOINS,
     arguments,
     attribute_chain,
     call_name,
@@ -72,7 +73,6 @@ _LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}
 _MADE_UP = {f"torch.{name}{like}" for name in ("eye", "zeros", "ones", "full") for like in ("", "_like")}
 _OF_LITERALS = {"torch.tensor", "torch.as_tensor", "torch.Tensor", "torch.FloatTensor"}
 _SHAPED = {"cuda", "to", "float", "view", "reshape", "unsqueeze", "expand", "expand_as", "repeat"}
-_JOINS = {"cat", "concat", "stack"}
 _DEPTH = 8
 
 
@@ -415,7 +415,7 @@ def _is_leaf(function: Function, node: cst.CSTNode) -> bool:
     values = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
     calls = [value for value in values if isinstance(value, cst.Call) and call_name(value) == "requires_grad_"]
     asked = [call.func.value for call in calls if isinstance(call.func, cst.Attribute)]
-    return any(not (isinstance(base, cst.Call) and call_name(base) in _JOINS) for base in asked)
+    return any(not (isinstance(base, cst.Call) and call_name(base) in JOINS) for base in asked)
 
 
 def _made_of(function: Function, form: Form) -> List[cst.CSTNode]:

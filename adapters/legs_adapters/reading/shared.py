@@ -9,7 +9,7 @@ import libcst as cst
 from legs_adapters.reading.l1 import Form
 from legs_adapters.reading.module import Function
 from legs_adapters.reading.picked import makes_mask
-from legs_adapters.reading.syntax import arguments, attribute_chain, call_name, walk_expressions
+from legs_adapters.reading.syntax import SIZES, arguments, attribute_chain, call_name, walk_expressions
 from legs_adapters.reading.training import Training
 
 __all__ = [
@@ -23,9 +23,6 @@ __all__ = [
     "unchanged",
     "unchanged_at",
 ]
-
-
-_SIZES = {"shape", "size", "dim", "ndim", "numel", "device", "dtype"}
 
 
 class Shared(NamedTuple):
@@ -158,7 +155,7 @@ def _edited(function: Function) -> Set[int]:
 def _asked_for_size(function: Function) -> Set[int]:
     """The ids of the names that are only asked how large they are: ``error.shape``, ``error.dim()``."""
     parts = [part for part in walk_expressions(function.body) if isinstance(part, cst.Attribute)]
-    return {id(part.value) for part in parts if part.attr.value in _SIZES}
+    return {id(part.value) for part in parts if part.attr.value in SIZES}
 
 
 def takes_no_gradient(training: Training, function: Function, call: cst.Call, given: cst.CSTNode) -> bool:

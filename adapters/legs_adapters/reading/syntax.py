@@ -10,9 +10,14 @@ from typing import Any, Dict, FrozenSet, Iterator, List, Optional, Tuple
 import libcst as cst
 
 __all__ = [
-    "arguments", "attribute_chain", "brief", "call_name", "children", "code", "constant", "dotted", "key_of",
-    "loops_around", "path_of", "root_of", "same", "strip_parens", "walk_expressions", "word_set", "words",
+    "JOINS", "SIZES", "arguments", "attribute_chain", "brief", "call_name", "children", "code", "constant", "dotted",
+    "key_of", "loops_around", "one_line", "path_of", "root_of", "same", "strip_parens", "walk_expressions", "word_set",
+    "words",
 ]  # fmt: skip
+
+JOINS = {"cat", "stack", "concat", "concatenate", "hstack", "vstack"}
+# What is asked of a tensor without a look at its values.
+SIZES = {"shape", "device", "dtype", "dim", "ndim", "size", "numel", "is_cuda"}
 
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _EMPTY = cst.Module(body=[])
@@ -26,9 +31,14 @@ def code(node: cst.CSTNode) -> str:
     return _EMPTY.code_for_node(node)
 
 
+def one_line(node: cst.CSTNode) -> str:
+    """Return a node's source text on one line."""
+    return " ".join(code(node).split())
+
+
 def brief(node: cst.CSTNode) -> str:
     """Return a node's source text on one line, cut at 60 characters: for a message."""
-    text = " ".join(code(node).split())
+    text = one_line(node)
     return text if len(text) <= 60 else text[:57] + "..."
 
 

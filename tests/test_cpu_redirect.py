@@ -6,9 +6,11 @@ import concurrent.futures
 import io
 import multiprocessing
 import os
+import pickle
 import threading
 import time
 
+import numpy as np
 import pytest
 import torch
 import torch.utils.data
@@ -19,6 +21,7 @@ NEW = hasattr(torch, "set_default_device")  # torch 2.0
 needs_new = pytest.mark.skipif(not NEW, reason="torch before 2.0 has no default device")
 # Made before anything is redirected: what was bound early stays what it was.
 original_zeros = torch.zeros
+original_save = torch.save
 
 
 @pytest.fixture(autouse=True)
@@ -197,6 +200,16 @@ class Anything:
     """What checkpoints of the time held beside tensors."""
 
 
+class RunsCode:
+    """What unpickles by running something."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
 class TestLoading:
     @pytest.mark.parametrize("place", [None, "cuda", torch.device("cuda"), "cpu", lambda storage, where: storage])
     def test_map_location(self, place):
@@ -205,13 +218,43 @@ class TestLoading:
         file.seek(0)
         assert torch.load(file, map_location=place)["x"].device.type == "cpu"
 
-    def test_what_is_no_tensor_is_loaded_as_it_used_to_be(self):
-        file = io.BytesIO()
-        torch.save((Anything(), 3), file)
-        file.seek(0)
-        found, iteration = torch.load(file)
-        assert isinstance(found, Anything)
-        assert iteration == 3
+    def test_what_the_run_itself_saved_is_loaded_whole(self, tmp_path):
+        buffer = io.BytesIO()
+        for place in (tmp_path / "own.pth", str(tmp_path / "named.pth"), buffer):
+            torch.save((Anything(), 3), place)
+            buffer.seek(0)
+            found, iteration = torch.load(place)
+            assert isinstance(found, Anything)
+            assert iteration == 3
+        with open(str(tmp_path / "own.pth"), "rb") as file:
+            assert torch.load(file)[1] == 3
+
+    def test_a_stranger_s_file_is_not_unpickled(self, tmp_path, monkeypatch):
+        ran = tmp_path / "ran"
+        path = tmp_path / "theirs.pth"
+        original_save((RunsCode(ran), torch.ones(1)), str(path))
+        with pytest.raises(pickle.UnpicklingError, match=r"theirs\.pth holds more than .* did not write it"):
+            torch.load(str(path))
+        assert not ran.exists()
+        torch.load(str(path), weights_only=False)  # asked for by name, in the script
+        assert ran.exists()
+        ran.rmdir()
+        monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # or by the user
+        torch.load(str(path))
+        assert ran.exists()
+
+    @pytest.mark.skipif(not hasattr(torch.serialization, "safe_globals"), reason="torch before 2.5 has no list of them")
+    def test_a_checkpoint_of_3dgs_from_an_earlier_run(self, tmp_path):
+        parameter = torch.nn.Parameter(torch.ones(3))
+        optimizer = torch.optim.Adam([{"params": [parameter], "lr": 0.1, "name": "xyz"}], eps=1e-15)
+        parameter.sum().backward()
+        optimizer.step()
+        extent = np.float32(4.5) * 1.1
+        original_save(((3, parameter, optimizer.state_dict(), extent, np.float32(2)), 7000), tmp_path / "chkpnt.pth")
+        (degree, found, state, radius, single), iteration = torch.load(tmp_path / "chkpnt.pth")
+        assert (degree, float(radius), float(single), iteration) == (3, float(extent), 2.0, 7000)
+        assert torch.equal(found, parameter)
+        assert state["param_groups"][0]["name"] == "xyz"
 
 
 class TestRuntime:

@@ -23,6 +23,7 @@ import torch.multiprocessing
 import torch.utils.data
 from torch import Tensor
 
+from legs_adapters.cpu.loading import LoadsSafely
 from legs_adapters.cpu.missing import MissingStandIn
 from legs_adapters.cpu.nvidia_smi import memory
 
@@ -276,17 +277,9 @@ def _types(redirection: Redirection) -> None:
 
 
 def _loading(redirection: Redirection) -> None:
-    takes_weights_only = "weights_only" in inspect.signature(torch.load).parameters
-
-    def make(old: Any) -> Any:
-        def load(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
-            if takes_weights_only:  # before torch 2.6 everything was unpickled, which checkpoints of the time need
-                kwargs.setdefault("weights_only", False)
-            return old(f, "cpu", *args, **kwargs)
-
-        return load
-
-    redirection.wrap(torch, "load", make)
+    both = LoadsSafely(torch.save, torch.load)
+    redirection.wrap(torch, "save", lambda old: lambda *args, **kwargs: both.save(*args, **kwargs))
+    redirection.wrap(torch, "load", lambda old: lambda *args, **kwargs: both.load(*args, **kwargs))
 
 
 class _GeneratorType(type(torch.Generator)):  # type: ignore[misc]

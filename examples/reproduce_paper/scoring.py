@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from legs_loss import ssim
+from legs_loss.scenes import open_image
 
 
 def gaussians(cloud: Path) -> int:
@@ -45,9 +46,7 @@ def score(renders: Path, truths: Path) -> Dict[str, Any]:
 
 
 def _read(path: Path) -> torch.Tensor:
-    from PIL import Image
-
-    with Image.open(str(path)) as image:
+    with open_image(path) as image:
         pixels = np.asarray(image.convert("RGB"), np.float32) / 255.0
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
 

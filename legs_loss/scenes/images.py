@@ -6,6 +6,7 @@ Source of the rules: utils/camera_utils.py, utils/general_utils.py and scene/dat
 from __future__ import annotations
 
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Callable, Iterator, Tuple
 
@@ -14,12 +15,24 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
+from legs_loss.files import open_regular
 from legs_loss.scenes.model import View
 
-__all__ = ["image_size", "image_tensor", "load_training_image", "resized_pixels", "row_strips", "training_size"]
+__all__ = [
+    "image_size",
+    "image_tensor",
+    "load_training_image",
+    "open_image",
+    "resized_pixels",
+    "row_strips",
+    "training_size",
+]
 
 WIDEST = 1600  # pixels; 3DGS shrinks wider photographs to this unless -r says otherwise
 STRIP_PIXELS = 1 << 16
+# Pillow looks at a file's first bytes, not at its name, and some of what it knows is handed to another program: an EPS
+# to Ghostscript. These are decoded in this process; HEIF where pillow-heif is installed and registered.
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM", "TGA", "GIF", "JPEG2000", "AVIF", "HEIF")
 
 
 def training_size(width: int, height: int, resolution: int = -1) -> Tuple[int, int]:
@@ -80,7 +93,7 @@ def load_training_image(
     Raises:
         LegsError: no such file, a file that Pillow cannot decode, or floats.
     """
-    with _opened(view.path) as image:
+    with open_image(view.path) as image:
         size = training_size(image.width, image.height, resolution)
         if image.mode.startswith("I"):
             return _deep_gray(image, size)
@@ -98,7 +111,7 @@ def image_size(path: Path) -> Tuple[int, int]:
     Raises:
         LegsError: no such file, or none that Pillow can read.
     """
-    with _opened(path) as image:
+    with open_image(path) as image:
         return image.size
 
 
@@ -115,19 +128,17 @@ def image_tensor(image: np.ndarray) -> Tensor:
     return torch.from_numpy(channels_first.astype(np.float32)) / 65535.0
 
 
-def row_strips(height: int, width: int) -> Iterator[slice]:
-    """Cut an image into strips of rows, small enough that temporaries of one hardly count."""
-    rows = max(1, STRIP_PIXELS // width)
-    return (slice(start, min(start + rows, height)) for start in range(0, height, rows))
-
-
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open an image with Pillow; whatever goes wrong while it is read is one error that names the file."""
+def open_image(path: Path) -> Iterator[Any]:
+    """Open a photograph with Pillow, in one of :data:`FORMATS`; the one place that opens images of a user's.
+
+    Raises:
+        LegsError: whatever goes wrong while it is open; the message names the file.
+    """
     from PIL import Image
 
     try:
-        with Image.open(str(path)) as image:
+        with open_regular(path) as file, Image.open(file, formats=_formats()) as image:
             yield image
     except LegsError as error:
         raise LegsError(f"{path}: {error}") from None
@@ -135,8 +146,26 @@ def _opened(path: Path) -> Iterator[Any]:
         raise LegsError(f"{path}: there is no such file") from None
     except MemoryError:
         raise
+    except Image.UnidentifiedImageError:
+        raise LegsError(f"{path}: not an image in a format that is read here ({', '.join(_formats())})") from None
     except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
-        raise LegsError(f"{path}: not an image that Pillow can read ({error})") from None
+        why = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise LegsError(f"{path}: not an image that Pillow can read ({why})") from None
+
+
+@lru_cache(maxsize=None)
+def _formats() -> Tuple[str, ...]:
+    """Those of :data:`FORMATS` that this Pillow was built with."""
+    from PIL import Image
+
+    Image.init()
+    return tuple(name for name in FORMATS if name in Image.OPEN)
+
+
+def row_strips(height: int, width: int) -> Iterator[slice]:
+    """Cut an image into strips of rows, small enough that temporaries of one hardly count."""
+    rows = max(1, STRIP_PIXELS // width)
+    return (slice(start, min(start + rows, height)) for start in range(0, height, rows))
 
 
 def _pixels(image: Any) -> np.ndarray:

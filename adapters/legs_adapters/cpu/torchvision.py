@@ -93,6 +93,9 @@ def save_image(tensor: Union[Tensor, List[Tensor]], fp: Any, format: Optional[st
     Image.fromarray(pixels).save(fp, format=format)
 
 
+FORMATS = ("JPEG", "PNG", "GIF", "WEBP")  # what torchvision decodes
+
+
 class ImageReadMode(enum.Enum):
     """Which channels are wanted of a picture."""
 
@@ -105,7 +108,7 @@ class ImageReadMode(enum.Enum):
 
 def read_image(path: Any, mode: ImageReadMode = ImageReadMode.UNCHANGED, **_: Any) -> Tensor:
     """[C, H, W] of a file, in its own type."""
-    with Image.open(path) as image:
+    with Image.open(path, formats=FORMATS) as image:
         array = np.array(image if mode.value is None else image.convert(mode.value))
     array = array[:, :, None] if array.ndim == 2 else array
     return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))

@@ -1,0 +1,154 @@
+"""Write docs/compatibility.md from corpus.csv, rounds.csv and page.md; every figure on the page is counted here.
+
+python docs/compatibility/build.py            # write the page
+python docs/compatibility/build.py --check    # exit 1 if the page is not what the data says
+"""
+
+import csv
+import re
+import sys
+from collections import Counter
+from pathlib import Path
+from string import Template
+
+HERE = Path(__file__).resolve().parent
+DOCS = HERE.parent
+PAGE = DOCS / "compatibility.md"
+COLUMNS = ("codebase", "commit", "kind", "round", "known", "first", "now", "sites", "view", "note")
+KINDS = ("static", "dynamic", "avatar", "SLAM", "framework", "other")
+
+# A row with several failures carries the gravest of them: this order, after "right".
+VERDICTS = {
+    "right": "every photometric L1 of a training step is chosen, and nothing else",
+    "wrong term": "something is weighted that must not be",
+    "missed": "a term is not found, or lies in a folder that is not entered",
+    "wrong form": "a line that stops at the first step, or weights the wrong axes",
+    "wrong view": "a `view=` that no view has, or that several have",
+    "error": "an error that quotes a line; nothing is written",
+    "timeout": "no answer within 500 s",
+}
+
+# Where other documents name a figure: the sentence that must stand there.
+SENTENCES = {
+    "README.md": "It was tried on $codebases public codebases. "
+    "Of $blind that it had never met, it was right at first contact in $first_right_rate",
+    "docs/patching.md": "says what it does to $codebases public codebases",
+}
+
+
+def read(name):
+    """Return the rows of a csv file beside this script as dictionaries."""
+    with (HERE / name).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def rate(part, whole):
+    """Return a share in whole percent."""
+    return f"{100 * part / whole:.0f}%"
+
+
+def right_of(rows):
+    """Return 'N of M (P%)': how many rows were right at first contact."""
+    right = sum(row["first"] == "right" for row in rows)
+    return f"{right} of {len(rows)} ({rate(right, len(rows))})"
+
+
+def names(rows):
+    """Return the codebases' names without their owners, separated by commas."""
+    return ", ".join(row["codebase"].split("/")[1] for row in rows)
+
+
+def verdict_table(blind):
+    """Return the table of verdicts at first contact and now."""
+    first, now = (Counter(row[key] for row in blind) for key in ("first", "now"))
+    cell = lambda count: f"{count} ({100 * count / len(blind):.1f}%)" if count else "–"  # noqa: E731
+    lines = ["| verdict | meaning | at first contact | now |", "| --- | --- | --- | --- |"]
+    return "\n".join(lines + [f"| {v} | {text} | {cell(first[v])} | {cell(now[v])} |" for v, text in VERDICTS.items()])
+
+
+def round_table(blind):
+    """Return the table of rounds, with the rules that each of them met."""
+    lines = ["| round | rules of | codebases | right |", "| --- | --- | --- | --- |"]
+    for entry in read("rounds.csv"):
+        rows = [row for row in blind if row["round"] == entry["round"]]
+        if rows:
+            right = sum(row["first"] == "right" for row in rows)
+            lines.append(f"| {entry['round']} | {entry['rules']} | {len(rows)} | {right} |")
+    return "\n".join(lines)
+
+
+def figures():
+    """Return every figure and list of the page, counted from the rows."""
+    rows = read("corpus.csv")
+    blind = [row for row in rows if row["round"] != "0"]
+    known = [row for row in rows if row["known"]]
+    last = max(int(row["round"]) for row in blind)
+    recent = [row for row in blind if int(row["round"]) > last - 13]
+    split = [row for row in blind if 6 <= int(row["round"]) <= 11]
+    first = Counter(row["first"] for row in blind)
+    now = Counter(row["now"] for row in rows)
+    failed = {verdict: names([row for row in rows if row["now"] == verdict]) for verdict in VERDICTS}
+    return {
+        "codebases": len(rows),
+        "developed": len(rows) - len(blind),
+        "blind": len(blind),
+        "first_right": first["right"],
+        "first_right_rate": rate(first["right"], len(blind)),
+        "now_right": now["right"],
+        "now_right_rate": rate(now["right"], len(rows)),
+        "recent": right_of(recent),
+        "recent_first": last - 12,
+        "recent_last": last,
+        "recent_wrong": sum(row["first"] == "wrong term" for row in recent),
+        "latest": right_of([row for row in blind if int(row["round"]) > last - 4]),
+        "static": right_of([row for row in split if row["kind"] == "static"]),
+        "rest": right_of([row for row in split if row["kind"] != "static"]),
+        "verdicts": verdict_table(blind),
+        "rounds": round_table(blind),
+        "known": len(known),
+        "known_right": sum(row["now"] == "right" for row in known),
+        "known_blind": right_of([row for row in known if row["round"] != "0"]),
+        "known_names": names(known),
+        "wrong_now": failed["wrong term"],
+        "view_now": failed["wrong view"],
+        "missed_count": now["missed"],
+        "missed_now": failed["missed"],
+        "error_count": now["error"],
+        "error_now": failed["error"],
+        "kinds": ", ".join(f"{kind} {count}" for kind, count in Counter(row["kind"] for row in rows).most_common()),
+    }
+
+
+def page():
+    """Return the page that the data gives."""
+    return Template((HERE / "page.md").read_text(encoding="utf-8")).substitute(figures())
+
+
+def stale():
+    """Return what is not as the data says: the page, or a sentence of another document."""
+    faults = (
+        [] if PAGE.read_text(encoding="utf-8") == page() else ["docs/compatibility.md: run docs/compatibility/build.py"]
+    )
+    for name, sentence in SENTENCES.items():
+        expected = Template(sentence).substitute(figures())
+        if expected not in re.sub(r"\s+", " ", (DOCS.parent / name).read_text(encoding="utf-8")):
+            faults.append(f"{name}: must say {expected!r}")
+    return faults
+
+
+def main(arguments):
+    """Write the page, or check it."""
+    if arguments == ["--check"]:
+        faults = stale()
+        print("\n".join(faults) or "docs/compatibility.md is what the data says")
+        return 1 if faults else 0
+    if arguments:
+        print(__doc__)
+        return 2
+    PAGE.write_text(page(), encoding="utf-8")
+    print(f"{PAGE.name}: {len(page().splitlines())} lines")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

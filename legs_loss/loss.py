@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from legs_loss.errors import LegsError
 from legs_loss.images import as_map, check_pair
 from legs_loss.kernels.backends import fused_or_none
-from legs_loss.spec import Spec, as_spec
+from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.ssim import d_ssim
 from legs_loss.weights import weight_map
 
@@ -156,7 +156,7 @@ class LEGSLoss(nn.Module):
         channels_last: bool = False,
     ) -> None:
         super().__init__()
-        self.spec = as_spec(spec)
+        self.spec: WeightSpec = as_spec(spec)
         self.lambda_dssim = lambda_dssim
         self.padding = padding
         self.renormalise = renormalise

@@ -46,7 +46,7 @@ class WeightMemo:
 
     def __init__(self, limit: int = DEFAULT_LIMIT) -> None:
         self.limit = limit
-        self.bytes = 0
+        self.bytes: int = 0
         self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
         self._lock = threading.RLock()
 

@@ -102,7 +102,7 @@ class WeightStore:
     """
 
     def __init__(self, path: Union[str, Path]) -> None:
-        self.path = Path(path)
+        self.path: Path = Path(path)
         if not (self.path / MANIFEST).is_file():
             raise LegsError(
                 f"{self.path} is no store of weight maps: it has no {MANIFEST} (legs precompute writes one)"
@@ -164,13 +164,13 @@ class StoreWriter:
     """
 
     def __init__(self, path: Union[str, Path]) -> None:
-        self.path = Path(path)
+        self.path: Path = Path(path)
 
     def __enter__(self) -> StoreWriter:
         with self._locked():
             for leftover in _leftovers(self.path, self.entries()):
                 _remove(leftover)
-            self.staging = Path(tempfile.mkdtemp(prefix=_STAGING, dir=str(self.path)))
+            self.staging: Path = Path(tempfile.mkdtemp(prefix=_STAGING, dir=str(self.path)))
             self._alive = _Lock(self.staging / _LOCK)
         return self
 

@@ -58,12 +58,14 @@ class Comparison:
     """
 
     def __init__(self, scene: Path, base: TrainConfig, out: Path, images: Optional[str] = None) -> None:
-        self.root, self.images, self.out = Path(scene), images, Path(out)
-        self.scene = read_scene(self.root, images)
-        self.base = replace(base, spec=BASELINE, seed=0)
+        self.root: Path = Path(scene)
+        self.images: Optional[str] = images
+        self.out: Path = Path(out)
+        self.scene: Scene = read_scene(self.root, images)
+        self.base: TrainConfig = replace(base, spec=BASELINE, seed=0)
         self._data: Optional[Dataset] = None
         self._mean_weights: Dict[WeightSpec, float] = {}
-        self.threshold = base.densify_grad_threshold or default_threshold(self.data.train)
+        self.threshold: float = base.densify_grad_threshold or default_threshold(self.data.train)
         self._begin()
 
     @property
@@ -171,7 +173,7 @@ class Comparison:
         path = self.out / "comparison.json"
         _keep(path, dict(settings, baseline=None), "comparison", _SETTINGS, ("path", "baseline"))
         # Anew each time: a comparison that goes on may do so with other code than it was begun with.
-        self.proof = prove_unweighted(self.data.train, self.base)
+        self.proof: Dict[str, Any] = prove_unweighted(self.data.train, self.base)
         _write(path, dict(_read(path, _SETTINGS), baseline=self.proof))
 
 

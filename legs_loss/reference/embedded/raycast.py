@@ -7,7 +7,7 @@ scene, and keeps the result as a small light map.
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Optional, Sequence, Tuple, Union
+from typing import Any, List, NamedTuple, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
@@ -75,9 +75,13 @@ class Quad:
         round: bool = False,
         casts_shadow: bool = True,
     ) -> None:
-        self.corner, self.across, self.down = (np.asarray(a, float) for a in (corner, across, down))
-        self.texture, self.round, self.casts_shadow = texture, round, casts_shadow
-        self.normal = _unit(np.cross(self.across, self.down))
+        self.corner: np.ndarray = np.asarray(corner, float)
+        self.across: np.ndarray = np.asarray(across, float)
+        self.down: np.ndarray = np.asarray(down, float)
+        self.texture: np.ndarray = texture
+        self.round: bool = round
+        self.casts_shadow: bool = casts_shadow
+        self.normal: np.ndarray = _unit(np.cross(self.across, self.down))
         # Rows: the dual basis, so that row @ (point - corner) is u, v and the height over the plane.
         self._dual = np.linalg.inv(np.stack([self.across, self.down, self.normal], axis=1))
         self.light: Optional[np.ndarray] = None
@@ -136,8 +140,11 @@ class Sphere(_Curved):
     """A sphere; its texture is laid out by longitude and latitude."""
 
     def __init__(self, centre: Vector, radius: float, texture: np.ndarray, gloss: float = 0.0) -> None:
-        self.centre, self.radius = np.asarray(centre, float), radius
-        self.texture, self.gloss, self.casts_shadow = texture, gloss, True
+        self.centre: np.ndarray = np.asarray(centre, float)
+        self.radius: float = radius
+        self.texture: np.ndarray = texture
+        self.gloss: float = gloss
+        self.casts_shadow: bool = True
 
     def hull(self) -> np.ndarray:
         """Points whose convex hull holds the surface."""
@@ -176,14 +183,17 @@ class Tube(_Curved):
         texture: np.ndarray,
         gloss: float = 0.0,
     ) -> None:
-        self.start, self.radius = np.asarray(start, float), radius
+        self.start: np.ndarray = np.asarray(start, float)
+        self.radius: float = radius
+        self.texture: np.ndarray = texture
+        self.gloss: float = gloss
         # The shadow of a thin wire under a wide lamp is too faint to see.
-        self.texture, self.gloss, self.casts_shadow = texture, gloss, radius > 0.02
+        self.casts_shadow: bool = radius > 0.02
         axis = np.asarray(end, float) - self.start
-        self.length = float(np.linalg.norm(axis))
+        self.length: float = float(np.linalg.norm(axis))
         axis = axis / self.length
         side = _unit(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
-        self.frame = np.stack([side, np.cross(axis, side), axis])  # rows
+        self.frame: np.ndarray = np.stack([side, np.cross(axis, side), axis])  # rows
 
     def hull(self) -> np.ndarray:
         """Points whose convex hull holds the surface."""
@@ -214,7 +224,7 @@ class Tube(_Curved):
         return self._shade(hits, normal, point, direction, lamp)
 
 
-def bake_light(surfaces: Sequence, lamp: Lamp, cell: float = 0.06, lamp_points: int = 12) -> None:
+def bake_light(surfaces: Sequence[Any], lamp: Lamp, cell: float = 0.06, lamp_points: int = 12) -> None:
     """Give every `Quad` its light map: one value a ``cell`` (metres), soft shadows included."""
     casters = [surface for surface in surfaces if surface.casts_shadow]
     targets = lamp.points(lamp_points)
@@ -249,7 +259,7 @@ def _blurred(table: np.ndarray) -> np.ndarray:
 
 
 def render(
-    surfaces: Sequence,
+    surfaces: Sequence[Any],
     lamp: Lamp,
     world_to_camera: np.ndarray,
     focal: float,
@@ -296,7 +306,7 @@ def _screen_rectangle(
 
 
 def _render_rows(
-    surfaces: Sequence,
+    surfaces: Sequence[Any],
     lamp: Lamp,
     rotation: np.ndarray,
     origin: np.ndarray,

@@ -46,13 +46,13 @@ class Adam:
     """The Gaussians as leaf tensors, and their two moments, kept in step as Gaussians come and go."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        self.steps = 0
-        self.moment1 = Gaussians(*(torch.zeros_like(getattr(gaussians, name)) for name in FIELDS))
-        self.moment2 = Gaussians(*(torch.zeros_like(getattr(gaussians, name)) for name in FIELDS))
+        self.steps: int = 0
+        self.moment1: Gaussians = Gaussians(*(torch.zeros_like(getattr(gaussians, name)) for name in FIELDS))
+        self.moment2: Gaussians = Gaussians(*(torch.zeros_like(getattr(gaussians, name)) for name in FIELDS))
         self._set(gaussians)
 
     def _set(self, gaussians: Gaussians) -> None:
-        self.gaussians = Gaussians(
+        self.gaussians: Gaussians = Gaussians(
             *(getattr(gaussians, name).detach().contiguous().requires_grad_(True) for name in FIELDS)
         )
 

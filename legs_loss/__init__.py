@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from legs_loss.curves import register_curve
     from legs_loss.errors import LegsError
     from legs_loss.loss import LEGSLoss, legs_loss, weighted_l1
+    from legs_loss.operators import OPERATORS
     from legs_loss.response import response
     from legs_loss.runtime import configure, l1_loss, unweighted
     from legs_loss.spec import PRESETS, WeightSpec
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from legs_loss.weights import weight_map
 
 _HOMES = {
+    "OPERATORS": "operators",
     "PRESETS": "spec",
     "LEGSLoss": "loss",
     "LegsError": "errors",
@@ -43,6 +45,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "OPERATORS",
     "PRESETS",
     "LEGSLoss",
     "LegsError",

@@ -1,72 +1,76 @@
-"""The operators of a response, by name: their stencils, without the border and the norm.
+"""The operators of a response, by name: their stencils as numbers, and their help texts.
 
-Like the curves they want nothing but a tensor's own methods, so that a setting is checked without importing torch.
+To add an operator, add a record. A kernel that does not declare it (``kernels/``) leaves it to torch.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Callable, Dict, List, Tuple
+from typing import Dict, NamedTuple, Tuple
 
 from legs_loss.errors import LegsError
 
-if TYPE_CHECKING:
-    from torch import Tensor
+__all__ = ["NORMS", "OPERATORS", "Operator", "Stencil", "check_operator", "operator_names"]
 
-__all__ = ["NORMS", "OPERATORS", "check_operator", "operator_names"]
-
-# An operator takes the image with a border of one pixel, [B, C, H+2, W+2], and returns its components,
-# each [B, C, H, W]. Differences are taken in an order that is exactly zero on a constant image.
-Operator = Callable[["Tensor"], List["Tensor"]]
+# Rows of weights, an odd number of rows and as many columns. A stencil is even (it equals its own mirror images, as a
+# second derivative does) or odd in one direction (a first derivative). Its centre is minus the sum of all others, so
+# that its response to a constant image is 0.
+Stencil = Tuple[Tuple[float, ...], ...]
 
 
-def _neighbour(padded: Tensor, row: int, column: int) -> Tensor:
-    height, width = padded.shape[-2] - 2, padded.shape[-1] - 2
-    return padded[..., 1 + row : 1 + row + height, 1 + column : 1 + column + width]
+class Operator(NamedTuple):
+    """An operator: the stencils that an image is correlated with.
+
+    Attributes:
+        name: in :class:`~legs_loss.WeightSpec`, legs.toml and on the command line.
+        stencils: one, or for a gradient two (across the columns, then down the rows), all of one size.
+        help: its description, a few words.
+    """
+
+    name: str
+    stencils: Tuple[Stencil, ...]
+    help: str
+
+    @property
+    def reach(self) -> int:
+        """How many pixels beyond its own a response depends on."""
+        return len(self.stencils[0]) // 2
 
 
-def _cross(padded: Tensor) -> Tensor:
-    return (_neighbour(padded, -1, 0) + _neighbour(padded, 1, 0)) + (
-        _neighbour(padded, 0, -1) + _neighbour(padded, 0, 1)
-    )
+def _gradient(across: Stencil) -> Tuple[Stencil, ...]:
+    return across, tuple(zip(*across))
 
 
-def _laplacian(padded: Tensor) -> List[Tensor]:
-    return [_cross(padded) - 4.0 * _neighbour(padded, 0, 0)]
+def _by_name(*operators: Operator) -> Dict[str, Operator]:
+    return {operator.name: operator for operator in operators}
 
 
-def _laplacian8(padded: Tensor) -> List[Tensor]:
-    diagonal = (_neighbour(padded, -1, -1) + _neighbour(padded, 1, 1)) + (
-        _neighbour(padded, -1, 1) + _neighbour(padded, 1, -1)
-    )
-    return [(_cross(padded) + diagonal) - 8.0 * _neighbour(padded, 0, 0)]
-
-
-def _central(padded: Tensor) -> List[Tensor]:
-    return [
-        0.5 * (_neighbour(padded, 0, 1) - _neighbour(padded, 0, -1)),
-        0.5 * (_neighbour(padded, 1, 0) - _neighbour(padded, -1, 0)),
-    ]
-
-
-def _smoothed_difference(side: float, middle: float) -> Operator:
-    def operator(padded: Tensor) -> List[Tensor]:
-        across = padded[..., :, 2:] - padded[..., :, :-2]
-        down = padded[..., 2:, :] - padded[..., :-2, :]
-        return [
-            side * (across[..., :-2, :] + across[..., 2:, :]) + middle * across[..., 1:-1, :],
-            side * (down[..., :, :-2] + down[..., :, 2:]) + middle * down[..., :, 1:-1],
-        ]
-
-    return operator
-
-
-OPERATORS: Dict[str, Operator] = {
-    "laplacian": _laplacian,
-    "laplacian8": _laplacian8,
-    "sobel": _smoothed_difference(1.0, 2.0),
-    "scharr": _smoothed_difference(3.0, 10.0),
-    "central": _central,
-}
+OPERATORS: Dict[str, Operator] = _by_name(
+    Operator(
+        "laplacian",
+        (((0, 1, 0), (1, -4, 1), (0, 1, 0)),),
+        "4 neighbours, the paper's",
+    ),
+    Operator(
+        "laplacian8",
+        (((1, 1, 1), (1, -8, 1), (1, 1, 1)),),
+        "8 neighbours",
+    ),
+    Operator(
+        "sobel",
+        _gradient(((-1, 0, 1), (-2, 0, 2), (-1, 0, 1))),
+        "gradient, rows weighted 1 2 1",
+    ),
+    Operator(
+        "scharr",
+        _gradient(((-3, 0, 3), (-10, 0, 10), (-3, 0, 3))),
+        "gradient, rows weighted 3 10 3",
+    ),
+    Operator(
+        "central",
+        _gradient(((0, 0, 0), (-0.5, 0, 0.5), (0, 0, 0))),
+        "gradient, central differences",
+    ),
+)
 
 NORMS = (1.0, 2.0, float("inf"))
 

@@ -26,6 +26,7 @@ from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.interrupts import kept_from_children
 from legs_loss.kernels.backends import backend_for
+from legs_loss.operators import OPERATORS
 from legs_loss.response import response
 from legs_loss.scenes import Scene, View, image_size, image_tensor, load_training_image, training_size
 from legs_loss.scenes.images import resized_pixels, row_strips
@@ -125,14 +126,16 @@ def normalised_map(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
 def _strength(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
     if _compiles(image.size):
-        from legs_loss.kernels.numba_response import photograph_response
+        from legs_loss.kernels.numba_response import photograph_response, supports_response
 
-        return torch.from_numpy(photograph_response(image, spec))
+        if supports_response(spec):
+            return torch.from_numpy(photograph_response(image, spec))
     height, width = image.shape[:2]
+    reach = OPERATORS[spec.operator].reach
     strength = torch.from_numpy(np.empty((height, width), np.float32))
     for rows in row_strips(height, width):
-        # Every operator reaches one row up and one down; at the photograph's own border it reflects.
-        above, below = max(rows.start - 1, 0), min(rows.stop + 1, height)
+        # Rows that the operator reaches; at the photograph's own border it reflects.
+        above, below = max(rows.start - reach, 0), min(rows.stop + reach, height)
         strip = response(image_tensor(image[above:below]), spec.operator, spec.p)
         strength[rows] = strip[0, rows.start - above : rows.stop - above]
     return strength
@@ -314,10 +317,12 @@ def _compiled_anew(spec: WeightSpec) -> bool:
     from PIL import Image
 
     from legs_loss.kernels.numba_resize import resized
-    from legs_loss.kernels.numba_response import photograph_response
+    from legs_loss.kernels.numba_response import photograph_response, supports_response
 
     with event.install_recorder("numba:compile") as compiled:
-        photograph_response(resized(Image.new("RGB", (64, 64)), (32, 32)), spec)
+        small = resized(Image.new("RGB", (64, 64)), (32, 32))
+        if supports_response(spec):
+            photograph_response(small, spec)
     return bool(compiled.buffer)
 
 

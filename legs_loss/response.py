@@ -7,14 +7,15 @@ Source: the LEGS paper, its weight's definition (op = Laplacian); EGGS, arXiv 24
 
 from __future__ import annotations
 
-from typing import List
+from functools import reduce
+from typing import Dict, List, Mapping, Sequence, Tuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from legs_loss.images import channels_first, check_image
-from legs_loss.operators import OPERATORS, check_operator
+from legs_loss.operators import OPERATORS, Operator, Stencil, check_operator
 
 __all__ = ["normalise_response", "response"]
 
@@ -25,8 +26,7 @@ def response(image: Tensor, operator: str = "laplacian", p: float = 2.0, channel
     Args:
         image: floats, [C, H, W] or [B, C, H, W] with any number of channels; [H, W, C] or [B, H, W, C] with
             ``channels_last``. Half precision is computed in float32.
-        operator: "laplacian" (4 neighbours: 0 1 0 / 1 -4 1 / 0 1 0), "laplacian8" (1 1 1 / 1 -8 1 / 1 1 1), or
-            a gradient: "sobel" (1 2 1), "scharr" (3 10 3), both unscaled, or "central" (differences / 2).
+        operator: a name of :data:`legs_loss.OPERATORS`, which has its stencils: a Laplacian or a gradient.
         p: 1, 2 or inf: the norm over channels, and for a gradient over its two directions too.
         channels_last: where the channel stands.
 
@@ -50,8 +50,7 @@ def response(image: Tensor, operator: str = "laplacian", p: float = 2.0, channel
     flat = channels_first(image.detach(), channels_last)
     flat = flat.to(torch.promote_types(flat.dtype, torch.float32))
     single = flat.dim() == 3
-    parts = OPERATORS[operator](_with_border(flat.unsqueeze(0) if single else flat))
-    strength = _norm(parts, p)
+    strength = _norm(_components(flat.unsqueeze(0) if single else flat, OPERATORS[operator]), p)
     strength = strength[0] if single else strength
     return strength.movedim(-3, -1) if channels_last else strength
 
@@ -76,10 +75,89 @@ def normalise_response(response: Tensor, eps: float = 1e-8) -> Tensor:
     return (response - low) / (high - low + eps)
 
 
-def _with_border(image: Tensor) -> Tensor:
-    # A side of one pixel has nothing to reflect: its only continuation is itself.
-    image = F.pad(image, (1, 1, 0, 0), mode="reflect" if image.shape[-1] > 1 else "replicate")
-    return F.pad(image, (0, 0, 1, 1), mode="reflect" if image.shape[-2] > 1 else "replicate")
+def _components(image: Tensor, operator: Operator) -> List[Tensor]:
+    """Correlate an image [B, C, H, W] with each stencil of an operator.
+
+    Not by torch's convolution, which sums in an order of its own: here every pixel is computed by the same operations,
+    and a constant image gives exactly 0.
+    """
+    padded = _with_border(image, operator.reach)
+    return [_correlated(padded, stencil) for stencil in operator.stencils]
+
+
+def _correlated(padded: Tensor, stencil: Stencil) -> Tensor:
+    """Correlate an image that has a border of the stencil's reach with it: [B, C, H, W]."""
+    reach = len(stencil) // 2
+    height, width = padded.shape[-2] - 2 * reach, padded.shape[-1] - 2 * reach
+    weights: Dict[_Tap, float] = {
+        (row - reach, column - reach): float(weight)
+        for row, line in enumerate(stencil)
+        for column, weight in enumerate(line)
+        if weight and (row, column) != (reach, reach)
+    }
+    if _is_odd(weights, row_sign=-1):
+        return _correlated(padded.transpose(-1, -2), tuple(zip(*stencil))).transpose(-1, -2)
+    odd = _is_odd(weights, column_sign=-1)
+
+    def rows(values: Tensor, row: int) -> Tensor:
+        return values[..., reach + row : reach + row + height, :]
+
+    def columns(column: int) -> Tensor:
+        return padded[..., reach + column : reach + column + width]
+
+    # Of an odd stencil, the right half of the taps: each stands for its difference from its mirror image.
+    across = {
+        column: columns(column) - columns(-column) if odd else columns(column)
+        for _, column in weights
+        if column > 0 or not odd
+    }
+    groups: Dict[float, List[Tensor]] = {}
+    for row, column in sorted(weights, key=_from_the_centre):
+        if column > 0 or not odd:
+            groups.setdefault(weights[row, column], []).append(rows(across[column], row))
+    centre = rows(columns(0), 0)
+    parts = []
+    for weight, values in groups.items():
+        value = _sum(values) if odd else _sum(values) - float(len(values)) * centre
+        parts.append(value if weight == 1.0 else weight * value)
+    return _sum(parts)
+
+
+_Tap = Tuple[int, int]  # row and column, from the centre
+
+
+def _is_odd(weights: Mapping[_Tap, float], row_sign: int = 1, column_sign: int = 1) -> bool:
+    return all(
+        weights.get((row_sign * row, column_sign * column)) == -weight for (row, column), weight in weights.items()
+    )
+
+
+def _from_the_centre(tap: _Tap) -> Tuple[int, _Tap, _Tap]:
+    """Order taps by their distance; opposite ones stand beside each other."""
+    row, column = tap
+    return row**2 + column**2, min(tap, (-row, -column)), tap
+
+
+def _sum(values: Sequence[Tensor]) -> Tensor:
+    """Add up in pairs: the sum of two, four or eight equal numbers is exact."""
+    if len(values) == 1:
+        return values[0]
+    half = (len(values) + 1) // 2
+    return _sum(values[:half]) + _sum(values[half:])
+
+
+def _with_border(image: Tensor, reach: int) -> Tensor:
+    """Reflect an image [B, C, H, W] at its sides; a side of one pixel continues itself."""
+    for axis in (-1, -2):
+        size = image.shape[axis]
+        if size > reach:
+            sides = (reach, reach, 0, 0) if axis == -1 else (0, 0, reach, reach)
+            image = F.pad(image, sides, mode="reflect")
+        else:
+            period = max(2 * size - 2, 1)
+            index = torch.arange(-reach, size + reach, device=image.device) % period
+            image = image.index_select(axis, torch.minimum(index, period - index) % size)
+    return image
 
 
 def _norm(parts: List[Tensor], p: float) -> Tensor:
@@ -87,5 +165,4 @@ def _norm(parts: List[Tensor], p: float) -> Tensor:
         return sum(part.abs().sum(1, keepdim=True) for part in parts)  # type: ignore[return-value]
     if p == 2.0:
         return torch.sqrt(sum((part * part).sum(1, keepdim=True) for part in parts))  # type: ignore[arg-type]
-    peaks = [part.abs().amax(1, keepdim=True) for part in parts]
-    return peaks[0] if len(peaks) == 1 else torch.maximum(peaks[0], peaks[1])
+    return reduce(torch.maximum, [part.abs().amax(1, keepdim=True) for part in parts])

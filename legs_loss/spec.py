@@ -23,7 +23,7 @@ class WeightSpec:
     """The settings of W = 1 + beta * f(E^). The defaults are the preset "legs".
 
     Attributes:
-        operator: of the response: "laplacian" (4 neighbours), "laplacian8", "sobel", "scharr", "central".
+        operator: of the response, a name of :data:`legs_loss.OPERATORS`.
         p: the norm over channels (and over a gradient's directions): 1, 2 or inf.
         curve: a registered curve's name, "C1" to "C5" or one of your own.
         beta: >= 0, how far the strongest response lifts the weight; 0 is 3DGS's own loss.

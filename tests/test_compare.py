@@ -431,6 +431,20 @@ def test_tables_by_hand() -> None:
     scores = scores_table(rows, ["3dgs", "C3"])
     assert "| C3 (legs) | 26.00 ± 0.00 |" in scores
     assert "250 ± 71" in scores
+    older = row_of("eggs", 0, plain)  # than a metric
+    for split in ("train", "test"):
+        older["metrics"][split] = {"psnr": 25.0, "ssim": 0.5}
+        older["metrics"]["views"][split] = {view: {"psnr": value, "ssim": 0.5} for view, value in plain.items()}
+    cells = [cell.strip() for cell in scores_table([older], ["eggs"]).splitlines()[-1].split("|")]
+    assert cells[2:8] == ["25.00", "0.5000", "25.00", "0.5000", "–", "–"]
+    assert difference([*rows, older], "eggs", "3dgs", "test", "psnr_strong") is None
+    newer = row_of("eggs", 0, plain)
+    for row in (older, newer):
+        row["metrics"]["growth"], row["versions"] = [], {}
+    newer["metrics"]["views"]["train"] = older["metrics"]["views"]["train"]
+    for scores in newer["metrics"]["views"]["test"].values():
+        scores["ssim"] = 0.5
+    assert again_text(older, newer).endswith("The same to the last digit.")  # of the metrics that both have
     differences = differences_table(rows, STUDIES["main"])
     # Only over the seeds that both have.
     assert times_gaussians([*rows, row_of("3dgs", 2, plain, 900)], "legs", "3dgs") == 2.5

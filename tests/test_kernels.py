@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from legs_loss import LegsError, LEGSLoss, WeightSpec, legs_loss, weight_map
 from legs_loss.kernels import backends
-from legs_loss.operators import operator_names
+from legs_loss.operators import OPERATORS, Operator, operator_names
 from legs_loss.precompute import normalised_map
 from legs_loss.response import response
 from legs_loss.scenes.images import image_tensor
@@ -27,7 +27,9 @@ from tests.support import legs_environment
 pytest.importorskip("numba")
 
 from legs_loss.kernels.numba_loss import fused_loss
-from legs_loss.kernels.numba_response import extremes, map_of_responses, photograph_response
+from legs_loss.kernels.numba_response import extremes, map_of_responses, photograph_response, supports_response
+
+COMPILED = [name for name in operator_names() if supports_response(WeightSpec(operator=name))]
 
 SHAPES = [(3, 1, 1), (1, 5, 7), (3, 40, 300), (2, 3, 30, 17), (3, 150, 530), (4, 11, 257), (2, 1, 8, 9), (3, 129, 8)]
 
@@ -41,7 +43,7 @@ class TestFusedLoss:
             fused_loss, prediction, target, {"none": None, "map": weight_map(target), "spec": PRESETS["legs"]}[weight]
         )
 
-    @pytest.mark.parametrize("operator", operator_names())
+    @pytest.mark.parametrize("operator", COMPILED)
     @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
     def test_every_operator_and_norm(self, operator, p):
         compare(fused_loss, *images((3, 31, 45)), WeightSpec(operator=operator, p=p))
@@ -128,7 +130,7 @@ class TestFusedLoss:
 
 
 class TestResponse:
-    @pytest.mark.parametrize("operator", operator_names())
+    @pytest.mark.parametrize("operator", COMPILED)
     @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
     def test_it_is_torchs_but_for_the_last_bit(self, operator, p):
         spec = WeightSpec(operator=operator, p=p)
@@ -160,7 +162,7 @@ class TestResponse:
         assert np.abs(maps[0] - maps[1]).max() <= 2.0**-11  # at most the next number of float16
 
     @pytest.mark.parametrize("value", [0.1, 0.7, 0.9999])
-    @pytest.mark.parametrize("operator", operator_names())
+    @pytest.mark.parametrize("operator", COMPILED)
     def test_a_constant_image_has_exactly_none(self, operator, value):
         image = torch.full((1, 3, 19, 31), value)
         assert not map_of_responses(image.numpy(), WeightSpec(operator=operator))[0].any()
@@ -204,6 +206,22 @@ class TestSelection:
         loss = legs_loss(prediction, target, weight=weight, padding=padding, lambda_dssim=share)
         assert used(loss) == "torch"
         loss.backward()
+
+    def test_an_operator_that_is_not_compiled_is_torchs(self, chosen, monkeypatch, capfd):
+        wide = Operator("wide", (((0, 0, 1, 0, 0), (0,) * 5, (1, 0, -4, 0, 1), (0,) * 5, (0, 0, 1, 0, 0)),), "a test")
+        monkeypatch.setitem(OPERATORS, "wide", wide)
+        prediction, target = images((3, 40, 50))
+        loss = legs_loss(prediction, target, WeightSpec(operator="wide"))
+        exact = legs_loss(prediction.double(), target.double(), WeightSpec(operator="wide"))
+        assert loss.item() == pytest.approx(exact.item(), rel=2e-5)
+        assert used(loss) == "fused"  # with torch's map
+        photograph = (torch.rand(1200, 400, 3) * 255).byte().numpy()
+        expected = response(image_tensor(photograph), "wide")
+        low, high = expected.aminmax()
+        stored = torch.from_numpy(normalised_map(photograph, WeightSpec(operator="wide")))
+        torch.testing.assert_close(stored.float(), ((expected - low) / (high - low + 1e-8))[0], rtol=0, atol=2.0**-11)
+        assert used(legs_loss(prediction, target)) == "fused"
+        assert capfd.readouterr().err == ""
 
     def test_an_unknown_backend_is_an_error(self, chosen):
         chosen("cuda")

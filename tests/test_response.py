@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from legs_loss import LegsError, response
-from legs_loss.operators import operator_names
+from legs_loss.operators import OPERATORS, operator_names
 from legs_loss.response import normalise_response
 from tests.strategies import images
 
@@ -88,6 +88,22 @@ class TestAgainstScipy:
         convolved = [ndimage.convolve(c.numpy(), eight, mode=ndimage_mode) for c in image]
         expected = np.sqrt((np.stack(convolved) ** 2).sum(0))
         np.testing.assert_allclose(response(image, "laplacian8")[0], expected, atol=1e-12)
+
+    @settings(max_examples=10, deadline=None)
+    @given(images())
+    @pytest.mark.parametrize("operator", OPERATORS.values(), ids=operator_names())
+    def test_every_record_is_what_is_computed(self, operator, image):
+        for stencil in operator.stencils:
+            assert sum(map(sum, stencil)) == pytest.approx(0.0, abs=1e-12)
+            assert len(stencil) == 2 * operator.reach + 1 == len(stencil[0])
+        parts = [
+            ndimage.correlate(channel.numpy(), np.array(stencil, float), mode=ndimage_mode)
+            for channel in image
+            for stencil in operator.stencils
+        ]
+        np.testing.assert_allclose(
+            response(image, operator.name)[0], np.sqrt((np.stack(parts) ** 2).sum(0)), atol=1e-11
+        )
 
 
 class TestSymmetries:

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Optional, Sequence, Tuple
 
-from legs_loss import LegsError, __version__
+from legs_loss import OPERATORS, LegsError, __version__
 
 if TYPE_CHECKING:
     from legs_adapters.findings import Problem
@@ -91,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     settings.add_argument("--preset", metavar="NAME", help="3dgs, eggs, legs-l or legs; default: legs")
     settings.add_argument("--beta", type=float, metavar="X", help="how far the strongest response lifts the weight")
     settings.add_argument("--curve", metavar="NAME", help="C1 to C5")
-    settings.add_argument("--operator", metavar="NAME", help="laplacian, laplacian8, sobel, scharr or central")
+    settings.add_argument("--operator", metavar="NAME", help=f"one of {', '.join(OPERATORS)}")
     settings.add_argument("--store", metavar="DIR", help="weight maps that legs precompute wrote")
     return parser
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, List, Optional
 
-from legs_loss import PRESETS, LegsError
+from legs_loss import OPERATORS, PRESETS, LegsError
 
 __all__ = ["SETTINGS_FILE", "settings_text"]
 
@@ -49,7 +49,7 @@ def settings_text(
         line("preset", name, True, f"one of {', '.join(PRESETS)}"),
         line("beta", spec.beta, beta is not None, "how far the strongest response lifts the weight; 0 is the plain L1"),
         line("curve", spec.curve, curve is not None, "C1 (linear) to C5"),
-        line("operator", spec.operator, operator is not None, "laplacian, laplacian8, sobel, scharr or central"),
+        line("operator", spec.operator, operator is not None, f"one of {', '.join(OPERATORS)}"),
         line(
             "store",
             store if store is not None else "path/to/legs_weights",

@@ -19,6 +19,7 @@ from legs_loss.experiments.running import read_rows
 from legs_loss.experiments.statistics import summarise_all
 from legs_loss.experiments.studies import STUDIES
 from legs_loss.experiments.tables import differences_table, paper_text, scores_table
+from legs_loss.reference.training.metrics import METRICS
 
 HERE = Path(__file__).resolve().parent
 TEXT = HERE.parent / "evidence.md"
@@ -33,8 +34,8 @@ def take(out: Path, path: Path) -> None:
     settings.pop("path")
     for row in rows:
         for scores in row["metrics"]["views"]["train"].values():
-            for name in ("psnr_strong", "psnr_rest"):  # no table has them of training views
-                scores.pop(name)
+            for name in [key for key, metric in METRICS.items() if "train" not in metric.splits]:
+                scores.pop(name, None)  # of rows that scored training views with it too
     lines = ",\n".join(json.dumps(_rounded(row), separators=(",", ":")) for row in rows)
     path.write_text(f'{{"settings":{json.dumps(settings)},"rows":[\n{lines}\n]}}\n', encoding="utf-8")
 

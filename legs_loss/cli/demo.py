@@ -109,18 +109,14 @@ def run(args: argparse.Namespace) -> int:
 
 def table(metrics: Dict[str, Dict[str, Any]]) -> str:
     """The results as text, a line a method."""
-    lines = [
-        "          training views     held-out views     held-out PSNR by response                mean",
-        "method    PSNR     SSIM      PSNR     SSIM      strongest 10%   the rest    Gaussians   weight   time",
-    ]
+    from legs_loss.experiments.statistics import summarise
+    from legs_loss.experiments.tables import LABELS, markdown, score_cells
+
+    lines = []
     for name, values in metrics.items():
-        train, test = values["train"], values["test"]
-        lines.append(
-            f"{name:<8} {train['psnr']:5.2f}   {train['ssim']:.4f}     {test['psnr']:5.2f}   {test['ssim']:.4f}     "
-            f"{test['psnr_strong']:13.2f}   {test['psnr_rest']:8.2f}    {values['gaussians']:9d}   "
-            f"{values['mean_weight']:6.2f}   {values['seconds']:3.0f} s"
-        )
-    return "\n".join(lines)
+        summary = summarise([{"arm": name, "metrics": values}])
+        lines.append([name, *score_cells(summary.mean, summary.spread), f"{values['seconds']:.0f} s"])
+    return markdown(["method", *LABELS, "time"], lines)
 
 
 def conclusion(metrics: Dict[str, Dict[str, Any]]) -> str:

@@ -161,8 +161,11 @@ def _resumed(checkpoint: Path, given: Dict[str, Any]) -> TrainConfig:
 
 
 def _print(metrics: Dict[str, Any]) -> None:
-    for label, name in (("training views", "train"), ("held-out views", "test")):
-        scores = metrics[name]
-        if scores:
-            print(f"{label}: PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
+    from legs_loss.reference.training.metrics import METRICS
+
+    for views, split in (("training views", "train"), ("held-out views", "test")):
+        scores = metrics[split] or {}
+        told = [f"{METRICS[key].label} {value:{METRICS[key].format}}" for key, value in scores.items()]
+        if told:
+            print(f"{views}: {', '.join(told)}")
     print(f"{metrics['gaussians']} Gaussians, {metrics['seconds']:.0f} s")

@@ -4,37 +4,69 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
 from legs_loss.errors import LegsError
+from legs_loss.reference.training.metrics import METRICS
 
-__all__ = ["SCORES", "Difference", "Summary", "difference", "summarise", "summarise_all", "times_gaussians"]
+__all__ = ["COLUMNS", "Column", "Difference", "Summary", "difference", "summarise", "summarise_all", "times_gaussians"]
 
 Rows = Sequence[Mapping[str, Any]]
 
-# A column's name, and where a row's metrics have it.
-SCORES: Mapping[str, Tuple[str, ...]] = {
-    "train PSNR": ("train", "psnr"),
-    "train SSIM": ("train", "ssim"),
-    "held-out PSNR": ("test", "psnr"),
-    "held-out SSIM": ("test", "ssim"),
-    "strongest 10%": ("test", "psnr_strong"),
-    "the rest": ("test", "psnr_rest"),
-    "Gaussians": ("gaussians",),
-    "ms an iteration": (),
-    "mean weight": ("mean_weight",),
-}
+
+class Column(NamedTuple):
+    """A column of a table of arms.
+
+    label: its head.
+    format: of a value.
+    value: of a row's metrics; NaN where the row lacks it.
+    middle: of values over seeds, in place of the mean.
+    spread: whether the standard deviation over seeds is told.
+    metric: the split and the key in METRICS, where it is a metric's.
+    """
+
+    label: str
+    format: str
+    value: Callable[[Mapping[str, Any]], float]
+    middle: Callable[[np.ndarray], Any] = np.mean
+    spread: bool = True
+    metric: Optional[Tuple[str, str]] = None
+
+
+def _metric_columns(split: str) -> List[Column]:
+    return [
+        Column(
+            metric.column(split),
+            metric.format,
+            # No view may be held out; a row may be older than the metric.
+            lambda metrics, key=key: (metrics[split] or {}).get(key, math.nan),  # type: ignore[misc]
+            metric=(split, key),
+        )
+        for key, metric in METRICS.items()
+        if split in metric.splits
+    ]
+
+
+def _milliseconds(metrics: Mapping[str, Any]) -> float:
+    return 1000.0 * metrics.get("processor_seconds", math.nan) / metrics["iterations"]
+
+
+COLUMNS: Tuple[Column, ...] = (
+    *_metric_columns("train"),
+    *_metric_columns("test"),
+    Column("Gaussians", ",.0f", lambda metrics: metrics["gaussians"]),
+    # A machine's first row compiles the kernels, which is no iteration's time: hence the median.
+    Column("ms an iteration", ".0f", _milliseconds, np.median, spread=False),
+    Column("mean weight", ".2f", lambda metrics: metrics.get("mean_weight", math.nan), spread=False),
+)
 
 RESAMPLES = 9999
 
 
 class Summary(NamedTuple):
-    """One arm: the number of its seeds, and of each of :data:`SCORES` its mean and standard deviation over them.
-
-    The mean of "ms an iteration" is the median.
-    """
+    """One arm: the number of its seeds, and by label of each of :data:`COLUMNS` its mean and standard deviation."""
 
     arm: str
     seeds: int
@@ -72,11 +104,10 @@ def summarise(rows: Rows) -> Summary:
     (6.0, 1.414, 20.0)
     """
     mean, spread = {}, {}
-    for name in SCORES:
-        values = np.array([_value(row["metrics"], name) for row in rows])
-        # A machine's first row compiles the kernels, which is no iteration's time.
-        mean[name] = float(np.median(values) if name == "ms an iteration" else values.mean())
-        spread[name] = float(values.std(ddof=1)) if len(values) > 1 else math.nan
+    for column in COLUMNS:
+        values = np.array([column.value(row["metrics"]) for row in rows], float)
+        mean[column.label] = float(column.middle(values))
+        spread[column.label] = float(values.std(ddof=1)) if len(values) > 1 else math.nan
     return Summary(rows[0]["arm"], len(rows), mean, spread)
 
 
@@ -88,11 +119,13 @@ def summarise_all(rows: Rows, arms: Sequence[str]) -> List[Summary]:
 def difference(rows: Rows, arm: str, reference: str, split: str = "test", score: str = "psnr") -> Optional[Difference]:
     """Return by how much ``arm`` exceeds ``reference``, over the seeds that both have; None if they share none.
 
+    It is None too where a row is older than the metric and lacks it.
+
     Args:
         rows: of any arms.
         arm, reference: two arms' names.
         split: "train" or "test".
-        score: "psnr", "ssim", "psnr_strong" or "psnr_rest".
+        score: a key of :data:`~legs_loss.reference.training.metrics.METRICS`.
 
     Raises:
         LegsError: the two were scored on other views.
@@ -105,6 +138,8 @@ def difference(rows: Rows, arm: str, reference: str, split: str = "test", score:
     if any(sorted(scores[seed]) != views for scores in (ours, theirs) for seed in seeds):
         raise LegsError(f"{arm} and {reference} were scored on other views")
     table = np.array([[ours[seed][view] - theirs[seed][view] for view in views] for seed in seeds])
+    if np.isnan(table).any():
+        return None
     low, high = _interval(table.mean(0))
     return Difference(float(table.mean()), low, high, tuple(table.mean(1).tolist()))
 
@@ -136,17 +171,6 @@ def _of(rows: Rows, arm: str) -> List[Mapping[str, Any]]:
 
 def _scores(rows: Rows, arm: str, split: str, score: str) -> Dict[int, Dict[str, float]]:
     return {
-        row["seed"]: {view: values[score] for view, values in row["metrics"]["views"][split].items()}
+        row["seed"]: {view: values.get(score, math.nan) for view, values in row["metrics"]["views"][split].items()}
         for row in _of(rows, arm)
     }
-
-
-def _value(metrics: Mapping[str, Any], name: str) -> float:
-    if name == "ms an iteration":
-        return 1000.0 * metrics.get("processor_seconds", math.nan) / metrics["iterations"]
-    value: Any = metrics
-    for key in SCORES[name]:
-        if value is None:  # no view is held out
-            return math.nan
-        value = value.get(key, math.nan)
-    return float(value)

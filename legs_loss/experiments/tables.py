@@ -8,10 +8,13 @@ from typing import Any, List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE
-from legs_loss.experiments.statistics import SCORES, Difference, difference, summarise, summarise_all, times_gaussians
+from legs_loss.experiments.statistics import COLUMNS, Difference, difference, summarise, summarise_all, times_gaussians
 from legs_loss.experiments.studies import Study
+from legs_loss.reference.training.metrics import METRICS
 
 __all__ = [
+    "LABELS",
+    "MISSING",
     "again_text",
     "difference_cell",
     "differences_table",
@@ -25,17 +28,8 @@ __all__ = [
 
 Rows = Sequence[Mapping[str, Any]]
 
-FORMATS: Mapping[str, str] = {
-    "train PSNR": ".2f",
-    "train SSIM": ".4f",
-    "held-out PSNR": ".2f",
-    "held-out SSIM": ".4f",
-    "strongest 10%": ".2f",
-    "the rest": ".2f",
-    "Gaussians": ",.0f",
-    "ms an iteration": ".0f",
-    "mean weight": ".2f",
-}
+LABELS = [column.label for column in COLUMNS]
+MISSING = "–"  # of a row that is older than the metric, or of held-out views where there are none
 SAME_NUMBER = 0.01  # of the Gaussians: the count control's promise
 
 
@@ -65,13 +59,13 @@ def label(arm: str) -> str:
 
 
 def score_cells(mean: Mapping[str, float], spread: Mapping[str, float]) -> List[str]:
-    """Return the cells of :data:`SCORES`: mean ± standard deviation where there is one."""
+    """Return the cells of :data:`COLUMNS`: mean ± standard deviation where there is one."""
     cells = []
-    for name in SCORES:
-        spec = FORMATS[name]
-        cell = format(mean[name], spec)
-        with_spread = name not in ("mean weight", "ms an iteration") and not math.isnan(spread[name])
-        cells.append(f"{cell} ± {format(spread[name], spec)}" if with_spread else cell)
+    for column in COLUMNS:
+        middle, deviation = mean[column.label], spread[column.label]
+        cell = MISSING if math.isnan(middle) else format(middle, column.format)
+        told = column.spread and not math.isnan(deviation)
+        cells.append(f"{cell} ± {format(deviation, column.format)}" if told else cell)
     return cells
 
 
@@ -81,15 +75,14 @@ def scores_table(rows: Rows, arms: Sequence[str]) -> str:
     for arm in arms:
         for summary in summarise_all(rows, [parse_arm(arm).name]):
             lines.append([label(arm), *score_cells(summary.mean, summary.spread), str(summary.seeds)])
-    return markdown(["arm", *SCORES, "seeds"], lines)
+    return markdown(["arm", *LABELS, "seeds"], lines)
 
 
-# A column of differences, and the split and score that it is of.
+# A column of differences, and the split and key of its metric.
 DIFFERENCES: Mapping[str, Tuple[str, str]] = {
-    "train PSNR": ("train", "psnr"),
-    "held-out PSNR": ("test", "psnr"),
-    "held-out SSIM": ("test", "ssim"),
-    "strongest 10%": ("test", "psnr_strong"),
+    column.label: column.metric
+    for column in COLUMNS
+    if column.metric is not None and column.metric[0] in METRICS[column.metric[1]].differences
 }
 
 
@@ -121,7 +114,7 @@ def _pairs_table(rows: Rows, study: Study) -> str:
         found = [gap for gap in gaps if gap is not None]
         if found:
             sizes = sorted(abs(gap.mean) for gap in found)
-            shown = [f"{size:.{4 if score == 'ssim' else 2}f}" for size in (sizes[len(sizes) // 2], sizes[-1])]
+            shown = [format(size, METRICS[score].format) for size in (sizes[len(sizes) // 2], sizes[-1])]
             lines.append([column, *shown, f"{sum(gap.clear for gap in found)} of {len(found)}"])
     return markdown(["between any two", "median difference", "largest", "not marked ?"], lines)
 
@@ -147,8 +140,10 @@ def study_text(rows: Rows, study: Study) -> str:
 def again_text(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Return a row's scores as they were and as they are when it is trained again, and whether they are the same."""
     lines = [[when, *score_cells(*summarise([row])[2:])] for when, row in (("then", then), ("now", now))]
-    same = all(then["metrics"][name] == now["metrics"][name] for name in ("views", "gaussians", "growth"))
-    text = f"{then['arm']}, seed {then['seed']}\n\n{markdown(['', *SCORES], lines)}\n\n"
+    same = _scores_agree(then, now) and all(
+        then["metrics"][name] == now["metrics"][name] for name in ("gaussians", "growth")
+    )
+    text = f"{then['arm']}, seed {then['seed']}\n\n{markdown(['', *LABELS], lines)}\n\n"
     if same:
         return text + "The same to the last digit."
     changed = [name for name, value in now["versions"].items() if then["versions"].get(name) != value]
@@ -157,6 +152,17 @@ def again_text(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         f"Not the same. What differs: {told or 'the processor, it seems'}. Another rounding grows in a training "
         "until it has moved the scores; --study noise shows how far."
     )
+
+
+def _scores_agree(then: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Whether every view has the same scores, of the metrics that both rows have."""
+    for split, views in then["metrics"]["views"].items():
+        for view, scores in views.items():
+            again = now["metrics"]["views"][split].get(view, {})
+            shared = set(scores) & set(again)
+            if not shared or any(scores[key] != again[key] for key in shared):
+                return False
+    return True
 
 
 def _orders(rows: Rows, study: Study, gains: Mapping[str, Difference]) -> List[str]:
@@ -175,11 +181,11 @@ def _orders(rows: Rows, study: Study, gains: Mapping[str, Difference]) -> List[s
 def difference_cell(value: Optional[Difference], score: str) -> str:
     """Return a difference as a cell: its interval in brackets, and a ? where it is not clear."""
     if value is None:
-        return "–"
-    digits = 4 if score == "ssim" else 2
-    text = f"{value.mean:+.{digits}f}"
+        return MISSING
+    signed = "+" + METRICS[score].format
+    text = format(value.mean, signed)
     if not math.isnan(value.low):
-        text += f" [{value.low:+.{digits}f}, {value.high:+.{digits}f}]"
+        text += f" [{format(value.low, signed)}, {format(value.high, signed)}]"
     return text + ("" if value.clear else " ?")
 
 

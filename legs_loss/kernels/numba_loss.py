@@ -26,13 +26,13 @@ from torch.autograd.function import once_differentiable
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, shape_of
 from legs_loss.kernels.compiling import ONE_AT_A_TIME, compiled
-from legs_loss.kernels.numba_response import CURVES, extremes, settings_of, weight_row
+from legs_loss.kernels.numba_response import CURVES, extremes, settings_of, supports_response, weight_row
 from legs_loss.kernels.vectors import LANES, absolute, load, multiply_add, prefetch, shifted, sign, splat, store, total
 from legs_loss.spec import WeightSpec
 from legs_loss.ssim import C1, C2, SIGMA, WINDOW_SIZE
 from legs_loss.weights import weight_map
 
-__all__ = ["fused_loss"]
+__all__ = ["fused_loss", "supports"]
 
 _REACH = WINDOW_SIZE // 2
 _TAPS = np.exp(-((np.arange(WINDOW_SIZE) - _REACH) ** 2) / (2 * SIGMA**2))
@@ -71,8 +71,8 @@ def fused_loss(
     Args:
         prediction: on the CPU, [C, H, W] or [B, C, H, W]; what is not float32 is converted.
         target: the same shape; no gradient flows to it.
-        weight: [1, H, W] or [B, 1, H, W]; a spec computes it from the target (without a map in memory where the curve
-            is one of C1 to C4, the percentile 100 and ``normalise`` "none"); None is 1 everywhere.
+        weight: [1, H, W] or [B, 1, H, W]; a spec computes it from the target (without a map in memory where
+            :func:`supports` says so); None is 1 everywhere.
         lambda_dssim: the share of D-SSIM.
 
     Returns:
@@ -81,13 +81,14 @@ def fused_loss(
     Raises:
         LegsError: a spec, and a target with NaN, infinity or plainly of 0..255.
     """
-    if isinstance(weight, WeightSpec) and not _in_kernel(weight):
+    if isinstance(weight, WeightSpec) and not supports(weight):
         weight = weight_map(target, weight)
     return _FusedLoss.apply(prediction.float(), target.float(), weight, lambda_dssim)
 
 
-def _in_kernel(spec: WeightSpec) -> bool:
-    return spec.curve in CURVES and spec.percentile == 100.0 and spec.normalise == "none"
+def supports(spec: WeightSpec) -> bool:
+    """Return whether the kernel makes the weights of a spec itself; other specs' are made by torch, as a map."""
+    return supports_response(spec) and spec.curve in CURVES and spec.percentile == 100.0 and spec.normalise == "none"
 
 
 class _Weights(NamedTuple):

@@ -26,9 +26,17 @@ from legs_loss.kernels.vectors import (
 )
 from legs_loss.spec import WeightSpec
 
-__all__ = ["CURVES", "extremes", "map_of_responses", "photograph_response", "settings_of", "weight_row"]
+__all__ = [
+    "CURVES",
+    "extremes",
+    "map_of_responses",
+    "photograph_response",
+    "settings_of",
+    "supports_response",
+    "weight_row",
+]
 
-# kind of stencil, the weights of a gradient's outer and middle rows
+# The operators that are written here: kind of stencil, the weights of a gradient's outer and middle rows
 _OPERATORS: Dict[str, Tuple[int, float, float]] = {
     "laplacian": (0, 0.0, 0.0),
     "laplacian8": (1, 0.0, 0.0),
@@ -44,6 +52,11 @@ CURVES = {"C1": 1, "C2": 2, "C3": 3, "C4": 4}
 _ROWS = 32  # a task's rows, where only the response is wanted
 _ZERO, _ONE, _TWO, _THREE = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(3.0)
 _FOUR, _EIGHT = np.float32(4.0), np.float32(8.0)
+
+
+def supports_response(spec: WeightSpec) -> bool:
+    """Return whether the response of a spec can be computed here; the functions below take no other."""
+    return spec.operator in _OPERATORS and spec.p in _NORMS
 
 
 def settings_of(spec: WeightSpec) -> Tuple[int, np.float32, np.float32, int]:

@@ -13,8 +13,8 @@ from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE, read_rows, scene_of
-from legs_loss.experiments.statistics import SCORES, difference, summarise_all, times_gaussians
-from legs_loss.experiments.tables import difference_cell, score_cells, times_cell
+from legs_loss.experiments.statistics import COLUMNS, difference, summarise_all, times_gaussians
+from legs_loss.experiments.tables import LABELS, MISSING, difference_cell, score_cells, times_cell
 from legs_loss.reference.training.dataset import load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
 from legs_loss.report.html_pictures import FORMATS as IMAGE_FORMATS
@@ -130,34 +130,34 @@ def _scores(rows: Sequence[Row], arms: Sequence[str]) -> str:
     body = []
     for summary in summarise_all(rows, arms):
         cells = score_cells(summary.mean, summary.spread)
-        values = [summary.mean[name] for name in SCORES]
+        values = [summary.mean[label] for label in LABELS]
         body.append(
             [(summary.arm, summary.arm), *zip(cells, map(_sortable, values)), (str(summary.seeds), str(summary.seeds))]
         )
     return _table(
         "Mean ± standard deviation over seeds. PSNR in dB. “strongest 10%” and “the rest” split each held-out "
         "photograph's pixels by their Laplacian response, which favours the weighted losses.",
-        ["arm", *SCORES, "seeds"],
+        ["arm", *LABELS, "seeds"],
         body,
     )
 
 
 def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
-    columns = (("train", "psnr"), ("train", "ssim"), ("test", "psnr"), ("test", "ssim"), ("test", "psnr_strong"))
+    columns = {column.label: column.metric for column in COLUMNS if column.metric is not None}
     body = []
     for arm in arms:
-        found = [difference(rows, arm, BASELINE, split, score) for split, score in columns]
+        found = [difference(rows, arm, BASELINE, split, score) for split, score in columns.values()]
         cells = [
             (difference_cell(one, score), _sortable(one.mean if one is not None else math.nan))
-            for one, (_, score) in zip(found, columns)
+            for one, (_, score) in zip(found, columns.values())
         ]
         ratio = times_gaussians(rows, arm, BASELINE)
-        times = ("–", _sortable(math.nan)) if ratio is None else (times_cell(ratio), _sortable(ratio))
+        times = (MISSING, _sortable(math.nan)) if ratio is None else (times_cell(ratio), _sortable(ratio))
         body.append([(arm, arm), *cells, times])
     return _table(
         f"Each arm minus {BASELINE}, paired by view. Brackets: 95% bootstrap interval over views. ? where it holds 0, "
         "or where seeds differ in sign.",
-        ["arm", "train PSNR", "train SSIM", "held-out PSNR", "held-out SSIM", "strongest 10%", "Gaussians"],
+        ["arm", *columns, "Gaussians"],
         body,
     )
 

@@ -1,9 +1,12 @@
-"""PSNR and SSIM of a rendering, and PSNR apart for the pixels with the strongest response and for the rest."""
+"""The metrics of a rendering, each one record: trainings, rows, tables, plots and the HTML page go through METRICS.
+
+To add a metric, add a record. A row that was trained before has none of it, and is shown so.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Optional, Sequence
+from typing import Callable, Dict, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
@@ -11,16 +14,32 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.response import response
 
-__all__ = ["Scores", "mean_scores", "psnr", "score", "strongest"]
+__all__ = ["METRICS", "Metric", "mean_scores", "psnr", "score", "strongest"]
 
 
-class Scores(NamedTuple):
-    """Of one view, or the means over views (as the field reports them): dB, and SSIM at most 1."""
+class Metric(NamedTuple):
+    """A number that says how near a rendering is to its photograph.
 
-    psnr: float
-    ssim: float
-    psnr_strong: float  # over the 10% of the pixels with the strongest Laplacian response of the photograph
-    psnr_rest: float  # over all others
+    Attributes:
+        key: its name in rows and files.
+        label: its name for people.
+        format: of a value in a table, as ``format()`` takes it.
+        splits: the views it is computed for, "train", "test" (the held-out ones) or both.
+        compute: (rendering, photograph), each [3, H, W] in [0, 1], to the value.
+        differences: the splits for which `legs compare` tells differences between arms in the terminal; the HTML page
+            tells all.
+    """
+
+    key: str
+    label: str
+    format: str
+    splits: Tuple[str, ...]
+    compute: Callable[[Tensor, Tensor], float]
+    differences: Tuple[str, ...] = ()
+
+    def column(self, split: str) -> str:
+        """Return the head of its column: with the split in front, where it has two."""
+        return self.label if len(self.splits) == 1 else f"{'train' if split == 'train' else 'held-out'} {self.label}"
 
 
 def psnr(prediction: Tensor, target: Tensor, mask: Optional[Tensor] = None) -> float:
@@ -55,26 +74,48 @@ def strongest(image: Tensor, fraction: float = 0.1) -> Tensor:
     return mask.reshape(strength.shape)
 
 
-def score(prediction: Tensor, target: Tensor) -> Scores:
-    """Return the scores of one rendering [3, H, W] (clipped to [0, 1]) against its photograph."""
+def _ssim(prediction: Tensor, target: Tensor) -> float:
     from legs_loss.kernels.numba_loss import fused_loss
 
-    prediction = prediction.clamp(0.0, 1.0)
-    mask = strongest(target)
-    return Scores(
-        psnr(prediction, target),
-        1.0 - float(fused_loss(prediction, target, None, 1.0)),  # SSIM alone, many times as fast as torch's
-        psnr(prediction, target, mask),
-        psnr(prediction, target, ~mask),
+    return 1.0 - float(fused_loss(prediction, target, None, 1.0))  # many times as fast as torch's
+
+
+METRICS: Mapping[str, Metric] = {
+    metric.key: metric
+    for metric in (
+        Metric("psnr", "PSNR", ".2f", ("train", "test"), psnr, differences=("train", "test")),
+        Metric("ssim", "SSIM", ".4f", ("train", "test"), _ssim, differences=("test",)),
+        Metric(
+            "psnr_strong",
+            "strongest 10%",  # PSNR of the pixels with the strongest Laplacian response of the photograph
+            ".2f",
+            ("test",),
+            lambda prediction, target: psnr(prediction, target, strongest(target)),
+            differences=("test",),
+        ),
+        Metric(
+            "psnr_rest",
+            "the rest",  # PSNR of all others
+            ".2f",
+            ("test",),
+            lambda prediction, target: psnr(prediction, target, ~strongest(target)),
+        ),
     )
+}
 
 
-def mean_scores(scores: Sequence[Scores]) -> Scores:
-    """Return the mean over views of each score.
+def score(prediction: Tensor, target: Tensor, split: str = "test") -> Dict[str, float]:
+    """Return by key the metrics of one rendering [3, H, W] (clipped to [0, 1]) of a photograph of a split."""
+    prediction = prediction.clamp(0.0, 1.0)
+    return {key: metric.compute(prediction, target) for key, metric in METRICS.items() if split in metric.splits}
+
+
+def mean_scores(scores: Sequence[Mapping[str, float]]) -> Dict[str, float]:
+    """Return the mean over views of each metric, as the field reports them.
 
     Raises:
         LegsError: there is no view.
     """
     if not scores:
         raise LegsError("there is no view to score")
-    return Scores(*(sum(values) / len(scores) for values in zip(*scores)))
+    return {key: sum(values[key] for values in scores) / len(scores) for key in scores[0]}

@@ -31,7 +31,7 @@ from legs_loss.reference.training.adam import Adam, position_rate
 from legs_loss.reference.training.checkpoint import read_checkpoint, write_checkpoint
 from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, load_dataset
 from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
-from legs_loss.reference.training.metrics import Scores, mean_scores, psnr, score
+from legs_loss.reference.training.metrics import mean_scores, psnr, score
 from legs_loss.scenes import Scene
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
@@ -367,10 +367,10 @@ class _Run:
 
     def metrics(self) -> Dict[str, Any]:
         """Scores over training and held-out views, and what they cost."""
-        train, test = self._scores(self.data.train), self._scores(self.data.test)
+        train, test = self._scores("train"), self._scores("test")
         return {
-            "train": mean_scores(list(train.values()))._asdict(),
-            "test": mean_scores(list(test.values()))._asdict() if test else None,
+            "train": mean_scores(list(train.values())),
+            "test": mean_scores(list(test.values())) if test else None,
             "gaussians": len(self.adam.gaussians),
             "densify_grad_threshold": self.threshold,
             "mean_weight": self._mean_weight(),
@@ -379,14 +379,15 @@ class _Run:
             "processor_seconds": float(self.clocks[1]),
             "growth": self.growth,
             "history": self.history,
-            "views": {
-                "train": {name: scores._asdict() for name, scores in train.items()},
-                "test": {name: scores._asdict() for name, scores in test.items()},
-            },
+            "views": {"train": train, "test": test},
         }
 
-    def _scores(self, views: List[TrainingView]) -> Dict[str, Scores]:
-        return {view.name: score(draw(self.adam.gaussians, view, self.config), view.image) for view in views}
+    def _scores(self, split: str) -> Dict[str, Dict[str, float]]:
+        views = self.data.train if split == "train" else self.data.test
+        return {view.name: score(self._drawn(view), view.image, split) for view in views}
+
+    def _drawn(self, view: TrainingView) -> Tensor:
+        return draw(self.adam.gaussians, view, self.config)
 
     def _mean_weight(self) -> float:
         if self.weigh is not None:
@@ -399,7 +400,8 @@ class _Run:
         if self.psnr is not None:
             point["train_psnr"] = self.psnr
         if self.data.test:
-            point["test_psnr"] = mean_scores(list(self._scores(self.data.test).values())).psnr
+            values = [psnr(self._drawn(view).clamp(0.0, 1.0), view.image) for view in self.data.test]
+            point["test_psnr"] = sum(values) / len(values)
         self.history.append(point)
 
     def _weight(self, index: int, rendering: Tensor) -> Optional[Tensor]:

@@ -13,10 +13,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from legs_adapters import journal as journal_module
 from legs_adapters.cli import main
+from legs_adapters.code.folders import walk
+from legs_adapters.code.sources import Source, decode
 from legs_adapters.journal import JOURNAL
 from legs_adapters.patch import plan, undo, write
-from legs_adapters.reading.folders import walk
-from legs_adapters.reading.repo import Source, decode
 from legs_adapters.runner import checkout_of
 
 from legs_loss import LegsError

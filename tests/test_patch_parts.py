@@ -8,10 +8,10 @@ import pytest
 
 cst = pytest.importorskip("libcst")
 
-from legs_adapters.reading.module import Module, parse  # noqa: E402
-from legs_adapters.reading.prospects import Prospects  # noqa: E402
-from legs_adapters.reading.repo import Source, Unreadable  # noqa: E402
-from legs_adapters.reading.syntax import code, walk_expressions  # noqa: E402
+from legs_adapters.code.module import Module, parse  # noqa: E402
+from legs_adapters.code.sources import Source, Unreadable  # noqa: E402
+from legs_adapters.code.syntax import code, walk_expressions  # noqa: E402
+from legs_adapters.terms.prospects import Prospects  # noqa: E402
 
 FILES = sorted(Path(__file__).parent.glob("test_patch_*.py"))
 

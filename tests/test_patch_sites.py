@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from legs_adapters.code.sources import decode
 from legs_adapters.patch import plan
-from legs_adapters.reading import own
-from legs_adapters.reading.repo import decode
+from legs_adapters.terms.functions import L1Functions
 
 from tests.patching_support import NAMES, checkout, expected, files, legs_patch
 
@@ -103,8 +103,8 @@ def test_functions_that_call_each_other_are_each_looked_into_once(tmp_path, monk
     texts["utils/loss_utils.py"] += f"\n\n{functions}def mean_of(a, b):\n    return l1_loss(a, b) + l1_of_0(a, b)\n"
     texts["train.py"] = texts["train.py"].replace("l1_loss", "mean_of")
     looked_into = []
-    meets = own._meet_in_differences
-    monkeypatch.setattr(own, "_meet_in_differences", lambda *args: looked_into.append(args[1]) or meets(*args))
+    meets = L1Functions._meet_in_differences
+    monkeypatch.setattr(L1Functions, "_meet_in_differences", lambda *args: looked_into.append(args[1]) or meets(*args))
     plan(checkout(tmp_path, texts))
     assert len(looked_into) == len(set(looked_into)) >= len(names)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Optional, Sequence, Tuple
 from legs_loss import OPERATORS, LegsError, __version__
 
 if TYPE_CHECKING:
-    from legs_adapters.findings import Problem
+    from legs_adapters.terms.findings import Problem
 
 __all__ = ["main"]
 
@@ -97,8 +97,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _patch(args: argparse.Namespace) -> int:
+    from legs_adapters.code.sources import check_root
     from legs_adapters.patch import plan, write
-    from legs_adapters.reading.repo import check_root
     from legs_adapters.report import as_diff, as_json, as_table
     from legs_adapters.settings import SETTINGS_FILE, settings_text
 
@@ -153,7 +153,7 @@ def _patch(args: argparse.Namespace) -> int:
 
 def _not_looked_into(root: Path, exclude: Sequence[str]) -> str:
     """Name the folders that may have the term, and that legs-patch does not enter by itself."""
-    from legs_adapters.reading.folders import not_entered
+    from legs_adapters.terms.other_folders import not_entered
 
     folders = not_entered(root, exclude)
     if not folders:

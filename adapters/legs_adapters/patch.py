@@ -8,13 +8,13 @@ import subprocess
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
-from legs_adapters.findings import Findings
+from legs_adapters.code.folders import walk, why_left_out
+from legs_adapters.code.sources import Source, Unreadable, check_root, read_source
+from legs_adapters.edit import Edit, apply_edits, rewrite
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest, replace_files, undo_edits
-from legs_adapters.reading.folders import walk, why_left_out
-from legs_adapters.reading.repo import Source, Unreadable, check_root, read_source
-from legs_adapters.rewrite import Edit, apply_edits, rewrite
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.sites import find
+from legs_adapters.terms.findings import Findings
 from legs_loss import LegsError
 
 __all__ = ["Plan", "Undone", "plan", "undo", "write"]

@@ -6,11 +6,12 @@ import difflib
 import json
 from typing import Dict, List, Sequence, Tuple
 
+from legs_adapters.code.sources import Source, decode
+from legs_adapters.code.syntax import one_line
 from legs_adapters.patch import Plan
-from legs_adapters.reading.repo import Source, decode
-from legs_adapters.reading.syntax import one_line
 
 __all__ = ["as_diff", "as_json", "as_table"]
+
 
 _RED, _GREEN, _CYAN, _BOLD, _PLAIN = "\033[31m", "\033[32m", "\033[36m", "\033[1m", "\033[0m"
 

@@ -20,9 +20,9 @@ from pathlib import Path
 from types import CodeType
 from typing import Dict, Optional, Sequence, Tuple, Type
 
+from legs_adapters.code.folders import SUBMODULE, VENDORED, foreign_folder
+from legs_adapters.code.sources import check_root
 from legs_adapters.patch import plan
-from legs_adapters.reading.folders import SUBMODULE, VENDORED, foreign_folder
-from legs_adapters.reading.repo import check_root
 from legs_loss import LegsError
 
 __all__ = ["checkout_of", "execute", "run_script"]

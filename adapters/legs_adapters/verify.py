@@ -20,9 +20,9 @@ import time
 from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence
 
+from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL
 from legs_adapters.patch import plan, undo
-from legs_adapters.reading.repo import check_root
 from legs_loss import LegsError
 
 __all__ = ["ITERATIONS", "Run", "Verdict", "verify", "watch"]

@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
 
-from legs_adapters.reading.folders import walk
+from legs_adapters.code.folders import walk
 
 __all__ = ["Call", "Interface", "survey"]
 

@@ -11,13 +11,14 @@ from typing import List
 
 import libcst as cst
 
-from legs_adapters.reading.absolute import is_l1_name
-from legs_adapters.reading.l1 import Form
-from legs_adapters.reading.module import Function
-from legs_adapters.reading.program import Program
-from legs_adapters.reading.syntax import arguments, call_name, constant, dotted, words
+from legs_adapters.code.module import Function
+from legs_adapters.code.program import Program
+from legs_adapters.code.syntax import arguments, call_name, constant, dotted, words
+from legs_adapters.terms.forms import Form
+from legs_adapters.terms.l1_names import is_l1_name
 
 __all__ = ["MENTIONED", "forms_of"]
+
 
 MENTIONED = re.compile(r"\badd_loss_metric\s*\(")
 _COLOUR = {"color", "colour", "rgb", "image", "photometric", "l1"}

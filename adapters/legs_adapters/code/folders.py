@@ -1,0 +1,143 @@
+"""List the Python files of a checkout, and the folders of it that are not entered, with the reason."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import re
+from pathlib import Path
+from typing import Iterator, List, NamedTuple, Optional, Sequence, Tuple
+
+__all__ = [
+    "PATCHABLE",
+    "SUBMODULE",
+    "TESTS",
+    "VENDORED",
+    "Skipped",
+    "folders_of",
+    "foreign_folder",
+    "walk",
+    "why_left_out",
+]
+
+VENDORED, SUBMODULE = "other people's code", "a submodule"
+TESTS, _CHECKOUT = "a folder of tests", "a checkout of its own"
+_FOREIGN = {
+    name: why
+    for why, names in (
+        (VENDORED, "submodules third_party third-party thirdparty external externals extern SIBR_viewers"),
+        (TESTS, "tests test testing"),
+        ("installed packages", "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs"),
+        ("what tools wrote", ".git .hg .svn __pycache__ .ipynb_checkpoints build dist .mypy_cache .pytest_cache"),
+    )
+    for name in names.split()
+}
+PATCHABLE = (VENDORED, TESTS, SUBMODULE, _CHECKOUT)
+_TEST_FILE = re.compile(r"^(test_.*|.*_test|conftest)\.py$")
+
+
+class Skipped(NamedTuple):
+    """A folder that is not looked into, relative to the root, and what it is."""
+
+    path: str
+    why: str
+
+
+def walk(root: Path, exclude: Sequence[str] = ()) -> Iterator[str]:
+    """Yield the paths of the checkout's own Python files, relative, posix separators, a folder's own files first.
+
+    Links are not followed, whether to files or to folders; left out are ``.git``, submodules, virtual environments,
+    vendored folders, tests, and what ``exclude`` names: globs on the relative path or, without a slash, on the name of
+    the file or of a folder above it.
+    """
+    for files, _ in folders_of(root, exclude):
+        yield from files
+
+
+def why_left_out(root: Path, path: str, exclude: Sequence[str] = ()) -> Optional[str]:
+    """Say why a file of the checkout is not one that ``walk`` yields; None where it is."""
+    if _excluded(path, exclude):
+        return "--exclude leaves it out"
+    foreign = foreign_folder(root, path)
+    if foreign is not None:
+        instead = ": run legs-patch on that folder" if foreign.why in PATCHABLE else ""
+        return f"{foreign.path} is not looked into ({foreign.why}){instead}"
+    if not path.endswith(".py"):
+        return "it is no .py file"
+    if _TEST_FILE.match(os.path.basename(path)):
+        return "tests are not looked into"
+    return "links are not followed" if os.path.islink(str(root / path)) else None
+
+
+def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
+    """Return the folder of a file that is not looked into: of third_party the one in it; None where there is none."""
+    submodules = _submodules(root)
+    parts = path.split("/")
+    for i in range(1, len(parts)):
+        folder = "/".join(parts[:i])
+        why = _why_foreign(root, folder, submodules)
+        if why == VENDORED and i + 1 < len(parts):
+            folder = "/".join(parts[: i + 1])
+            why = _why_foreign(root, folder, submodules) or why
+        if os.path.islink(str(root / folder)):
+            why = "a link"
+        if why is not None:
+            return Skipped(folder, why)
+    return None
+
+
+def folders_of(root: Path, exclude: Sequence[str]) -> Iterator[Tuple[List[str], List[Skipped]]]:
+    """Yield, a folder at a time, the Python files in it, and the folders in it that are not entered."""
+    submodules = _submodules(root)
+    for here, folders, files in os.walk(str(root), followlinks=False):
+        relative = Path(here).relative_to(root).as_posix()
+        prefix = "" if relative == "." else relative + "/"
+        skipped = []
+        for name in sorted(folders):
+            why = _why_foreign(root, prefix + name, submodules)
+            if _excluded(prefix + name, exclude) or os.path.islink(os.path.join(here, name)):
+                folders.remove(name)
+            elif why is not None:
+                folders.remove(name)
+                skipped.append(Skipped(prefix + name, why))
+        folders.sort()
+        own = []
+        for name in sorted(files):
+            full = os.path.join(here, name)
+            if not name.endswith(".py") or _TEST_FILE.match(name) or _excluded(prefix + name, exclude):
+                continue
+            if not os.path.islink(full) and os.path.isfile(full):
+                own.append(prefix + name)
+        yield own, skipped
+
+
+def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[str]:
+    """Say what a folder is that holds other people's code, or none at all; None for the checkout's own."""
+    full = str(root / path)
+    if path in submodules:
+        return SUBMODULE
+    name = os.path.basename(path)
+    if name in _FOREIGN:
+        return _FOREIGN[name]
+    if os.path.exists(os.path.join(full, "pyvenv.cfg")):
+        return "a virtual environment"
+    return _CHECKOUT if os.path.lexists(os.path.join(full, ".git")) else None
+
+
+def _excluded(path: str, patterns: Sequence[str]) -> bool:
+    parts = path.split("/")
+    for pattern in patterns:
+        pattern = pattern.rstrip("/")
+        if any(fnmatch.fnmatch("/".join(parts[: i + 1]), pattern) for i in range(len(parts))):
+            return True
+        if "/" not in pattern and any(fnmatch.fnmatch(part, pattern) for part in parts):
+            return True
+    return False
+
+
+def _submodules(root: Path) -> List[str]:
+    try:
+        text = (root / ".gitmodules").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return []
+    return [match.strip().rstrip("/") for match in re.findall(r"^\s*path\s*=\s*(.+)$", text, re.M)]

@@ -1,0 +1,281 @@
+"""One parsed file: its functions and classes, and where its nodes stand in its bytes."""
+
+from __future__ import annotations
+
+import re
+from typing import Callable, Dict, Iterator, List, Optional, Sequence, Tuple
+
+import libcst as cst
+
+from legs_adapters.code.flow import Flow
+from legs_adapters.code.parsing import Cut, Lines, Part, Place, body_part, outline_part
+from legs_adapters.code.reaching import Definition
+from legs_adapters.code.sources import Source, Unreadable
+from legs_adapters.code.syntax import arguments, dotted
+
+__all__ = ["Class", "Function", "Module", "parse"]
+
+_PRINT_STATEMENT = re.compile(
+    r"^\s*(print\s+[\"'\w]|exec\s+[\"']|raise\s+\w+\s*,)|^\s*except\s+[\w.]+\s*,\s*\w+\s*:", re.M
+)
+_DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
+
+
+class Function:
+    """A function, a method, or a module's top level.
+
+    Attributes:
+        module, name: where it stands.
+        node: its header; its body is ``body``.
+        parent: the function around it; a module's top level for what is defined there; None for the top level itself.
+        owner: its class, for a method.
+        text: what it is written in: its own body, or (where that is not known by itself) what is around it. What a
+            function says is said there: a cheap question before the dear ones.
+    """
+
+    def __init__(
+        self,
+        module: Module,
+        node: cst.FunctionDef | cst.Module,
+        parent: Optional[Function] = None,
+        owner: Optional[Class] = None,
+        cut: Optional[Cut] = None,
+    ) -> None:
+        self.module = module
+        self.node = node
+        self.parent = parent
+        self.owner = owner
+        self.name = node.name.value if isinstance(node, cst.FunctionDef) else ""
+        self._cut = cut
+        self._part: Optional[Part] = None
+        self._body: Optional[cst.BaseSuite | cst.Module] = None
+        self._inner: List[Function] = []
+        self._flow: Optional[Flow] = None
+        if cut is not None:
+            self.text = module.lines.data[cut.start : cut.end].decode("utf-8")
+        else:
+            self.text = parent.text if parent is not None and parent.parent is not None else module.outline_text
+
+    def __repr__(self) -> str:
+        return f"<{self.module.path}:{self.name or 'top level'}>"
+
+    @property
+    def body(self) -> cst.BaseSuite | cst.Module:
+        """Its statements, parsed when they are first asked for."""
+        if self._body is None:
+            self._body = self.node if isinstance(self.node, cst.Module) else self.node.body
+            if self._cut is not None:
+                try:
+                    self._part = body_part(self.module.lines, self._cut)
+                    header = self._part.tree.body[0]
+                    assert isinstance(header, cst.FunctionDef)
+                    self._body = header.body
+                    self._inner = self.module.collect(self._body.body, self)
+                except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
+                    self.module.failure = _failure(self.module.path, self.module.text, error)
+        return self._body
+
+    @property
+    def inner(self) -> List[Function]:
+        """The functions that are defined in its body, and theirs, in source order."""
+        if self._cut is not None and self._body is None and _DEFINES.search(self.text):
+            assert self.body is not None  # which finds them
+        return self._inner
+
+    def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
+        """Say where a node of its body stands in the file, on request with the brackets around it.
+
+        Raises:
+            ValueError: LibCST would write another text than it read.
+        """
+        scope: Function = self
+        while scope._cut is None and scope.parent is not None:
+            scope = scope.parent
+        return (scope._part or self.module.outline).place(node, brackets)
+
+    @property
+    def flow(self) -> Flow:
+        """Its reaching definitions, computed once."""
+        if self._flow is None:
+            parameters = self.node.params if isinstance(self.node, cst.FunctionDef) else None
+            self._flow = Flow(self.body, parameters)
+        return self._flow
+
+    @property
+    def parameters(self) -> List[str]:
+        """Positional parameters' names, ``self`` and ``cls`` excepted."""
+        if not isinstance(self.node, cst.FunctionDef):
+            return []
+        names = [param.name.value for param in (*self.node.params.posonly_params, *self.node.params.params)]
+        return names[1:] if self.owner is not None and not self.static and names else names
+
+    def given(self, call: cst.Call, parameter: str) -> Optional[cst.BaseExpression]:
+        """What a call of it gives for a parameter; None where it leaves that out, or it cannot be seen."""
+        positional, keywords, _ = arguments(call)
+        if parameter in keywords or parameter not in self.parameters:
+            return keywords.get(parameter)
+        position = self.parameters.index(parameter)
+        return positional[position] if position < len(positional) else None
+
+    @property
+    def static(self) -> bool:
+        """Whether it is a static method."""
+        return "staticmethod" in self.decorators
+
+    @property
+    def decorators(self) -> List[str]:
+        """The last names of its decorators."""
+        if not isinstance(self.node, cst.FunctionDef):
+            return []
+        names = []
+        for decorator in self.node.decorators:
+            node = decorator.decorator
+            names.append((dotted(node.func if isinstance(node, cst.Call) else node) or "").split(".")[-1])
+        return names
+
+
+class Class:
+    """A class: its methods, and what is stored in its attributes by any of them."""
+
+    def __init__(self, module: Module, node: cst.ClassDef, parent: Function) -> None:
+        self.module = module
+        self.node = node
+        self.parent = parent
+        self.name = node.name.value
+        self.methods: Dict[str, Function] = {}
+        self.fields: Dict[str, cst.BaseExpression] = dict(_fields(node))
+
+    @property
+    def bases(self) -> List[str]:
+        """The last names of its base classes."""
+        return [(dotted(arg.value) or "").split(".")[-1] for arg in self.node.bases]
+
+    def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
+        """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""
+        found: List[Tuple[Function, Definition]] = []
+        for method in self.methods.values():
+            if attribute in method.text and where(method):
+                definitions = method.flow.definitions.get(f"self.{attribute}", [])
+                # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
+                found.extend((method, d) for d in definitions if not str(d.key).startswith("."))
+        return found
+
+
+def _fields(node: cst.ClassDef) -> Iterator[Tuple[str, cst.BaseExpression]]:
+    for statement in node.body.body:
+        for small in statement.body if isinstance(statement, cst.SimpleStatementLine) else ():
+            if isinstance(small, cst.Assign):
+                for target in small.targets:
+                    if isinstance(target.target, cst.Name):
+                        yield target.target.value, small.value
+            elif isinstance(small, cst.AnnAssign) and isinstance(small.target, cst.Name) and small.value:
+                yield small.target.value, small.value
+
+
+class Module:
+    """A parsed file.
+
+    Attributes:
+        text, lines: the file's text.
+        outline, outline_text: the file without the bodies of its functions.
+        classes: every class in it, but for those that functions define.
+        failure: why a body of it could not be parsed after all.
+    """
+
+    def __init__(self, path: str, text: str) -> None:
+        self.path = path
+        self.text = text
+        self.lines = Lines(text.encode("utf-8"))
+        self.outline, cuts = outline_part(self.lines)
+        self.outline_text = self.outline.text.decode("utf-8")
+        self.failure: Optional[Unreadable] = None
+        self.classes: List[Class] = []
+        self.by_node: Dict[int, Function | Class] = {}
+        self.top = Function(self, self.outline.tree)
+        self._cuts: Iterator[Optional[Cut]] = iter(cuts)
+        self._functions = self.collect(self.outline.tree.body, self.top)
+        self._cuts = iter(())
+
+    def collect(
+        self, statements: Sequence[cst.CSTNode], parent: Function, owner: Optional[Class] = None
+    ) -> List[Function]:
+        """Take in what statements define; return its functions, in source order."""
+        functions: List[Function] = []
+        for node in _definitions(statements):
+            if isinstance(node, cst.FunctionDef):
+                cut = next(self._cuts, None) if parent is self.top else None
+                function = Function(self, node, parent, owner, cut)
+                functions.append(function)
+                self.by_node[id(node)] = function
+                if owner is not None:
+                    owner.methods.setdefault(function.name, function)
+                if cut is None:
+                    function._inner = self.collect(node.body.body, function)
+            else:
+                found = Class(self, node, parent)
+                self.classes.append(found)
+                self.by_node[id(node)] = found
+                functions += self.collect(node.body.body, parent, found)
+        return functions
+
+    def functions(self, says: Callable[[str], object]) -> Iterator[Function]:
+        """Yield the functions whose text says so, methods and nested functions too, in source order."""
+        return _chosen(self._functions, says)
+
+    def named(self, name: str) -> Iterator[Function]:
+        """Yield the functions of this name."""
+        for function in self._functions:
+            if function.name == name:
+                yield function
+            if name in function.text:
+                yield from (inner for inner in _chosen(function.inner, bool) if inner.name == name)
+
+    def scopes(self, says: Callable[[str], object]) -> Iterator[Function]:
+        """Yield the top level and the functions whose text says so."""
+        return _chosen([self.top, *self._functions], says)
+
+
+def _chosen(functions: Sequence[Function], says: Callable[[str], object]) -> Iterator[Function]:
+    for function in functions:
+        if says(function.text):
+            yield function
+            yield from _chosen(function.inner, says)
+
+
+def parse(source: Source) -> Module | Unreadable:
+    """Parse one file; what is not Python, or not of this version, is returned with its reason."""
+    try:
+        return Module(source.path, source.text)
+    except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
+        return _failure(source.path, source.text, error)
+
+
+def _failure(path: str, text: str, error: Exception) -> Unreadable:
+    if isinstance(error, cst.ParserSyntaxError):
+        python2 = _PRINT_STATEMENT.search(text) is not None
+        return Unreadable(path, "Python 2" if python2 else f"does not parse (line {getattr(error, 'raw_line', 0)})")
+    if isinstance(error, RecursionError):
+        return Unreadable(path, "is nested too deeply")
+    return Unreadable(path, f"cannot be parsed: {type(error).__name__}")
+
+
+def _definitions(statements: Sequence[cst.CSTNode]) -> Iterator[cst.FunctionDef | cst.ClassDef]:
+    """Yield the functions and classes that statements define, in branches and loops too, in source order."""
+    for node in statements:
+        if isinstance(node, (cst.FunctionDef, cst.ClassDef)):
+            yield node
+        elif isinstance(node, cst.BaseCompoundStatement):
+            for body in _bodies(node):
+                yield from _definitions(body)
+
+
+def _bodies(node: cst.CSTNode) -> Iterator[Sequence[cst.CSTNode]]:
+    """Yield the blocks of a compound statement."""
+    if hasattr(node, "body"):
+        yield node.body.body
+    for clause in (*getattr(node, "handlers", ()), *getattr(node, "cases", ())):
+        yield clause.body.body
+    for name in ("orelse", "finalbody"):
+        clause = getattr(node, name, None)
+        if clause is not None:
+            yield from _bodies(clause)

@@ -1,0 +1,188 @@
+"""A file parsed in parts: its outline first, the body of a function only when somebody asks for it.
+
+LibCST keeps every space and makes a node of each, which costs some fifteen times what Python's own parser costs. That
+one finds where the bodies stand; the outline has ``pass`` in their place. What it cannot read, or cannot place (before
+Python 3.8), is parsed in one part.
+"""
+
+from __future__ import annotations
+
+import ast
+import bisect
+import re
+import warnings
+from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+
+import libcst as cst
+from libcst.metadata import ByteSpanPositionProvider, CodeSpan, MetadataWrapper
+
+from legs_adapters.code.syntax import code
+
+__all__ = ["Cut", "Lines", "Part", "Place", "body_part", "outline_part"]
+
+_FORM_FEED = re.compile(rb"^[ \t\f]*\f", re.M)  # LibCST loses these
+_NEWLINE = re.compile(rb"\r\n|\r|\n")
+_LONE_RETURN = re.compile(rb"\r(?!\n)")
+
+
+class Place(NamedTuple):
+    """Where a node stands: bytes of the file without its byte order mark; lines count from 1, columns from 0."""
+
+    start: int
+    end: int
+    line: int
+    column: int
+    last_line: int
+
+
+class Cut(NamedTuple):
+    """The bytes of a function's body: whole lines."""
+
+    start: int
+    end: int
+
+
+class Lines:
+    """The lines of a file."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self._starts = [0, *(match.end() for match in _NEWLINE.finditer(data))]
+
+    def start(self, line: int) -> int:
+        """Return the byte where a line begins; the end of the file for the line after the last."""
+        return self._starts[line - 1] if line <= len(self._starts) else len(self.data)
+
+    def text(self, line: int) -> str:
+        """Return one line, without the white space around it."""
+        return self.data[self.start(line) : self.start(line + 1)].decode("utf-8").strip()
+
+    def place(self, start: int, end: int) -> Place:
+        """Say where bytes stand."""
+        line, last = bisect.bisect_right(self._starts, start), bisect.bisect_left(self._starts, end)
+        return Place(start, end, line, start - self._starts[line - 1], max(line, last))
+
+
+class Part:
+    """Bytes that were parsed by themselves, and how they map to the file.
+
+    Attributes:
+        tree: what was parsed.
+        text: what it was parsed from.
+    """
+
+    def __init__(self, lines: Lines, text: bytes, shifts: Sequence[Tuple[int, int]]) -> None:
+        self.tree = cst.parse_module(text.decode("utf-8"))
+        self.text = text
+        self._lines = lines
+        self._shifts = shifts
+        self._spans: Dict[cst.CSTNode, CodeSpan] = {}
+
+    def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
+        """Say where a node stands in the file, on request with the brackets around it.
+
+        Raises:
+            ValueError: LibCST would write another text than it read.
+        """
+        if not self._spans:
+            if self.tree.bytes != self.text:
+                raise ValueError("LibCST would write another text")
+            self._spans.update(MetadataWrapper(self.tree, unsafe_skip_copy=True).resolve(ByteSpanPositionProvider))
+        span = self._spans[node]
+        start, end = span.start, span.start + span.length
+        if brackets and isinstance(node, cst.BaseExpression):
+            start -= sum(len(code(part).encode()) for part in node.lpar)
+            end += sum(len(code(part).encode()) for part in node.rpar)
+        return self._lines.place(self._in_file(start), self._in_file(end))
+
+    def _in_file(self, at: int) -> int:
+        return at + self._shifts[bisect.bisect_right(self._shifts, (at, len(self._lines.data))) - 1][1]
+
+
+def outline_part(lines: Lines) -> Tuple[Part, List[Optional[Cut]]]:
+    """Parse a file without the bodies of its functions and methods.
+
+    Returns:
+        It, and for each of those functions, in source order, what was cut; nothing where nothing could be cut.
+
+    Raises:
+        libcst.ParserSyntaxError, RecursionError, ValueError: it does not parse.
+    """
+    if _FORM_FEED.search(lines.data):
+        feeds = [(match.start(), match.end(), b"") for match in _FORM_FEED.finditer(lines.data)]
+        return Part(lines, *_replaced(lines.data, feeds)), []
+    cuts = _cuts(lines) if _LONE_RETURN.search(lines.data) is None else []
+    try:
+        return Part(lines, *_replaced(lines.data, [_stub(lines.data, cut) for cut in cuts if cut is not None])), cuts
+    except cst.ParserSyntaxError:
+        if not any(cuts):
+            raise
+        return Part(lines, lines.data, [(0, 0)]), []
+
+
+def body_part(lines: Lines, cut: Cut) -> Part:
+    """Parse what was cut, as the body of the one function of a module.
+
+    Raises:
+        libcst.ParserSyntaxError, RecursionError, ValueError: it does not parse.
+    """
+    newline = _NEWLINE.search(lines.data)
+    header = b"async def _():" + (newline.group() if newline is not None else b"\n")
+    return Part(lines, header + lines.data[cut.start : cut.end], [(0, cut.start - len(header))])
+
+
+def _stub(data: bytes, cut: Cut) -> Tuple[int, int, bytes]:
+    body = data[cut.start : cut.end]
+    indent = body[: len(body) - len(body.lstrip(b" \t"))]
+    newline = re.search(rb"(\r\n|\r|\n)?\Z", body)
+    assert newline is not None
+    return cut.start, cut.end, indent + b"pass" + newline.group()
+
+
+def _replaced(data: bytes, spans: Sequence[Tuple[int, int, bytes]]) -> Tuple[bytes, List[Tuple[int, int]]]:
+    """Return the text with spans of it replaced, and (byte of it, how many bytes further it stands in the file)."""
+    shifts, parts, at, length = [(0, 0)], [], 0, 0
+    for start, end, stub in spans:
+        parts += [data[at:start], stub]
+        length += len(parts[-2]) + len(stub)
+        shifts.append((length, end - length))
+        at = end
+    return b"".join([*parts, data[at:]]), shifts
+
+
+def _cuts(lines: Lines) -> List[Optional[Cut]]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            tree = ast.parse(lines.data)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return []  # Python 2, or newer than this Python: LibCST knows
+    return [_cut(lines, node) for node in _functions(tree.body)]
+
+
+def _functions(statements: Sequence[ast.stmt]) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    """Yield the functions and methods that stand in no other function, in source order."""
+    for node in statements:
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            yield node
+            continue
+        yield from _functions(getattr(node, "body", ()))
+        for clause in (*getattr(node, "handlers", ()), *getattr(node, "cases", ())):
+            yield from _functions(clause.body)
+        yield from _functions(getattr(node, "orelse", ()))
+        yield from _functions(getattr(node, "finalbody", ()))
+
+
+def _cut(lines: Lines, node: ast.FunctionDef | ast.AsyncFunctionDef) -> Optional[Cut]:
+    """Say where a body stands, if it has lines of its own and Python says where they end."""
+    first, last = node.body[0], node.body[-1]
+    end_line, end_column = getattr(last, "end_lineno", None), getattr(last, "end_col_offset", None)
+    if end_line is None or end_column is None:
+        return None
+    decorators = getattr(first, "decorator_list", ())
+    first_line = min([first.lineno, *(decorator.lineno for decorator in decorators)])
+    start, end = lines.start(first_line), lines.start(end_line + 1)
+    before = b"" if decorators else lines.data[start : start + first.col_offset]
+    after = lines.data[lines.start(end_line) + end_column : end]
+    continued = lines.data[:start].rstrip(b"\r\n").endswith(b"\\") or after.rstrip().endswith(b"\\")
+    return Cut(start, end) if first_line > node.lineno and not before.strip() and not continued else None

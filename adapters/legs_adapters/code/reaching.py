@@ -1,0 +1,136 @@
+"""Reaching definitions: for every place that is read, the assignments that its value can come from.
+
+``losses["im"] = x`` and ``self.x = y`` are places of their own and also belong to the whole (``losses``, ``self``);
+``losses.append(x)`` adds to the whole.
+"""
+
+from __future__ import annotations
+
+from typing import Dict, FrozenSet, List, Optional, Sequence, Set, Tuple
+
+import libcst as cst
+
+from legs_adapters.code.syntax import walk_expressions
+
+__all__ = ["Definition", "Env", "Reaching", "join"]
+
+
+class Definition:
+    """One way in which a place got its value.
+
+    Attributes:
+        place: ``x``, ``self.x`` or ``losses['im']``.
+        kind: "assign", "augment" (``x += v``), "element" (of a loop, or of what is unpacked), "part" (of such an
+            element that is unpacked in its turn), "parameter", "import", "function", "class", "mutate"
+            (``x.append(v)``), "store" (``x[...] = v``, seen from ``x``), "with", "inplace" (``x.mul_(v)``).
+        node: the statement, parameter or expression that did it.
+        value: where the value comes from, if that is an expression.
+        index: which element of the value, where it is unpacked and known.
+        key: for a store under a literal key: the key.
+        order: which definition of its function it is, in the order of the source.
+    """
+
+    __slots__ = ("index", "key", "kind", "node", "order", "place", "value")
+
+    def __init__(
+        self,
+        place: str,
+        kind: str,
+        node: cst.CSTNode,
+        value: Optional[cst.CSTNode] = None,
+        index: Optional[int] = None,
+        key: object = None,
+    ) -> None:
+        self.place = place
+        self.kind = kind
+        self.node = node
+        self.value = value
+        self.index = index
+        self.key = key
+        self.order = 0
+
+
+Env = Dict[str, FrozenSet[Definition]]
+
+
+def join(envs: Sequence[Optional[Env]]) -> Optional[Env]:
+    """Return what may stand in each place after one of several ways; None where none of them goes on."""
+    alive = [env for env in envs if env is not None]
+    if not alive:
+        return None
+    joined = dict(alive[0])
+    for env in alive[1:]:
+        for place, definitions in env.items():
+            joined[place] = joined[place] | definitions if place in joined else definitions
+    return joined
+
+
+class Reaching:
+    """The definitions of one function body, and which of them reach each use.
+
+    Attributes:
+        definitions: every definition by place, in source order: what a nested function sees.
+    """
+
+    def __init__(self) -> None:
+        self.definitions: Dict[str, List[Definition]] = {}
+        self._reaching: Dict[int, Set[Definition]] = {}
+        self._names: Dict[int, List[Env]] = {}
+        self._made: Dict[Tuple[int, str, str], Definition] = {}
+
+    def reaching(self, node: cst.CSTNode) -> FrozenSet[Definition]:
+        """Return the definitions that this use of a place can come from; empty for what is not local."""
+        return frozenset(self._reaching.get(id(node), ()))
+
+    def names_at(self, node: cst.CSTNode, place: str) -> FrozenSet[Definition]:
+        """Return the definitions of a place that reach a call or an operation, whether or not it reads it."""
+        found: Set[Definition] = set()
+        for env in self._names.get(id(node), ()):
+            found |= env.get(place, frozenset())
+        return frozenset(found)
+
+    def _define(
+        self,
+        place: str,
+        kind: str,
+        node: cst.CSTNode,
+        value: Optional[cst.CSTNode] = None,
+        index: Optional[int] = None,
+        key: object = None,
+    ) -> Definition:
+        known = (id(node), place, kind)
+        if known not in self._made:
+            self._made[known] = Definition(place, kind, node, value, index, key)
+            self._made[known].order = len(self._made)
+            self.definitions.setdefault(place, []).append(self._made[known])
+        return self._made[known]
+
+    @staticmethod
+    def _bind(env: Env, definition: Definition) -> None:
+        place = definition.place
+        for other in [other for other in env if other.startswith((place + ".", place + "["))]:
+            del env[other]
+        env[place] = frozenset([definition])
+
+    @staticmethod
+    def _add(env: Env, definition: Definition) -> None:
+        env[definition.place] = env.get(definition.place, frozenset()) | {definition}
+
+    def unchanged(self, *nodes: cst.CSTNode) -> bool:
+        """Return whether the names in expressions mean the same all through the body, once they have been read here."""
+        for part in (part for node in nodes for part in walk_expressions(node)):
+            if isinstance(part, cst.Name):
+                known = self.reaching(part)
+                everywhere = [d for d in self.definitions.get(part.value, []) if d.kind != "store"]
+                if known and not set(everywhere) <= known:
+                    return False
+        return True
+
+    def unchanged_at(self, call: cst.CSTNode, *nodes: cst.CSTNode) -> bool:
+        """Return whether names that were read in expressions mean the same at a call further down."""
+        return all(
+            self.names_at(call, part.value) == self.reaching(part)
+            for node in nodes
+            for part in walk_expressions(node)
+            if isinstance(part, cst.Name) and self.reaching(part)
+        )

@@ -1,0 +1,88 @@
+"""A checkout and its files as they stand on disk: bytes, and what Python reads in them."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from legs_loss import LegsError
+
+__all__ = ["BOM", "Source", "Unreadable", "check_root", "decode", "read_source"]
+
+BOM = b"\xef\xbb\xbf"
+
+_CODING = re.compile(rb"^[ \t\f]*#.*?coding[:=][ \t]*([-\w.]+)")
+_UTF8_NAMES = {"utf8", "utf-8", "utf_8", "u8", "utf8-sig", "utf-8-sig", "ascii", "us-ascii"}
+
+
+@dataclass(frozen=True)
+class Source:
+    """One Python file, as it stands on disk.
+
+    Attributes:
+        path: relative to the root, posix separators.
+        data: its exact bytes.
+        text: what Python reads: decoded, without a byte order mark, line ends as they are.
+    """
+
+    path: str
+    data: bytes
+    text: str
+
+    @property
+    def bom(self) -> bytes:
+        """The byte order mark, if the file starts with one."""
+        return BOM if self.data.startswith(BOM) else b""
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    """A file that was left because it cannot be read as Python: reported, never fatal."""
+
+    path: str
+    reason: str
+
+
+def check_root(path: str | os.PathLike[str]) -> Path:
+    """Return the folder to work in, absolute.
+
+    Raises:
+        LegsError: it is not a folder, or it is the root of the file system.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        what = "is a file: give the folder of the checkout" if root.exists() else "does not exist"
+        raise LegsError(f"{path} {what}")
+    root = root.resolve()
+    if root == root.parent:
+        raise LegsError(f"{root} is the root of the file system: give the folder of one checkout")
+    return root
+
+
+def read_source(root: Path, path: str) -> Source | Unreadable:
+    """Read one file; what cannot be read as UTF-8 is returned with its reason."""
+    try:
+        data = (root / path).read_bytes()
+    except OSError as error:
+        return Unreadable(path, f"cannot be read: {error.strerror}")
+    return decode(path, data)
+
+
+def decode(path: str, data: bytes) -> Source | Unreadable:
+    """Decode a file's bytes as Python would, if it is UTF-8."""
+    for line in data[len(BOM) if data.startswith(BOM) else 0 :].split(b"\n")[:2]:
+        match = _CODING.match(line)
+        if match is not None:
+            name = match.group(1).decode("ascii", "replace").lower()
+            if name not in _UTF8_NAMES:
+                return Unreadable(path, f"not UTF-8 (it declares {name})")
+            break
+        if line.strip() and not line.lstrip().startswith(b"#"):
+            break
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        return Unreadable(path, f"not UTF-8 (byte {error.start})")
+    return Source(path, data, text)

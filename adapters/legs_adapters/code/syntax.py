@@ -1,0 +1,266 @@
+"""Small questions to a LibCST tree: what is this node called, which words are in its name, which constant is it."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+from typing import Any, Dict, FrozenSet, Iterable, Iterator, List, Optional, Set, Tuple
+
+import libcst as cst
+
+__all__ = [
+    "arguments",
+    "attribute_chain",
+    "brief",
+    "call_name",
+    "children",
+    "code",
+    "constant",
+    "dotted",
+    "key_of",
+    "loops_around",
+    "one_line",
+    "path_of",
+    "root_of",
+    "same",
+    "strip_parens",
+    "walk_all",
+    "walk_expressions",
+    "word_set",
+    "words",
+    "words_in",
+    "words_under",
+]
+
+_CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+_EMPTY = cst.Module(body=[])
+_MISSING = object()
+_NODES: Dict[type, bool] = {}
+_FIELDS: Dict[type, Tuple[str, ...]] = {}
+
+
+def code(node: cst.CSTNode) -> str:
+    """Return a node's source text, exactly."""
+    return _EMPTY.code_for_node(node)
+
+
+def one_line(node: cst.CSTNode) -> str:
+    """Return a node's source text on one line."""
+    return " ".join(code(node).split())
+
+
+def brief(node: cst.CSTNode) -> str:
+    """Return a node's source text on one line, cut at 60 characters: for a message."""
+    text = one_line(node)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def dotted(node: cst.CSTNode) -> Optional[str]:
+    """Return ``a.b.c`` for a chain of names, else None."""
+    if isinstance(node, cst.Name):
+        return node.value
+    if isinstance(node, cst.Attribute):
+        base = dotted(node.value)
+        return None if base is None else f"{base}.{node.attr.value}"
+    return None
+
+
+def word_set(text: str) -> FrozenSet[str]:
+    """Return the words of a text as a set: a long list that is pleasant to read."""
+    return frozenset(text.split())
+
+
+def words(name: str) -> Tuple[str, ...]:
+    """Return the words of an identifier, lower case: ``gtImage_2`` is gt, image, 2."""
+    return tuple(word.lower() for word in _CAMEL.findall(name))
+
+
+def constant(node: Optional[cst.CSTNode], default: Any = None) -> Any:
+    """Return the value of a literal (also a negative number, a tuple of literals), else ``default``."""
+    if node is None:
+        return default
+    if isinstance(node, cst.SimpleString):
+        try:
+            return node.evaluated_value
+        except Exception:
+            return default
+    if isinstance(node, (cst.Integer, cst.Float)):
+        return ast.literal_eval(node.value)
+    if isinstance(node, cst.Name) and node.value in ("None", "True", "False"):
+        return {"None": None, "True": True, "False": False}[node.value]
+    if isinstance(node, cst.UnaryOperation) and isinstance(node.operator, cst.Minus):
+        value = constant(node.expression, _MISSING)
+        return -value if isinstance(value, (int, float)) else default
+    if isinstance(node, (cst.Tuple, cst.List)):
+        values = [constant(element.value, _MISSING) for element in node.elements]
+        return default if _MISSING in values else tuple(values)
+    return default
+
+
+def key_of(node: cst.CSTNode) -> Any:
+    """Return the literal key of ``x["key"]`` or ``x[0]``, else None."""
+    if isinstance(node, cst.Subscript) and len(node.slice) == 1:
+        index = node.slice[0].slice
+        if isinstance(index, cst.Index) and index.star is None:
+            value = constant(index.value)
+            return value if isinstance(value, (str, int)) and not isinstance(value, bool) else None
+    return None
+
+
+def path_of(node: cst.CSTNode) -> Optional[str]:
+    """Return one spelling for a place that can be assigned: ``x``, ``self.x``, ``losses['im']``; else None."""
+    kind = type(node)
+    if kind is cst.Name:
+        return node.value  # type: ignore[attr-defined]
+    if kind is cst.Attribute:
+        base = path_of(node.value)  # type: ignore[attr-defined]
+        return None if base is None else f"{base}.{node.attr.value}"  # type: ignore[attr-defined]
+    if kind is cst.Subscript:
+        base, key = path_of(node.value), key_of(node)  # type: ignore[attr-defined]
+        return None if base is None or key is None else f"{base}[{key!r}]"
+    return None
+
+
+def attribute_chain(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    """Yield the node, then what it is an attribute, an item or a call of, down to the root."""
+    while True:
+        yield node
+        if isinstance(node, (cst.Attribute, cst.Subscript)):
+            node = node.value
+        elif isinstance(node, cst.Call):
+            node = node.func
+        else:
+            return
+
+
+def root_of(node: cst.Name | cst.Attribute) -> str:
+    """Return the last name of ``a.b``: b."""
+    return node.value if isinstance(node, cst.Name) else node.attr.value
+
+
+def call_name(node: cst.Call) -> str:
+    """Return the last name of what is called: ``f`` of ``a.b.f(x)``; empty where it has none."""
+    if isinstance(node.func, cst.Name):
+        return node.func.value
+    if isinstance(node.func, cst.Attribute):
+        return node.func.attr.value
+    return ""
+
+
+def arguments(node: cst.Call) -> Tuple[List[cst.BaseExpression], Dict[str, cst.BaseExpression], bool]:
+    """Return positional arguments, keyword arguments, and whether there is a ``*`` or ``**`` among them."""
+    positional: List[cst.BaseExpression] = []
+    keywords: Dict[str, cst.BaseExpression] = {}
+    starred = False
+    for arg in node.args:
+        if arg.star:
+            starred = True
+        elif arg.keyword is not None:
+            keywords[arg.keyword.value] = arg.value
+        else:
+            positional.append(arg.value)
+    return positional, keywords, starred
+
+
+def strip_parens(text: str) -> str:
+    """Return text without the pairs of brackets around all of it."""
+    text = text.strip()
+    while text.startswith("(") and text.endswith(")"):
+        depth = 0
+        for i, letter in enumerate(text):
+            depth += (letter == "(") - (letter == ")")
+            if depth == 0 and i < len(text) - 1:
+                return text
+        text = text[1:-1].strip()
+    return text
+
+
+def children(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    """Yield a node's direct children in source order, without white space and punctuation."""
+    for name in _fields(type(node)):
+        value = getattr(node, name)
+        kind = type(value)
+        if kind is list or kind is tuple:
+            for item in value:
+                if _is_node(type(item)):
+                    yield item
+        elif _is_node(kind):
+            yield value
+
+
+def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    """Yield a node and every node under it, but not the bodies of functions and classes under it."""
+    stack = [node]
+    while stack:
+        node = stack.pop()
+        yield node
+        below = [
+            child for child in children(node) if type(child) is not cst.FunctionDef and type(child) is not cst.ClassDef
+        ]
+        stack.extend(reversed(below))
+
+
+def loops_around(root: cst.CSTNode, node: cst.CSTNode) -> List[cst.CSTNode]:
+    """Return the loops that an expression stands in, the innermost first."""
+    stack: List[Tuple[cst.CSTNode, Tuple[cst.CSTNode, ...]]] = [(root, ())]
+    while stack:
+        part, loops = stack.pop()
+        if part is node:
+            return list(reversed(loops))
+        inner = (*loops, part) if isinstance(part, (cst.For, cst.While)) else loops
+        stack.extend((child, inner) for child in children(part))
+    return []
+
+
+def _is_node(kind: type) -> bool:
+    """Whether a class is one of LibCST's nodes: to ask isinstance of every node costs more than all the rest."""
+    if kind not in _NODES:
+        _NODES[kind] = issubclass(kind, cst.CSTNode)
+    return _NODES[kind]
+
+
+def _fields(kind: type) -> Tuple[str, ...]:
+    if kind not in _FIELDS:
+        _FIELDS[kind] = tuple(
+            field.name
+            for field in dataclasses.fields(kind)
+            if not field.name.startswith(("whitespace", "lpar", "rpar", "lbrac", "rbrac"))
+            and field.name
+            not in ("leading_lines", "trailing_whitespace", "header", "footer", "comma", "equal", "semicolon")
+        )
+    return _FIELDS[kind]
+
+
+def same(a: cst.CSTNode, b: cst.CSTNode) -> bool:
+    """Return whether two expressions are written alike, brackets and spaces aside."""
+    return _squeeze(a) == _squeeze(b)
+
+
+def _squeeze(node: cst.CSTNode) -> str:
+    return re.sub(r"\s+|#[^\n]*", "", strip_parens(code(node)))
+
+
+def walk_all(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    """Yield a node and every node under it, in no particular order."""
+    stack = [node]
+    while stack:
+        part = stack.pop()
+        yield part
+        stack.extend(children(part))
+
+
+def words_under(node: cst.CSTNode) -> Set[str]:
+    """Return the words of the names and strings in an expression."""
+    return words_in(walk_all(node))
+
+
+def words_in(nodes: Iterable[cst.CSTNode]) -> Set[str]:
+    """Return the words of those nodes that are names or strings."""
+    found: Set[str] = set()
+    for node in nodes:
+        if isinstance(node, cst.Name):
+            found.update(words(node.value))
+        elif isinstance(node, cst.SimpleString) and isinstance(constant(node), str):
+            found.update(words(constant(node)))
+    return found

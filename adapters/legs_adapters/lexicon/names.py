@@ -1,0 +1,56 @@
+"""Which kind of picture a name speaks of, and whether it speaks of a rendering or of a photograph."""
+
+from __future__ import annotations
+
+from typing import Optional
+
+from legs_adapters.code.syntax import words
+from legs_adapters.lexicon.words import (
+    HELD_IN,
+    KIND_OF,
+    KINDS,
+    LAID_OVER,
+    LIT_BY,
+    OF_ONE,
+    OF_PICTURES,
+    PICTURES,
+    RENDER,
+    TARGET,
+    WHICH,
+)
+
+__all__ = ["kind_of_words", "role_of_words"]
+
+
+def kind_of_words(name: str) -> Optional[str]:
+    """Return the kind that a name speaks of; the more special where it has several."""
+    spoken = words(name)
+    if "and" in spoken:  # of what image_and_depth holds the one is no depth, the other no image
+        at = spoken.index("and")
+        both = {kind_of_words("_".join(part)) for part in (spoken[:at], spoken[at + 1 :])}
+        if "image" in both and len(both - {None}) > 1:
+            return None
+    if "no" in spoken[1:]:  # image_no_sh
+        spoken = spoken[: spoken.index("no", 1)]
+    said = [word for word in spoken if not word.isdigit() and word not in HELD_IN | WHICH]
+    if said and said[-1] in LAID_OVER:
+        return "mask"  # of whatever: laid over an image, it leaves an image
+    kinds = {KIND_OF[word] for word in spoken if word in KIND_OF}
+    if "image" in kinds:  # sky_rgb, render_sh
+        if spoken[-1] in LIT_BY and "image" in spoken and TARGET.intersection(spoken):
+            spoken = spoken[:-1]  # original_image_train_light
+        if spoken[-1] in PICTURES:
+            spoken = tuple(word for word in spoken if word not in OF_ONE)  # offset_image, not image_offset
+        kinds = {KIND_OF[word] for word in spoken if word in KIND_OF and word not in OF_PICTURES}
+        if "base" in spoken or "precomp" in spoken:  # rendered_base_color; colors_precomp, a colour for each Gaussian
+            return "parameter"
+    return min(kinds, key=KINDS.index) if kinds else None
+
+
+def role_of_words(name: str) -> Optional[str]:
+    """Return the role that a name speaks of, if it speaks of one."""
+    found = set(words(name))
+    target, render = bool(found & TARGET), bool(found & RENDER)
+    if target and render:  # rendered_gt, gt_pred: only a closer look can tell
+        return None
+    return "target" if target else "render" if render else None

@@ -1,0 +1,129 @@
+"""Which calls a value came out of, whatever the names are that it had on the way: what the makers' names are for."""
+
+from __future__ import annotations
+
+from typing import List, Optional, Set
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.program import Program
+from legs_adapters.code.reaching import Definition
+from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, word_set, words
+from legs_adapters.lexicon.names import role_of_words
+
+__all__ = ["is_of_mesh", "is_rendering"]
+
+_KEEPS = word_set(
+    """
+    array as_tensor astype cat clamp clip clone contiguous cpu cuda detach flip float from_numpy half numpy permute
+    reshape squeeze stack tensor to transpose type unsqueeze view
+    """
+)
+_MODULES = word_set("torch np numpy")
+_MESH_RASTERIZERS = ("nvdiffrast.", "kaolin.render.", "pytorch3d.renderer")
+
+
+def is_rendering(function: Function, node: cst.CSTNode) -> bool:
+    """Whether a value came out of functions that render, each of the ways that it can have come."""
+    makers = _makers(function, node, set())
+    return bool(makers) and all(maker is not None and _renders(maker) for maker in makers)
+
+
+def is_of_mesh(program: Program, function: Function, node: cst.CSTNode) -> bool:
+    """Whether a value can have come out of a rasterizer of triangles, or is sampled from their texture."""
+    return any(
+        _draws_mesh(maker) or _rasterizes_mesh(program, function, maker, 0)
+        for maker in _makers(function, node, set())
+        if maker is not None
+    )
+
+
+def _rasterizes_mesh(program: Program, function: Function, call: cst.Call, depth: int) -> bool:
+    """Whether a call is of a rasterizer of triangles, or of a method that calls one."""
+    for reference in program.resolve(function, call.func):
+        if reference.kind in ("external", "made by") and str(reference.target).startswith(_MESH_RASTERIZERS):
+            return True
+        callee = reference.target
+        if depth == 0 and isinstance(callee, Function) and not reference.guess:
+            draws = [inner for inner in callee.flow.calls if "raster" in call_name(inner).lower()]
+            if draws and all(_rasterizes_mesh(program, callee, inner, depth + 1) for inner in draws):
+                return True
+            if not draws and _samples_texture(callee):
+                return True
+    return False
+
+
+def _samples_texture(function: Function) -> bool:
+    """Whether what it returns is ``grid_sample(texture, uv)``."""
+    makers = [maker for value in function.flow.returns for maker in _makers(function, value, set())]
+    return bool(makers) and all(
+        maker is not None
+        and call_name(maker) == "grid_sample"
+        and len(arguments(maker)[0]) > 1
+        and "uv" in words(code(arguments(maker)[0][1]))
+        for maker in makers
+    )
+
+
+def _draws_mesh(call: cst.Call) -> bool:
+    """``render_mesh(...)``, ``mesh_renderer(...)``."""
+    spoken = words(call_name(call))
+    return "mesh" in spoken and any(word.startswith(("render", "raster")) for word in spoken)
+
+
+def _renders(call: cst.Call) -> bool:
+    name = call_name(call)
+    return words(name)[:1] in (("render",), ("rendering",)) and role_of_words(name) == "render"
+
+
+def _makers(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> List[Optional[cst.Call]]:
+    """The calls that a value comes out of as it is, but for its type, its axes and its range; None for anything else.
+
+    What depends on itself has no maker there.
+    """
+    if node is None:
+        return [None]
+    if id(node) in seen:
+        return []
+    seen.add(id(node))
+    if isinstance(node, cst.Name):
+        definitions = sorted(function.flow.reaching(node), key=lambda d: d.order)
+        filled = any(definition.kind == "mutate" for definition in definitions)
+        parts = [_value(definition) for definition in definitions if not (filled and _is_empty(definition.value))]
+        return [maker for part in parts for maker in _makers(function, part, seen)] if parts else [None]
+    if isinstance(node, (cst.Subscript, cst.Attribute)):
+        part = node.attr.value if isinstance(node, cst.Attribute) else str(key_of(node))
+        return [None] if role_of_words(part) == "target" else _makers(function, node.value, seen)
+    if isinstance(node, (cst.ListComp, cst.GeneratorExp)):
+        return _makers(function, node.elt, seen)
+    if isinstance(node, cst.BinaryOperation) and constant(node.right) is not None:
+        return _makers(function, node.left, seen)
+    if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Multiply):  # image * mask
+        return [*_makers(function, node.left, seen), *_makers(function, node.right, seen)]
+    if isinstance(node, cst.Call) and call_name(node) in _KEEPS:
+        base = node.func.value if isinstance(node.func, cst.Attribute) else None
+        if base is None or (isinstance(base, cst.Name) and base.value in _MODULES):
+            return _makers(function, arguments(node)[0][0] if arguments(node)[0] else None, seen)
+        return _makers(function, base, seen)
+    return [node if isinstance(node, cst.Call) else None]
+
+
+def _is_empty(node: Optional[cst.CSTNode]) -> bool:
+    return isinstance(node, cst.List) and not node.elements
+
+
+def _value(definition: Definition) -> Optional[cst.CSTNode]:
+    """What is assigned, or what a loop goes over."""
+    value = definition.value
+    if definition.kind == "mutate" and isinstance(value, cst.Call):  # renderings.append(image)
+        given = arguments(value)[0]
+        return given[0] if call_name(value) == "append" and given else None
+    if definition.kind == "element" and isinstance(value, cst.Call):
+        given, index = arguments(value)[0], definition.index
+        if call_name(value) == "enumerate" and given:
+            return given[0] if index == 1 else None
+        if call_name(value) == "zip" and index is not None:
+            return given[index] if index < len(given) else None
+        return None if index else value  # what renders returns the rendering first
+    return value if definition.kind in ("assign", "element") else None

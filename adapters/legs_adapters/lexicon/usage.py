@@ -1,0 +1,86 @@
+"""What the code around an expression shows of it, whatever its name says: a mask, a crop, a rendering."""
+
+from __future__ import annotations
+
+from typing import List
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.syntax import call_name, constant, root_of, same, walk_expressions, words
+from legs_adapters.lexicon.names import kind_of_words, role_of_words
+
+__all__ = [
+    "are_neighbours",
+    "draws",
+    "is_asked_for",
+    "is_box",
+    "is_cropped",
+    "is_loaded",
+    "is_masked",
+    "is_taken_from_one",
+]
+
+_GAUSSIANS = {"gaussians", "gaussian", "splats"}
+_LOADERS = {"loader", "dataloader"}
+_CAMERAS = {"cam", "camera", "view", "viewpoint"}
+
+
+def draws(values: List[cst.BaseExpression]) -> bool:
+    """Whether a function is given the Gaussians and a camera, ``imlsplat(gaussians, viewpoint_cam, background)``."""
+    names = [root_of(value) for value in values if isinstance(value, (cst.Name, cst.Attribute))]
+    spoken = [set(words(name)) for name in names]
+    return any(each & _GAUSSIANS for each in spoken) and any(each & _CAMERAS for each in spoken)
+
+
+def is_box(function: Function, node: cst.CSTNode) -> bool:
+    """Whether a kernel is all ones, which blurs."""
+    found = function.flow.definitions.get(node.value, []) if isinstance(node, cst.Name) else []
+    made = [definition.value for definition in found if definition.kind == "assign"]
+    return bool(made) and all(isinstance(value, cst.Call) and call_name(value) == "ones" for value in made)
+
+
+def is_cropped(function: Function, node: cst.Name) -> bool:
+    """Whether a name stands for a part of a picture, ``image[:, :half]``, and for nothing else."""
+    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
+    return len(made) == len(function.flow.reaching(node)) and all(
+        isinstance(value, cst.Subscript) and all(isinstance(part.slice, cst.Slice) for part in value.slice)
+        for value in made
+    )
+
+
+def is_masked(function: Function, node: cst.Name) -> bool:
+    """Whether a name that speaks of an image, too, stands for a product and for nothing else."""
+    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
+    products = [v for v in made if isinstance(v, cst.BinaryOperation) and isinstance(v.operator, cst.Multiply)]
+    says_image = any(kind_of_words(word) == "image" for word in words(node.value))
+    return says_image and bool(made) and len(products) == len(made)
+
+
+def is_taken_from_one(function: Function, node: cst.Name) -> bool:
+    """Whether ``1 - objects`` stands somewhere: whatever it is called, it is a mask."""
+    return any(
+        isinstance(part, cst.BinaryOperation)
+        and isinstance(part.operator, cst.Subtract)
+        and constant(part.left) == 1
+        and same(part.right, node)
+        for part in function.flow.expressions
+    )
+
+
+def are_neighbours(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:
+    """``x[1:] - x[:-1]``: a picture's own slope."""
+    return isinstance(left, cst.Subscript) and isinstance(right, cst.Subscript) and same(left.value, right.value)
+
+
+def is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
+    """Whether a dictionary is what a data loader hands out, and the entry its own: nothing has rendered it."""
+    made = [d for d in function.flow.reaching(node) if d.kind != "store" or d.key in (None, key)]
+    sources = [part for d in made if d.kind == "element" and d.value is not None for part in walk_expressions(d.value)]
+    loaders = [part for part in sources if isinstance(part, cst.Name) and set(words(part.value)) & _LOADERS]
+    return bool(loaders) and all(d.kind == "element" for d in made)
+
+
+def is_asked_for(key: str) -> bool:
+    """``images_output``: nothing but that it is what comes out says that it is a rendering."""
+    return all(role_of_words(word) != "render" or word in ("output", "outputs") for word in words(key))

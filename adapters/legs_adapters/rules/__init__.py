@@ -1,0 +1,1 @@
+"""The reasons why an L1 term is left unweighted."""

@@ -1,0 +1,167 @@
+"""Tell the purpose of a backward pass by the optimiser that steps after it: of Gaussians, poses, an embedding, none.
+
+An L1 whose gradients move a pose alone is tracking; one that moves an embedding alone fits a view for evaluation; one
+whose gradients are read and thrown away scores Gaussians. Only where something else moves is it training.
+"""
+
+from __future__ import annotations
+
+from typing import Dict, List, Optional, Set
+
+import libcst as cst
+
+from legs_adapters.code.calls import likely_calls
+from legs_adapters.code.module import Function
+from legs_adapters.code.program import Program
+from legs_adapters.code.syntax import attribute_chain, call_name, loops_around, walk_all, words
+from legs_adapters.lexicon.optimised import EMBEDDINGS, GAUSSIANS, MODELS, POSES, Optimised
+from legs_adapters.tensors.backward import Training
+from legs_adapters.tensors.steps import (
+    MAKES_OPTIMISERS,
+    calls_in,
+    gradients_read,
+    has_step,
+    is_backward,
+    is_step,
+    may_step,
+    only_reads_gradients,
+)
+
+__all__ = ["Purposes"]
+
+_DEPTH = 3
+
+
+class Purposes:
+    """Tells for the expressions of one program which purpose their backward pass has."""
+
+    def __init__(self, program: Program, training: Training) -> None:
+        self.program = program
+        self.training = training
+        self._optimised = Optimised(program)
+
+    def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[str]:
+        """Return "tracking", "evaluation" or "scoring" for an expression that does not train; None where it may."""
+        calls = {id(call): call for call in function.flow.calls}
+        if not any(is_backward(call) for call in calls.values()):
+            return self._of_callers(function, depth)
+        scopes = [*loops_around(function.body, node), function.body]
+        stepped = False
+        for scope in scopes:
+            inside = list(calls_in(scope, node, calls))
+            stepped = stepped or any(is_step(call) for call, _ in inside)
+            if not any(is_backward(call) for call, _ in inside):
+                continue
+            optimisers = [call for call, elsewhere in inside if is_step(call) and not elsewhere]
+            if optimisers:
+                spoken = [self._optimised.words(function, call) for call in optimisers]
+                if all(some & POSES and not some & MODELS for some in spoken):
+                    return "tracking"
+                if all(some & EMBEDDINGS and not some & MODELS for some in spoken):
+                    return "evaluation"
+                return None
+            here = {id(call) for call, _ in inside}
+            if self._is_stepped_later(function, node, here, calls):
+                continue
+            asked = [call for call in function.flow.calls if id(call) in here]
+            for_good = self._nobody_steps(function, 0)
+            if only_reads_gradients(scope, asked, for_good) or (for_good and self._read_by_callers(function)):
+                return "scoring"
+            if self._emptied_by_callers(function):
+                return "scoring"
+            if self._reads_its_own(function, scope):
+                return "scoring"
+        # At a module's top nobody else can take the step.
+        return "scoring" if stepped or function.parent is None else None
+
+    @staticmethod
+    def _is_stepped_later(function: Function, node: cst.CSTNode, here: Set[int], calls: Dict[int, cst.Call]) -> bool:
+        """Whether a loop further out has a step, and no backward pass but these: one of a batch of views."""
+        around = list(calls_in(function.body, node, calls))
+        other = [call for call, elsewhere in around if is_backward(call) and not elsewhere and id(call) not in here]
+        return not other and any(is_step(call) and not elsewhere for call, elsewhere in around)
+
+    def _nobody_steps(self, function: Function, depth: int) -> bool:
+        """Whether neither a function nor what calls it, as far as that is known, can step."""
+        if may_step(function.flow.calls):
+            return False
+        if function.parent is None:
+            return True
+        callers = self._callers(function)
+        return bool(callers) and depth < _DEPTH and all(self._nobody_steps(c, depth + 1) for c in callers)
+
+    def _callers(self, function: Function) -> List[Function]:
+        return list(dict.fromkeys(caller for caller, _ in likely_calls(self.program, function)))
+
+    def _emptied_by_callers(self, function: Function) -> bool:
+        """Whether each caller has the gradients read, and sets them to nothing, before anything can step."""
+        calls = list(likely_calls(self.program, function))
+        return bool(calls) and all(self._is_emptied_after(caller, call) for caller, call in calls)
+
+    def _is_emptied_after(self, caller: Function, call: cst.Call) -> bool:
+        """``accumulate(scene)``, then ``gaussians.prune(count)``, then ``optimizer.zero_grad()``."""
+        at = caller.place(call).last_line
+        after = sorted((caller.place(other).line, i) for i, other in enumerate(caller.flow.calls))
+        read = False
+        for line, i in after:
+            later = caller.flow.calls[i]
+            if line <= at:
+                continue
+            if call_name(later) == "zero_grad":
+                return read
+            called = [r.target for r in self.program.resolve(caller, later.func) if isinstance(r.target, Function)]
+            if may_step([later]) or any(map(has_step, called)):
+                return False
+            read = read or any("grad" in each.text and gradients_read(list(walk_all(each.body))) for each in called)
+        return False
+
+    def _read_by_callers(self, function: Function) -> bool:
+        """Whether a caller also calls what reads gradients: ``accumulate(scene)``, then ``gaussians.prune(count)``."""
+        called = self._called(function, *self._callers(function))
+        read = any("grad" in each.text and gradients_read(list(walk_all(each.body))) for each in called)
+        return read and not any(map(has_step, called))
+
+    def _called(self, *functions: Function) -> List[Function]:
+        """What functions call: a step may stand there under any name, ``gaussians.post_backward()``."""
+        called = [
+            reference.target
+            for function in functions
+            for call in function.flow.calls
+            for reference in self.program.resolve(function, call.func)
+        ]
+        return [each for each in called if isinstance(each, Function)]
+
+    def _reads_its_own(self, function: Function, scope: cst.CSTNode) -> bool:
+        """Whether the gradients that are read are of models made here, which nobody else gets to step on."""
+        roots = [list(attribute_chain(part))[-1] for part in gradients_read(list(walk_all(scope)))]
+        names = [root for root in roots if isinstance(root, cst.Name)]
+        given = {
+            part.value for value in function.flow.returns for part in walk_all(value) if isinstance(part, cst.Name)
+        }
+        own = bool(roots) and len(names) == len(roots) and not given & {name.value for name in names}
+        own = own and all(self._made_here(function, name) for name in names)
+        return own and not any(map(has_step, self._called(function)))
+
+    def trains_its_own(self, function: Function) -> bool:
+        """Whether it makes a Gaussian model and steps that model's optimiser: training, wherever the file lies."""
+        steps = [call.func for call in function.flow.calls if is_step(call)]
+        stepped = [step.value for step in steps if isinstance(step, cst.Attribute)]
+        return any(
+            isinstance(optimiser, cst.Attribute)
+            and optimiser.attr.value in MAKES_OPTIMISERS
+            and isinstance(optimiser.value, cst.Name)
+            and self._made_here(function, optimiser.value)
+            for optimiser in stepped
+        )
+
+    def _made_here(self, function: Function, model: cst.Name) -> bool:
+        """``gaussians = GaussianModel(3)``, whatever is stored in it then."""
+        made = [definition.value for definition in function.flow.reaching(model) if definition.kind != "store"]
+        return bool(made) and all(isinstance(v, cst.Call) and set(words(call_name(v))) & GAUSSIANS for v in made)
+
+    def _of_callers(self, function: Function, depth: int) -> Optional[str]:
+        sites = self.training.sites.get(function, [])
+        if not sites or depth >= _DEPTH:
+            return None
+        purposes = {self.purpose(caller, call, depth + 1) for caller, call in sites}
+        return purposes.pop() if len(purposes) == 1 else None

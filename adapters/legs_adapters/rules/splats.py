@@ -1,0 +1,89 @@
+"""Whether a loss is about Gaussian splatting at all, going by the words of the files around it."""
+
+from __future__ import annotations
+
+import re
+from typing import Dict, Set
+
+import libcst as cst
+
+from legs_adapters.code.module import Function, Module
+from legs_adapters.code.program import Program
+from legs_adapters.code.syntax import code, words
+from legs_adapters.rules.no_pictures import made_of
+from legs_adapters.tensors.backward import Training
+from legs_adapters.terms.forms import Form
+
+__all__ = ["Splats"]
+
+_SPLATS = re.compile(
+    r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_gaussian|render_pkg|3dgs|surfel", re.I
+)
+_GAUSSIANS = re.compile(r"splat|gaussians|gaussian_?(model|render|scene|raster)|diff_\w*raster|3dgs|surfel", re.I)
+_RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
+_FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
+
+
+class Splats:
+    """Tells for the functions of one program whether they are about Gaussian splatting."""
+
+    def __init__(self, program: Program, training: Training) -> None:
+        self.program = program
+        self.training = training
+        self._splats: Dict[str, bool] = {}
+
+    def about(self, function: Function, form: Form) -> bool:
+        """Return whether the term of a function is about splats: by its files, or by the rendering itself."""
+        return self._speaks_around(function) or self._rendered(function.module, function, form)
+
+    def _speaks_around(self, function: Function) -> bool:
+        """Whether the file, or a file that trains through it, is about Gaussian splatting: not a network for depth."""
+        seen: Set[Function] = set()
+        queue = [function]
+        while queue:
+            current = queue.pop()
+            if current in seen:
+                continue
+            seen.add(current)
+            speaks = self._speaks_of_splats(current.module.path) or self._takes_splats(current.module)
+            if speaks and self._runs_with(function.module, current.module):
+                return True
+            queue.extend(caller for caller, _ in self.training.sites.get(current, []))
+        return False
+
+    def _runs_with(self, module: Module, other: Module) -> bool:
+        """Whether what a function is called by, going by names, can be: it runs with it, or is near it."""
+        near = other.path.split("/")[0] == module.path.split("/")[0] or "/" not in module.path
+        return near or other.path in self.program.together(module)
+
+    def _rendered(self, module: Module, function: Function, form: Form) -> bool:
+        """Whether the rendering says so itself, or files beside it do, where the file is not about rays."""
+        sides = made_of(function, form)
+        names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
+        if _RAYS.search(module.text) or "mesh" in words(module.path.rpartition("/")[2]):
+            return False
+        if _FIELD.search(module.text):
+            return False
+        rendered = any(word.startswith(("render", "raster")) for word in names)
+        folder = module.path.rpartition("/")[0]
+        near = [path for path in self.program.sources if not folder or path.startswith(folder + "/")]
+        if rendered and folder:  # of what, if no Gaussians are near? A mesh is rasterized, too
+            top = folder.split("/")[0] + "/"
+            together = self.program.together(module)
+            near = [path for path in self.program.sources if path.startswith(top) or path in together]
+            near = [path for path in near if _GAUSSIANS.search(self.program.sources[path].text)]
+        return any(self._speaks_of_splats(path) for path in near)
+
+    def _takes_splats(self, module: Module) -> bool:
+        """Whether a file imports something Gaussian, ``GazeGaussianNet``, from one that speaks of splats."""
+        for node in module.top.flow.imports:
+            if isinstance(node, cst.ImportFrom) and "gaussian" in code(node).lower():
+                found = self.program.imported_from(module, node)
+                if found is not None and self._speaks_of_splats(found.path):
+                    return True
+        return False
+
+    def _speaks_of_splats(self, path: str) -> bool:
+        if path not in self._splats:
+            self._splats[path] = _SPLATS.search(self.program.sources[path].text) is not None
+        return self._splats[path]

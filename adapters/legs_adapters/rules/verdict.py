@@ -1,0 +1,189 @@
+"""The verdict on one form: a site, a term that is left with the reason, or a problem that a person must settle."""
+
+from __future__ import annotations
+
+import re
+from typing import Optional, Sequence, Tuple
+
+import libcst as cst
+
+from legs_adapters.code.calls import sure_calls
+from legs_adapters.code.module import Function
+from legs_adapters.code.parsing import Place
+from legs_adapters.code.syntax import code, one_line, same, walk_expressions
+from legs_adapters.lexicon.masks import is_rows, picked_from
+from legs_adapters.lexicon.meaning import swapped
+from legs_adapters.rules.analysis import Analysis
+from legs_adapters.rules.uses import Use
+from legs_adapters.tensors.layout import is_channels_last, lies_last
+from legs_adapters.terms.advice import advice, difference_of, is_torch_l1
+from legs_adapters.terms.error_maps import is_huber, shared_of
+from legs_adapters.terms.findings import Kept, Left, Problem, Site
+from legs_adapters.terms.forms import Form
+from legs_adapters.terms.sides import pair_of
+
+__all__ = ["Verdicts", "left"]
+
+_FORWARD = ("forward", "__call__")
+
+
+def left(function: Function, place: Place, reason: str) -> Left:
+    """Return what stands at a place as left for a reason."""
+    return Left(function.module.path, place.line, function.module.lines.text(place.line), reason)
+
+
+class Verdicts:
+    """Gives the verdicts on the forms of one program."""
+
+    def __init__(self, analysis: Analysis) -> None:
+        self.analysis = analysis
+
+    def of(self, function: Function, form: Form, place: Place, by_hand: bool) -> Site | Left | Problem:
+        """Return what becomes of a form; ``by_hand`` where a person says that it is the loss."""
+        pair = pair_of(self.analysis.meanings, function, form)
+        if not by_hand:
+            reason = (
+                "definition" if self._is_definition(function, form) else self.analysis.reasons.why(function, form, pair)
+            )
+            if reason is not None:
+                return left(function, place, reason)
+        target_first = swapped(pair.a, pair.b)
+        if target_first is None and not by_hand:
+            if not pair.speaks_of_images:
+                return left(function, place, "unknown")
+            sides = f"{one_line(pair.first)} and {one_line(pair.second)}"
+            why = f"cannot tell which of {sides} is the rendering and which the photograph"
+            return self.problem(function, form, place, why)
+        flipped = bool(target_first)
+        picked = None if pair.selection else self._picked(function, form)
+        if picked is not None:
+            form = _of_whole_pictures(form, *picked)
+            pair = pair._replace(first=form.first, second=form.second)
+        prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
+        if is_rows(self.analysis.meanings, function, pair.first) or is_rows(
+            self.analysis.meanings, function, pair.second
+        ):
+            why = "the images are lists of pixels there, of which there is no weight map"
+            return self.problem(function, form, place, why, flipped)
+        if is_huber(self.analysis.training, function, form):
+            return left(function, place, "huber")
+        if form.reduction == "signed":
+            difference = one_line(difference_of(form))
+            why = f"the difference {difference} was weighted where it was made, which l1_loss would lose"
+            return self.problem(function, form, place, why, flipped)
+        if form.reduction == "taken":
+            assert form.callee is not None
+            why = f"{one_line(form.callee)} takes the absolute value of the difference"
+            return self.problem(function, form, place, why, flipped)
+        if not form.direct and not function.flow.unchanged_at(form.call, form.first, form.second):
+            return self.problem(function, form, place, "the difference has a name of its own", flipped)
+        uses = self.analysis.uses.of(function, prediction, target)
+        others = [(use, use.purpose) for use in uses if use.purpose is not None]
+        if others and len(others) == len(uses):
+            return left(function, place, others[0][1])
+        unsettled = self.analysis.uses.unsettled(function, uses) if others else None
+        if unsettled is not None:  # its body cannot be both
+            first, purpose = others[0]
+            why = f"{function.name} also serves {purpose} at {first.where}"
+            why += f"; what it serves at {unsettled} cannot be told" if unsettled != first.where else ""
+            problem = self.problem(function, form, place, why, flipped)
+            return problem._replace(advice=problem.advice + _in_a_copy(function, uses))
+        shared = shared_of(self.analysis.training, function, form)
+        aside: Tuple[cst.Name, ...] = ()
+        if shared is not None and not shared.trains:
+            return left(function, place, "weighting" if self.analysis.training.touches(function) else "untrained")
+        if shared is not None and shared.loss:
+            form = form._replace(node=shared.loss[0], reduction="again")
+            place = function.place(form.node)
+        elif shared is not None and shared.aside:
+            aside = tuple(shared.aside)
+        elif shared is not None:
+            return self.problem(function, form, place, f"{one_line(form.node)} serves more than the loss", flipped)
+        last = self._is_channels_last(function, prediction, target, form.node)
+        last = last or (picked is not None and lies_last(function, picked[0]))
+        view = self.analysis.views.of(function, target, form.call)
+        stands = (function.module.path, place.line, place.column, place.last_line)
+        kept = tuple(self._kept(function, *other) for other in others)
+        return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside, kept)
+
+    @staticmethod
+    def _kept(function: Function, use: Use, purpose: str) -> Kept:
+        module, line = use.caller.module, use.caller.place(use.call).line
+        return Kept(module.path, line, module.lines.text(line), purpose, _called(function), use.call, use.caller)
+
+    def _picked(self, function: Function, form: Form) -> Optional[Tuple[cst.Subscript, cst.Subscript]]:
+        """``image[:, mask]`` and ``photo[:, mask]`` of a form that compares names of theirs.
+
+        None where the names stand for anything else, or where image, photo or mask is another by then.
+        """
+        of_torch = form.callee is not None and is_torch_l1(form.callee) and not form.extras
+        if not form.direct or not (form.reduction in ("mean", "none") or (form.reduction == "own" and of_torch)):
+            return None
+        one, other = (picked_from(self.analysis.meanings, function, side) for side in (form.first, form.second))
+        if one is None or other is None or not function.flow.unchanged_at(form.call, one, other):
+            return None
+        alike = re.sub(r"\s+", "", _index(one)) == re.sub(r"\s+", "", _index(other))
+        return (one, other) if alike else None
+
+    def _is_channels_last(
+        self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode, error: cst.CSTNode
+    ) -> bool:
+        """Whether the two lie so; or a photograph does that the same rendering is compared with elsewhere."""
+        others = [
+            form.second
+            for form in self.analysis.forms.of(function)
+            if form.first is not prediction
+            and same(form.first, prediction)
+            and _is_same_place(function, form.first, prediction)
+        ]
+        lie = (
+            is_channels_last(self.analysis.training, function, prediction, other, error=error)
+            for other in (target, *others)
+        )
+        return any(lie)
+
+    def _is_definition(self, function: Function, form: Form) -> bool:
+        """Whether this is the body of the codebase's own L1 function, whose calls are what counts."""
+        if self.analysis.forms.functions.shape(function) is None:
+            return False
+        calls = self.analysis.training.sites.get(function) or list(sure_calls(self.analysis.program, function))
+        known = {id(f.call) for caller, _ in calls for f in self.analysis.forms.of(caller)}
+        return function in self.analysis.callbacks.functions or all(
+            id(call) in known or self.analysis.forms.functions.shape(caller) is not None for caller, call in calls
+        )
+
+    def problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
+        """Return a form as a problem, with the text to write there by hand."""
+        module = function.module
+        last = is_channels_last(self.analysis.training, function, form.first, form.second)
+        rows = any(is_rows(self.analysis.meanings, function, side) for side in (form.first, form.second))
+        text = advice(form, flipped, last, rows)
+        return Problem(module.path, place.line, module.lines.text(place.line), reason, text)
+
+
+def _of_whole_pictures(form: Form, one: cst.Subscript, other: cst.Subscript) -> Form:
+    """The same of image and photo, its result indexed by the mask."""
+    form = form._replace(first=one.value, second=other.value, direct=False, selection=_index(one))
+    return form._replace(reduction="mean") if form.reduction == "own" else form
+
+
+def _index(node: cst.Subscript) -> str:
+    return code(node)[len(code(node.value)) :].strip()
+
+
+def _is_same_place(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
+    """Whether two expressions that are written alike are of the same values."""
+    names = [[part for part in walk_expressions(node) if isinstance(part, cst.Name)] for node in (first, second)]
+    return all(function.flow.reaching(one) == function.flow.reaching(other) for one, other in zip(*names))
+
+
+def _in_a_copy(function: Function, uses: Sequence[Use]) -> str:
+    """Where to write it, for a function that some calls need as it is."""
+    calls = [use.where for use in uses if use.purpose is None]
+    shown = ", ".join(calls[:3]) + (f" and {len(calls) - 3} more" if len(calls) > 3 else "")
+    return f", in a copy of {_called(function)} for {shown}" if calls else ""
+
+
+def _called(function: Function) -> str:
+    """What a function is called by: of a ``forward`` the name of its class."""
+    return function.owner.name if function.owner is not None and function.name in _FORWARD else function.name

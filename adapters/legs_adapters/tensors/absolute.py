@@ -1,0 +1,45 @@
+"""Absolute values and means, as functions and as methods of a tensor."""
+
+from __future__ import annotations
+
+from typing import Optional
+
+import libcst as cst
+
+from legs_adapters.code.syntax import call_name
+
+__all__ = ["abs_argument", "is_abs", "mean_of"]
+
+
+def mean_of(node: cst.Call) -> Optional[cst.Call]:
+    """Return ``x`` of ``x.mean()`` or ``torch.mean(x)``: the mean of everything, nothing else asked for."""
+    if call_name(node) != "mean" or not isinstance(node.func, cst.Attribute):
+        return None
+    if not node.args and isinstance(node.func.value, cst.Call):
+        return node.func.value
+    if _is_module(node.func.value) and len(node.args) == 1 and isinstance(node.args[0].value, cst.Call):
+        return node.args[0].value
+    return None
+
+
+def abs_argument(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
+    """Return what an absolute value is taken of; None of what takes none."""
+    if not isinstance(node, cst.Call) or not is_abs(node):
+        return None
+    if isinstance(node.func, cst.Attribute) and not node.args:
+        return node.func.value
+    return node.args[0].value if len(node.args) == 1 and not node.args[0].star else None
+
+
+def is_abs(node: cst.Call) -> bool:
+    """Return whether a call takes an absolute value: ``abs(x)``, ``torch.abs(x)``, ``x.abs()``."""
+    if isinstance(node.func, cst.Name):
+        return node.func.value == "abs"
+    if isinstance(node.func, cst.Attribute) and node.func.attr.value in ("abs", "absolute"):
+        return not node.args or (len(node.args) == 1 and _is_module(node.func.value))
+    return False
+
+
+def _is_module(node: cst.CSTNode) -> bool:
+    """Whether what has ``abs`` or ``mean`` can be torch, under whatever name: a tensor's own take no tensor."""
+    return isinstance(node, cst.Name) and node.value not in ("np", "numpy", "math", "jnp", "cp", "cupy", "tf")

@@ -1,0 +1,114 @@
+"""Calls that run a backward pass or step an optimiser, and what reads the gradients between them."""
+
+from __future__ import annotations
+
+from typing import Dict, Iterable, Iterator, List, Tuple
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.syntax import call_name, children, constant, walk_all, word_set, words, words_under
+
+__all__ = [
+    "MAKES_OPTIMISERS",
+    "calls_in",
+    "gradients_read",
+    "has_step",
+    "is_backward",
+    "is_step",
+    "may_step",
+    "only_reads_gradients",
+]
+
+_SCHEDULES = word_set("sched scheduler schedulers lr strategy profiler progress pbar tqdm bar")
+MAKES_OPTIMISERS = {"optimizer", "optimiser", "optimizers", "optimisers"}
+_STEPS = word_set("step steps update optimize optimise optim adam sgd")
+_NOTHING = object()
+
+
+def is_backward(call: cst.Call) -> bool:
+    """Return whether a call runs a backward pass."""
+    return call_name(call) in ("backward", "manual_backward")
+
+
+def is_step(call: cst.Call) -> bool:
+    """``gaussians.optimizer.step()``, ``optimizers.optimizer_step_all()``."""
+    said = set(words(call_name(call)))
+    if not isinstance(call.func, cst.Attribute) or not (
+        said == {"step"} or ("step" in said and said & MAKES_OPTIMISERS)
+    ):
+        return False
+    return not _is_of_schedule(call)
+
+
+def may_step(calls: Iterable[cst.Call]) -> bool:
+    """Whether a call says that it steps, under whatever name: ``gaussians.update(opt)``; not ``pbar.update(1)``."""
+    return any(set(words(call_name(call))) & _STEPS and not _is_of_schedule(call) for call in calls)
+
+
+def _is_of_schedule(call: cst.Call) -> bool:
+    return isinstance(call.func, cst.Attribute) and bool(words_under(call.func.value) & _SCHEDULES)
+
+
+def has_step(function: Function) -> bool:
+    """Whether an optimiser steps in it. Its text may be its whole file's, so that only leads to a closer look."""
+    return "step" in function.text and any(map(is_step, function.flow.calls))
+
+
+def only_reads_gradients(scope: cst.CSTNode, calls: List[cst.Call], for_good: bool) -> bool:
+    """Whether the gradients are read after each backward pass, and nothing can have stepped.
+
+    They are set to nothing then; where nobody steps, ``for_good``, they need not be.
+    """
+    last = max(i for i, call in enumerate(calls) if is_backward(call))
+    if may_step(calls):
+        return False
+    parts = list(walk_all(scope))
+    again = isinstance(scope, (cst.For, cst.While)) and any(_empties(part) for part in parts)
+    if not for_good and not again and "zero_grad" not in [call_name(call) for call in calls[last:]]:
+        return False
+    return bool(gradients_read(parts))
+
+
+def gradients_read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
+    """The gradients that are read, ``xyz.grad``; none where a step by hand takes one of them."""
+    asked = {id(p) for part in parts if _asks(part) for p in walk_all(part)}
+    taken = {id(p) for part in parts for given in _taken(part) for p in walk_all(given)}
+    read = [p for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in asked]
+    return [] if any(id(p) in taken for p in read) else read
+
+
+def _empties(node: cst.CSTNode) -> bool:
+    """``xyz.grad = None``: in a loop each pass but the last loses its gradients, wherever in it that stands."""
+    if not isinstance(node, cst.Assign) or constant(node.value, _NOTHING) is not None:
+        return False
+    return any(isinstance(t.target, cst.Attribute) and t.target.attr.value == "grad" for t in node.targets)
+
+
+def _asks(node: cst.CSTNode) -> bool:
+    """``xyz.grad is not None``."""
+    return isinstance(node, cst.Comparison) or _empties(node)
+
+
+def _taken(node: cst.CSTNode) -> List[cst.CSTNode]:
+    """What a step by hand takes: ``xyz -= lr * xyz.grad``, ``xyz - xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``."""
+    if isinstance(node, cst.AugAssign):
+        return [node.value] if isinstance(node.operator, cst.SubtractAssign) else []
+    if isinstance(node, cst.BinaryOperation):  # xyz.grad - other.grad compares the two
+        of_grads = any(isinstance(p, cst.Attribute) and p.attr.value == "grad" for p in walk_all(node.left))
+        return [node.right] if isinstance(node.operator, cst.Subtract) and not of_grads else []
+    in_place = isinstance(node, cst.Call) and call_name(node).endswith("_")
+    return [child.value for child in children(node) if in_place and isinstance(child, cst.Arg)]
+
+
+def calls_in(scope: cst.CSTNode, node: cst.CSTNode, calls: Dict[int, cst.Call]) -> Iterator[Tuple[cst.Call, bool]]:
+    """Yield the calls in a scope; each with whether it belongs to another training loop in it."""
+    stack: List[Tuple[cst.CSTNode, bool]] = [(scope, False)]
+    while stack:
+        part, elsewhere = stack.pop()
+        if id(part) in calls:
+            yield calls[id(part)], elsewhere
+        if part is not scope and isinstance(part, (cst.For, cst.While)) and not elsewhere:
+            below = list(walk_all(part))
+            elsewhere = node not in below and any(isinstance(p, cst.Call) and is_backward(p) for p in below)
+        stack.extend((child, elsewhere) for child in children(part))

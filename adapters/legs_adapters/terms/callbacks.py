@@ -1,0 +1,91 @@
+"""Find L1 functions that are passed as callbacks, ``self.criterion = l1_loss``: the name is replaced there."""
+
+from __future__ import annotations
+
+from typing import Dict, List, NamedTuple, Optional, Set
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.program import Program
+from legs_adapters.tensors.backward import Training
+from legs_adapters.terms.forms import Form, Forms
+from legs_adapters.terms.functions import L1Functions
+
+__all__ = ["Callback", "Callbacks"]
+
+
+class Callback(NamedTuple):
+    """A callback: the form to replace, and the function in which it is called.
+
+    ``outer`` is the call that passes it there, for one of a list: one function may get images and depths so.
+    """
+
+    form: Form
+    caller: Function
+    outer: Optional[cst.Call] = None
+
+
+class Callbacks:
+    """The callbacks of one program.
+
+    Attributes:
+        functions: the L1 functions that are passed as callbacks.
+        by_holder: the callbacks, by the function or top level that names them.
+    """
+
+    def __init__(self, program: Program, training: Training, forms: Forms) -> None:
+        self.functions: Set[Function] = set()
+        self.by_holder: Dict[Function, List[Callback]] = {}
+        own = forms.functions
+        for function, calls in list(training.sites.items()):
+            shape = own.shape(function)
+            if shape is None:
+                continue
+            known = {id(form.call) for caller, _ in calls for form in forms.of(caller)}
+            unknown = [
+                (caller, call)
+                for caller, call in calls
+                if id(call) not in known and own.shape(caller) is None and len(call.args) == 2
+            ]
+            for holder in program.mentioning(function.name) if unknown else ():
+                for definition in [d for found in holder.flow.definitions.values() for d in found]:
+                    value = definition.value
+                    if definition.kind != "assign" or not isinstance(value, (cst.Name, cst.Attribute)):
+                        continue
+                    references = program.resolve(holder, value)
+                    if [r.target for r in references] != [function] or references[0].guess:
+                        continue
+                    if not _is_read(holder, definition.place):
+                        continue
+                    self.functions.add(function)
+                    near = [(c, call) for c, call in unknown if c.module is holder.module] or unknown
+                    caller, call = near[0]
+                    reduction = "callable" if shape == "mean" else "registered"
+                    form = Form(value, call, call.args[0].value, call.args[1].value, reduction, value)
+                    self.by_holder.setdefault(holder, []).append(Callback(form, caller))
+        for function in list(training.sites):
+            self._in_lists(own, training, function)
+
+    def _in_lists(self, own: L1Functions, training: Training, function: Function) -> None:
+        """``on_crops(image, gt, [l1, perceptual])``, which calls ``losses[i](image, gt)``."""
+        for call in function.flow.calls:
+            table = call.func.value if isinstance(call.func, cst.Subscript) else None
+            if not isinstance(table, cst.Name) or len(call.args) != 2:
+                continue
+            if {definition.kind for definition in function.flow.reaching(table)} != {"parameter"}:
+                continue
+            for caller, outer in training.sites[function]:
+                given = function.given(outer, table.value)
+                for element in given.elements if isinstance(given, cst.List) else ():
+                    if own.is_l1(caller, element.value):
+                        sides = call.args[0].value, call.args[1].value
+                        form = Form(element.value, call, *sides, "registered", element.value)
+                        self.by_holder.setdefault(caller, []).append(Callback(form, function, outer))
+
+
+def _is_read(holder: Function, place: str) -> bool:
+    """Whether a function, or one in it, reads a name of its own; what has other names, others may read."""
+    if holder.parent is None or "." in place:
+        return True
+    return any(read.value == place for each in (holder, *holder.inner) for read in each.flow.reads)

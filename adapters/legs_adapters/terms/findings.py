@@ -1,0 +1,114 @@
+"""What is found in a checkout: terms to weight, terms left alone, and terms that a person must settle."""
+
+from __future__ import annotations
+
+from typing import Dict, List, NamedTuple, Tuple
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.program import Program
+from legs_adapters.code.sources import Unreadable
+from legs_adapters.lexicon.views import View
+from legs_adapters.terms.forms import Form
+
+__all__ = ["Findings", "Kept", "Left", "Problem", "Site"]
+
+
+class Kept(NamedTuple):
+    """A call that stays unweighted although the function it calls has a site in it.
+
+    Attributes:
+        path, line, text: where it stands, and what that line says.
+        reason: what it is for, in one word.
+        function: what is called.
+        call: all of it.
+        scope: the function that it stands in.
+    """
+
+    path: str
+    line: int
+    text: str
+    reason: str
+    function: str
+    call: cst.Call
+    scope: Function
+
+
+class Site(NamedTuple):
+    """One photometric L1 term.
+
+    Attributes:
+        path, line, column: where it begins; the line counts from 1, the column from 0.
+        last_line: where it ends.
+        form: the expression.
+        swapped: the ground truth is the first of the two arguments.
+        selection: the index by a mask that both arguments carry, as written with its brackets, and the one that a named
+            difference of them is taken with; empty without.
+        channels_last: the images are [H, W, C].
+        view: the verdict on ``view=``.
+        scope: the function that it stands in.
+        aside: other reads of the same error map, which are not the loss and keep the plain one.
+        kept: calls of that function that are not the loss.
+    """
+
+    path: str
+    line: int
+    column: int
+    last_line: int
+    form: Form
+    swapped: bool
+    selection: str
+    channels_last: bool
+    view: View
+    scope: Function
+    aside: Tuple[cst.Name, ...] = ()
+    kept: Tuple[Kept, ...] = ()
+
+    @property
+    def function(self) -> str:
+        """The name of the function that it stands in."""
+        return self.scope.name
+
+    def named_by(self, line: int) -> bool:
+        """Whether a line that a person names is one of its lines."""
+        return self.line <= line <= self.last_line
+
+
+class Left(NamedTuple):
+    """An L1 that was seen and left, with one word why."""
+
+    path: str
+    line: int
+    text: str
+    reason: str
+
+
+class Problem(NamedTuple):
+    """A term that a person must settle: where it is, what it says, and what to write there by hand."""
+
+    path: str
+    line: int
+    text: str
+    reason: str
+    advice: str
+
+
+class Findings(NamedTuple):
+    """All that was found; in the order of the files.
+
+    ``doubts`` are of what was left in a file that trains, where nothing else is weighted: perhaps the loss after all.
+    """
+
+    sites: List[Site]
+    left: List[Left]
+    problems: List[Problem]
+    doubts: List[Problem]
+    patched: List[Left]
+    unreadable: List[Unreadable]
+    program: Program
+
+    @property
+    def kept(self) -> Dict[Kept, Site]:
+        """The calls that stay unweighted, each with a site in the function that it calls."""
+        return {kept: site for site in self.sites for kept in site.kept}

@@ -1,0 +1,62 @@
+"""A loss whose function is settled at run time, ``loss_fn = eval(f"{kind}_loss")``, beside D-SSIM of the same pair."""
+
+from __future__ import annotations
+
+from typing import List, Optional, Sequence
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.program import Program
+from legs_adapters.code.syntax import arguments, call_name, constant, key_of, same
+from legs_adapters.tensors.backward import Training
+from legs_adapters.terms.forms import Form
+from legs_adapters.terms.l1_names import is_l1_name
+from legs_adapters.terms.ssim import STRUCTURAL, is_given
+
+__all__ = ["chosen_at_run_time"]
+
+_BY_NAME = {"eval", "getattr"}
+
+
+def chosen_at_run_time(program: Program, training: Training, function: Function, known: Sequence[Form]) -> List[Form]:
+    """Return the calls that may be the L1 of a function's loss, going by what they stand beside.
+
+    What is called is given a pair of pictures that SSIM is given too, and is looked up by a name that settings make.
+    ``known`` are the function's own forms: of a pair that has an L1, nothing else is one.
+    """
+    structural = [
+        call for call in function.flow.calls if STRUCTURAL.search(call_name(call)) and training.includes(call)
+    ]
+    found = []
+    for call in function.flow.calls if structural else ():
+        positional, keywords, starred = arguments(call)
+        if len(positional) != 2 or keywords or starred or not training.includes(call):
+            continue
+        first, second = positional
+        beside = any(is_given(function, other, first) and is_given(function, other, second) for other in structural)
+        settled = any(same(form.first, first) and same(form.second, second) for form in known)
+        if beside and not settled and _is_looked_up(program, function, call):
+            found.append(Form(call, call, first, second, "own", call.func))
+    return found
+
+
+def _is_looked_up(program: Program, function: Function, call: cst.Call) -> bool:
+    """Whether it is not known what is called before the settings are."""
+    if program.resolve(function, call.func) or is_l1_name(call_name(call)):
+        return False
+    definitions = program.lookup(function, call.func) or []
+    owner = program.owner_of(function)
+    if not definitions and owner is not None and isinstance(call.func, cst.Attribute):
+        definitions = owner.stores(call.func.attr.value)
+    made = [definition.value for _, definition in definitions if definition.kind == "assign"] or [call.func]
+    return all(map(_looks_up, made))
+
+
+def _looks_up(value: Optional[cst.CSTNode]) -> bool:
+    """``eval(name)``, ``getattr(losses, name)``, ``globals()[name]``, ``losses[name]``; not ``losses["l2"]``."""
+    if isinstance(value, cst.Subscript):
+        return key_of(value) is None
+    if not isinstance(value, cst.Call) or call_name(value) not in _BY_NAME:
+        return False
+    return not any(isinstance(constant(arg.value), str) for arg in value.args)

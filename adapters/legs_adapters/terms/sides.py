@@ -1,0 +1,106 @@
+"""The two sides of an L1: what both of them share, and which is the ground truth."""
+
+from __future__ import annotations
+
+import re
+from typing import List, NamedTuple
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.syntax import code, constant, key_of, same, walk_expressions, words
+from legs_adapters.lexicon.depiction import Meanings
+from legs_adapters.lexicon.masks import is_mask
+from legs_adapters.lexicon.meaning import Meaning
+from legs_adapters.lexicon.names import kind_of_words, role_of_words
+from legs_adapters.terms.forms import Form
+
+__all__ = ["Pair", "are_counterparts", "is_role", "of_rays", "pair_of", "same_root"]
+
+_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
+
+
+class Pair(NamedTuple):
+    """What is compared.
+
+    Attributes:
+        first, second: the two sides, without an index by a mask that both carry.
+        selection: that index as written, with its brackets; empty without.
+        a, b: what the two stand for; a factor that both have says nothing of it.
+    """
+
+    first: cst.BaseExpression
+    second: cst.BaseExpression
+    selection: str
+    a: Meaning
+    b: Meaning
+
+    @property
+    def speaks_of_images(self) -> bool:
+        """Whether both sides have a name that speaks of an image."""
+        return _speaks_of_images(self.first) and _speaks_of_images(self.second)
+
+
+def pair_of(meanings: Meanings, function: Function, form: Form) -> Pair:
+    """Look at the two sides of a form."""
+    first, second, selection = form.first, form.second, ""
+    if isinstance(first, cst.Subscript) and isinstance(second, cst.Subscript):
+        inner = [code(node)[len(code(node.value)) :] for node in (first, second)]
+        squeezed = [re.sub(r"\s+", "", text) for text in inner]
+        if squeezed[0] == squeezed[1] and any(is_mask(meanings, function, element) for element in first.slice):
+            # the weight map needs the whole image
+            first, second, selection = first.value, second.value, inner[0].strip()
+    left, right = _without_shared_factors(first, second)
+    return Pair(first, second, selection, meanings.of(function, left), meanings.of(function, right))
+
+
+def _without_shared_factors(first: cst.BaseExpression, second: cst.BaseExpression) -> List[cst.BaseExpression]:
+    """``image * (1 - mask)`` and ``gt * (1 - mask)`` are ``image`` and ``gt``."""
+    if not (isinstance(first, cst.BinaryOperation) and isinstance(second, cst.BinaryOperation)):
+        return [first, second]
+    if not (isinstance(first.operator, cst.Multiply) and isinstance(second.operator, cst.Multiply)):
+        return [first, second]
+    for one, factor in ((first.left, first.right), (first.right, first.left)):
+        for other, again in ((second.left, second.right), (second.right, second.left)):
+            if same(factor, again):
+                return _without_shared_factors(one, other)
+    return [first, second]
+
+
+def same_root(form: Form) -> bool:
+    """``x[1:] - x[:-1]``: a picture against itself."""
+    a, b = form.first, form.second
+    if not (isinstance(a, cst.Subscript) and isinstance(b, cst.Subscript)) or isinstance(key_of(a), str):
+        return False
+    return same(a.value, b.value) and not same(a, b)
+
+
+def are_counterparts(form: Form) -> bool:
+    """``rendered_lips`` and ``gt_lips``: the same thing, once rendered and once photographed."""
+    names = []
+    for node in (form.first, form.second):
+        key = key_of(node)
+        text = node.value if isinstance(node, cst.Name) else key if isinstance(key, str) else ""
+        names.append((role_of_words(text), [w for w in words(text) if role_of_words(w) is None], words(text)))
+    (a, rest_a, _), (b, rest_b, _) = names
+    spoken = {word for _, _, each in names for word in each}
+    rendered = any(word.startswith("render") for word in spoken)
+    return {a, b} == {"render", "target"} and bool(rest_a) and rest_a == rest_b and rendered
+
+
+def of_rays(form: Form) -> bool:
+    """Whether the names speak of rays, or of a field that they go through: a list of colours, whatever it is called."""
+    return any(_RAYS.search(code(node)) for node in (form.first, form.second))
+
+
+def is_role(node: cst.CSTNode) -> bool:
+    """Whether a name says nothing but what it is to the loss: ``pred``, ``target``."""
+    return isinstance(node, cst.Name) and all(role_of_words(word) is not None for word in words(node.value))
+
+
+def _speaks_of_images(node: cst.CSTNode) -> bool:
+    return any(
+        kind_of_words(str(part.value if isinstance(part, cst.Name) else constant(part))) == "image"
+        for part in walk_expressions(node)
+        if isinstance(part, (cst.Name, cst.SimpleString))
+    )

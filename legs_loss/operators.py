@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Dict, NamedTuple, Tuple
 
-from legs_loss.errors import LegsError
+from legs_loss.errors import LegsError, did_you_mean
 
 __all__ = ["NORMS", "OPERATORS", "Operator", "Stencil", "check_operator", "operator_names"]
 
@@ -87,6 +87,7 @@ def check_operator(operator: str, p: float) -> None:
         LegsError: one of them is unknown; the message lists what there is.
     """
     if operator not in OPERATORS:
-        raise LegsError(f"no operator is named {operator!r}: choose one of {', '.join(OPERATORS)}")
+        hint = did_you_mean(operator, OPERATORS)
+        raise LegsError(f"no operator is named {operator!r}{hint}: choose one of {', '.join(OPERATORS)}")
     if p not in NORMS:
         raise LegsError(f"p must be 1, 2 or inf, got {p!r}")

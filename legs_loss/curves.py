@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Callable, Dict, Tuple
 
-from legs_loss.errors import LegsError
+from legs_loss.errors import LegsError, did_you_mean
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -64,7 +64,7 @@ def curve(name: str) -> Curve:
     except (KeyError, TypeError):
         raise LegsError(
             f"no curve is named {name!r}: choose one of {', '.join(_CURVES)}, "
-            "or add your own with register_curve(name, function)"
+            "or add your own with register_curve(name, function)" + did_you_mean(name, _CURVES)
         ) from None
 
 

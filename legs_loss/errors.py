@@ -1,8 +1,8 @@
-"""The one exception that this package raises for a user's mistake, and what helps its messages."""
+"""The one exception that this package raises for a user's mistake, and what it adds about names that were mistyped."""
 
 from __future__ import annotations
 
-from difflib import get_close_matches
+import difflib
 from typing import Iterable
 
 __all__ = ["LegsError", "did_you_mean"]
@@ -12,13 +12,16 @@ class LegsError(ValueError):
     """Bad input: the message says what was wrong, where, and what to do."""
 
 
-def did_you_mean(word: object, known: Iterable[str]) -> str:
-    """Return `` (did you mean 'legs'?)`` where a known word is near, for a message about a mistyped one; else nothing.
+def did_you_mean(name: object, names: Iterable[str]) -> str:
+    """Return the end of an error message that proposes the known name nearest to a mistyped one, "" if none is near.
 
-    >>> did_you_mean("legz", ["3dgs", "legs"])
-    " (did you mean 'legs'?)"
-    >>> did_you_mean("best", ["3dgs", "legs"])
-    ''
+    Example:
+        >>> did_you_mean("legz", ["3dgs", "eggs", "legs"]), did_you_mean("best", ["3dgs", "eggs", "legs"])
+        ("; did you mean 'legs'?", '')
     """
-    near = get_close_matches(str(word), list(known), n=1, cutoff=0.7)
-    return f" (did you mean {near[0]!r}?)" if near else ""
+    wanted = str(name).lower()
+    known = {one.lower(): one for one in names}
+    near = difflib.get_close_matches(wanted, [one for one in known if one != wanted], 1, 0.6)
+    if wanted in known:  # in another case
+        near = [wanted]
+    return f"; did you mean {known[near[0]]!r}?" if near else ""

@@ -87,7 +87,7 @@ def check_operator(operator: str, p: float) -> None:
         LegsError: one of them is unknown; the message lists what there is.
     """
     if operator not in OPERATORS:
-        hint = did_you_mean(operator, OPERATORS)
-        raise LegsError(f"no operator is named {operator!r}{hint}: choose one of {', '.join(OPERATORS)}")
+        names = ", ".join(OPERATORS)
+        raise LegsError(f"no operator is named {operator!r}: choose one of {names}" + did_you_mean(operator, OPERATORS))
     if p not in NORMS:
         raise LegsError(f"p must be 1, 2 or inf, got {p!r}")

@@ -27,6 +27,7 @@ from legs_loss.errors import LegsError
 from legs_loss.interrupts import kept_from_children
 from legs_loss.kernels.backends import backend_for
 from legs_loss.operators import OPERATORS
+from legs_loss.origin import note_scene
 from legs_loss.response import response
 from legs_loss.scenes import Scene, View, image_size, image_tensor, load_training_image, training_size
 from legs_loss.scenes.images import resized_pixels, row_strips
@@ -109,6 +110,8 @@ def precompute(
                         due = time.monotonic() + _COMMIT_SECONDS
             finally:
                 _commit(writer, staged)
+    if out.resolve().parent != scene.root.resolve():
+        note_scene(out, scene)
     return report
 
 

@@ -66,8 +66,6 @@ class _Run:
         self._asked: Set[Tuple[str, int, int]] = set()
         self._store: Optional[WeightStore] = None
         self._store_opened = False
-        for note in config.notes:
-            self.say_once(note, note)
 
     def weight(self, target: Tensor, view: Optional[str], channels_last: bool) -> Tensor:
         """Return one image's weight map, [1, H, W] (channels-last: [H, W, 1])."""

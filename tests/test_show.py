@@ -87,7 +87,7 @@ class TestShow:
         [
             (["{scene}", "--views", "absent"], "absent is no view; there are 6, such as images/0.png"),
             (["{store}", "--preset", "eggs"], "no maps of operator sobel"),
-            (["{scene}/nothing"], "there is no folder"),
+            (["{scene}/nothing"], "there is no file or folder"),
             (["{scene}/sparse/0/images.bin"], "not an image"),
         ],
     )

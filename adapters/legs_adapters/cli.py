@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Optional, Sequence, Tuple
@@ -145,7 +146,7 @@ def _patch(args: argparse.Namespace) -> int:
     else:
         print(as_table(found), end="")
         if wrote:
-            print(f"\nwrote {', '.join(wrote)}; take it back with: legs-patch --undo {args.folder}")
+            print(f"\nwrote {', '.join(wrote)}; take it back with: legs-patch --undo {shlex.quote(args.folder)}")
         else:
             print(f"\nnothing to do: {'it is patched' if found.findings.patched else 'nothing could be decided'}")
     return _left_to_the_user(problems)

@@ -8,6 +8,7 @@ import sys
 from typing import Optional, Sequence
 
 from legs_loss._version import __version__
+from legs_loss.cli.parser import Parser
 from legs_loss.errors import LegsError
 
 __all__ = ["main"]
@@ -34,10 +35,9 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="legs", description="The LEGS loss for 3D Gaussian Splatting.", epilog=EXIT_CODES
-    )
+    parser = Parser(prog="legs", description="The LEGS loss for 3D Gaussian Splatting.", epilog=EXIT_CODES)
     parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
+    _add_completion(parser)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.required = True
     for name in COMMANDS:
@@ -46,3 +46,18 @@ def _parser() -> argparse.ArgumentParser:
         command.add_arguments(sub)
         sub.set_defaults(run=command.run)
     return parser
+
+
+def _add_completion(parser: argparse.ArgumentParser) -> None:
+    name, what = "--print-completion", "print the completion script of a shell, for its start-up file"
+    try:
+        import shtab
+    except ImportError:
+        parser.add_argument(name, action=_NoCompletion, metavar="SHELL", help=f"{what}; needs shtab")
+    else:
+        shtab.add_argument_to(parser, [name], help=what)
+
+
+class _NoCompletion(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        parser.error("completion needs shtab: pip install 'legs-loss[completion]'")

@@ -6,6 +6,7 @@ STORE is the folder that legs precompute wrote, or the scene that has it as legs
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections import Counter
 from pathlib import Path
@@ -22,11 +23,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the summary; 1 when something is damaged."""
     from legs_loss.config import STORE_FOLDER
-    from legs_loss.store import DamagedStoreError, WeightStore
+    from legs_loss.errors import LegsError
+    from legs_loss.store import MANIFEST, DamagedStoreError, WeightStore
 
     path = Path(args.store)
     if (path / STORE_FOLDER).is_dir():
         path = path / STORE_FOLDER
+    if not path.exists():
+        raise LegsError(f"there is no folder {path}: give a store, or the scene that has one")
+    if path.is_dir() and not (path / MANIFEST).is_file():
+        raise LegsError(_without_store(path))
     try:
         store = WeightStore(path)
     except DamagedStoreError as error:
@@ -51,6 +57,22 @@ def run(args: argparse.Namespace) -> int:
     if damaged:
         print("legs: error: run legs precompute again to repair the store", file=sys.stderr)
     return 1 if damaged else 0
+
+
+def _without_store(path: Path) -> str:
+    """What is said of a folder that is no store."""
+    from legs_loss.errors import LegsError
+    from legs_loss.scenes import read_scene
+    from legs_loss.store import MANIFEST
+
+    try:
+        views = read_scene(path).views
+    except LegsError:
+        return f"{path} is no store of weight maps (it has no {MANIFEST}), and no scene"
+    return (
+        f"{path} has {len(views)} photograph(s) and no weight maps yet: legs precompute {shlex.quote(str(path))} makes "
+        "them; a store that was written elsewhere is given by its own folder"
+    )
 
 
 def _counted(values: Iterable[str]) -> str:

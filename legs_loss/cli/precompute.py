@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections import Counter
 from pathlib import PurePosixPath
@@ -34,12 +35,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-w", "--white_background", action="store_true", help="as in 3DGS: lay alpha over white")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="whose operator to use; default: legs")
-    parser.add_argument("--out", metavar="DIR", help="the store's folder; default: SCENE/legs_weights")
+    parser.add_argument(
+        "--out", metavar="DIR", help="the store's folder; default: SCENE/legs_weights, where a training finds it"
+    )
     parser.add_argument("--workers", type=int, default=_cores(), metavar="N", help="processes; default: one a core")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the store; 1 when a photograph was skipped."""
+    from legs_loss.cli.checks import check_resolution
+    from legs_loss.config import STORE_FOLDER
     from legs_loss.errors import LegsError
     from legs_loss.precompute import precompute
     from legs_loss.scenes import read_scene
@@ -47,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
     if args.workers < 1:
         raise LegsError(f"--workers must be at least 1, got {args.workers}")
     scene = read_scene(args.scene, args.images)
+    check_resolution(args.resolution, scene.views)
     report = precompute(
         scene,
         out=args.out,
@@ -68,6 +74,12 @@ def run(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     print(f"{report.store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")
+    if not report.store.resolve().parent.samefile(scene.root) or report.store.name != STORE_FOLDER:
+        print(
+            f"legs: note: a training that is given the scene looks in {scene.root / STORE_FOLDER}, not there: name the "
+            f"store with LEGS_STORE={shlex.quote(str(report.store.resolve()))}, or as `store` in legs.toml",
+            file=sys.stderr,
+        )
     return 1 if report.skipped else 0
 
 

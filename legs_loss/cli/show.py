@@ -1,19 +1,23 @@
 """Draw a contact sheet (PNG): photograph, response and weight map of some views, and the curves.
 
-SCENE and IMAGE are computed anew; of a STORE the stored maps are drawn, beside the photographs of the scene it lies in.
+SCENE and IMAGE are computed anew; of a STORE the stored maps are drawn, beside the photographs of its scene.
 """
 
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Callable, Dict, List, Optional, Sequence
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from legs_loss.report.sheet import Shown
     from legs_loss.scenes import View
     from legs_loss.spec import WeightSpec
+    from legs_loss.store import Entry
 
 HELP = "draw a contact sheet of weight maps, and the curves"
 
@@ -32,12 +36,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw and save the sheet."""
+    from legs_loss.errors import LegsError
     from legs_loss.report.sheet import save_sheet
     from legs_loss.scenes import View, read_scene
     from legs_loss.spec import as_spec
     from legs_loss.store import MANIFEST
 
     path, spec = Path(args.path), as_spec(args.preset)
+    if not path.exists():
+        raise LegsError(f"there is no file or folder {path}: give a scene, a store or a photograph")
     shown: Dict[str, Callable[[], Shown]] = {}  # by the view's name
     if path.is_file() and path.name != MANIFEST:
         shown[path.name] = partial(_computed, View(path.name, path), spec)
@@ -63,18 +70,16 @@ def _computed(view: View, spec: WeightSpec) -> Shown:
 
 def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
     from legs_loss.errors import LegsError
+    from legs_loss.origin import scene_of_store
     from legs_loss.report.sheet import Shown
-    from legs_loss.scenes import View, load_training_image
-    from legs_loss.store import Entry, WeightStore
+    from legs_loss.store import WeightStore
 
-    store = WeightStore(path)
+    store, scene = WeightStore(path), scene_of_store(path)
+    views = {} if scene is None else {view.name: view for view in scene.views}
 
     def draw(entry: Entry) -> Shown:
-        view = View(entry.view, path.parent / entry.view, composited=entry.background is not None)
-        try:
-            photograph = load_training_image(view, entry.width, white_background=entry.background == "white")
-        except LegsError:  # the store lies elsewhere: the map alone
-            photograph = None
+        view = views.get(entry.view)
+        photograph = None if view is None else _photograph(view, entry)
         return Shown(f"{entry.view}\n{entry.width}x{entry.height}", photograph, store.normalised_response(entry))
 
     # Of a view with several sizes, the largest comes last and stays.
@@ -83,6 +88,21 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
     if not fits:
         raise LegsError(f"{path} has no maps of operator {spec.operator}: show another preset, or precompute this one")
     return {entry.view: partial(draw, entry) for entry in fits}
+
+
+def _photograph(view: View, entry: Entry) -> Optional[np.ndarray]:
+    """The very image that a map was made from, None if it is missing or has changed."""
+    from legs_loss.errors import LegsError
+    from legs_loss.scenes import image_size, load_training_image, training_size
+    from legs_loss.store import fingerprint
+
+    with suppress(LegsError):
+        size = image_size(view.path)
+        for resolution in (-1, 1, 2, 4, 8, entry.width):
+            if training_size(*size, resolution) == (entry.width, entry.height):
+                photograph = load_training_image(view, resolution, entry.background == "white")
+                return photograph if fingerprint(photograph) == entry.fingerprint else None
+    return None
 
 
 def _choose(names: Sequence[str], chosen: Optional[Sequence[str]]) -> List[str]:

@@ -69,6 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, or go on training, and print the scores."""
+    from legs_loss.cli.checks import check_trainable
     from legs_loss.errors import LegsError
     from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, point_cloud, train
     from legs_loss.scenes import read_scene
@@ -87,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         config = TrainConfig(**given)
     scene = read_scene(args.scene, args.images)
+    check_trainable(scene, config.resolution)
     with progress_bar(config.iterations, out.name) as show:
         result = train(
             scene,
@@ -113,7 +115,7 @@ def set_threads(count: Optional[int]) -> None:
     try:
         import numba
     except ImportError:
-        raise LegsError("training needs numba: pip install legs-loss[cpu]") from None
+        raise LegsError("training needs numba: pip install 'legs-loss[cpu]'") from None
     import torch
 
     if count is None:

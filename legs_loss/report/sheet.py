@@ -70,7 +70,7 @@ def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) 
             axes.set(xticks=[], yticks=[], frame_on=False)
         weight = weight_from_response(torch.from_numpy(np.array(view.normalised))[None], spec)[0].numpy()
         if view.photograph is None:
-            photograph.text(0.5, 0.5, "photograph\nnot found", ha="center", va="center", color=_FAINT)
+            photograph.text(0.5, 0.5, "not found,\nor changed since", ha="center", va="center", color=_FAINT)
         else:
             unit = view.photograph / np.float32(np.iinfo(view.photograph.dtype).max)
             photograph.imshow(unit.squeeze(-1) if unit.shape[-1] == 1 else unit, cmap="gray", vmin=0, vmax=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Optional, Tuple, Union
 
@@ -41,7 +42,12 @@ def read_scene(path: Union[str, Path], images: Optional[str] = None) -> Scene:
     """
     root = Path(path)
     if not root.is_dir():
-        raise LegsError(f"there is no folder {root}: a scene is a folder")
+        what = f"{root} is a file" if root.exists() else f"there is no folder {root}"
+        raise LegsError(f"{what}: a scene is a folder")
+    return replace(_read_scene(root, images), images=images)
+
+
+def _read_scene(root: Path, images: Optional[str]) -> Scene:
     if (root / "sparse").is_dir():
         return read_colmap(root, *_images_folder(root, images or "images"))
     if find_transforms(root):

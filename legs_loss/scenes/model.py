@@ -76,12 +76,16 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene on disk: ``kind`` is "colmap", "transforms" or "folder"; views are sorted by name."""
+    """A scene on disk: ``kind`` is "colmap", "transforms" or "folder"; views are sorted by name.
+
+    ``images`` is the folder of the photographs, where the scene was read with one.
+    """
 
     root: Path
     kind: str
     views: Tuple[View, ...]
     read_points: Optional[Callable[[], PointCloud]] = None
+    images: Optional[str] = None
 
     @property
     def points(self) -> Optional[PointCloud]:

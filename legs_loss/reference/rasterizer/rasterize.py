@@ -93,7 +93,7 @@ def _numba_renderer(means: Tensor) -> Any:
         import numba  # noqa: F401
     except ImportError as error:
         raise LegsError(
-            "the numba rasterizer needs numba: pip install legs-loss[cpu], or use backend='torch'"
+            "the numba rasterizer needs numba: pip install 'legs-loss[cpu]', or use backend='torch'"
         ) from error
     from legs_loss.reference.rasterizer.compiled import render
 

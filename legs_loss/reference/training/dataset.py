@@ -17,7 +17,7 @@ from legs_loss.spec import WeightSpec
 from legs_loss.store import WeightStore, fingerprint
 from legs_loss.weights import weight_from_response, weight_map
 
-__all__ = ["Dataset", "TrainingView", "extent", "load_dataset", "load_view", "split_views"]
+__all__ = ["Dataset", "TrainingView", "extent", "load_dataset", "load_view", "pinhole_camera", "split_views"]
 
 HOLD_OUT = 8  # every so manieth view, sorted by name, as in the field
 
@@ -102,7 +102,7 @@ def load_view(scene: Scene, view: View, resolution: int = -1, white_background: 
     Raises:
         LegsError: it has no pinhole camera, or the photograph cannot be read.
     """
-    camera = _camera(scene, view)
+    camera = pinhole_camera(scene, view)
     image = image_tensor(load_training_image(view, resolution, white_background))
     height, width = image.shape[1:]
     return TrainingView(view.name, camera.resized(width, height), image.expand(3, height, width).contiguous())
@@ -116,7 +116,12 @@ def extent(views: List[TrainingView]) -> float:
     return 1.1 * float(radius) or 1.0
 
 
-def _camera(scene: Scene, view: View) -> Camera:
+def pinhole_camera(scene: Scene, view: View) -> Camera:
+    """Return a view's camera.
+
+    Raises:
+        LegsError: it has none, or one with distortion.
+    """
     if view.camera is not None:
         return view.camera
     if view.camera_model:

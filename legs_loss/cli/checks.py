@@ -1,0 +1,56 @@
+"""What is checked of a command's arguments before anything is computed."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from typing import Optional, Sequence, Tuple
+
+from legs_loss.errors import LegsError
+from legs_loss.scenes import Scene, View, image_size, training_size
+
+__all__ = ["check_resolution", "check_trainable"]
+
+_TINY = 64  # pixels: a width that was meant as a divisor
+
+
+def check_resolution(resolution: int, views: Sequence[View]) -> None:
+    """Check ``-r``, and warn on stderr where it was probably meant to divide, as only 1, 2, 4 and 8 do.
+
+    Raises:
+        LegsError: no image has this resolution.
+    """
+    size = _first_size(views)
+    width, height = training_size(*(size or (1 << 20, 1 << 20)), resolution)
+    if size is not None and resolution not in (-1, 1, 2, 4, 8) and width < min(_TINY, size[0]):
+        print(
+            f"legs: warning: -r {resolution} makes images of {width}x{height} pixels: as in 3DGS, 1, 2, 4 and 8 divide "
+            "the size, and any other number is the width",
+            file=sys.stderr,
+        )
+
+
+def check_trainable(scene: Scene, resolution: int) -> None:
+    """Check what a training will need of a scene, from its files' heads.
+
+    Raises:
+        LegsError: views without pinhole cameras, no points to start from, or a bad resolution.
+    """
+    from legs_loss.reference.training.dataset import pinhole_camera, split_views
+
+    for views in split_views(scene):
+        for view in views:
+            pinhole_camera(scene, view)
+    if scene.read_points is None:
+        raise LegsError(
+            f"{scene.root}: there are no points to start from: training needs a COLMAP scene, which has them in "
+            "sparse/0/points3D.bin"
+        )
+    check_resolution(resolution, scene.views)
+
+
+def _first_size(views: Sequence[View]) -> Optional[Tuple[int, int]]:
+    for view in views[:1]:
+        with suppress(LegsError, OSError):
+            return image_size(view.path)
+    return None

@@ -1,0 +1,57 @@
+"""Where a store's photographs lie: a note beside the maps, for a store that is not in its scene's folder.
+
+The note only says where to look. Whoever reads it compares fingerprints before a photograph is taken for a map's own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Optional
+
+from legs_loss.errors import LegsError
+from legs_loss.files import read_regular
+from legs_loss.scenes import Scene, read_scene
+
+__all__ = ["NOTE", "note_scene", "scene_of_store"]
+
+NOTE = "scene.json"
+_LIMIT = 1 << 16  # bytes
+
+
+def note_scene(store: Path, scene: Scene) -> None:
+    """Write the note of a store that was made from a scene; the newest scene stays.
+
+    Raises:
+        LegsError: the note cannot be written.
+    """
+    images = None if scene.images is None else str(scene.images)
+    if images is not None and not (scene.root / images).is_dir():
+        images = os.path.abspath(images)
+    text = json.dumps({"scene": os.path.abspath(str(scene.root)), "images": images}, indent=1) + "\n"
+    part = store / (NOTE + ".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(str(part), str(store / NOTE))
+    except OSError as error:
+        raise LegsError(f"cannot write {store / NOTE}: {error.strerror or error}") from None
+
+
+def scene_of_store(store: Path) -> Optional[Scene]:
+    """Return the scene that a store was made from: the one it notes, else the folder it lies in; None if there is none.
+
+    Args:
+        store: the store's folder.
+    """
+    root, images = store.resolve().parent, None
+    try:
+        note = json.loads(read_regular(store / NOTE, _LIMIT))
+        root = Path(note["scene"])
+        images = None if note["images"] is None else str(note["images"])
+    except (OSError, ValueError, TypeError, LookupError):
+        pass  # none, or damaged
+    try:
+        return read_scene(root, images)
+    except LegsError:
+        return None

@@ -1,0 +1,207 @@
+"""What a new user meets in the first ten minutes: typos, wrong folders, a store elsewhere. Each gets a clear answer."""
+
+from __future__ import annotations
+
+import builtins
+import shlex
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from legs_loss import LegsError, WeightSpec
+from legs_loss.cli import main
+from legs_loss.errors import did_you_mean
+from legs_loss.precompute import precompute
+from legs_loss.scenes import read_scene
+from tests.support import colmap_scene, legs, photograph, save
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return colmap_scene(tmp_path / "a scene", names=[f"{i}.png" for i in range(3)])
+
+
+def says(capsys, *arguments):
+    """Run ``legs`` in this process; return its exit code and what it wrote to stderr."""
+    try:
+        code = main([str(argument) for argument in arguments])
+    except SystemExit as left:
+        code = left.code
+    return code, capsys.readouterr().err
+
+
+class TestTypos:
+    @pytest.mark.parametrize(
+        ("arguments", "meant"),
+        [
+            (["precomput", "x"], "precompute"),
+            (["precompute", "x", "--preset", "legz"], "legs"),
+            (["precompute", "x", "--resoluton", "2"], "--resolution"),
+            (["precompute", "x", "--resoluton=2"], "--resolution"),
+            (["train", "x", "--densify_grad_treshold", "2"], "--densify_grad_threshold"),
+        ],
+    )
+    def test_the_name_that_was_meant_is_proposed(self, capsys, arguments, meant):
+        code, text = says(capsys, *arguments)
+        assert code == 2
+        assert text.endswith(f"did you mean {meant!r}?\n")
+        assert text.startswith("usage: legs" + (" " + arguments[0] if len(arguments) > 2 else ""))
+
+    def test_nothing_is_proposed_for_what_is_like_nothing(self, capsys):
+        code, text = says(capsys, "zzz")
+        assert code == 2
+        assert "did you mean" not in text
+
+    @pytest.mark.parametrize(
+        ("settings", "meant"),
+        [({"curve": "c3"}, "C3"), ({"curve": "C33"}, "C3"), ({"operator": "laplacien"}, "laplacian")],
+    )
+    def test_settings(self, settings, meant):
+        with pytest.raises(LegsError, match=rf"did you mean '{meant}'\?$"):
+            WeightSpec(**settings)
+
+    def test_a_name_that_is_there_is_not_proposed_to_itself(self):
+        assert did_you_mean(3, ["legs"]) == ""
+
+
+class TestStoreElsewhere:
+    def test_precompute_says_that_no_training_will_find_it(self, capsys, scene, tmp_path):
+        code, text = says(capsys, "precompute", scene, "--out", tmp_path / "my maps", "--workers", 1)
+        assert code == 0
+        assert f"LEGS_STORE='{tmp_path / 'my maps'}'" in text
+        code, text = says(capsys, "precompute", scene, "--workers", 1)
+        assert code == 0
+        assert "LEGS_STORE" not in text
+
+    def test_the_store_remembers_its_scene(self, scene, tmp_path, monkeypatch):
+        pytest.importorskip("matplotlib")
+        from legs_loss.report import sheet
+
+        shown = []
+        monkeypatch.setattr(sheet, "save_sheet", lambda path, views, spec, title: shown.extend(views))
+        store = precompute(read_scene(scene), tmp_path / "store", resolution=2).store
+        assert main(["show", str(store)]) == 0
+        assert [view.photograph.shape for view in shown] == [(15, 20, 3)] * 3
+        # A photograph that is another one now is not shown as the map's.
+        save(scene / "images" / "1.png", photograph(40, 30, 99))
+        shown.clear()
+        assert main(["show", str(store)]) == 0
+        assert [view.photograph is None for view in shown] == [False, True, False]
+
+    def test_a_note_that_is_damaged_or_leads_nowhere_is_no_error(self, scene, tmp_path, monkeypatch):
+        pytest.importorskip("matplotlib")
+        from legs_loss.report import sheet
+
+        shown = []
+        monkeypatch.setattr(sheet, "save_sheet", lambda path, views, spec, title: shown.extend(views))
+        store = precompute(read_scene(scene), tmp_path / "store").store
+        for note in ("{", "[]", '{"scene": 3, "images": null}', '{"scene": "/nowhere", "images": null}'):
+            (store / "scene.json").write_text(note)
+            assert main(["show", str(store)]) == 0
+        assert all(view.photograph is None for view in shown)
+
+    def test_photographs_from_another_folder(self, scene, tmp_path):
+        from legs_loss.origin import scene_of_store
+
+        (scene / "images").rename(tmp_path / "photographs")
+        store = precompute(read_scene(scene, str(tmp_path / "photographs")), tmp_path / "store").store
+        assert [view.path.is_file() for view in scene_of_store(store).views] == [True] * 3
+
+
+class TestResolution:
+    def test_a_width_that_was_meant_as_a_divisor(self, capsys, scene):
+        code, text = says(capsys, "precompute", scene, "-r", 3, "--workers", 1)
+        assert code == 0
+        assert "-r 3 makes images of 3x2 pixels" in text
+        for resolution in (1, 2, 40, 100):
+            assert "warning" not in says(capsys, "precompute", scene, "-r", resolution, "--workers", 1)[1]
+
+    def test_training_checks_before_its_bar(self, capsys, scene, tmp_path):
+        pytest.importorskip("numba")
+        folder = save(tmp_path / "folder" / "a.png", photograph(8, 8)).parent
+        for arguments, message in (
+            ([scene, "-r", "0"], "resolution must be"),
+            ([folder], "view(s) none is left"),
+            ([tmp_path / "none"], "there is no folder"),
+        ):
+            code, text = says(capsys, "train", *arguments, "-m", tmp_path / "run")
+            assert code == 2
+            assert text.startswith("legs: error: ")
+            assert text.count("\n") == 1
+            assert message in text
+        assert not (tmp_path / "run").exists()
+
+
+class TestWhatIsNotThere:
+    def test_info_of_a_scene_without_a_store(self, capsys, scene, tmp_path):
+        code, text = says(capsys, "info", scene)
+        assert code == 2
+        assert "has 3 photograph(s) and no weight maps yet: legs precompute '" in text
+        assert "there is no folder" in says(capsys, "info", tmp_path / "none")[1]
+
+    def test_show_of_a_file_that_is_missing(self, capsys, tmp_path):
+        code, text = says(capsys, "show", tmp_path / "missing.jpg")
+        assert code == 2
+        assert text.startswith(f"legs: error: there is no file or folder {tmp_path / 'missing.jpg'}: ")
+
+    def test_a_scene_that_is_a_file(self, capsys, tmp_path):
+        Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(str(tmp_path / "a.png"))
+        assert "a.png is a file: a scene is a folder" in says(capsys, "precompute", tmp_path / "a.png")[1]
+
+
+class TestCommandsToCopy:
+    def test_undo_with_a_space_in_the_path(self, tmp_path):
+        pytest.importorskip("libcst")
+        from legs_adapters.cli import main as patch
+
+        checkout = tmp_path / "my gs"
+        checkout.mkdir()
+        (checkout / "train.py").write_text(
+            "from gaussian_renderer import render\nfrom utils.loss_utils import l1_loss\n\n\n"
+            "def training(scene, gaussians):\n    for cam in scene:\n        image = render(cam, gaussians)['render']\n"
+            "        loss = l1_loss(image, cam.original_image.cuda())\n        loss.backward()\n"
+        )
+        before = (checkout / "train.py").read_text()
+        from contextlib import redirect_stdout
+        from io import StringIO
+
+        with redirect_stdout(StringIO()) as output:
+            assert patch([str(checkout)]) == 0
+        command = output.getvalue().split("take it back with: ")[1].strip()
+        assert command == f"legs-patch --undo '{checkout}'"
+        assert patch(shlex.split(command)[1:]) == 0
+        assert (checkout / "train.py").read_text() == before
+
+    def test_extras_are_quoted_wherever_they_are_printed(self):
+        from tests.support import ROOT
+
+        for folder in ("legs_loss", "adapters"):
+            for path in (ROOT / folder).rglob("*.py"):
+                for line in path.read_text(encoding="utf-8").splitlines():
+                    if "pip install legs-loss[" in line:
+                        pytest.fail(f"{path}: {line.strip()}")
+
+
+class TestCompletion:
+    def test_shells_get_a_script(self):
+        pytest.importorskip("shtab")
+        for shell, word in (("bash", "complete"), ("zsh", "#compdef legs")):
+            done = legs("--print-completion", shell)
+            assert done.returncode == 0, done.stderr
+            assert word in done.stdout
+            assert "precompute" in done.stdout
+            assert "--white_background" in done.stdout
+
+    def test_without_shtab_it_says_what_to_install(self, capsys, monkeypatch):
+        real = builtins.__import__
+
+        def hidden(name, *arguments, **options):
+            if name == "shtab":
+                raise ImportError(name)
+            return real(name, *arguments, **options)
+
+        monkeypatch.setattr(builtins, "__import__", hidden)
+        code, text = says(capsys, "--print-completion", "bash")
+        assert code == 2
+        assert "pip install 'legs-loss[completion]'" in text

@@ -31,8 +31,12 @@ def main():
         os.environ[name] = str(args.threads)
 
     import torch
-    from legs_adapters.cpu import fastergs, fastgs, generic, inria, surfels, taming
-    from legs_adapters.cpu.survey import Call, Interface
+    from legs_adapters.shims.inria import forks, taming
+    from legs_adapters.shims.inria.survey import Call, Interface
+    from legs_adapters.shims.modules import FasterGSCudaBackend as fastergs
+    from legs_adapters.shims.modules import diff_gaussian_rasterization as inria
+    from legs_adapters.shims.modules import diff_gaussian_rasterization_fastgs as fastgs
+    from legs_adapters.shims.modules import diff_surfel_rasterization as surfels
 
     from legs_loss.kernels.numba_loss import fused_loss
     from legs_loss.reference import Gaussians, rasterize
@@ -123,8 +127,7 @@ def main():
         )
         return results[0], results
 
-    surfels_module = surfels.module("diff_surfel_rasterization")
-    plain_module, depth_module = generic.module("diff_fork"), with_depth(generic)
+    plain_module, depth_module = forks.module("diff_fork", Interface()), with_depth(forks)
     contestants = {
         "reference": lambda raw: direct(raw, 2),
         "reference, absolute sums": lambda raw: direct(raw, 4),
@@ -134,8 +137,8 @@ def main():
         "generic": lambda raw: standing(plain_module, raw, 3, False, {}),
         "generic, depth and alpha": lambda raw: standing(depth_module, raw, 3, False, {}),
         "fastergs": lambda raw: (FasterGS.apply(info, *raw), ()),
-        "surfels": lambda raw: standing(surfels_module, raw, 3, False, {}),
-        "surfels, all channels": lambda raw: standing(surfels_module, raw, 3, False, {}),
+        "surfels": lambda raw: standing(surfels, raw, 3, False, {}),
+        "surfels, all channels": lambda raw: standing(surfels, raw, 3, False, {}),
     }
     baselines = {"fastgs": "reference, absolute sums"}
 

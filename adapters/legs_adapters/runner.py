@@ -96,10 +96,10 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
     sys.meta_path.insert(0, _Finder(sources))
     refusals: Tuple[Type[BaseException], ...] = ()
     if cpu_root is not None:
-        from legs_adapters.cpu import MissingStandIn, start
+        from legs_adapters.shims import MissingShim, start
 
         start(cpu_root)
-        refusals = (MissingStandIn,)
+        refusals = (MissingShim,)
     main = _main_module(file)
     sys.argv[:] = [name, *arguments]
     sys.path[0] = os.path.dirname(os.path.realpath(name))

@@ -1,4 +1,4 @@
-"""The spherical harmonics of the direction in which a Gaussian is seen, and their gradient, compiled."""
+"""Evaluate the colour of a Gaussian by spherical harmonics of the viewing direction, and its gradient, compiled."""
 
 # mypy: ignore-errors
 # (numba infers the types, by its own rules)
@@ -86,3 +86,35 @@ def harmonics_gradient(degree, x, y, z, g):
             + _E5 * (xx - yy) * g[14]
         )
     return gx, gy, gz
+
+
+@compiled()
+def shade(means, i, position, degree, sh, basis, clamped, colour):
+    """Fill Gaussian `i`'s `colour` [3] as seen from `position`, and which of its channels are clamped at 0."""
+    dx, dy, dz, _ = direction(means, i, position)
+    harmonics(degree, dx, dy, dz, basis)
+    for channel in range(3):
+        value = np.float32(0.5)
+        for k in range((degree + 1) * (degree + 1)):
+            value += basis[k] * sh[i, k, channel]
+        clamped[i, channel] = value < np.float32(0)
+        colour[channel] = max(value, np.float32(0))
+
+
+@compiled()
+def shade_gradient(means, i, position, degree, sh, clamped, red, green, blue, basis, g_basis, g_sh):
+    """Fill Gaussian `i`'s `g_sh` from the gradient to its colour; return the gradient to its mean."""
+    coefficients = (degree + 1) * (degree + 1)
+    dx, dy, dz, distance = direction(means, i, position)
+    harmonics(degree, dx, dy, dz, basis)
+    red = np.float32(0) if clamped[i, 0] else np.float32(red)
+    green = np.float32(0) if clamped[i, 1] else np.float32(green)
+    blue = np.float32(0) if clamped[i, 2] else np.float32(blue)
+    for k in range(coefficients):
+        g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = basis[k] * red, basis[k] * green, basis[k] * blue
+        g_basis[k] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
+    g_sh[i, coefficients:] = 0
+    vx, vy, vz = harmonics_gradient(degree, dx, dy, dz, g_basis)
+    along = vx * dx + vy * dy + vz * dz
+    nearness = 1 / distance
+    return (vx - along * dx) * nearness, (vy - along * dy) * nearness, (vz - along * dz) * nearness

@@ -38,8 +38,13 @@ class Splats(NamedTuple):
 
 
 def rotations(quaternions: Tensor) -> Tensor:
-    """[N, 4] wxyz of any length -> [N, 3, 3]."""
-    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=1).unbind(1)
+    """Return the rotation matrices [N, 3, 3] of quaternions [N, 4], wxyz of any length."""
+    return unit_rotations(torch.nn.functional.normalize(quaternions, dim=1))
+
+
+def unit_rotations(quaternions: Tensor) -> Tensor:
+    """Return the rotation matrices [N, 3, 3] of normalised quaternions [N, 4], wxyz."""
+    w, x, y, z = quaternions.unbind(1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -122,15 +127,23 @@ def blend(offsets: Tensor, conics: Tensor, opacities: Tensor, rgb: Tensor, backg
     """Colours [P, 3] of P pixels from n splats in depth order; `offsets` [P, n, 2] run from pixel to splat."""
     dx, dy = offsets.unbind(2)
     a, b, c = conics.unbind(1)
-    response = opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    alpha, before, left = cover(opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy))
+    return (alpha * before) @ rgb + left * background
+
+
+def cover(response: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
+    """Apply the alpha thresholds to P pixels' responses [P, n], in depth order.
+
+    Returns:
+        Each splat's alpha [P, n], 0 where it is not drawn; the transmittance before it [P, n]; what is left [P, 1].
+    """
     # As upstream: the gradient passes the ceiling as if it were not there.
     alpha = response + (response.clamp_max(MAX_ALPHA) - response).detach()
-    alpha = torch.where(alpha < MIN_ALPHA, torch.zeros_like(alpha), alpha)
+    alpha = torch.where(alpha >= MIN_ALPHA, alpha, torch.zeros_like(alpha))
     unfinished = torch.cumprod(1 - alpha, 1) >= MIN_TRANSMITTANCE
     alpha = torch.where(unfinished, alpha, torch.zeros_like(alpha))
     behind = torch.cumprod(1 - alpha, 1)  # the transmittance after each splat
-    before = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], 1)
-    return (alpha * before) @ rgb + behind[:, -1:] * background
+    return alpha, torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], 1), behind[:, -1:]
 
 
 class _Offsets(torch.autograd.Function):

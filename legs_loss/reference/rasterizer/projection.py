@@ -29,7 +29,7 @@ from legs_loss.reference.rasterizer.geometry import (
     times_rotation,
     to_camera,
 )
-from legs_loss.reference.rasterizer.harmonics import direction, harmonics
+from legs_loss.reference.rasterizer.harmonics import shade
 from legs_loss.reference.rasterizer.sorting import FIRST_SLOT, ROWS, STRIP, band_at, bands_across, packed, unpacked
 
 BLOCK = 512  # Gaussians that one thread takes at a time
@@ -62,10 +62,10 @@ def tile_range(centre, radius, tiles):
 
 
 @compiled()
-def origin(strip_x, strip_y, rows):
-    """The pixel coordinates about which a splat's polynomial in a strip is written: amid the rows that it reaches."""
+def origin(left, top, rows):
+    """Return the pixel coordinates about which an entry is written: amid the rows of the strip that it reaches."""
     first, end, _ = unpacked(rows)
-    return strip_x * WIDE + 0.5 * (WIDE - 1), strip_y * TALL + 0.5 * (first + end - 1)
+    return left + 0.5 * (WIDE - 1), top + 0.5 * (first + end - 1)
 
 
 @compiled()
@@ -145,7 +145,6 @@ def _project_block(
     dilation, square, splats, depths, radii, clamped, boxes, slots,
 ):  # fmt: skip
     basis = np.empty(16, np.float32)
-    coefficients = (degree + 1) * (degree + 1)
     state, before_camera, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
     for i in range(np.uint64(first), np.uint64(end)):
         radii[i] = 0
@@ -195,14 +194,7 @@ def _project_block(
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, y0, x1, y1
         slots[i] = (x1 - x0) * ((y1 - 1) // TALL + 1 - y0 // TALL)
 
-        dx, dy, dz, _ = direction(means, i, position)
-        harmonics(degree, dx, dy, dz, basis)
-        for channel in range(3):
-            colour = np.float32(0.5)
-            for k in range(coefficients):
-                colour += basis[k] * sh[i, k, channel]
-            clamped[i, channel] = colour < np.float32(0)
-            splats[i, 6 + channel] = max(colour, np.float32(0))
+        shade(means, i, position, degree, sh, basis, clamped, splats[i, 6:])
         splats[i, 5] = summit
 
 

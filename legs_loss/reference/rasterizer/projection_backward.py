@@ -22,7 +22,7 @@ from legs_loss.reference.rasterizer.geometry import (
     times_rotation,
     to_camera,
 )
-from legs_loss.reference.rasterizer.harmonics import direction, harmonics, harmonics_gradient
+from legs_loss.reference.rasterizer.harmonics import shade_gradient
 from legs_loss.reference.rasterizer.projection import BLOCK, MEAN, SHAPE, lay_out
 from legs_loss.reference.rasterizer.sorting import FIRST_SUM
 from legs_loss.reference.rasterizer.strips import ABSOLUTE_MOMENTS, UNIT
@@ -137,7 +137,6 @@ def _project_backward_block(
     splats, clamped, firsts, sums, half,
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
 ):  # fmt: skip
-    coefficients = (degree + 1) * (degree + 1)
     basis, g_basis = np.empty(16, np.float32), np.empty(16, np.float32)
     state, drawn, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
     for i in range(first, end):
@@ -180,21 +179,12 @@ def _project_backward_block(
             g_view[i, 2], g_view[i, 3] = state[ABSOLUTE, j] * half[0], state[ABSOLUTE + 1, j] * half[1]
 
         # Colour: to the coefficients, and through the direction to the mean.
-        dx, dy, dz, distance = direction(means, i, position)
-        harmonics(degree, dx, dy, dz, basis)
-        red = np.float32(0) if clamped[i, 0] else np.float32(state[COLOUR, j])
-        green = np.float32(0) if clamped[i, 1] else np.float32(state[COLOUR + 1, j])
-        blue = np.float32(0) if clamped[i, 2] else np.float32(state[COLOUR + 2, j])
-        for k in range(coefficients):
-            g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = basis[k] * red, basis[k] * green, basis[k] * blue
-            g_basis[k] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
-        g_sh[i, coefficients:] = 0
-        vx, vy, vz = harmonics_gradient(degree, dx, dy, dz, g_basis)
-        along = vx * dx + vy * dy + vz * dz
-        nearness = 1 / distance
-        g_means[i, 0] = state[MEAN, j] + (vx - along * dx) * nearness
-        g_means[i, 1] = state[MEAN + 1, j] + (vy - along * dy) * nearness
-        g_means[i, 2] = state[MEAN + 2, j] + (vz - along * dz) * nearness
+        red, green, blue = state[COLOUR, j], state[COLOUR + 1, j], state[COLOUR + 2, j]
+        mx, my, mz = shade_gradient(
+            means, i, position, degree, sh, clamped, red, green, blue, basis, g_basis, g_sh
+        )  # fmt: skip
+        g_means[i, 0], g_means[i, 1] = state[MEAN, j] + mx, state[MEAN + 1, j] + my
+        g_means[i, 2] = state[MEAN + 2, j] + mz
 
 
 @compiled(parallel=True)

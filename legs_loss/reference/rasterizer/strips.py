@@ -103,7 +103,7 @@ def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
         prefetch(splats, draws[min(np.int64(k) + AHEAD, len(draws) - 1), OWNER])
         i = np.uint64(draws[k, OWNER])
         p, q, r = UNIT * splats[i, 2], UNIT * splats[i, 3], UNIT * splats[i, 4]
-        x, y = origin(strip_x, strip_y, draws[k, ROWS])
+        x, y = origin(strip_x * WIDE, strip_y * TALL, draws[k, ROWS])
         x -= splats[i, 0]
         y -= splats[i, 1]
         entries[k, 0] = _LOG2E * splats[i, 5]
@@ -116,12 +116,12 @@ def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
 
 
 @compiled()
-def place(state, across, down):
-    """Pixel coordinates, full transmittance; pixels outside the image count as finished."""
+def place(xs, transmittance, across, down):
+    """Fill a row's pixel coordinates and full transmittance; pixels outside the image count as finished."""
     for x in range(WIDE):
-        state[X + x] = x - (WIDE - 1) / 2
-    for pixel in range(PIXELS):
-        state[T + pixel] = _ONE if pixel % WIDE < across and pixel // WIDE < down else -_ONE
+        xs[x] = x - (WIDE - 1) / 2
+    for pixel in range(len(transmittance)):
+        transmittance[pixel] = _ONE if pixel % WIDE < across and pixel // WIDE < down else -_ONE
 
 
 @njit(inline="always")
@@ -149,10 +149,10 @@ def _read(pixels, at, wide, state):
 
 
 @compiled()
-def _unfinished(state):
-    """Whether a pixel of the strip still takes colour: as a rule, already the first one does."""
-    for pixel in range(PIXELS):  # noqa: SIM110 (numba compiles no any() of a generator)
-        if state[T + pixel] > _ZERO:
+def unfinished(transmittance):
+    """Return whether a pixel of the strip still takes colour: as a rule, already the first one does."""
+    for pixel in range(len(transmittance)):  # noqa: SIM110 (numba compiles no any() of a generator)
+        if transmittance[pixel] > _ZERO:
             return True
     return False
 
@@ -221,10 +221,10 @@ def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, ba
     height, width, pixels = image.shape[1], image.shape[2], image.reshape(-1)
     left, top = strip % across * WIDE, strip // across * TALL
     wide, tall = min(WIDE, width - left), min(TALL, height - top)
-    place(state, wide, tall)
+    place(state[X:], state[T : T + PIXELS], wide, tall)
     state[RED : RED + 3 * PIXELS] = 0
     end = ranges[strip]
-    while end < ranges[strip + 1] and _unfinished(state):
+    while end < ranges[strip + 1] and unfinished(state[T : T + PIXELS]):
         begin, end = end, min(end + CHECK, ranges[strip + 1])
         _expand(begin, end, strip % across, strip // across, splats, draws, entries)
         _blend(state, begin, end, draws, entries)
@@ -296,7 +296,7 @@ def _render_backward_strip(strip, across, state, ranges, draws, entries, ends, i
     height, width, pixels, g_pixels = image.shape[1], image.shape[2], image.reshape(-1), g_image.reshape(-1)
     left, top = strip % across * WIDE, strip // across * TALL
     wide, tall = min(WIDE, width - left), min(TALL, height - top)
-    place(state, wide, tall)
+    place(state[X:], state[T : T + PIXELS], wide, tall)
     state[RED:X] = 0
     for y in range(tall):
         rest = splat(_ZERO)

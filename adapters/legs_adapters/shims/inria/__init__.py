@@ -1,0 +1,1 @@
+"""What the shims of Inria's family of rasterizers share."""

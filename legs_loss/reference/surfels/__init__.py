@@ -1,0 +1,6 @@
+"""Surfels (2D Gaussian Splatting) to an image: the readable oracle and the compiled rasterizer behind one function."""
+
+from legs_loss.reference.surfels.model import Surfels, SurfelView
+from legs_loss.reference.surfels.rasterize import rasterize_surfels
+
+__all__ = ["SurfelView", "Surfels", "rasterize_surfels"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
+import re
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,6 +30,7 @@ from legs_adapters.shims.modules import fused_ssim, lpips, simple_knn, torch_sca
 from legs_loss import LegsError, ssim
 from legs_loss.reference.conventions import NEAR, TILE
 from legs_loss.reference.rasterizer import covariance, oracle
+from tests.support import ROOT
 
 WIDTH, HEIGHT = 72, 50
 BACKGROUND = torch.tensor([0.1, 0.5, 0.9])
@@ -680,6 +683,28 @@ class TestOthers:
             assert build(name, shim).__name__ == name
         for name in finder.AMENDED.values():
             assert importlib.import_module(f"legs_adapters.shims.modules.{name}").amend
+
+    def test_the_recipe_in_contributing_is_one_file(self, tmp_path, monkeypatch):
+        text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+        (code,) = re.findall(r"```python\n(\"\"\"diff_gaussian_rasterization_foo.*?)```", text, re.S)
+        (tmp_path / "diff_gaussian_rasterization_foo.py").write_text(code)
+        monkeypatch.setattr(finder.modules, "__path__", [*finder.modules.__path__, str(tmp_path)])
+        monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
+        finder.install()
+        from diff_gaussian_rasterization_foo import GaussianRasterizationSettings, GaussianRasterizer
+
+        given, fields = gaussians(), camera()
+        rasterizer = GaussianRasterizer(GaussianRasterizationSettings(**fields, gamma=2.0))
+        image, _, depth = rasterizer(means2D=torch.zeros(60, 3), **given)
+        dense = Dense(given, fields)
+        close(image, dense.image)
+        close(depth, (dense.weights @ dense.depths).reshape(1, *dense.shape))
+        with pytest.raises(
+            MissingShim, match=r"diff_gaussian_rasterization_foo.GaussianRasterizer.forward\(gain=...\)"
+        ):
+            rasterizer(means2D=torch.zeros(60, 3), gain=1.0, **given)
+        with pytest.raises(MissingShim, match=r"diff_gaussian_rasterization_foo.unlisted"):
+            from diff_gaussian_rasterization_foo import unlisted  # noqa: F401
 
     def test_a_fork_s_own_rasterizer_is_not_inria_s(self):
         plain, more, scored = Interface(), Interface(), Interface()

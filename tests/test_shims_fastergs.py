@@ -373,7 +373,7 @@ class TestModule:
         import weakref
 
         image, *buffers, _, _, _ = fastergs.forward(*scene(), *settings())
-        kept = weakref.ref(buffers[0].drawn.visible)
+        kept = weakref.ref(buffers[0].kept.visible)
         assert not image.requires_grad
         del buffers
         gc.collect()

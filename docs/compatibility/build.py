@@ -14,7 +14,6 @@ from string import Template
 HERE = Path(__file__).resolve().parent
 DOCS = HERE.parent
 PAGE = DOCS / "compatibility.md"
-COLUMNS = ("codebase", "commit", "kind", "round", "known", "first", "now", "sites", "view", "note")
 KINDS = ("static", "dynamic", "avatar", "SLAM", "framework", "other")
 
 # A row with several failures carries the gravest of them: this order, after "right".
@@ -40,6 +39,16 @@ def read(name):
     """Return the rows of a csv file beside this script as dictionaries."""
     with (HERE / name).open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def corpus():
+    """Return the rows of corpus.csv; exit with the row, if one has a word that no figure counts."""
+    rows = read("corpus.csv")
+    for line, row in enumerate(rows, 2):
+        for key, words in (("kind", KINDS), ("first", VERDICTS), ("now", VERDICTS)):
+            if row[key] not in words and not (key == "first" and row["round"] == "0" and row[key] == ""):
+                sys.exit(f"corpus.csv:{line}: {row['codebase']}: {key} is {row[key]!r}, not one of {', '.join(words)}")
+    return rows
 
 
 def rate(part, whole):
@@ -79,7 +88,7 @@ def round_table(blind):
 
 def figures():
     """Return every figure and list of the page, counted from the rows."""
-    rows = read("corpus.csv")
+    rows = corpus()
     blind = [row for row in rows if row["round"] != "0"]
     known = [row for row in rows if row["known"]]
     last = max(int(row["round"]) for row in blind)

@@ -13,7 +13,7 @@ from legs_loss.errors import LegsError
 
 __all__ = ["main"]
 
-COMMANDS = ("precompute", "show", "info", "train", "demo", "compare", "report", "env", "run")
+COMMANDS = ("scene", "precompute", "show", "info", "train", "demo", "compare", "report", "env", "run")
 
 EXIT_CODES = "exit codes: 0 done; 1 done, but some items failed; 2 bad input or usage; 130 interrupted"
 

@@ -1,0 +1,68 @@
+"""Make a COLMAP scene of photographs: find where each was taken, and points of the scene.
+
+PHOTOS is a folder of photographs of one still scene, each overlapping its neighbours. OUT gets the undistorted photographs
+in images/ and COLMAP's cameras, poses and points in sparse/0/, as 3DGS, its forks and this package's commands read them.
+Needs pycolmap: pip install "legs-loss[colmap]".
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = "make a COLMAP scene of photographs"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("photographs", metavar="PHOTOS", type=Path, help="a folder of photographs")
+    parser.add_argument("out", metavar="OUT", type=Path, help="the scene's folder, which must not exist yet")
+    parser.add_argument(
+        "--max_size", type=int, default=3200, metavar="N", help="pixels of the longer side at most; default: 3200"
+    )
+    parser.add_argument(
+        "--overlap",
+        type=int,
+        metavar="N",
+        help="compare each photograph with the N that follow it by name, for frames of a video; default: all with all",
+    )
+    parser.add_argument("--threads", type=int, default=-1, metavar="N", help="default: one a core")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the scene; 1 when the camera of a photograph was not found."""
+    from tqdm import tqdm
+
+    from legs_loss.errors import LegsError
+    from legs_loss.scenes.reconstruct import reconstruct
+
+    for name, fits, wanted in (
+        ("max_size", args.max_size >= 64, "at least 64"),
+        ("overlap", args.overlap is None or args.overlap >= 1, "at least 1"),
+        ("threads", args.threads == -1 or args.threads >= 1, "at least 1"),
+    ):
+        if not fits:
+            raise LegsError(f"--{name} must be {wanted}, got {getattr(args, name)}")
+    bars = {}
+
+    def tell(step: str, done: int, of: int) -> None:
+        if step not in bars:
+            bars[step] = tqdm(total=of, desc=step)
+        bar = bars[step]
+        bar.update(done - bar.n)
+        if done == of:
+            bar.close()
+
+    try:
+        made = reconstruct(args.photographs, args.out, args.max_size, args.overlap, args.threads, tell)
+    finally:
+        for bar in bars.values():
+            bar.close()
+    print(
+        f"{made.folder}: {len(made.placed)} of {len(made.placed) + len(made.lost)} photographs, {made.points} points, "
+        f"mean reprojection error {made.error:.2f} pixels"
+    )
+    if made.lost:
+        print(f"legs: no camera was found for {', '.join(made.lost)}: they are left out", file=sys.stderr)
+    return 1 if made.lost else 0

@@ -1,0 +1,205 @@
+"""Photographs -> a COLMAP scene: where each was taken and some points of the scene, by pycolmap.
+
+What COLMAP's own programs do one after the other, with 3DGS's layout as the result: undistorted photographs in images/,
+pinhole cameras, poses and points in sparse/0/.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Callable, List, NamedTuple, Optional, Sequence, Tuple
+
+from legs_loss.errors import LegsError
+
+__all__ = ["PHOTOGRAPHS", "Reconstructed", "reconstruct"]
+
+PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+EXTRACTED_AT_ONCE = 4
+MATCHED_AT_ONCE = 100  # pairs
+FEWEST = 3  # photographs that a scene needs
+
+# Of a step's name, how many are done and how many there are.
+Tell = Callable[[str, int, int], None]
+
+
+class Reconstructed(NamedTuple):
+    """A scene that was made.
+
+    Attributes:
+        folder: the scene.
+        placed, lost: the names of the photographs whose camera was found, and of the others.
+        points: the number of points.
+        error: the mean distance in pixels from where a point was seen to where it is drawn.
+    """
+
+    folder: Path
+    placed: Tuple[str, ...]
+    lost: Tuple[str, ...]
+    points: int
+    error: float
+
+
+def reconstruct(
+    photographs: Path,
+    out: Path,
+    max_size: int = 3200,
+    overlap: Optional[int] = None,
+    threads: int = -1,
+    tell: Tell = lambda step, done, of: None,
+) -> Reconstructed:
+    """Find the cameras of photographs and points of the scene, and write them as a COLMAP scene.
+
+    Args:
+        photographs: a folder of photographs, all of one scene; folders within it are looked at too.
+        out: the scene's folder, which must not exist yet. It appears when it is whole.
+        max_size: pixels of the longer side: features are looked for, and photographs written, at this size at most.
+        overlap: compare each photograph with so many that follow it by name, for frames of a video; None compares all
+            with all.
+        threads: -1 for one a core.
+        tell: called as the work goes on.
+
+    Raises:
+        LegsError: pycolmap is missing, there are too few photographs, or no scene can be made of them.
+    """
+    pycolmap = _pycolmap()
+    names = _photographs(photographs)
+    if out.exists():
+        raise LegsError(f"{out} exists already: choose another folder, or remove it")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.part-", dir=str(out.parent)))
+    except OSError as error:
+        raise LegsError(f"cannot write {out}: {error.strerror or error}") from None
+    try:
+        database = work / "database.db"
+        _extract(pycolmap, database, photographs, names, max_size, threads, tell)
+        _match(pycolmap, database, work / "pairs.txt", names, overlap, threads, tell)
+        model = _map(pycolmap, database, photographs, work / "models", len(names), threads, tell)
+        scene = _undistort(pycolmap, model, photographs, work, max_size, threads, tell)
+        placed = sorted(image.name for image in model.images.values() if image.has_pose)
+        os.replace(str(scene), str(out))
+    finally:
+        shutil.rmtree(str(work), ignore_errors=True)
+    lost = tuple(sorted(set(names) - set(placed)))
+    return Reconstructed(out, tuple(placed), lost, len(model.points3D), float(model.compute_mean_reprojection_error()))
+
+
+def _pycolmap() -> Any:
+    try:
+        import pycolmap
+    except ImportError:
+        raise LegsError('reconstruction needs pycolmap: pip install "legs-loss[colmap]"') from None
+    if not hasattr(pycolmap, "match_image_pairs"):
+        raise LegsError('this pycolmap is too old: pip install --upgrade "legs-loss[colmap]"')
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # what failed is said in our own words
+    pycolmap.set_random_seed(0)
+    return pycolmap
+
+
+def _photographs(folder: Path) -> List[str]:
+    if not folder.is_dir():
+        raise LegsError(f"there is no folder {folder}: give the folder of the photographs")
+    names = sorted(
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.suffix.lower() in PHOTOGRAPHS and path.is_file()
+    )
+    if len(names) < FEWEST:
+        raise LegsError(f"{folder}: {len(names)} photographs ({', '.join(PHOTOGRAPHS)}); at least {FEWEST} are needed")
+    return names
+
+
+def _one_camera(folder: Path, names: Sequence[str]) -> bool:
+    """Whether all photographs have one size, and one focal length as far as they tell it."""
+    from PIL import Image
+
+    kinds = set()
+    for name in names:
+        try:
+            with Image.open(str(folder / name)) as photograph:
+                exif = photograph.getexif()
+                kinds.add((photograph.size, exif.get_ifd(0x8769).get(0x920A) if exif else None))
+        except (OSError, SyntaxError, ValueError) as error:
+            raise LegsError(f"{folder / name} cannot be read: {error}") from None
+    return len(kinds) == 1
+
+
+def _extract(
+    pycolmap: Any, database: Path, folder: Path, names: Sequence[str], max_size: int, threads: int, tell: Tell
+) -> None:
+    mode = pycolmap.CameraMode.SINGLE if _one_camera(folder, names) else pycolmap.CameraMode.AUTO
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size, options.num_threads = max_size, threads
+    reader = pycolmap.ImageReaderOptions()
+    for start in range(0, len(names), EXTRACTED_AT_ONCE):
+        tell("features", start, len(names))
+        pycolmap.extract_features(
+            database, folder, list(names[start : start + EXTRACTED_AT_ONCE]), mode, reader, options
+        )
+        if mode == pycolmap.CameraMode.SINGLE:  # one camera for all calls, not one for each
+            with pycolmap.Database.open(database) as opened:
+                reader.existing_camera_id = opened.read_all_cameras()[0].camera_id
+    tell("features", len(names), len(names))
+
+
+def _match(
+    pycolmap: Any, database: Path, listed: Path, names: Sequence[str], overlap: Optional[int], threads: int, tell: Tell
+) -> None:
+    pairs = [
+        (first, second)
+        for first, second in combinations(range(len(names)), 2)
+        if overlap is None or second - first <= overlap
+    ]
+    matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
+    matching.num_threads, pairing.match_list_path = threads, listed
+    for start in range(0, len(pairs), MATCHED_AT_ONCE):
+        tell("pairs", start, len(pairs))
+        block = pairs[start : start + MATCHED_AT_ONCE]
+        listed.write_text("".join(f"{names[first]} {names[second]}\n" for first, second in block), encoding="utf-8")
+        pycolmap.match_image_pairs(database, matching, pairing)
+    tell("pairs", len(pairs), len(pairs))
+
+
+def _map(pycolmap: Any, database: Path, folder: Path, out: Path, count: int, threads: int, tell: Tell) -> Any:
+    out.mkdir()
+    placed = [0]
+
+    def one_more(by: int) -> None:
+        placed[0] = min(count, placed[0] + by)
+        tell("cameras", placed[0], count)
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed, options.min_model_size = threads, 0, FEWEST
+    tell("cameras", 0, count)
+    models = pycolmap.incremental_mapping(
+        database, folder, out, options, "", lambda: one_more(2), lambda: one_more(1)
+    )
+    if not models:
+        raise LegsError(
+            f"{folder}: no scene can be made of these photographs. They must show one still scene from different places, "
+            "each overlapping its neighbours by half or more, with texture, in focus"
+        )
+    tell("cameras", count, count)
+    return max(models.values(), key=lambda model: model.num_reg_images())
+
+
+def _undistort(
+    pycolmap: Any, model: Any, folder: Path, work: Path, max_size: int, threads: int, tell: Tell
+) -> Path:
+    tell("photographs", 0, 1)
+    best, made = work / "best", work / "undistorted"
+    best.mkdir()
+    model.write(best)
+    options = pycolmap.UndistortCameraOptions()
+    options.max_image_size = max_size
+    pycolmap.undistort_images(made, best, folder, undistort_options=options, jpeg_quality=95, num_threads=threads)
+    scene = work / "scene"
+    (scene / "sparse").mkdir(parents=True)
+    os.replace(str(made / "images"), str(scene / "images"))
+    os.replace(str(made / "sparse"), str(scene / "sparse" / "0"))
+    tell("photographs", 1, 1)
+    return scene

@@ -44,7 +44,7 @@ class Config:
     @property
     def active(self) -> bool:
         """Whether any weight is applied."""
-        return not self.off and self.spec.beta > 0.0
+        return not self.off and not self.spec.unweighted
 
 
 def find_config(

@@ -12,7 +12,7 @@ from legs_loss.images import as_map, check_pair
 from legs_loss.kernels.backends import fused_or_none
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.ssim import d_ssim
-from legs_loss.weights import weight_map
+from legs_loss.weights import error_weight_map, weight_map
 
 __all__ = ["LEGSLoss", "legs_loss", "weighted_l1"]
 
@@ -111,6 +111,8 @@ def legs_loss(
     if not 0.0 <= lambda_dssim <= 1.0:
         raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
     check_pair(prediction, target)
+    if weight is None and spec.error > 0.0:
+        weight = error_weight_map(prediction, target, spec, channels_last)
     fused = fused_or_none(
         prediction,
         target,
@@ -123,7 +125,7 @@ def legs_loss(
     )
     if fused is not None:
         return fused
-    if weight is None and spec.beta > 0.0:
+    if weight is None and not spec.unweighted:
         weight = weight_map(target, spec, channels_last)
     photometric = weighted_l1(prediction, target, weight, mask, renormalise, channels_last)
     if lambda_dssim == 0.0:

@@ -7,6 +7,7 @@ Source: the LEGS paper, its weight's definition (op = Laplacian); EGGS, arXiv 24
 
 from __future__ import annotations
 
+import math
 from functools import reduce
 from typing import Dict, List, Mapping, Sequence, Tuple
 
@@ -17,7 +18,7 @@ from torch import Tensor
 from legs_loss.images import channels_first, check_image
 from legs_loss.operators import OPERATORS, Operator, Stencil, check_operator
 
-__all__ = ["normalise_response", "response"]
+__all__ = ["gaussian_blur", "normalise_response", "response"]
 
 
 def response(image: Tensor, operator: str = "laplacian", p: float = 2.0, channels_last: bool = False) -> Tensor:
@@ -73,6 +74,28 @@ def normalise_response(response: Tensor, eps: float = 1e-8) -> Tensor:
     low = response.amin(over, keepdim=True)
     high = response.amax(over, keepdim=True)
     return (response - low) / (high - low + eps)
+
+
+def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
+    """Return an image averaged with a Gaussian of ``sigma`` pixels, cut off at 3 sigma, the border reflected.
+
+    Args:
+        image: [C, H, W] or [B, C, H, W].
+        sigma: 0 leaves it as it is.
+
+    Example:
+        >>> (100 * gaussian_blur(torch.tensor([[[0.0, 0.0, 1.0, 0.0, 0.0]]]), 0.5)).round()
+        tensor([[[ 0., 11., 79., 11.,  0.]]])
+    """
+    if sigma == 0.0:
+        return image
+    reach = math.ceil(3.0 * sigma)
+    steps = torch.arange(-reach, reach + 1, dtype=image.dtype, device=image.device)
+    kernel = torch.exp(-0.5 * (steps / sigma) ** 2)
+    kernel = kernel / kernel.sum()
+    padded = _with_border(image.reshape(-1, 1, *image.shape[-2:]), reach)
+    blurred = F.conv2d(F.conv2d(padded, kernel.reshape(1, 1, 1, -1)), kernel.reshape(1, 1, -1, 1))
+    return blurred.reshape(image.shape)
 
 
 def _components(image: Tensor, operator: Operator) -> List[Tensor]:

@@ -24,8 +24,9 @@ from legs_loss.errors import LegsError
 from legs_loss.images import as_map, check_pair, is_compiling
 from legs_loss.loss import weighted_l1
 from legs_loss.memo import DEFAULT_LIMIT, WeightMemo
+from legs_loss.response import normalise_response, response
 from legs_loss.spec import Spec, as_spec
-from legs_loss.weights import weight_from_response, weight_map
+from legs_loss.weights import error_weight_map, weight_from_response, weight_map
 
 if TYPE_CHECKING:
     from legs_loss.store import WeightStore
@@ -68,7 +69,7 @@ class _Run:
         self._store_opened = False
 
     def weight(self, target: Tensor, view: Optional[str], channels_last: bool) -> Tensor:
-        """Return one image's weight map, [1, H, W] (channels-last: [H, W, 1])."""
+        """Return one image's weight map, [1, H, W] (channels-last: [H, W, 1]); E^ where weights follow the error."""
         made = _counts.stored + _counts.computed
         weight = self.memo.recall(target, lambda: self._make(target, view, channels_last))
         _counts.remembered += _counts.stored + _counts.computed == made
@@ -86,7 +87,10 @@ class _Run:
             _counts.stored += 1
             return weight
         _counts.computed += 1
-        return weight_map(target, self.config.spec, channels_last)
+        spec = self.config.spec
+        if spec.error > 0.0:
+            return normalise_response(response(target, spec.operator, spec.p, channels_last), spec.eps)
+        return weight_map(target, spec, channels_last)
 
     def _from_store(self, target: Tensor, view: Optional[str], channels_last: bool) -> Optional[Tensor]:
         store = self._open_store()
@@ -118,7 +122,9 @@ class _Run:
         except LegsError as error:
             self.say_once("damaged", f"{error}; the weights of such views are computed")
             return None
-        weight = weight_from_response(normalised, self.config.spec)
+        weight = normalised.float()
+        if self.config.spec.error == 0.0:
+            weight = weight_from_response(normalised, self.config.spec)
         return weight.movedim(0, -1) if channels_last else weight
 
     def _open_store(self) -> Optional[WeightStore]:
@@ -205,7 +211,11 @@ def l1_loss(
     check_pair(prediction, target)
     _check_layout(target, channels_last)
     if is_compiling():  # what the compiler traces has no memory: the weight becomes part of the graph
-        weight = weight_map(target, run.config.spec, channels_last)
+        spec = run.config.spec
+        if spec.error > 0.0:
+            weight = error_weight_map(prediction, target, spec, channels_last)
+        else:
+            weight = weight_map(target, spec, channels_last)
         return _weighted(prediction, target, weight, mask, channels_last, reduction, own)
     run.say_once("active", _describe(run.config))
     _counts.weighted += 1
@@ -215,6 +225,8 @@ def l1_loss(
             weight = run.weight(target, views[0], channels_last)
         else:
             weight = torch.stack([run.weight(target[i], name, channels_last) for i, name in enumerate(views)])
+        if run.config.spec.error > 0.0:
+            weight = error_weight_map(prediction, target, run.config.spec, channels_last, weight)
     return _weighted(prediction, target, weight, mask, channels_last, reduction, own)
 
 

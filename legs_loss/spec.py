@@ -31,7 +31,13 @@ class WeightSpec:
             responses are clamped to 1.
         normalise: "none", as in the paper, or "mean": each map is divided by its mean, so that it moves weight
             between pixels without scaling the L1 term.
+        scale: > 0, multiplies the map. In a loss with lambda 0.2 a map of mean 1 times 0.6 has the balance of L1 and
+            SSIM of lambda 0.3; gradients, which many codebases compare with a threshold to densify, shrink with it.
         eps: > 0, in the normalisation's denominator.
+        error: in [0, 1], how much of the rendering's own error joins the response: the curve is applied to
+            E^ ** (1 - error) * e ** error, normalised to [0, 1], where e is the mean absolute error around a pixel. 0
+            is the paper's weight, 1 looks at the error alone. Such weights change at every step; none are stored.
+        error_blur: >= 0, the standard deviation in pixels of the Gaussian that the error is averaged with.
 
     Raises:
         LegsError: a setting is unknown or out of range.
@@ -48,16 +54,27 @@ class WeightSpec:
     beta: float = 10.0
     percentile: float = 100.0
     normalise: str = "none"
+    scale: float = 1.0
     eps: float = 1e-8
+    error: float = 0.0
+    error_blur: float = 1.5
 
     def __post_init__(self) -> None:
         check_operator(self.operator, self.p)
         curve(self.curve)
         _check_number("beta", self.beta, 0.0 <= self.beta < float("inf"), "at least 0")
         _check_number("percentile", self.percentile, 0.0 < self.percentile <= 100.0, "above 0 and at most 100")
+        _check_number("scale", self.scale, 0.0 < self.scale < float("inf"), "above 0")
         _check_number("eps", self.eps, 0.0 < self.eps < float("inf"), "above 0")
+        _check_number("error", self.error, 0.0 <= self.error <= 1.0, "in [0, 1]")
+        _check_number("error_blur", self.error_blur, 0.0 <= self.error_blur < float("inf"), "at least 0")
         if self.normalise not in ("none", "mean"):
             raise LegsError(f'normalise must be "none" or "mean", got {self.normalise!r}')
+
+    @property
+    def unweighted(self) -> bool:
+        """Whether the weight is 1 everywhere: 3DGS's own loss."""
+        return self.beta == 0.0 and self.scale == 1.0
 
 
 Spec = Union[str, WeightSpec]

@@ -37,7 +37,7 @@ from legs_loss.experiments.weighting import WEIGHTINGS, fading, growing, multisc
 from legs_loss.reference.training import trainer
 from legs_loss.reference.training.dataset import TrainingView, load_dataset
 from legs_loss.reference.training.side_by_side import train_arm
-from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, train
+from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, by_error, train
 from legs_loss.scenes import read_scene
 from tests.support import without_times
 
@@ -52,8 +52,14 @@ def test_names_of_arms() -> None:
     assert parse_arm("beta=5").spec == WeightSpec(beta=5.0)
     assert parse_arm("operator=sobel,p=1,beta=2").spec == WeightSpec(operator="sobel", p=1.0, beta=2.0)
     assert parse_arm("legs:mean1").spec == replace(PRESETS["legs"], normalise="mean")
-    arm = parse_arm("percentile=99:mean1:error@C1")
-    assert (arm.name, arm.weighting, arm.at) == ("percentile=99:mean1:error@legs-l", "error", "legs-l")
+    arm = parse_arm("percentile=99,error=0.5:mean1:late:lambda=0.3@C1")
+    assert (arm.name, arm.weighting, arm.at) == (
+        "percentile=99,error=0.5:mean1:late:lambda=0.3@legs-l",
+        "late",
+        "legs-l",
+    )
+    assert arm.at == "legs-l"
+    assert (arm.spec.error, arm.config(BASE, 1.0, 1.0).lambda_dssim) == (0.5, 0.3)
     # One training, one name, so that it is never run twice.
     assert [parse_arm(name).name for name in ("C1", "C3", "beta=10", "beta=0", "legs-l")] == [
         "legs-l",
@@ -73,6 +79,8 @@ def test_names_of_arms() -> None:
         ("beta=much", "beta must be a number"),
         ("beta=-1", "beta"),
         ("legs:louder", "no change is named 'louder'"),
+        ("legs:lambda=2", "lambda must be a number in"),
+        ("legs:lambda=0.2:lambda=0.3", "give lambda once"),
         ("legs:fading:shuffled", "one of"),
         ("legs:scale:mean1", "scale"),
         ("3dgs:shuffled", "no weights to change"),
@@ -92,7 +100,7 @@ def test_every_study_and_change_can_be_named() -> None:
         assert all(folder.replace("-", "").replace(".", "").isalnum() for folder in folders)
         for arm in [*study.against, *study.against.values()]:
             assert arm in study.arms
-    for change in CHANGES:
+    for change in (name.replace("=X", "=0.3") for name in CHANGES):
         assert parse_arm(f"legs:{change}").changes == (change,)
     assert set(WEIGHTINGS) | set(LOSSES) <= set(CHANGES)
 
@@ -192,7 +200,10 @@ def test_weight_goes_where_the_rendering_errs() -> None:
     wrong = image.clone()
     wrong[:, 10:14, 10:14] += 0.3
     view = TrainingView("a", None, image, None)  # type: ignore[arg-type]
-    weigh = WEIGHTINGS["error"]([view], replace(BASE, spec=WeightSpec(percentile=99.0)))
+    config = replace(BASE, spec=WeightSpec(percentile=99.0, error=0.5, curve="C1"))
+    weigh = by_error([view], config)
+    assert WEIGHTINGS["late"]([view], config)(0, 0.3, wrong) is None
+    assert torch.equal(WEIGHTINGS["late"]([view], config)(0, 0.4, wrong), weigh(0, 0.4, wrong))
     weight = weigh(0, 0.0, wrong)
     assert float(weight[0, 10:14, 10:14].mean()) > 3
     assert float(weight[0, :6].max()) == 1.0

@@ -1,8 +1,8 @@
 """Make a COLMAP scene of photographs: find where each was taken, and points of the scene.
 
-PHOTOS is a folder of photographs of one still scene, each overlapping its neighbours. OUT gets the undistorted photographs
-in images/ and COLMAP's cameras, poses and points in sparse/0/, as 3DGS, its forks and this package's commands read them.
-Needs pycolmap: pip install "legs-loss[colmap]".
+PHOTOS is a folder of photographs of one still scene, each overlapping its neighbours. OUT gets the undistorted
+photographs in images/ and COLMAP's cameras, poses and points in sparse/0/, as 3DGS, its forks and this package's
+commands read them. Needs pycolmap: pip install "legs-loss[colmap]".
 """
 
 from __future__ import annotations

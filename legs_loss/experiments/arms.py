@@ -9,6 +9,7 @@ Gaussians that another arm has, densification by densification: "legs@3dgs".
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Mapping, Optional, Sequence, Tuple
 
@@ -27,14 +28,16 @@ CHANGES: Mapping[str, str] = {
     "shuffled": "each map's pixels in random order",
     "mean1": "each map divided by its mean",
     "half": "half the L1 term, weighted or not, so that SSIM counts for more",
+    "lambda=X": "the share X of D-SSIM in the loss",
     "threshold": "the densification threshold times the loss's mean weight",
     "growing": "beta grows from 0 over the run",
     "fading": "beta falls to 0 over the run",
     "multiscale": "the mean of the responses at three sizes",
-    "error": "the response times the rendering's error nearby",
+    "late": "the weights set in after a third of the run",
+    "latest": "the weights set in after two thirds of the run",
     "ssim": "the weights also inside the mean of SSIM's map",
 }
-_WEIGHTINGS = ("shuffled", "growing", "fading", "multiscale", "error")  # one of them at most
+_WEIGHTINGS = ("shuffled", "growing", "fading", "multiscale", "late", "latest")  # one of them at most
 
 LOOSE = 0.25  # of the threshold: where another arm's numbers are the limit, they are to be met
 
@@ -47,6 +50,7 @@ class ArmSpec:
     spec: WeightSpec
     changes: Tuple[str, ...] = ()
     at: Optional[str] = None  # the arm whose numbers of Gaussians this one gets
+    lambda_dssim: Optional[float] = None
 
     @property
     def folder(self) -> str:
@@ -82,6 +86,8 @@ class ArmSpec:
             threshold *= LOOSE
         if "scale" in self.changes:
             return replace(base, spec="3dgs", l1_scale=base.l1_scale * mean_weight, densify_grad_threshold=threshold)
+        if self.lambda_dssim is not None:
+            base = replace(base, lambda_dssim=self.lambda_dssim)
         scale = base.l1_scale * (0.5 if "half" in self.changes else 1.0)
         return replace(base, spec=self.spec, l1_scale=scale, densify_grad_threshold=threshold)
 
@@ -100,8 +106,9 @@ def parse_arm(name: str) -> ArmSpec:
     """
     own, at_sign, at = name.partition("@")
     loss, *changes = own.split(":")
+    lambda_dssim = _lambda(name, changes)
     for change in changes:
-        if change not in CHANGES:
+        if change not in CHANGES and not change.startswith("lambda="):
             raise LegsError(f"{name}: no change is named {change!r}: choose one of {', '.join(CHANGES)}")
     if len(set(changes)) < len(changes) or sum(change in _WEIGHTINGS for change in changes) > 1:
         raise LegsError(f"{name}: give each change once, and one of {', '.join(_WEIGHTINGS)} at most")
@@ -110,14 +117,14 @@ def parse_arm(name: str) -> ArmSpec:
     if at_sign and "@" in at:
         raise LegsError(f"{name}: the arm behind the @ has an @ of its own")
     spec = _loss(name, loss)
-    if spec.beta == 0 and set(changes) - {"half"}:
+    if spec.unweighted and any(change != "half" and not change.startswith("lambda=") for change in changes):
         raise LegsError(f"{name}: {loss} has no weights to change")
     leader = parse_arm(at).name if at_sign else None
     preset = next((preset for preset, known in PRESETS.items() if known == spec), loss)
     own_name = ":".join([preset, *changes])
     if "mean1" in changes:
         spec = replace(spec, normalise="mean")
-    return ArmSpec(own_name if leader is None else f"{own_name}@{leader}", spec, tuple(changes), leader)
+    return ArmSpec(own_name if leader is None else f"{own_name}@{leader}", spec, tuple(changes), leader, lambda_dssim)
 
 
 def parse_arms(names: Sequence[str]) -> List[ArmSpec]:
@@ -132,6 +139,19 @@ def parse_arms(names: Sequence[str]) -> List[ArmSpec]:
 def needed(arms: Sequence[ArmSpec]) -> List[ArmSpec]:
     """Return the arms, and before them those whose numbers of Gaussians they take."""
     return list(dict.fromkeys([parse_arm(arm.at) for arm in arms if arm.at is not None] + list(arms)))
+
+
+def _lambda(name: str, changes: Sequence[str]) -> Optional[float]:
+    found = [change.partition("=")[2] for change in changes if change.startswith("lambda=")]
+    if len(found) > 1:
+        raise LegsError(f"{name}: give lambda once")
+    try:
+        value = float(found[0]) if found else None
+    except ValueError:
+        value = math.nan
+    if value is not None and not 0.0 <= value <= 1.0:
+        raise LegsError(f"{name}: lambda must be a number in [0, 1], got {found[0]!r}")
+    return value
 
 
 def _loss(name: str, loss: str) -> WeightSpec:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from legs_loss.reference.training.dataset import TrainingView
-from legs_loss.reference.training.trainer import TrainConfig, Weigh, Weighting
+from legs_loss.reference.training.trainer import TrainConfig, Weigh, Weighting, by_error
 from legs_loss.response import normalise_response, response
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_from_response
@@ -21,7 +21,6 @@ from legs_loss.weights import weight_from_response
 __all__ = ["WEIGHTINGS"]
 
 SCALES = (1, 2, 4)  # the photograph's own size, a half and a quarter of it
-BLUR = 5  # pixels: the error's neighbourhood
 
 
 def shuffled(views: List[TrainingView], config: TrainConfig) -> Weigh:
@@ -49,17 +48,14 @@ def multiscale(views: List[TrainingView], config: TrainConfig) -> Weigh:
     return lambda index, done, rendering: maps[index]
 
 
-def error(views: List[TrainingView], config: TrainConfig) -> Weigh:
-    """The normalised response times the rendering's own error nearby, in the response's place: weight where it errs."""
-    spec = config.weights
-    responses = [_response_at(view.image, 1, spec) for view in views]
+def late(views: List[TrainingView], config: TrainConfig) -> Weigh:
+    """The spec's weights from a third of the run on; 3DGS's own loss before."""
+    return _from(1.0 / 3.0, views, config)
 
-    def weigh(index: int, done: float, rendering: Tensor) -> Tensor:
-        wrong = (rendering - views[index].image).abs().mean(0, keepdim=True)
-        nearby = avg_pool2d(wrong, BLUR, stride=1, padding=BLUR // 2, count_include_pad=False)
-        return weight_from_response(normalise_response(responses[index] * nearby, spec.eps), spec)
 
-    return weigh
+def latest(views: List[TrainingView], config: TrainConfig) -> Weigh:
+    """The spec's weights from two thirds of the run on; 3DGS's own loss before."""
+    return _from(2.0 / 3.0, views, config)
 
 
 WEIGHTINGS: Mapping[str, Weighting] = {
@@ -67,8 +63,17 @@ WEIGHTINGS: Mapping[str, Weighting] = {
     "growing": growing,
     "fading": fading,
     "multiscale": multiscale,
-    "error": error,
+    "late": late,
+    "latest": latest,
 }
+
+
+def _from(onset: float, views: List[TrainingView], config: TrainConfig) -> Weigh:
+    def maps(index: int, done: float, rendering: Tensor) -> Optional[Tensor]:
+        return views[index].weight
+
+    weigh = by_error(views, config) if config.weights.error > 0.0 else maps
+    return lambda index, done, rendering: weigh(index, done, rendering) if done > onset else None
 
 
 def _shuffle(weight: Optional[Tensor], generator: torch.Generator) -> Optional[Tensor]:

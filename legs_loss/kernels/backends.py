@@ -101,7 +101,7 @@ def fused_or_none(
     Args:
         weight: a map, or the spec to compute it with. The others are as for ``legs_loss``, and checked.
     """
-    unweighted = isinstance(weight, WeightSpec) and weight.beta == 0.0
+    unweighted = isinstance(weight, WeightSpec) and weight.unweighted
     if unweighted and not _forced():
         return None  # 3DGS's own loss, to the last bit
     if padding != "zeros" or lambda_dssim == 0.0 or is_compiling() or not _takes(prediction, target, weight, mask):

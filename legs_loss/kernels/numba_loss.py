@@ -88,7 +88,11 @@ def fused_loss(
 
 def supports(spec: WeightSpec) -> bool:
     """Return whether the kernel makes the weights of a spec itself; other specs' are made by torch, as a map."""
-    return supports_response(spec) and spec.curve in CURVES and spec.percentile == 100.0 and spec.normalise == "none"
+    return (
+        supports_response(spec)
+        and spec.curve in CURVES
+        and (spec.percentile, spec.normalise, spec.scale, spec.error) == (100.0, "none", 1.0, 0.0)
+    )
 
 
 class _Weights(NamedTuple):

@@ -6,7 +6,7 @@ import base64
 import io
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, NamedTuple, Tuple
+from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Tuple
 
 import numpy as np
 import torch
@@ -17,7 +17,8 @@ from legs_loss.experiments.weighting import WEIGHTINGS
 from legs_loss.reference.ply import read_ply
 from legs_loss.reference.training.dataset import TrainingView
 from legs_loss.reference.training.trainer import TrainConfig, draw, point_cloud, step_weight
-from legs_loss.weights import weight_map
+from legs_loss.spec import WeightSpec
+from legs_loss.weights import error_weight_map, weight_map
 
 __all__ = ["KINDS", "Drawn", "Pictures", "differing", "draw_row", "encode"]
 
@@ -59,11 +60,18 @@ def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Drawn:
     """Draw a view with a row's Gaussians, and make the weight map that its run would have ended with there."""
     config = TrainConfig.from_dict(row["config"])
     rendering = draw(read_ply(point_cloud(folder, config)), view, config)
-    weight = weight_map(view.image, config.spec) if config.weights.beta > 0 else None
+    weight = _weight(config.weights, view.image, rendering)
     if row["weighting"] is not None:
         weight = WEIGHTINGS[row["weighting"]]([replace(view, weight=weight)], config)(0, 1.0, rendering)
     weight = step_weight(weight, view, config)
     return Drawn(rendering.clamp(0, 1), torch.ones_like(view.image[:1]) if weight is None else weight)
+
+
+def _weight(spec: WeightSpec, photograph: Tensor, rendering: Tensor) -> Optional[Tensor]:
+    """The weight map at the end of the run; None where nothing is weighted."""
+    if spec.unweighted:
+        return None
+    return error_weight_map(rendering, photograph, spec) if spec.error > 0.0 else weight_map(photograph, spec)
 
 
 def encode(view: TrainingView, drawn: Mapping[str, Drawn], form: Mapping[str, Any]) -> Pictures:

@@ -175,21 +175,17 @@ def _map(pycolmap: Any, database: Path, folder: Path, out: Path, count: int, thr
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.min_model_size = threads, 0, FEWEST
     tell("cameras", 0, count)
-    models = pycolmap.incremental_mapping(
-        database, folder, out, options, "", lambda: one_more(2), lambda: one_more(1)
-    )
+    models = pycolmap.incremental_mapping(database, folder, out, options, "", lambda: one_more(2), lambda: one_more(1))
     if not models:
         raise LegsError(
-            f"{folder}: no scene can be made of these photographs. They must show one still scene from different places, "
-            "each overlapping its neighbours by half or more, with texture, in focus"
+            f"{folder}: no scene can be made of these photographs. They must show one still scene from different "
+            "places, each overlapping its neighbours by half or more, with texture, in focus"
         )
     tell("cameras", count, count)
     return max(models.values(), key=lambda model: model.num_reg_images())
 
 
-def _undistort(
-    pycolmap: Any, model: Any, folder: Path, work: Path, max_size: int, threads: int, tell: Tell
-) -> Path:
+def _undistort(pycolmap: Any, model: Any, folder: Path, work: Path, max_size: int, threads: int, tell: Tell) -> Path:
     tell("photographs", 0, 1)
     best, made = work / "best", work / "undistorted"
     best.mkdir()

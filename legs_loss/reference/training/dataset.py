@@ -83,13 +83,13 @@ def load_dataset(
             not fit.
     """
     train, test = split_views(scene)
-    opened = _open_store(scene, store) if spec.beta > 0 and weights is None else None
+    opened = _open_store(scene, store) if not spec.unweighted and weights is None else None
 
     def weighted(view: View) -> TrainingView:
         loaded = load_view(scene, view, resolution, white_background)
         if weights is not None:
             return replace(loaded, weight=_explicit(weights, loaded))
-        return replace(loaded, weight=_weight(opened, loaded, spec)) if spec.beta > 0 else loaded
+        return replace(loaded, weight=_weight(opened, loaded, spec)) if not spec.unweighted else loaded
 
     return Dataset(
         [weighted(view) for view in train], [load_view(scene, view, resolution, white_background) for view in test]

@@ -32,8 +32,10 @@ from legs_loss.reference.training.checkpoint import read_checkpoint, write_check
 from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, load_dataset
 from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.reference.training.metrics import mean_scores, psnr, score
+from legs_loss.response import normalise_response, response
 from legs_loss.scenes import Scene
 from legs_loss.spec import Spec, WeightSpec, as_spec
+from legs_loss.weights import error_weight_map
 
 __all__ = [
     "Loss",
@@ -42,6 +44,7 @@ __all__ = [
     "TrainConfig",
     "Weigh",
     "Weighting",
+    "by_error",
     "draw",
     "point_cloud",
     "step_loss",
@@ -177,6 +180,17 @@ def step_loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lamb
     return fused_loss(prediction, target, weight, lambda_dssim)
 
 
+def by_error(views: List[TrainingView], config: TrainConfig) -> Weigh:
+    """Make the weights of a spec that follows the rendering's error (``spec.error``)."""
+    spec = config.weights
+    responses = [normalise_response(response(view.image, spec.operator, spec.p), spec.eps) for view in views]
+
+    def weigh(index: int, done: float, rendering: Tensor) -> Tensor:
+        return error_weight_map(rendering, views[index].image, spec, normalised=responses[index])
+
+    return weigh
+
+
 def draw(gaussians: Gaussians, view: TrainingView, config: TrainConfig) -> Tensor:
     """Return a finished scene's rendering of a view, [3, H, W], not clipped."""
     with torch.no_grad():
@@ -226,7 +240,10 @@ def train(
         LegsError: the scene cannot be trained on, numba is missing, or the checkpoint does not fit.
         KeyboardInterrupt: Ctrl-C, after the checkpoint.
     """
-    data = load_dataset(scene, config.weights, config.resolution, config.white_background, store, weights)
+    maps = config.weights if config.weights.error == 0.0 else WeightSpec(beta=0.0)
+    data = load_dataset(scene, maps, config.resolution, config.white_background, store, weights)
+    if weighting is None and config.weights.error > 0.0:
+        weighting = by_error
     folder = None if out is None else Path(out)
     if resume:
         if folder is None:

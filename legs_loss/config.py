@@ -58,7 +58,7 @@ def find_config(
         start: a file or folder of the codebase: legs.toml is looked for there and in the folders above it, up to the
             root of its git checkout. None looks nowhere.
         environ: in place of ``os.environ``: LEGS_PRESET, LEGS_BETA, LEGS_CURVE, LEGS_OPERATOR, LEGS_P,
-            LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_EPS, LEGS_STORE, LEGS_OFF.
+            LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_SCALE, LEGS_EPS, LEGS_ERROR, LEGS_ERROR_BLUR, LEGS_STORE, LEGS_OFF.
         argv: in place of ``sys.argv``: the scene after ``-s`` / ``--source_path`` is where the store is looked for.
 
     Raises:

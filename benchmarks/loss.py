@@ -9,7 +9,7 @@ table shows the median and the least and greatest of them. On one thread the pro
 pytorch-msssim and torchmetrics are measured where they are installed. "3DGS" is Inria's l1_loss + ssim: |a - b|.mean()
 and legs_loss.ssim, which tests/test_ssim.py holds equal to theirs to the last bit. torch.compile compiles the reference
 before it is timed. Contenders of more than two seconds get three rounds. On a GPU a time is that of ten steps between
-two events, the backend is Triton, and beside the table stands what the bytes that must move would take at the
+two events, and beside the table stands what the bytes that must move would take at the
 bandwidth of a copy.
 """
 
@@ -31,6 +31,7 @@ from torch import Tensor
 
 from legs_loss import legs_loss, ssim, weight_map
 from legs_loss.kernels.backends import backend_for, finding
+from legs_loss.kernels.contract import Weights
 from legs_loss.spec import PRESETS
 
 LAMBDA = 0.2
@@ -158,11 +159,11 @@ def losses(prediction: Tensor, target: Tensor) -> Contenders:
 
     contenders: Dict[str, Callable[[Tensor], Tensor]] = {}
     backend = backend_for(prediction.device)
-    kernel = finding(backend, prediction.device).fused if backend != "torch" else None
+    kernel = finding(backend, prediction.device).backend if backend != "torch" else None
     if kernel is not None:
         contenders["LEGS, weights in the kernel"] = lambda image: legs_loss(image, target, LEGS)
         contenders["LEGS, stored map"] = lambda image: legs_loss(image, target, weight=stored)
-        contenders["3DGS by the kernel"] = lambda image: kernel(image, target, None, LAMBDA)
+        contenders["3DGS by the kernel"] = lambda image: kernel.loss(image, target, Weights(), LAMBDA)
     contenders["LEGS by torch"] = lambda image: (
         (1.0 - LAMBDA) * (weight_map(target, LEGS) * torch.abs(image - target)).mean()
         + LAMBDA * (1.0 - ssim(image, target))
@@ -220,7 +221,7 @@ def losses(prediction: Tensor, target: Tensor) -> Contenders:
 def weightings(target: Tensor) -> Contenders:
     """Return each way to the weights of a photograph as a function."""
     found: Contenders = {"weight_map": lambda: weight_map(target, LEGS)}
-    if not target.is_cuda and finding("numba", target.device).fused is not None:
+    if not target.is_cuda and finding("numba", target.device).backend is not None:
         from legs_loss.kernels.numba_response import extremes
 
         batch = target.unsqueeze(0).numpy()
@@ -342,7 +343,7 @@ def machine(device: torch.device) -> Dict[str, str]:
     versions = {"python": platform.python_version(), "torch": torch.__version__}
     if device.type == "cuda":
         versions["gpu"], versions["cuda"] = torch.cuda.get_device_name(device), str(torch.version.cuda)
-    for package in ("numba", "triton", "fused_ssim", "kornia", "pytorch_msssim", "torchmetrics"):
+    for package in ("numba", "fused_ssim", "kornia", "pytorch_msssim", "torchmetrics"):
         try:
             versions[package] = str(getattr(__import__(package), "__version__", "installed"))
         except ImportError:

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from legs_loss.errors import LegsError
 from legs_loss.images import as_map, check_pair
-from legs_loss.kernels.backends import fused_or_none
+from legs_loss.kernels.backends import fused_loss
+from legs_loss.kernels.contract import Weights
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.ssim import d_ssim
 from legs_loss.weights import error_weight_map, weight_map
@@ -92,8 +93,8 @@ def legs_loss(
         channels_last: where the channel stands.
 
     Returns:
-        A scalar, differentiable in the prediction. With a weight it is computed by numba or Triton where they are
-        installed and take the images (docs/performance.md): equal up to rounding, differentiable once.
+        A scalar, differentiable in the prediction. With a weight it is computed by a backend where one is
+        installed and takes the images (docs/performance.md): equal up to rounding, differentiable once.
 
     Raises:
         LegsError: shapes, ranges or names that do not fit, or a target with NaN or infinity (on the CPU).
@@ -113,16 +114,8 @@ def legs_loss(
     check_pair(prediction, target)
     if weight is None and spec.error > 0.0:
         weight = error_weight_map(prediction, target, spec, channels_last)
-    fused = fused_or_none(
-        prediction,
-        target,
-        spec if weight is None else weight,
-        mask,
-        lambda_dssim,
-        padding,
-        renormalise,
-        channels_last,
-    )
+    weights = Weights(spec if weight is None else None, None, weight, mask, renormalise)
+    fused = fused_loss(prediction, target, weights, lambda_dssim, padding, channels_last)
     if fused is not None:
         return fused
     if weight is None and not spec.unweighted:

@@ -225,7 +225,7 @@ class TestSelection:
 
     def test_an_unknown_backend_is_an_error(self, chosen):
         chosen("cuda")
-        with pytest.raises(LegsError, match="LEGS_BACKEND must be one of torch, numba, triton, got 'cuda'"):
+        with pytest.raises(LegsError, match="LEGS_BACKEND must be one of torch, numba, got 'cuda'"):
             legs_loss(*images((3, 20, 30)))
 
     @pytest.mark.parametrize(
@@ -309,15 +309,11 @@ class TestSelection:
             "legs_loss.kernels.numba_loss.fused_loss", lambda *args: 1.01 * fused_loss(*args[:2], *args[2:])
         )
         assert used(legs_loss(*images((3, 20, 30)))) == "torch"
-        assert "its trial gave" in capfd.readouterr().err
+        assert "its trial of the loss gave" in capfd.readouterr().err
 
-    @pytest.mark.parametrize(
-        ("name", "settings"),
-        [("numba", {}), ("triton", {"LEGS_BACKEND": "triton", "TRITON_INTERPRET": "1"})],
-    )
-    def test_a_broken_install(self, tmp_path, name, settings):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "__init__.py").write_text("raise ImportError('needs NumPy 1.99 or less')\n")
+    def test_a_broken_install(self, tmp_path):
+        (tmp_path / "numba").mkdir()
+        (tmp_path / "numba" / "__init__.py").write_text("raise ImportError('needs NumPy 1.99 or less')\n")
         code = (
             "import torch, legs_loss\n"
             "x = torch.rand(3, 16, 16, requires_grad=True)\n"
@@ -327,10 +323,9 @@ class TestSelection:
         environment = legs_environment()
         environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
         environment.pop("LEGS_BACKEND", None)
-        environment.update(settings)
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
         assert done.returncode == 0, done.stderr
-        assert done.stderr.count(f"legs-loss: {name} is not used, torch is: ImportError: needs NumPy 1.99 or less") == 1
+        assert done.stderr.count("legs-loss: numba is not used, torch is: ImportError: needs NumPy 1.99 or less") == 1
 
     @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
     def test_a_forked_process_uses_torch(self, chosen):

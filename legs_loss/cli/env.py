@@ -34,7 +34,7 @@ def _lines() -> Iterator[Tuple[str, str]]:
     yield "python", f"{platform.python_version()}, {platform.platform()}"
     yield "torch", f"{torch.__version__}, {torch.get_num_threads()} threads"
     yield "CUDA", _cuda()
-    for name, package in (("numba", "numba"), ("triton", "triton"), ("fused-ssim", "fused_ssim")):
+    for name, package in (("numba", "numba"), ("fused-ssim", "fused_ssim")):
         yield name, _version(package)
     yield "LEGS_BACKEND", os.environ.get("LEGS_BACKEND") or "not set"
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]

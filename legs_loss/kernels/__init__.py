@@ -1,1 +1,4 @@
-"""The LEGS loss made fast: one file a backend. The torch code in ssim.py and loss.py is what each must equal."""
+"""The two sums of the loss (weighted L1, SSIM) made fast. contract.py says what a backend offers, backends.py chooses.
+
+The torch code in loss.py, ssim.py and weights.py is the reference, which each backend equals up to rounding.
+"""

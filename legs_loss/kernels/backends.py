@@ -1,8 +1,8 @@
-"""Which code computes the loss: torch, or where they are installed and work, numba on the CPU and Triton on a GPU.
+"""Which code computes the loss: torch, or a backend where one is installed and works.
 
 A backend is tried once before it is used, on a small image against torch. One that is not installed is passed over in
 silence; one that fails, then or later, is named once on stderr; torch does the work then.
-``LEGS_BACKEND=torch|numba|triton`` forces one; what that one does not take is torch's all the same.
+``LEGS_BACKEND=torch|numba`` forces one; what that one does not take is torch's all the same.
 """
 
 from __future__ import annotations
@@ -12,38 +12,45 @@ import importlib.util
 import os
 import sys
 import threading
-from typing import Any, Callable, Dict, NamedTuple, Optional, Union
+from typing import Callable, Dict, NamedTuple, Optional
 
 import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.images import as_map, channels_first, is_compiling
+from legs_loss.kernels.contract import Backend, Weights
 from legs_loss.spec import WeightSpec
-from legs_loss.ssim import d_ssim
 from legs_loss.weights import weight_map
 
-__all__ = ["BACKENDS", "Finding", "backend_for", "finding", "fused_or_none", "runs_on"]
+__all__ = [
+    "BACKENDS",
+    "Finding",
+    "backend_for",
+    "finding",
+    "fused_l1",
+    "fused_loss",
+    "fused_range",
+    "fused_ssim",
+    "runs_on",
+]
 
-Fused = Callable[[Tensor, Tensor, Union[Tensor, WeightSpec, None], float], Tensor]
-
-_MODULES = {"numba": "legs_loss.kernels.numba_loss", "triton": "legs_loss.kernels.triton_loss"}
-BACKENDS = ("torch", *_MODULES)
-_DTYPES = (torch.float32, torch.float16, torch.bfloat16)
-_MOST_CHANNELS = 4
+# A backend: the package it needs, the module whose BACKEND it is, and the type of the devices it is for.
+_KNOWN = {"numba": ("numba", "legs_loss.kernels.numba_backend", "cpu")}
+BACKENDS = ("torch", *_KNOWN)
 _OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 
 
 class Finding(NamedTuple):
-    """What trying a backend on a device gave: its function, or why there is none.
+    """What trying a backend on a device gave: the backend, or why it is not used.
 
     Attributes:
-        fused: (prediction, target, weight, lambda_dssim) -> loss, or None.
+        backend: None where it is not used.
         installed: whether its package is there at all.
         reason: in words.
     """
 
-    fused: Optional[Fused]
+    backend: Optional[Backend]
     installed: bool
     reason: str
 
@@ -54,16 +61,16 @@ _forked = False
 
 
 def backend_for(device: torch.device) -> str:
-    """Return which backend the loss uses for images on a device: "torch", "numba" or "triton".
+    """Return which backend the loss uses for images on a device: "torch" or the name of another.
 
     Raises:
         LegsError: LEGS_BACKEND is none of these.
     """
     forced = _forced()
-    name = forced or {"cpu": "numba", "cuda": "triton"}.get(device.type, "torch")
+    name = forced or next((name for name in _KNOWN if runs_on(name, device)), "torch")
     if name == "torch" or not runs_on(name, device):
         return "torch"
-    return name if finding(name, device).fused is not None else "torch"
+    return name if finding(name, device).backend is not None else "torch"
 
 
 def finding(name: str, device: torch.device) -> Finding:
@@ -76,81 +83,158 @@ def finding(name: str, device: torch.device) -> Finding:
     return _findings[key]
 
 
-def _record(name: str, device: torch.device, found: Finding) -> None:
-    _findings[f"{name} {device.type}"] = found
-    if found.fused is None and (found.installed or _forced() == name):
-        print(f"legs-loss: {name} is not used, torch is: {found.reason}", file=sys.stderr, flush=True)
+def runs_on(name: str, device: torch.device) -> bool:
+    """Return whether a backend is for a device."""
+    return device.type == _KNOWN[name][2] and not _forked
 
 
-def _in_words(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error).strip() or 'no message'}".splitlines()[0]
-
-
-def fused_or_none(
+def fused_loss(
     prediction: Tensor,
     target: Tensor,
-    weight: Union[Tensor, WeightSpec],
-    mask: Optional[Tensor],
+    weights: Weights,
     lambda_dssim: float,
-    padding: str,
-    renormalise: bool,
-    channels_last: bool,
+    padding: str = "zeros",
+    channels_last: bool = False,
 ) -> Optional[Tensor]:
     """Return what :func:`legs_loss.legs_loss` returns, by the backend for these images; None where that is torch.
 
-    Args:
-        weight: a map, or the spec to compute it with. The others are as for ``legs_loss``, and checked.
+    The arguments are checked as a pair already; maps and masks are in any shape that ``legs_loss`` takes.
     """
-    unweighted = isinstance(weight, WeightSpec) and weight.unweighted
-    if unweighted and not _forced():
-        return None  # 3DGS's own loss, to the last bit
-    if padding != "zeros" or lambda_dssim == 0.0 or is_compiling() or not _takes(prediction, target, weight, mask):
+    unweighted = weights.map is None and (weights.spec is None or weights.spec.unweighted)
+    if padding != "zeros" or lambda_dssim == 0.0 or (unweighted and not _forced()):
+        return None  # unweighted it is 3DGS's own loss, to the last bit
+    return _fused(
+        "loss",
+        prediction,
+        target,
+        weights,
+        channels_last,
+        lambda backend, first, second, resolved: backend.loss(first, second, resolved, lambda_dssim),
+    )
+
+
+def fused_l1(prediction: Tensor, target: Tensor, weights: Weights, channels_last: bool = False) -> Optional[Tensor]:
+    """Return what :func:`legs_loss.weighted_l1` returns, by the backend for these images; None where that is torch."""
+    return _fused(
+        "l1",
+        prediction,
+        target,
+        weights,
+        channels_last,
+        lambda backend, first, second, resolved: backend.weighted_l1(first, second, resolved),
+    )
+
+
+def fused_ssim(
+    prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: bool = False
+) -> Optional[Tensor]:
+    """Return what :func:`legs_loss.ssim` returns, by the backend for these images; None where that is torch."""
+    if padding != "zeros":
         return None
-    if channels_first(prediction, channels_last).shape[-3] > _MOST_CHANNELS:
+    return _fused(
+        "ssim",
+        prediction,
+        target,
+        Weights(),
+        channels_last,
+        lambda backend, first, second, _: backend.ssim(first, second),
+    )
+
+
+def fused_range(target: Tensor, spec: WeightSpec, channels_last: bool = False) -> Optional[Tensor]:
+    """Return :meth:`~legs_loss.kernels.contract.Backend.response_range` of a target, [B, 2] (one image: [1, 2]).
+
+    None where no backend makes the weights of this spec for this image by itself.
+    """
+    return _fused(
+        "l1",
+        target.detach(),
+        target.detach(),
+        Weights(spec),
+        channels_last,
+        lambda backend, _, second, resolved: (
+            backend.response_range(second, spec) if resolved.spec is not None else None
+        ),
+        with_maps=False,
+    )
+
+
+Operation = Callable[[Backend, Tensor, Tensor, Weights], Optional[Tensor]]
+
+
+def _fused(
+    operation: str,
+    prediction: Tensor,
+    target: Tensor,
+    weights: Weights,
+    channels_last: bool,
+    run: Operation,
+    with_maps: bool = True,
+) -> Optional[Tensor]:
+    if is_compiling() or not _plain_tensors(prediction, target, weights.map, weights.mask, weights.range):
         return None
-    name = backend_for(prediction.device)
-    if name == "torch":
+    backend = _ready_backend(prediction.device)
+    if backend is None or operation not in backend.offers:
         return None
     first, second = channels_first(prediction, channels_last), channels_first(target, channels_last)
-    factor: Union[Tensor, WeightSpec, None] = weight
-    if unweighted and mask is None:
-        factor = None
-    elif mask is not None or not isinstance(weight, WeightSpec):
-        # A mask is a factor of the weight.
-        factor = _map(weight, target, channels_last)
-        if mask is not None:
-            mask = as_map(mask, prediction, channels_last, "mask").float()
-            factor = factor * (mask / _covered(mask) if renormalise else mask)
-        factor = channels_first(factor, channels_last)
-    fused = finding(name, prediction.device).fused
-    assert fused is not None
+    if first.shape[-3] > backend.most_channels or not {first.dtype, second.dtype} <= backend.dtypes:
+        return None
     try:
-        return fused(first, second, factor, lambda_dssim)
+        resolved = _resolved(backend, weights, target, channels_last, with_maps)
+        return run(backend, first, second, resolved)
     except (LegsError, MemoryError, _OUT_OF_MEMORY):
         raise
-    except Exception as error:  # a size, type or number of channels that its trial did not compile
-        _record(name, prediction.device, Finding(None, True, _in_words(error)))
+    except Exception as error:  # a size or type that its trial did not meet
+        _record(backend.name, prediction.device, Finding(None, True, _in_words(error)))
         return None
 
 
-def _map(weight: Union[Tensor, WeightSpec], target: Tensor, channels_last: bool) -> Tensor:
-    made = weight_map(target, weight, channels_last) if isinstance(weight, WeightSpec) else weight
-    return as_map(made, target, channels_last, "weight").float()
+def _ready_backend(device: torch.device) -> Optional[Backend]:
+    if _capturing(device) and not _tried(device):
+        return None  # a trial waits for the device, which a capture does not survive
+    name = backend_for(device)
+    backend = None if name == "torch" else finding(name, device).backend
+    return backend if backend is not None and backend.is_ready(device) else None
 
 
-def _covered(mask: Tensor) -> Tensor:
-    return mask.mean().clamp(min=torch.finfo(mask.dtype).tiny)
+def _capturing(device: torch.device) -> bool:
+    probe = getattr(torch.cuda, "is_current_stream_capturing", None)
+    return device.type == "cuda" and probe is not None and bool(probe())
 
 
-def _takes(*tensors: Any) -> bool:
-    prediction, *constants = [tensor for tensor in tensors if isinstance(tensor, Tensor)]
-    if any(tensor.requires_grad for tensor in constants) or any(map(_is_special, (prediction, *constants))):
-        return False
-    return all(tensor.dtype in _DTYPES for tensor in (prediction, constants[0]))
+def _tried(device: torch.device) -> bool:
+    return all(f"{name} {device.type}" in _findings for name in _KNOWN if runs_on(name, device))
+
+
+def _resolved(backend: Backend, weights: Weights, target: Tensor, channels_last: bool, with_maps: bool) -> Weights:
+    """Return weights as the backend takes them: maps channels first, and no spec that it does not know."""
+    spec, map_, range_ = weights.spec, weights.map, weights.range
+    if spec is not None and spec.unweighted:
+        spec = None
+    if spec is not None and not backend.makes_weights_of(spec):
+        map_ = weight_map(target, spec, channels_last) if with_maps else None
+        spec = range_ = None
+    return Weights(
+        spec,
+        range_,
+        _map(map_, target, channels_last, "weight"),
+        _map(weights.mask, target, channels_last, "mask"),
+        weights.renormalise,
+    )
+
+
+def _map(values: Optional[Tensor], target: Tensor, channels_last: bool, name: str) -> Optional[Tensor]:
+    return None if values is None else channels_first(as_map(values, target, channels_last, name), channels_last)
+
+
+def _plain_tensors(prediction: Tensor, *constants: Optional[Tensor]) -> bool:
+    """Whether the values are plainly in memory, and a gradient flows to the prediction only."""
+    given = [tensor for tensor in constants if isinstance(tensor, Tensor)]
+    return not any(tensor.requires_grad for tensor in given) and not any(map(_is_special, (prediction, *given)))
 
 
 def _is_special(tensor: Tensor) -> bool:
-    """Whether the values are not plainly in memory: a subclass, or what torch.func wraps."""
+    """Whether this is a subclass, or what torch.func wraps."""
     if type(tensor) not in (Tensor, torch.nn.Parameter):
         return True
     functorch = getattr(torch._C, "_functorch", None)
@@ -165,61 +249,32 @@ def _forced() -> Optional[str]:
     return name or None
 
 
-def runs_on(name: str, device: torch.device) -> bool:
-    """Return whether a backend is for a device: numba for the CPU, Triton for CUDA or, interpreted, for the CPU."""
-    if name == "numba":
-        return device.type == "cpu" and not _forked
-    interpreted = os.environ.get("TRITON_INTERPRET", "0") == "1"
-    return device.type == "cuda" or (device.type == "cpu" and interpreted)
-
-
 def _try(name: str, device: torch.device) -> Finding:
+    package, module, _ = _KNOWN[name]
     try:
-        if importlib.util.find_spec(name) is None:
+        if importlib.util.find_spec(package) is None:
             return Finding(None, False, "it is not installed")
         if name == "numba" and sys.version_info < (3, 8):
             return Finding(None, False, "the last numba for Python 3.7 takes minutes to compile the weights")
-        fused = importlib.import_module(_MODULES[name]).fused_loss
+        from legs_loss.kernels.trial import difference_from_torch
+
+        backend = importlib.import_module(module).BACKEND
         threads = torch.get_num_threads()
-        problem = _difference_from_torch(fused, device)
+        problem = difference_from_torch(backend, device)
         torch.set_num_threads(threads)  # numba's first parallel loop sets OpenMP's number, which is torch's too
     except Exception as error:  # whatever a broken install, compiler or driver raises
         return Finding(None, True, _in_words(error))
-    return Finding(None if problem else fused, True, problem or "its trial agreed with torch")
+    return Finding(None if problem else backend, True, problem or "its trial agreed with torch")
 
 
-def _difference_from_torch(fused: Fused, device: torch.device) -> Optional[str]:
-    """Run a backend on a small image with every kind of weight; say what is wrong with the result.
+def _record(name: str, device: torch.device, found: Finding) -> None:
+    _findings[f"{name} {device.type}"] = found
+    if found.backend is None and (found.installed or _forced() == name):
+        print(f"legs-loss: {name} is not used, torch is: {found.reason}", file=sys.stderr, flush=True)
 
-    Of two tiles each way, where tiles are small; against float64, since a GPU's convolutions in float32 may be tf32's.
-    """
-    rows, columns = torch.arange(50.0).reshape(1, 50, 1), torch.arange(60.0).reshape(1, 1, 60)
-    channels = torch.arange(1.0, 4.0).reshape(3, 1, 1)
-    target = (0.5 + 0.4 * torch.sin(channels * (0.3 * rows + 0.2 * columns))).to(device)
-    spec = WeightSpec()
-    weights = weight_map(target, spec)
-    exact = target.double()
-    for weight, expected_weight in ((None, torch.ones_like(weights)), (spec, weights), (weights, weights)):
-        results = []
-        for function, dtype in (
-            (lambda image, weight=weight: fused(image, target, weight, 0.2), torch.float32),
-            (
-                lambda image, weight=expected_weight: (
-                    0.8 * (weight * (image - exact).abs()).mean() + 0.2 * d_ssim(image, exact)
-                ),
-                torch.float64,
-            ),
-        ):
-            image = (0.9 * target + 0.02).to(dtype).requires_grad_()
-            with torch.enable_grad():
-                loss = function(image)
-                (gradient,) = torch.autograd.grad(loss, image)
-            results.append((loss.detach().double(), gradient.double()))
-        (loss, gradient), (expected, reference) = results
-        apart = float((gradient - reference).norm() / reference.norm())
-        if not (abs(float(loss - expected)) <= 1e-4 * float(expected) and apart <= 1e-3):
-            return f"its trial gave {float(loss):g} where torch gives {float(expected):g}, the gradient {apart:.2g} off"
-    return None
+
+def _in_words(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).strip() or 'no message'}".splitlines()[0]
 
 
 def _after_fork() -> None:

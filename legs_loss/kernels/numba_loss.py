@@ -32,7 +32,7 @@ from legs_loss.spec import WeightSpec
 from legs_loss.ssim import C1, C2, SIGMA, WINDOW_SIZE
 from legs_loss.weights import weight_map
 
-__all__ = ["fused_loss", "supports"]
+__all__ = ["fused_loss", "response_range", "supports"]
 
 _REACH = WINDOW_SIZE // 2
 _TAPS = np.exp(-((np.arange(WINDOW_SIZE) - _REACH) ** 2) / (2 * SIGMA**2))
@@ -150,7 +150,8 @@ def _loss_and_gradient(
     x, y = _flat(prediction), _flat(target)
     weights = _NONE
     if isinstance(weight, WeightSpec):
-        ranges = _ranges(target, y.reshape(views, channels, height, width), weight)
+        ranges = response_range(target, weight)
+        ranges[:, 1] += np.float32(weight.eps)
         weights = _Weights(2, _EMPTY, ranges, *settings_of(weight), CURVES[weight.curve], np.float32(weight.beta))
     elif weight is not None:
         weights = _NONE._replace(kind=1, stored=_flat(weight))
@@ -170,12 +171,16 @@ def _flat(tensor: Tensor) -> np.ndarray:
     return tensor.detach().float().contiguous().numpy().reshape(-1)
 
 
-def _ranges(target: Tensor, y: np.ndarray, spec: WeightSpec) -> np.ndarray:
-    """Return of each view the least response and max - min + eps."""
-    found = extremes(y, spec)
+def response_range(target: Tensor, spec: WeightSpec) -> np.ndarray:
+    """Return of each view of [C, H, W] or [B, C, H, W] the least response, and the greatest less the least, [B, 2].
+
+    Raises:
+        LegsError: a target with NaN, infinity or plainly of 0..255.
+    """
+    found = extremes(_flat(target).reshape(-1, *target.shape[-3:]), spec)
     if not (found[:, 2].max() <= 1.0 and found[:, 3].sum() == 0.0):
         check_values(target)  # overshoots are fine; it raises for what is not
-    return np.stack([found[:, 0], found[:, 1] - found[:, 0] + np.float32(spec.eps)], 1)
+    return np.stack([found[:, 0], found[:, 1] - found[:, 0]], 1)
 
 
 @njit(parallel=True, cache=True)

@@ -28,6 +28,8 @@ from legs_loss.spec import WeightSpec
 
 __all__ = [
     "CURVES",
+    "NORMS",
+    "STENCILS",
     "extremes",
     "map_of_responses",
     "photograph_response",
@@ -37,14 +39,14 @@ __all__ = [
 ]
 
 # The operators that are written here: kind of stencil, the weights of a gradient's outer and middle rows
-_OPERATORS: Dict[str, Tuple[int, float, float]] = {
+STENCILS: Dict[str, Tuple[int, float, float]] = {
     "laplacian": (0, 0.0, 0.0),
     "laplacian8": (1, 0.0, 0.0),
     "central": (2, 0.0, 0.5),
     "sobel": (2, 1.0, 2.0),
     "scharr": (2, 3.0, 10.0),
 }
-_NORMS = {1.0: 1, 2.0: 2, float("inf"): 3}
+NORMS = {1.0: 1, 2.0: 2, float("inf"): 3}
 _SQUARED = 4  # the square of the norm 2
 # C5 needs a sine; it and curves of the user's own are applied by torch, to a map.
 CURVES = {"C1": 1, "C2": 2, "C3": 3, "C4": 4}
@@ -56,13 +58,13 @@ _FOUR, _EIGHT = np.float32(4.0), np.float32(8.0)
 
 def supports_response(spec: WeightSpec) -> bool:
     """Return whether the response of a spec can be computed here; the functions below take no other."""
-    return spec.operator in _OPERATORS and spec.p in _NORMS
+    return spec.operator in STENCILS and spec.p in NORMS
 
 
 def settings_of(spec: WeightSpec) -> Tuple[int, np.float32, np.float32, int]:
     """Return an operator and its norm as the functions here take them."""
-    kind, side, middle = _OPERATORS[spec.operator]
-    return kind, np.float32(side), np.float32(middle), _NORMS[spec.p]
+    kind, side, middle = STENCILS[spec.operator]
+    return kind, np.float32(side), np.float32(middle), NORMS[spec.p]
 
 
 def map_of_responses(image: np.ndarray, spec: WeightSpec) -> Tuple[np.ndarray, np.ndarray]:
@@ -133,7 +135,7 @@ def _reduced(image: np.ndarray, spec: WeightSpec, out: Optional[np.ndarray]) -> 
     with ONE_AT_A_TIME:
         *operator, norm = settings_of(spec)
         # The root of the greatest square is the greatest root: one a view is enough.
-        rooted = out is None and norm == _NORMS[2.0]
+        rooted = out is None and norm == NORMS[2.0]
         settings = (*operator, _SQUARED if rooted else norm)
         _strips(image.reshape(-1), (views, channels, height, width), settings, strips, kept, found)
     if rooted:

@@ -1,0 +1,88 @@
+"""What a backend is: what it declares, and the operations that it offers. torch is the reference for each of them.
+
+A backend never meets what it did not declare: backends.py hands that to torch. So no kernel needs a branch for "any
+other curve", which would compute something else without a word.
+"""
+
+from __future__ import annotations
+
+from typing import FrozenSet, NamedTuple, Optional
+
+import torch
+from torch import Tensor
+
+from legs_loss.spec import WeightSpec
+
+__all__ = ["Backend", "Weights"]
+
+
+class Weights(NamedTuple):
+    """Where the weight of a pixel comes from. With none of it given the weight is 1.
+
+    Attributes:
+        spec: the weight is made from the target by this spec; never beside ``map``.
+        range: what :meth:`Backend.response_range` returned for these targets and this spec, [B, 2]. Without it the
+            backend makes it, in a pass of its own over the target.
+        map: the weight itself, one value a pixel, [1, H, W] or [B, 1, H, W].
+        mask: a factor of the weight in the same shapes, bool or floats in [0, 1].
+        renormalise: divide the weighted L1 by the mask's mean.
+    """
+
+    spec: Optional[WeightSpec] = None
+    range: Optional[Tensor] = None
+    map: Optional[Tensor] = None
+    mask: Optional[Tensor] = None
+    renormalise: bool = False
+
+
+class Backend:
+    """A fast implementation of the loss. Subclasses set the attributes and define the operations in ``offers``.
+
+    Images are [C, H, W] or [B, C, H, W] with any strides, of a type in ``dtypes``; no gradient flows to a target, a
+    map or a mask. An operation returns a float32 scalar, differentiable once in the prediction. It repeats bit for
+    bit. On a GPU nothing waits for the device, and all is launched on the current stream.
+
+    Attributes:
+        name: as in LEGS_BACKEND.
+        offers: of "loss", "l1" and "ssim": which of :meth:`loss`, :meth:`weighted_l1` and :meth:`ssim` there are.
+        dtypes: of the images.
+        most_channels: how many channels an image may have.
+        operators, norms, curves: of the specs whose weights the backend makes by itself; torch makes a map for others.
+    """
+
+    name: str
+    offers: FrozenSet[str] = frozenset()
+    dtypes: FrozenSet[torch.dtype] = frozenset({torch.float32, torch.float16, torch.bfloat16})
+    most_channels: int = 4
+    operators: FrozenSet[str] = frozenset()
+    norms: FrozenSet[float] = frozenset()
+    curves: FrozenSet[str] = frozenset()
+
+    def makes_weights_of(self, spec: WeightSpec) -> bool:
+        """Return whether the weights of a spec need no map: it differs from the defaults in what is known here only."""
+        known = WeightSpec(operator=spec.operator, p=spec.p, curve=spec.curve, beta=spec.beta, eps=spec.eps)
+        return spec == known and spec.operator in self.operators and spec.p in self.norms and spec.curve in self.curves
+
+    def is_ready(self, device: torch.device) -> bool:
+        """Return whether an operation may be launched now; False where that must not load or compile anything."""
+        return True
+
+    def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
+        """Return the least response of each view, and the greatest less the least: float32 [B, 2] on its device.
+
+        It depends on the spec's operator and p only. On the CPU a target with NaN, infinity or values of 0..255 is
+        refused (LegsError); on other devices a NaN makes both numbers NaN, and so each weight.
+        """
+        raise NotImplementedError
+
+    def loss(self, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
+        """Return (1 - lambda) * L_w + lambda * (1 - SSIM), SSIM with zero padding."""
+        raise NotImplementedError
+
+    def weighted_l1(self, prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
+        """Return the mean over pixels of the weight times the mean over channels of |prediction - target|."""
+        raise NotImplementedError
+
+    def ssim(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """Return the mean SSIM, with zero padding."""
+        raise NotImplementedError

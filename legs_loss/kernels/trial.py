@@ -1,0 +1,71 @@
+"""The trial of a backend: each operation that it offers on a small image, value and gradient, against torch."""
+
+from __future__ import annotations
+
+from typing import Callable, Iterator, Optional, Tuple
+
+import torch
+from torch import Tensor
+
+from legs_loss.kernels.contract import Backend, Weights
+from legs_loss.spec import WeightSpec
+from legs_loss.weights import weight_map
+
+__all__ = ["difference_from_torch"]
+
+_SHARE = 0.2
+_Loss = Callable[[Tensor], Tensor]
+
+
+def difference_from_torch(backend: Backend, device: torch.device) -> Optional[str]:
+    """Run each operation of a backend on a small image; say what is wrong with the first wrong result.
+
+    The image has two tiles each way, where tiles are small. The reference is in float64, since a GPU's convolutions in
+    float32 may be tf32's.
+    """
+    rows, columns = torch.arange(50.0).reshape(1, 50, 1), torch.arange(60.0).reshape(1, 1, 60)
+    channels = torch.arange(1.0, 4.0).reshape(3, 1, 1)
+    target = (0.5 + 0.4 * torch.sin(channels * (0.3 * rows + 0.2 * columns))).to(device)
+    for name, function, reference in _operations(backend, target):
+        results = []
+        for loss_of, dtype in ((function, torch.float32), (reference, torch.float64)):
+            image = (0.9 * target + 0.02).to(dtype).requires_grad_()
+            with torch.enable_grad():
+                loss = loss_of(image)
+                (gradient,) = torch.autograd.grad(loss, image)
+            results.append((loss.detach().double(), gradient.double()))
+        (loss, gradient), (expected, exact) = results
+        apart = float((gradient - exact).norm() / exact.norm())
+        if not (abs(float(loss - expected)) <= 1e-4 * float(expected) and apart <= 1e-3):
+            return (
+                f"its trial of the {name} gave {float(loss):g} where torch gives {float(expected):g}, "
+                f"the gradient {apart:.2g} off"
+            )
+    return None
+
+
+def _operations(backend: Backend, target: Tensor) -> Iterator[Tuple[str, _Loss, _Loss]]:
+    """Yield of each operation with each kind of weight: its name, the backend's function, and the reference."""
+    from legs_loss.ssim import ssim  # which itself asks backends.py
+
+    exact = target.double()
+    spec = WeightSpec()
+    weights = weight_map(target, spec)
+    kinds = ((Weights(), torch.ones_like(weights)), (Weights(spec), weights), (Weights(map=weights), weights))
+
+    def l1(weight: Tensor) -> _Loss:
+        return lambda image: (weight * (image - exact).abs()).mean()
+
+    def whole(weight: Tensor) -> _Loss:
+        return lambda image: (1.0 - _SHARE) * l1(weight)(image) + _SHARE * (1.0 - ssim(image, exact))
+
+    def of_backend(operation: Callable[..., Tensor], *rest: object) -> _Loss:
+        return lambda image: operation(image, target, *rest)
+
+    for kind, weight in kinds:
+        if "loss" in backend.offers:
+            yield "loss", of_backend(backend.loss, kind, _SHARE), whole(weight)
+        if "l1" in backend.offers:
+            yield "weighted L1", of_backend(backend.weighted_l1, kind), l1(weight)
+    if "ssim" in backend.offers:
+        yield "SSIM", of_backend(backend.ssim), lambda image: ssim(image, exact)

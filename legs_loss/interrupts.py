@@ -1,17 +1,19 @@
-"""Ctrl-C and the processes that this one starts: it is the parent's to handle, and it is never lost."""
+"""Ctrl-C over steps that belong together, and in processes that this one starts: held back, never lost."""
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
 from contextlib import contextmanager
-from typing import Iterator
+from typing import Iterator, List
 
 try:
     from multiprocessing.resource_tracker import ensure_running
 except ImportError:  # Python 3.7's name
     from multiprocessing.semaphore_tracker import ensure_running  # type: ignore[no-redef]
 
-__all__ = ["kept_from_children"]
+__all__ = ["held_back", "kept_from_children"]
 
 
 @contextmanager
@@ -33,3 +35,22 @@ def kept_from_children() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Hold Ctrl-C back over a few steps that belong together; it strikes right after them.
+
+    Elsewhere than in the main thread, which alone gets Ctrl-C, nothing is done.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    struck: List[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: struck.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before if before is not None else signal.SIG_DFL)
+        if struck:
+            signal.raise_signal(signal.SIGINT) if hasattr(signal, "raise_signal") else os.kill(os.getpid(), struck[0])

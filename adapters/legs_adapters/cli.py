@@ -30,7 +30,13 @@ EXIT_CODES = (
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
-    args = _parser().parse_args(argv)
+    parser = _parser()
+    args = parser.parse_args(argv)
+    if args.undo and (args.check or args.verify):
+        parser.error("--undo goes with --diff, --force and --trust only")
+    if args.trust is not None and not args.undo:
+        parser.error("--trust goes with --undo")
+    before = _journal(args.folder)
     try:
         if args.verify:
             return _patch(args) or _verify(args)
@@ -39,7 +45,14 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
         print(f"legs-patch: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("legs-patch: interrupted; nothing was changed", file=sys.stderr)
+        # What is written is written with the journal, all of it or nothing: the journal knows.
+        if _journal(args.folder) == before:
+            what = "nothing was changed"
+        elif args.undo:
+            what = "by then the patch was taken back"
+        else:
+            what = f"by then it was patched; take it back with: legs-patch --undo {args.folder}"
+        print(f"legs-patch: interrupted; {what}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()
@@ -58,12 +71,19 @@ def _parser() -> argparse.ArgumentParser:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--diff", action="store_true", help="show what would change as a unified diff; write nothing")
     what.add_argument("--check", action="store_true", help="exit with 1 if something would change; write nothing")
-    what.add_argument("--undo", action="store_true", help="take the patch back, byte for byte")
     what.add_argument(
         "--verify",
         action="store_true",
         help="patch, then prove on the CPU that it took: train copies with and without it for a few dozen steps, and "
         "compare",
+    )
+    parser.add_argument(
+        "--undo", action="store_true", help="take the patch back, byte for byte; with --diff: show what that would do"
+    )
+    parser.add_argument(
+        "--trust",
+        metavar="NAME",
+        help="with --undo: follow a journal that was not written by you on this machine; the refusal says its name",
     )
     parser.add_argument(
         "--force",
@@ -183,19 +203,31 @@ def _verify(args: argparse.Namespace) -> int:
 def _undo(args: argparse.Namespace) -> int:
     import json
 
-    from legs_adapters.patch import undo
+    from legs_adapters.report import changes_as_diff
+    from legs_adapters.undo import undo
 
-    done = undo(args.folder, args.force)
+    done = undo(args.folder, args.force, args.trust, look=args.diff)
     if args.json:
         print(json.dumps({"restored": done.restored, "removed": done.removed, "kept": done.kept}, indent=2))
         return 0
-    for name in done.restored:
+    if args.diff:
+        print(changes_as_diff(done.changes, _colour()), end="")
+    for name in () if args.diff else done.restored:
         print(f"restored {name}")
-    for name in done.removed:
+    for name in () if args.diff else done.removed:
         print(f"removed {name}")
     for name, reason in done.kept:
-        print(f"kept {name}: {reason}")
+        print(f"kept {name}: {reason}", file=sys.stderr if args.diff else sys.stdout)
     return 0
+
+
+def _journal(folder: str) -> bytes:
+    """What tells one state of a checkout's journal from another; empty where there is none."""
+    try:
+        found = os.lstat(os.path.join(folder, ".legs-patch.json"))
+    except (OSError, ValueError):
+        return b""
+    return repr((found.st_ino, found.st_size, found.st_mtime_ns)).encode()
 
 
 def _left_to_the_user(problems: Sequence[Problem]) -> int:

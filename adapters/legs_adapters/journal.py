@@ -1,29 +1,30 @@
 """What was edited, so that it can be taken back: the exact bytes from before, and what they became.
 
-The journal is one file in the root of the checkout. Every write goes through :func:`replace_files`, all or nothing.
+The journal is one file in the root of the checkout. A checkout may come from a stranger, and its journal with it: it
+names only what legs-patch ever writes, and it is sealed (:mod:`legs_adapters.checkout.seal`).
 """
 
 from __future__ import annotations
 
 import base64
-import contextlib
-import difflib
 import hashlib
 import json
-import os
-import shutil
-import tempfile
+import re
 import zlib
 from pathlib import Path
-from typing import Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 
+from legs_adapters.checkout.replace import LARGEST, check_name, read_file
+from legs_adapters.checkout.seal import is_sealed, seal
+from legs_adapters.settings import SETTINGS_FILE
 from legs_loss import LegsError
 
-__all__ = ["JOURNAL", "Journal", "Layer", "replace_files", "undo_edits"]
+__all__ = ["JOURNAL", "Journal", "Layer", "digest"]
 
 JOURNAL = ".legs-patch.json"
 _VERSION = 1
 _NOTE = "What legs-patch changed here, and the bytes from before. legs-patch --undo needs it; do not edit it."
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class Layer(NamedTuple):
@@ -47,50 +48,45 @@ class Journal:
     Attributes:
         files: for each patched path its layers, the oldest first.
         created: files that a patch created, with the checksum of what it wrote.
+        data: the file's bytes as they were read; None where there was no journal.
+        ours: whether this user wrote it; an empty journal is.
     """
 
-    def __init__(self, files: Dict[str, List[Layer]], created: Dict[str, str]) -> None:
+    def __init__(
+        self, files: Dict[str, List[Layer]], created: Dict[str, str], data: Optional[bytes] = None, ours: bool = True
+    ) -> None:
         self.files = files
         self.created = created
+        self.data = data
+        self.ours = ours
 
     @classmethod
     def read(cls, root: Path) -> Journal:
-        """Read a checkout's journal; an empty one where there is none.
+        """Read a checkout's journal, whoever wrote it; an empty one where there is none.
 
         Raises:
-            LegsError: it is there and cannot be read.
+            LegsError: it is there and is none, or names what legs-patch never writes.
         """
-        path = root / JOURNAL
-        if not path.is_file() or path.is_symlink():
+        data = read_file(root, JOURNAL)
+        if data is None:
             return cls({}, {})
+        path = root / JOURNAL
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(data.decode("utf-8"))
             if content["version"] != _VERSION:
                 raise LegsError(f"{path} was written by another version of legs-patch: undo with that one")
-            files = {
-                str(name): [
-                    Layer(
-                        _unpack(layer["original"]), tuple((a, b, c) for a, b, c in layer["edits"]), str(layer["after"])
-                    )
-                    for layer in layers
-                ]
-                for name, layers in content["files"].items()
-            }
-            created = {str(name): str(digest) for name, digest in content["created"].items()}
-        except LegsError:
-            raise
-        except Exception as error:
+            claimed = content.pop("seal", None)
+            ours = is_sealed(_canonical(content), claimed, root)
+            files, created = _read_files(content["files"]), _read_created(content["created"])
+        except LegsError as error:
+            raise LegsError(f"{error}; {path}: nothing was changed" if str(path) not in str(error) else error) from None
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
             raise LegsError(f"{path} cannot be read ({error}): restore the files from git, and remove it") from None
-        for name in (*files, *created):
-            if os.path.isabs(name) or ".." in name.split("/") or name.split("/")[0] == ".git":
-                raise LegsError(f"{path} names {name!r}, which is outside of the checkout: nothing was changed")
-        return cls(files, created)
+        return cls(files, created, data, ours)
 
-    def dump(self) -> Optional[bytes]:
-        """Return the file's content; None where there is nothing to remember."""
-        if not self.files and not self.created:
-            return None
-        content = {
+    def dump(self, root: Path) -> bytes:
+        """Return the file's content, sealed; without a seal where this machine keeps no key."""
+        content: Dict[str, Any] = {
             "note": _NOTE,
             "version": _VERSION,
             "files": {
@@ -101,6 +97,9 @@ class Journal:
             },
             "created": dict(sorted(self.created.items())),
         }
+        sealed = seal(_canonical(content), root)
+        if sealed is not None:
+            content["seal"] = sealed
         return (json.dumps(content, indent=1) + "\n").encode("utf-8")
 
     def wrote(self, path: str, data: bytes) -> bool:
@@ -109,125 +108,69 @@ class Journal:
         known = layers[-1].after if layers else self.created.get(path)
         return known == digest(data)
 
+    @property
+    def name(self) -> str:
+        """What this very journal is called when someone else's is to be trusted: the start of its checksum."""
+        return digest(self.data or b"")[:16]
+
 
 def digest(data: bytes) -> str:
     """Return the checksum that the journal keeps of a file."""
     return hashlib.sha256(data).hexdigest()
 
 
-def undo_edits(original: bytes, patched: bytes, current: bytes) -> Tuple[bytes, List[str]]:
-    """Put a patch's own lines back in a file that was edited since.
-
-    Args:
-        original, patched: the file before and after the patch.
-        current: the file as it stands.
-
-    Returns:
-        The file with the patch's lines as they were and the edits as they are; and the patched lines that are no
-        longer there as the patch left them, which were left alone.
-    """
-    before, after, lines = (data.splitlines(keepends=True) for data in (original, patched, current))
-    lost: List[str] = []
-    hunks = difflib.SequenceMatcher(None, before, after, autojunk=False).get_opcodes()
-    kept = difflib.SequenceMatcher(None, after, lines, autojunk=False).get_matching_blocks()
-    where = {block.a + i: block.b + i for block in kept for i in range(block.size)}
-    changes: List[Tuple[int, int, Sequence[bytes]]] = []
-    for tag, i1, i2, j1, j2 in hunks:
-        if tag == "equal":
-            continue
-        places = [where.get(j) for j in range(j1, j2)]
-        if j1 == j2 or None in places or places != list(range(places[0], places[0] + j2 - j1)):  # type: ignore[arg-type,operator]
-            lost.extend(line.decode("utf-8", "replace").strip() for line in after[j1:j2])
-            continue
-        assert places[0] is not None
-        changes.append((places[0], places[0] + j2 - j1, before[i1:i2]))
-    for start, end, put in reversed(changes):
-        lines[start:end] = put
-    return b"".join(lines), lost
+def _canonical(content: Any) -> bytes:
+    return json.dumps(content, sort_keys=True, separators=(",", ":")).encode("ascii")
 
 
-def replace_files(root: Path, changes: Mapping[str, Tuple[Optional[bytes], Optional[bytes]]]) -> None:
-    """Replace files, each atomically, and all of them or none.
-
-    Args:
-        changes: by relative path, in order: the bytes expected there now (None: no file) and the bytes to put there
-            (None: remove the file).
-
-    Raises:
-        LegsError: a file is not as expected, or cannot be written; then all are as they were.
-    """
-    for path, (expected, _) in changes.items():
-        _check_inside(root, path)
-        if _read(root / path) != expected:
-            raise LegsError(f"{path} changed while legs-patch was at work: nothing was written; run it again")
-    staged: Dict[str, str] = {}
-    done: List[str] = []
-    try:
-        for path, (_, data) in changes.items():
-            if data is not None:
-                staged[path] = _stage(root / path, data)
-        for path, (_, data) in changes.items():
-            done.append(path)
-            if data is None:
-                (root / path).unlink()
-            else:
-                os.replace(staged[path], str(root / path))
-    except BaseException as error:
-        for path in reversed(done):
-            _restore(root / path, changes[path][0])
-        if isinstance(error, OSError):
-            raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
-        raise
-    finally:
-        for name in staged.values():
-            with contextlib.suppress(OSError):
-                os.unlink(name)
+def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
+    files: Dict[str, List[Layer]] = {}
+    room = LARGEST
+    for name, layers in content.items():
+        check_name(name)
+        if not name.endswith(".py"):
+            raise LegsError(f"{name!r} is no Python file, and nothing else is patched")
+        files[name] = []
+        for layer in layers:
+            files[name].append(_read_layer(layer, room))
+            room -= len(files[name][-1].original)
+    return files
 
 
-def _stage(path: Path, data: bytes) -> str:
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".legs-patch", dir=str(path.parent))
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        if path.exists():
-            shutil.copymode(str(path), name)
-        else:
-            umask = os.umask(0)
-            os.umask(umask)
-            os.chmod(name, 0o666 & ~umask)
-    except BaseException:
-        os.unlink(name)
-        raise
-    return name
+def _read_layer(content: Dict[str, Any], room: int) -> Layer:
+    original = _unpack(content["original"], room)
+    edits = []
+    for start, end, text in content["edits"]:
+        if type(start) is not int or type(end) is not int or not 0 <= start <= end <= len(original):
+            raise ValueError(f"an edit of bytes {start!r} to {end!r} of {len(original)}")
+        text.encode("utf-8")
+        edits.append((start, end, text))
+    return Layer(original, tuple(edits), _checksum(content["after"]))
 
 
-def _restore(path: Path, data: Optional[bytes]) -> None:
-    if _read(path) == data:
-        return
-    if data is None:
-        path.unlink()
-    else:
-        os.replace(_stage(path, data), str(path))
+def _read_created(content: Dict[str, Any]) -> Dict[str, str]:
+    for name in content:
+        if name != SETTINGS_FILE:
+            raise LegsError(f"{name!r} is not {SETTINGS_FILE}, and nothing else is created")
+    return {name: _checksum(value) for name, value in content.items()}
 
 
-def _read(path: Path) -> Optional[bytes]:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        return None
-
-
-def _check_inside(root: Path, path: str) -> None:
-    full = root / path
-    if full.is_symlink() or root not in (full.resolve(), *full.resolve().parents):
-        raise LegsError(f"{path} is a link: legs-patch follows none")
+def _checksum(value: Any) -> str:
+    if not isinstance(value, str) or not _DIGEST.fullmatch(value):
+        raise ValueError("a checksum that is none")
+    return value
 
 
 def _pack(data: bytes) -> str:
     return base64.b64encode(zlib.compress(data, 9)).decode("ascii")
 
 
-def _unpack(text: str) -> bytes:
-    return zlib.decompress(base64.b64decode(text))
+def _unpack(text: str, room: int) -> bytes:
+    """Decompress a file; what a few kilobytes may become is bounded."""
+    stream = zlib.decompressobj()
+    data = stream.decompress(base64.b64decode(text, validate=True), max(room, 0) + 1)
+    if len(data) > room:
+        raise ValueError(f"its files are larger than {LARGEST >> 20} MiB")
+    if not stream.eof:
+        raise ValueError("a file is cut short")
+    return data

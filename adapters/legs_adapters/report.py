@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import difflib
 import json
-from typing import Dict, List, Sequence, Tuple
+from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 
-from legs_adapters.code.sources import Source, decode
 from legs_adapters.code.syntax import one_line
 from legs_adapters.patch import Plan
+from legs_adapters.settings import SETTINGS_FILE
+from legs_loss.terminal import printable
 
-__all__ = ["as_diff", "as_json", "as_table"]
+__all__ = ["as_diff", "as_json", "as_table", "changes_as_diff"]
 
 
 _RED, _GREEN, _CYAN, _BOLD, _PLAIN = "\033[31m", "\033[32m", "\033[36m", "\033[1m", "\033[0m"
@@ -85,20 +86,27 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
 
 def as_diff(plan: Plan, colour: bool) -> str:
     """Return a unified diff of what would be written."""
-    parts: List[str] = []
-    for path, after in plan.after.items():
-        before = plan.findings.program.sources[path]
-        changed = decode(path, after)
-        assert isinstance(changed, Source)
-        parts.extend(_unified(path, before.text, changed.text))
+    changes: Dict[str, Tuple[Optional[bytes], Optional[bytes]]] = {
+        path: (plan.findings.program.sources[path].data, after) for path, after in plan.after.items()
+    }
     if plan.settings is not None:
-        parts.extend(_unified("legs.toml", "", plan.settings, new=True))
+        changes[SETTINGS_FILE] = (None, plan.settings.encode("utf-8"))
+    return changes_as_diff(changes, colour)
+
+
+def changes_as_diff(changes: Mapping[str, Tuple[Optional[bytes], Optional[bytes]]], colour: bool) -> str:
+    """Return a unified diff of files' bytes before and after; None is no file."""
+    parts = [printable(line) for path, (before, after) in changes.items() for line in _unified(path, before, after)]
     return "".join(_coloured(line) if colour else line for line in parts)
 
 
-def _unified(path: str, before: str, after: str, new: bool = False) -> List[str]:
+def _unified(path: str, before: Optional[bytes], after: Optional[bytes]) -> List[str]:
     lines = difflib.unified_diff(
-        _lines(before), _lines(after), "/dev/null" if new else f"a/{path}", f"b/{path}", lineterm="\n"
+        _lines(before),
+        _lines(after),
+        "/dev/null" if before is None else f"a/{path}",
+        "/dev/null" if after is None else f"b/{path}",
+        lineterm="\n",
     )
     shown = []
     for line in lines:
@@ -106,7 +114,8 @@ def _unified(path: str, before: str, after: str, new: bool = False) -> List[str]
     return shown
 
 
-def _lines(text: str) -> List[str]:
+def _lines(data: Optional[bytes]) -> List[str]:
+    text = (data or b"").decode("utf-8-sig", "replace")
     # splitlines() would also split at form feeds and at letters that only look like line ends
     return (
         text.replace("\r\n", "\n").replace("\r", "\n").splitlines(keepends=True)

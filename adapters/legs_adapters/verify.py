@@ -20,9 +20,11 @@ import time
 from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence
 
+from legs_adapters.checkout.replace import locked
 from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL
-from legs_adapters.patch import plan, undo
+from legs_adapters.patch import plan
+from legs_adapters.undo import undo
 from legs_loss import LegsError
 
 __all__ = ["ITERATIONS", "Run", "Verdict", "verify", "watch"]
@@ -133,8 +135,9 @@ def verify(
         )
         precompute(read_scene(scene), scene / "legs_weights")
         patched, unpatched = (Path(work) / name / root.name for name in ("patched", "unpatched"))
-        for copy in (patched, unpatched):
-            shutil.copytree(str(root), str(copy), symlinks=True, ignore=_unneeded)
+        with locked(root, f"legs-patch --verify {folder}"):
+            for copy in (patched, unpatched):
+                shutil.copytree(str(root), str(copy), symlinks=True, ignore=_unneeded)
         undo(unpatched, force=True)
         runs = {}
         for name, copy, off in (("unpatched", unpatched, ""), ("patched", patched, ""), ("LEGS_OFF", patched, "1")):
@@ -192,7 +195,7 @@ def _arguments(script: Path, given: Optional[str], iterations: int, **places: Pa
 
 def _unneeded(folder: str, names: List[str]) -> List[str]:
     """What a copy can do without: histories, caches, and anything large."""
-    left = {".git", "__pycache__", "node_modules", "output", "outputs"} & set(names)
+    left = {".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs"} & set(names)
     for name in names:
         path = os.path.join(folder, name)
         if os.path.isfile(path) and os.path.getsize(path) > 64 << 20:

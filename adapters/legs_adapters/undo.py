@@ -1,0 +1,140 @@
+"""Taking the patches of a checkout back: from the journal, what each file was."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from pathlib import Path
+from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
+
+from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
+from legs_adapters.code.sources import check_root
+from legs_adapters.journal import JOURNAL, Journal, digest
+from legs_loss import LegsError
+
+__all__ = ["Undone", "undo", "undo_edits"]
+
+
+class Undone(NamedTuple):
+    """What an undo did, or would do.
+
+    Attributes:
+        restored: the files that are as before the patch.
+        removed: the files that the patch had created.
+        kept: the files left as they are, with the reason.
+        changes: by path, the bytes before and after.
+    """
+
+    restored: List[str]
+    removed: List[str]
+    kept: List[Tuple[str, str]]
+    changes: Changes
+
+
+def undo(path: str | os.PathLike[str], force: bool = False, trust: Optional[str] = None, look: bool = False) -> Undone:
+    """Take every patch of a checkout back.
+
+    Args:
+        path: the checkout.
+        force: in files that were edited since, put the patch's own lines back and leave the edits.
+        trust: the name of a journal that this user did not write, and that is to be followed all the same.
+        look: change nothing, and return what would be done; then any journal will do.
+
+    Raises:
+        LegsError: nothing was patched; a stranger wrote the journal; or a file was edited since, and not ``force``.
+            Nothing is changed then.
+    """
+    root = check_root(path)
+    with locked(root, f"legs-patch --undo {path}"):
+        journal = Journal.read(root)
+        if journal.data is None:
+            raise LegsError(f"{root}: there is nothing to take back: no {JOURNAL}")
+        if not (journal.ours or look or trust == journal.name):
+            raise LegsError(_not_ours(root, journal, path))
+        done = _work_out(root, journal, force)
+        if not look:
+            replace_files(root, {**done.changes, JOURNAL: (journal.data, None)})
+    return done
+
+
+def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
+    changes: Dict[str, Tuple[Optional[bytes], Optional[bytes]]] = {}
+    done = Undone([], [], [], changes)
+    edited: List[str] = []
+    for name, layers in journal.files.items():
+        current = read_file(root, name)
+        if current is None:
+            done.kept.append((name, "it is gone"))
+            continue
+        data = current
+        lost: List[str] = []
+        for layer in reversed(layers):
+            if digest(data) == layer.after:
+                data = layer.original
+            elif data != layer.original:  # as before already: the write was interrupted, or git took it back
+                if digest(data) in (digest(earlier.original) for earlier in layers):
+                    continue
+                edited.append(name)
+                data, missing = undo_edits(layer.original, layer.patched(), data)
+                lost.extend(missing)
+        if lost:
+            done.kept.append((name, "these lines were changed since and stay: " + "; ".join(sorted(set(lost)))))
+        if data != current:
+            changes[name] = (current, data)
+            done.restored.append(name)
+    if edited and not force:
+        raise LegsError(
+            f"{', '.join(sorted(set(edited)))}: edited since it was patched; --undo --force puts the patch's own lines "
+            "back and leaves the edits"
+        )
+    for name, wrote in journal.created.items():
+        current = read_file(root, name)
+        if current is None:
+            continue
+        if digest(current) == wrote:
+            changes[name] = (current, None)
+            done.removed.append(name)
+        else:
+            done.kept.append((name, "it was edited since: yours now"))
+    return done
+
+
+def _not_ours(root: Path, journal: Journal, path: object) -> str:
+    names = [*journal.files, *journal.created]
+    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return (
+        f"{root / JOURNAL} was not written by your legs-patch on this machine (or by one before it had seals, or its "
+        f"key is gone): nothing was changed. It is about {shown}, which git can restore. To follow it all the same, "
+        f"look at what it would do with `legs-patch --undo --diff {path}`, and name it: "
+        f"`legs-patch --undo --trust {journal.name} {path}`"
+    )
+
+
+def undo_edits(original: bytes, patched: bytes, current: bytes) -> Tuple[bytes, List[str]]:
+    """Put a patch's own lines back in a file that was edited since.
+
+    Args:
+        original, patched: the file before and after the patch.
+        current: the file as it stands.
+
+    Returns:
+        The file with the patch's lines as they were and the edits as they are; and the patched lines that are no
+        longer there as the patch left them, which were left alone.
+    """
+    before, after, lines = (data.splitlines(keepends=True) for data in (original, patched, current))
+    lost: List[str] = []
+    hunks = difflib.SequenceMatcher(None, before, after, autojunk=False).get_opcodes()
+    kept = difflib.SequenceMatcher(None, after, lines, autojunk=False).get_matching_blocks()
+    where = {block.a + i: block.b + i for block in kept for i in range(block.size)}
+    changes: List[Tuple[int, int, Sequence[bytes]]] = []
+    for tag, i1, i2, j1, j2 in hunks:
+        if tag == "equal":
+            continue
+        places = [where[j] for j in range(j1, j2) if j in where]
+        if j1 == j2 or len(places) < j2 - j1 or places[-1] - places[0] >= j2 - j1:
+            lost.extend(line.decode("utf-8", "replace").strip() for line in after[j1:j2])
+        else:
+            changes.append((places[0], places[-1] + 1, before[i1:i2]))
+    for start, end, put in reversed(changes):
+        lines[start:end] = put
+    return b"".join(lines), lost

@@ -1,0 +1,136 @@
+"""Exclusive locks on files: one holder at a time, released by the system when the holder's process dies."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import sys
+import time
+from types import TracebackType
+from typing import Optional, Type, Union
+
+from legs_loss.errors import LegsError
+
+__all__ = ["FileLock", "HeldError", "is_held"]
+
+_POLL = 0.02  # seconds
+_FAR = 1 << 30  # where Windows locks one byte, which can then be read by nobody else: behind all text
+
+
+class HeldError(LegsError):
+    """Another process holds the lock, and did not let go in time."""
+
+
+class FileLock:
+    """An exclusive lock on a file; a context manager.
+
+    Args:
+        path: the file, made where it is missing, never through a link.
+        wait: how many seconds to wait for another holder; None waits for ever.
+        note: who holds it, written to the file for the one who waits.
+        remove: delete the file on release.
+
+    Raises:
+        HeldError: it is held; the message is the holder's note.
+        OSError: the file cannot be made, or is a link, a pipe or a folder.
+    """
+
+    def __init__(
+        self,
+        path: Union[str, os.PathLike[str]],
+        wait: Optional[float] = None,
+        note: str = "",
+        remove: bool = False,
+    ) -> None:
+        self._path, self._remove = os.fspath(path), remove
+        until = None if wait is None else time.monotonic() + wait
+        while True:
+            self._descriptor = _open(self._path)
+            try:
+                self._take(until)
+                if remove and not _is_same(self._descriptor, self._path):  # its last holder has deleted it since
+                    os.close(self._descriptor)
+                    continue
+                if note:
+                    os.ftruncate(self._descriptor, 0)
+                    os.write(self._descriptor, note.encode("utf-8", "backslashreplace"))
+                return
+            except BaseException:
+                os.close(self._descriptor)
+                raise
+
+    def release(self) -> None:
+        """Let the next one in."""
+        if self._remove and os.name == "posix":  # elsewhere an open file cannot be deleted: an empty one stays
+            os.unlink(self._path)
+        os.close(self._descriptor)
+
+    def __enter__(self) -> FileLock:
+        return self
+
+    def __exit__(
+        self, kind: Optional[Type[BaseException]], error: Optional[BaseException], where: Optional[TracebackType]
+    ) -> None:
+        self.release()
+
+    def _take(self, until: Optional[float]) -> None:
+        while not _try_lock(self._descriptor, block=until is None):
+            if until is not None and time.monotonic() >= until:
+                raise HeldError(os.pread(self._descriptor, 500, 0).decode("utf-8", "replace") if _PREAD else "")
+            time.sleep(_POLL)
+
+
+def is_held(path: Union[str, os.PathLike[str]]) -> bool:
+    """Return whether another holds the lock of a file, or whether that cannot be found out."""
+    try:
+        FileLock(path, wait=0.0).release()
+    except (OSError, HeldError):
+        return True
+    return False
+
+
+_PREAD = hasattr(os, "pread")
+
+
+def _open(path: str) -> int:
+    if os.path.islink(path):  # for Windows; elsewhere the flag says it without a race
+        raise OSError(errno.ELOOP, "a link, which is not followed", path)
+    flags = os.O_RDWR | os.O_CREAT
+    for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY", "O_NOINHERIT"):
+        flags |= getattr(os, name, 0)
+    descriptor = os.open(path, flags, 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "not a regular file but a pipe, a socket or a device", path)
+    return descriptor
+
+
+def _is_same(descriptor: int, path: str) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.lstat(path))
+    except FileNotFoundError:
+        return False
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _try_lock(descriptor: int, block: bool) -> bool:
+        os.lseek(descriptor, _FAR, os.SEEK_SET)
+        try:
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        finally:
+            os.lseek(descriptor, 0, os.SEEK_SET)
+        return True
+else:
+    import fcntl
+
+    def _try_lock(descriptor: int, block: bool) -> bool:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if block else fcntl.LOCK_NB))
+        except BlockingIOError:
+            return False
+        return True

@@ -1,0 +1,401 @@
+"""A checkout from a stranger that brings its own journal: it is reported, and nothing of it is done."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import zlib
+from contextlib import redirect_stderr, redirect_stdout
+
+import pytest
+from legs_adapters.checkout.seal import seal
+from legs_adapters.cli import main
+from legs_adapters.journal import JOURNAL
+
+from tests.patching_support import checkout, files, legs_patch, run_git, snapshot
+from tests.support import legs_environment
+
+COMMAND = 'touch "$LEGS_ATTACK"; false'
+EVIL = f"[core]\n\trepositoryformatversion = 0\n\tbare = false\n\tfsmonitor = {json.dumps(COMMAND)}\n".encode()
+
+
+def pack(data):
+    return base64.b64encode(zlib.compress(data)).decode()
+
+
+def digest(data):
+    return hashlib.sha256(data).hexdigest()
+
+
+def journal(written, created=()):
+    """Return a journal that would put the second bytes where the first are, and delete what has the bytes created."""
+    return json.dumps(
+        {
+            "version": 1,
+            "note": "",
+            "files": {
+                name: [{"after": digest(now), "edits": [], "original": pack(put)}]
+                for name, (now, put) in dict(written).items()
+            },
+            "created": {name: digest(now) for name, now in dict(created).items()},
+        }
+    )
+
+
+def state(folder):
+    """Return every file's bytes, those in .git too but its index, which git itself rewrites."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "index"
+    }
+
+
+@pytest.fixture
+def attack(tmp_path):
+    """A folder to put a checkout in, and the file that its commands make where they run."""
+    ran = tmp_path / "attack-ran"
+    yield tmp_path, ran
+    assert not ran.exists(), "a command of the checkout ran"
+
+
+def run(*arguments, ran, **environment):
+    """Run ``legs-patch`` in this process: what a command that it starts would do is seen all the same."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        for name, value in {"LEGS_ATTACK": str(ran), **environment}.items():
+            patch.setenv(name, value)
+        try:
+            code = main([str(word) for word in arguments])
+        except SystemExit as error:
+            code = error.code
+    return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+
+
+NAMES = {
+    "plain": ".git/config",
+    "behind a dot": "./.git/config",
+    "two slashes": ".//.git/config",
+    "in and out": "sub/../.git/config",
+    "of a nested checkout": "sub/.git/config",
+    "behind a link": "g/config",
+    "in capitals": ".GIT/config",
+    "with a dot behind": ".git./config",
+    "with a space behind": ".git /config",
+    "by its short name": "GIT~1/config",
+    "as a stream": ".git::$INDEX_ALLOCATION/config",
+    "with a letter nobody sees": ".g\u200cit/config",
+    "with backslashes": ".git\\config",
+    "an absolute path": "ABSOLUTE/.git/config",
+    "a link to a file": "config",
+    "a hook": ".git/hooks/fsmonitor.py",
+    "a shell script": "run.sh",
+    "a nul": "a\0.py",
+    "nothing": "",
+    "the folder itself": ".",
+    "outside": "../outside.py",
+    "the journal": JOURNAL,
+}
+
+
+@pytest.mark.parametrize("what", NAMES, ids=lambda what: what.replace(" ", "_"))
+def test_a_clone_with_a_journal_of_its_own(what, attack):
+    """``legs-patch .; legs-patch --undo .; git status``: what used to run a command of the stranger's."""
+    folder, ran = attack
+    root = checkout(folder / "clone", {**files("inria"), "run.sh": "old\n", "sub/.git/config": "[core]\n"}, git=True)
+    for link, target in (("g", ".git"), ("config", ".git/config")):
+        (root / link).symlink_to(target)
+    name = NAMES[what].replace("ABSOLUTE", str(root))
+    config = (root / "sub" if name.startswith("sub/.") else root) / ".git" / "config"
+    (root / ".git" / "hooks" / "fsmonitor.py").write_bytes(config.read_bytes())
+    current = {"run.sh": b"old\n"}.get(name, config.read_bytes())
+    content = json.loads(journal({name: (current, EVIL)}, {".git/HEAD": (root / ".git" / "HEAD").read_bytes()}))
+    alone = json.loads(journal({name: (current, EVIL)}))
+    # Even one's own seal opens nothing that legs-patch does not write.
+    true = seal(json.dumps(alone, sort_keys=True, separators=(",", ":")).encode(), root)
+    for sealed in (content, dict(content, seal="0" * 64), dict(content, seal=7), dict(alone, seal=true)):
+        (root / JOURNAL).write_text(json.dumps(sealed))
+        before = state(root)
+        trust = ["--trust", digest((root / JOURNAL).read_bytes())[:16]]
+        for arguments in (["--force"], ["--undo"], ["--undo", "--force", *trust], ["--undo", "--diff"]):
+            done = run(*arguments, root, ran=ran)
+            assert done.returncode == 2, arguments
+            assert JOURNAL in done.stderr
+            assert done.stderr.count("\n") == 1
+            assert state(root) == before
+    environment = dict(os.environ, LEGS_ATTACK=str(ran))
+    subprocess.run(["git", "-C", str(root), "status"], stdout=subprocess.DEVNULL, env=environment, check=False)
+
+
+def test_the_attack_whole(attack):
+    folder, ran = attack
+    origin = checkout(folder / "origin", files("inria"), git=True)
+    config = b"[core]\n\trepositoryformatversion = 0\n\tfilemode = true\n\tbare = false\n"
+    for name in ("./.git/config", "g/config"):
+        (origin / JOURNAL).write_text(journal({name: (config, EVIL)}, {"./.git/HEAD": b"ref: refs/heads/master\n"}))
+        subprocess.run(["git", "clone", "-q", str(origin), str(folder / "clone")], check=True)
+        (folder / "clone" / ".git" / "config").write_bytes(config)
+        (folder / "clone" / "g").symlink_to(".git")
+        shutil.copy(str(origin / JOURNAL), str(folder / "clone"))
+        environment = dict(legs_environment(), LEGS_ATTACK=str(ran))
+        legs_patch("clone", cwd=str(folder), env=environment)
+        legs_patch("--undo", "clone", cwd=str(folder), env=environment)
+        subprocess.run(["git", "-C", str(folder / "clone"), "status"], env=environment, stdout=subprocess.DEVNULL)
+        assert (folder / "clone" / ".git" / "config").read_bytes() == config
+        shutil.rmtree(str(folder / "clone"))
+
+
+class TestSomeoneElses:
+    @pytest.fixture
+    def theirs(self, attack):
+        """A checkout that another user patched."""
+        folder, ran = attack
+        root = checkout(folder / "theirs", files("inria"), git=True)
+        before = snapshot(root)
+        assert run(root, ran=ran, XDG_STATE_HOME=str(folder / "their-state")).returncode == 0
+        return root, before, ran
+
+    def test_is_reported_and_left(self, theirs):
+        root, _, ran = theirs
+        patched = state(root)
+        refused = run("--undo", root, ran=ran)
+        assert refused.returncode == 2
+        assert "was not written by your legs-patch on this machine" in refused.stderr
+        assert "It is about train.py, legs.toml, which git can restore" in refused.stderr
+        line = (
+            files("inria")["train.py"]
+            .splitlines()
+            .index("            l1_test += l1_loss(image, gt_image).mean().double()")
+            + 2
+        )
+        more = run("--site", f"train.py:{line}", "--force", root, ran=ran)
+        assert (more.returncode, state(root)) == (2, patched)
+        assert "is not yours" in more.stderr
+        again = run(root, ran=ran)  # nothing to do, so nothing to refuse
+        assert (again.returncode, state(root)) == (0, patched)
+
+    def test_is_followed_by_name_after_a_look(self, theirs):
+        root, before, ran = theirs
+        patched = state(root)
+        look = run("--undo", "--diff", root, ran=ran)
+        assert look.returncode == 0
+        assert "-        Ll1 = legs_loss.l1_loss(image, gt_image, view=viewpoint_cam.image_name)" in look.stdout
+        assert "+        Ll1 = l1_loss(image, gt_image)" in look.stdout
+        assert "+++ /dev/null" in look.stdout
+        assert state(root) == patched
+        name = re.search(r"--trust (\w{16}) ", run("--undo", root, ran=ran).stderr).group(1)
+        assert run("--undo", "--trust", "0" * 16, root, ran=ran).returncode == 2
+        assert state(root) == patched
+        assert run("--undo", "--trust", name, root, ran=ran).returncode == 0
+        assert snapshot(root) == before
+
+    def test_changed_since_it_is_another(self, theirs):
+        root, _, ran = theirs
+        name = re.search(r"--trust (\w{16}) ", run("--undo", root, ran=ran).stderr).group(1)
+        content = json.loads((root / JOURNAL).read_text())
+        content["files"]["train.py"][0]["original"] = pack(b"import evil\n")
+        (root / JOURNAL).write_text(json.dumps(content))
+        assert run("--undo", "--trust", name, root, ran=ran).returncode == 2
+
+
+class TestOnesOwn:
+    def test_an_edited_one_is_no_longer(self, attack):
+        folder, ran = attack
+        root = checkout(folder / "mine", files("inria"))
+        assert run(root, ran=ran).returncode == 0
+        content = json.loads((root / JOURNAL).read_text())
+        content["files"]["train.py"][0].update(original=pack(b"import evil\n"), edits=[])
+        (root / JOURNAL).write_text(json.dumps(content))
+        before = state(root)
+        refused = run("--undo", root, ran=ran)
+        assert (refused.returncode, state(root)) == (2, before)
+        assert "was not written by your legs-patch" in refused.stderr
+
+    @pytest.mark.parametrize("how", ["moved", "copied"])
+    def test_a_moved_checkout_is_undone(self, how, attack):
+        folder, ran = attack
+        root = checkout(folder / "here", files("inria"))
+        before = snapshot(root)
+        assert run(root, ran=ran).returncode == 0
+        there = folder / "elsewhere" / "renamed"
+        shutil.copytree(str(root), str(there)) if how == "copied" else shutil.move(str(root), str(there))
+        assert run("--undo", there, ran=ran).returncode == 0
+        assert snapshot(there) == before
+
+    @pytest.mark.parametrize("state_home", ["absent", "a file", "inside the checkout", "of a damaged key"])
+    def test_without_a_key_the_journal_is_nobody_s(self, state_home, attack):
+        folder, ran = attack
+        root = checkout(folder / "mine", files("inria"))
+        before = snapshot(root)
+        place = folder / "state"
+        if state_home == "a file":
+            place.write_text("")
+        elif state_home == "inside the checkout":  # which may have brought a key along
+            place = root / "state"
+            checkout(root, {"state/legs-loss/journal.key": b"k" * 32})
+            before = snapshot(root)
+        elif state_home == "of a damaged key":
+            checkout(place, {"legs-loss/journal.key": b"short"})
+        else:
+            place.mkdir()
+        assert run(root, ran=ran, XDG_STATE_HOME=str(place)).returncode == 0
+        if state_home == "absent":
+            shutil.rmtree(str(place))
+        refused = run("--undo", root, ran=ran, XDG_STATE_HOME=str(place))
+        assert refused.returncode == 2
+        assert "or its key is gone" in refused.stderr
+        name = re.search(r"--trust (\w{16}) ", refused.stderr).group(1)
+        assert run("--undo", "--trust", name, root, ran=ran, XDG_STATE_HOME=str(place)).returncode == 0
+        assert snapshot(root) == before
+
+    def test_the_key_is_one_s_own(self, attack):
+        folder, ran = attack
+        root = checkout(folder / "mine", files("inria"))
+        assert run(root, ran=ran, XDG_STATE_HOME=str(folder / "state")).returncode == 0
+        key = folder / "state" / "legs-loss" / "journal.key"
+        assert (key.stat().st_mode & 0o777, len(key.read_bytes())) == (0o600, 32)
+        assert os.listdir(str(key.parent)) == ["journal.key"]
+
+
+def layers(*contents):
+    """Return a journal of one file with these layers, each a change of a good one."""
+    good = {"original": pack(b"x"), "edits": [], "after": "0" * 64}
+    return json.dumps({"version": 1, "files": {"a.py": [{**good, **change} for change in contents]}, "created": {}})
+
+
+DAMAGED = {
+    "empty": "",
+    "no json": "hello",
+    "not utf-8": b"\xff\xfe",
+    "deep": "[" * 100_000,
+    "a number": "3",
+    "a list": "[]",
+    "no version": "{}",
+    "another version": '{"version": 7}',
+    "no files": '{"version": 1}',
+    "files are a list": '{"version": 1, "files": [], "created": {}}',
+    "layers are a number": '{"version": 1, "files": {"a.py": 3}, "created": {}}',
+    "a layer is a number": '{"version": 1, "files": {"a.py": [3]}, "created": {}}',
+    "no base64": layers({"original": "%"}),
+    "not compressed": layers({"original": "AAAA"}),
+    "cut short": layers({"original": pack(b"hello" * 100)[:12]}),
+    "gigabytes": layers({"original": pack(bytes(200 << 20))}),
+    "gigabytes in pieces": layers(*[{"original": pack(bytes(30 << 20))}] * 9),
+    "edits outside": layers({"edits": [[0, 9, ""]]}),
+    "edits of halves": layers({"edits": [[0, 1, "\ud800"]]}),
+    "edits of floats": layers({"edits": [[0.0, 1, ""]]}),
+    "edits of numbers": layers({"edits": [[0, 1, 7]]}),
+    "no checksum": layers({"after": "z"}),
+    "huge numbers": '{"version": ' + "9" * 5000 + "}",
+}
+
+
+@pytest.mark.parametrize("what", DAMAGED, ids=lambda what: what.replace(" ", "_"))
+def test_a_damaged_journal_is_one_line(what, attack):
+    folder, ran = attack
+    root = checkout(folder / "mine", {**files("inria"), JOURNAL: DAMAGED[what]})
+    before = state(root)
+    for arguments in (["--undo"], ["--undo", "--diff"], ["--force"]):
+        done = run(*arguments, root, ran=ran)
+        assert done.returncode == 2
+        assert done.stderr.startswith("legs-patch: error: ")
+        assert done.stderr.count("\n") == 1
+        assert str(root / JOURNAL) in done.stderr
+    assert state(root) == before
+
+
+@pytest.mark.parametrize("what", ["link", "pipe", "folder"])
+def test_a_journal_that_is_no_file(what, attack):
+    folder, ran = attack
+    root = checkout(folder / "mine", files("inria"))
+    if what == "link":
+        (folder / "elsewhere.json").write_text(journal({"train.py": ((root / "train.py").read_bytes(), b"evil")}))
+        (root / JOURNAL).symlink_to(folder / "elsewhere.json")
+    elif what == "pipe":
+        os.mkfifo(str(root / JOURNAL))
+    else:
+        (root / JOURNAL).mkdir()
+    before = state(root)
+    for arguments in (["--undo"], []):
+        done = run(*arguments, root, ran=ran)
+        assert done.returncode == 2
+        assert JOURNAL in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert state(root) == before
+
+
+CONFIG = """
+[core]
+    fsmonitor = "COMMAND"
+    hooksPath = .hooks
+    pager = "COMMAND"
+    sshCommand = "COMMAND"
+    repositoryformatversion = 1
+[extensions]
+    partialClone = origin
+[remote "origin"]
+    url = ext::sh -c COMMAND
+    promisor = true
+[protocol "ext"]
+    allow = always
+[filter "plain"]
+    clean = "COMMAND"
+    process = "COMMAND"
+    required = true
+[filter "a=b"]
+    clean = "COMMAND"
+[diff "plain"]
+    textconv = "COMMAND"
+    command = "COMMAND"
+[diff]
+    external = "COMMAND"
+"""
+
+
+@pytest.mark.parametrize("attributes", ["*.py filter=plain diff=plain\n", "*.py filter=a=b\n", ""])
+@pytest.mark.parametrize("where", ["of its own", "as a file", "bare", "above"])
+def test_git_runs_nothing_of_the_checkout_s(where, attributes, attack):
+    """An archive, unlike a clone, brings a ``.git`` of its own; and a clone may have a bare repository in a folder."""
+    folder, ran = attack
+    root = checkout(folder / "theirs", {**files("inria"), ".gitattributes": attributes}, git=True)
+    config = CONFIG.replace("COMMAND", f"touch {ran}")
+    for hook in ("post-index-change", "post-checkout", "fsmonitor-watchman"):
+        checkout(root, {f".hooks/{hook}": f"#!/bin/sh\ntouch {ran}\n", f".git/hooks/{hook}": "#!/bin/sh\nfalse\n"})
+        (root / ".hooks" / hook).chmod(0o755)
+    run_git(root, "rm", "-q", "--cached", "utils/loss_utils.py")
+    for path in root.rglob("*.py"):
+        path.write_text(path.read_text() + "\n")  # what is not as the index has it is put through the filters
+    (root / ".git" / "config").write_text(config)
+    target = root
+    if where == "as a file":
+        (root / ".git").rename(folder / "gitdir")
+        (root / ".git").write_text(f"gitdir: {folder / 'gitdir'}\n")
+    elif where == "bare":
+        for path in (root / ".git").iterdir():
+            path.rename(root / path.name)
+        (root / ".git").rmdir()
+        (root / "config").write_text(config.replace("[core]", "[core]\n    bare = false\n    worktree = .\n"))
+    elif where == "above":
+        target = root / "utils"
+        (root / "train.py").rename(target / "train.py")
+    run(target, ran=ran)
+    run("--force", target, ran=ran)
+    run("--undo", target, ran=ran)
+    assert not ran.exists()
+    if where == "of its own" and "plain" in attributes:  # the premise, or this proves nothing
+        subprocess.run(["git", "-C", str(root), "status"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        assert ran.exists()
+        ran.unlink()
+
+
+def test_git_of_the_checkout_s_own_is_not_run(attack):
+    folder, ran = attack
+    root = checkout(folder / "theirs", {**files("inria"), "git": f"#!/bin/sh\ntouch {ran}\n"})
+    (root / "git").chmod(0o755)
+    assert run(root, ran=ran, PATH=os.pathsep.join([str(root), os.environ["PATH"]])).returncode == 0

@@ -36,6 +36,23 @@ class TestValues:
         ).float()
         assert torch.equal(response(dot(), "laplacian8")[0], expected)
 
+    @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
+    def test_eight_neighbours_equal_kornia(self, p):
+        filters = pytest.importorskip("kornia.filters")
+        image = torch.rand(2, 3, 17, 23, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        channels = filters.laplacian(image, 3, border_type="reflect", normalized=False)
+        expected = torch.linalg.vector_norm(channels, p, dim=1, keepdim=True)
+        torch.testing.assert_close(response(image, "laplacian8", p), expected)
+
+    @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
+    def test_sobel_equals_kornia_inside(self, p):
+        filters = pytest.importorskip("kornia.filters")
+        image = torch.rand(1, 3, 17, 23, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        # kornia's border is replicated, so that only the inside is the same.
+        slopes = filters.spatial_gradient(image, "sobel", normalized=False)[:, :, :, 1:-1, 1:-1]
+        expected = torch.linalg.vector_norm(slopes.flatten(1, 2), p, dim=1, keepdim=True)
+        torch.testing.assert_close(response(image, "sobel", p)[..., 1:-1, 1:-1], expected)
+
     def test_three_by_three_with_reflected_border_by_hand(self):
         image = torch.tensor([[[1.0, 2.0, 4.0], [3.0, 5.0, 7.0], [6.0, 8.0, 9.0]]])
         # Corner (0, 0): up and down are both 3, left and right both 2: 3 + 3 + 2 + 2 - 4 * 1 = 6.

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.config import Config, find_config
+from legs_loss.distributed import is_first_process
 from legs_loss.errors import LegsError
 from legs_loss.images import as_map, check_pair, is_compiling
 from legs_loss.loss import weighted_l1
@@ -76,9 +77,11 @@ class _Run:
         return weight
 
     def say_once(self, kind: str, message: str) -> None:
-        """Print a line on stderr, the first time that this kind of thing happens."""
+        """Print a line on stderr, the first time that this kind of thing happens; of "active" only rank 0 does."""
         if kind not in self.said:
             self.said.add(kind)
+            if kind == "active" and not is_first_process():
+                return
             print(f"legs-loss: {message}", file=sys.stderr, flush=True)
 
     def _make(self, target: Tensor, view: Optional[str], channels_last: bool) -> Tensor:

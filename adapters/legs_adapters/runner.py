@@ -1,6 +1,7 @@
-"""A training script with the LEGS loss, its files untouched: the same edits as legs-patch makes, while Python imports.
+"""Run a training script with the LEGS loss, its files untouched: legs-patch's edits are made while Python imports.
 
     legs run train.py -s scene/
+    torchrun --nproc_per_node 2 -m legs_loss run train.py -s scene/
 
 Every line keeps its number, so that tracebacks point at the right lines.
 """
@@ -8,22 +9,19 @@ Every line keeps its number, so that tracebacks point at the right lines.
 from __future__ import annotations
 
 import atexit
-import importlib.machinery
-import importlib.util
-import linecache
 import os
 import signal
 import sys
 import threading
-import types
 from pathlib import Path
-from types import CodeType
 from typing import Dict, Optional, Sequence, Tuple, Type
 
 from legs_adapters.code.folders import SUBMODULE, VENDORED, foreign_folder
 from legs_adapters.code.sources import check_root
 from legs_adapters.patch import plan
+from legs_adapters.rewritten import Loader, install, main_module
 from legs_loss import LegsError
+from legs_loss.distributed import is_first_process
 
 __all__ = ["checkout_of", "execute", "run_script"]
 
@@ -49,14 +47,14 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
     Args:
         script: the script.
         arguments: its arguments.
-        cpu: run it without a GPU: what it asks of CUDA is answered by the CPU, and its rasterizer by a stand-in.
+        cpu: run it without a GPU: what it asks of CUDA is answered by the CPU, and its rasterizer by a shim.
 
     Returns:
         The exit code, where the script does not leave by ``sys.exit`` (which goes on as it is).
 
     Raises:
         LegsError: there is no such script; or its codebase has a term that cannot be decided, or, unless ``cpu``,
-            none; or, with ``cpu``, the script wants something of CUDA that has no stand-in.
+            none; or, with ``cpu``, the script wants something of CUDA that has no shim.
     """
     path = Path(script)
     if not path.is_file():
@@ -69,15 +67,19 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
     if not found.after and not found.findings.patched:
         if not cpu:
             raise LegsError(f"no photometric L1 term was found in {root}")
-        print(
-            f"legs-loss: no photometric L1 term was found in {root}: nothing is weighted", file=sys.stderr, flush=True
-        )
+        _say(f"no photometric L1 term was found in {root}: nothing is weighted")
     sources = {os.path.realpath(str(root / name)): data for name, data in found.after.items()}
     for site in found.findings.sites:
-        print(f"legs-loss: {site.path}:{site.line} is weighted in this run", file=sys.stderr, flush=True)
+        _say(f"{site.path}:{site.line} is weighted in this run")
     for kept in found.findings.kept:
-        print(f"legs-loss: {kept.path}:{kept.line} stays plain in this run", file=sys.stderr, flush=True)
+        _say(f"{kept.path}:{kept.line} stays plain in this run")
     return execute(str(script), arguments, sources, root if cpu else None)
+
+
+def _say(message: str) -> None:
+    """Print a line on stderr, in the first of the processes that torchrun starts."""
+    if is_first_process():
+        print(f"legs-loss: {message}", file=sys.stderr, flush=True)
 
 
 def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[Path] = None) -> int:
@@ -93,20 +95,19 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
         The exit code, where the script does not leave by ``sys.exit``.
     """
     file = _as_python_names(name)
-    sys.meta_path.insert(0, _Finder(sources))
+    install(sources)
     refusals: Tuple[Type[BaseException], ...] = ()
     if cpu_root is not None:
         from legs_adapters.shims import MissingShim, start
 
         start(cpu_root)
         refusals = (MissingShim,)
-    main = _main_module(file)
     sys.argv[:] = [name, *arguments]
     sys.path[0] = os.path.dirname(os.path.realpath(name))
+    main = main_module("__main__", file)
     sys.modules["__main__"] = main
-    loader = _Loader("__main__", file, sources.get(os.path.realpath(name)))
     try:
-        code = loader.code()
+        code = Loader("__main__", file, sources.get(os.path.realpath(name))).code()
     except SyntaxError as error:
         sys.excepthook(type(error), error.with_traceback(None), None)
         return 1
@@ -126,68 +127,10 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
 
 
 def _as_python_names(script: str) -> str:
-    """`__file__` of a script, as it stands in tracebacks too: since 3.9 absolute, with `..` left as it is on POSIX."""
+    """Return a script's `__file__`, as tracebacks have it: since 3.9 absolute, with `..` left as it is on POSIX."""
     if sys.version_info < (3, 9):
         return script
     return os.path.join(os.getcwd(), script) if os.name == "posix" else os.path.abspath(script)
-
-
-class _Loader(importlib.machinery.SourceFileLoader):
-    """Loads a file's rewritten source in place of what is on disk; never from, nor into, a bytecode cache."""
-
-    def __init__(self, name: str, path: str, data: Optional[bytes]) -> None:
-        super().__init__(name, path)
-        self._data = data
-
-    def get_data(self, path: str | os.PathLike[str]) -> bytes:
-        if self._data is not None and os.fspath(path) == self.path:
-            return self._data
-        return super().get_data(os.fspath(path))
-
-    def get_code(self, fullname: str) -> Optional[CodeType]:
-        return self.code()
-
-    def code(self) -> CodeType:
-        """Compile what is to run, and let tracebacks quote it."""
-        data = self.get_data(self.path)
-        if self._data is not None:
-            text = importlib.util.decode_source(data)
-            # Without a time of last change, linecache does not look at the disk again.
-            linecache.cache[self.path] = (len(text), None, text.splitlines(keepends=True), self.path)
-        return self.source_to_code(data, self.path)
-
-
-class _Finder:
-    """Finds modules as Python does, and swaps the loader of those that were rewritten."""
-
-    def __init__(self, sources: Dict[str, bytes]) -> None:
-        self._sources = sources
-
-    def find_spec(
-        self, name: str, path: Optional[Sequence[str]] = None, target: Optional[types.ModuleType] = None
-    ) -> Optional[importlib.machinery.ModuleSpec]:
-        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
-        if spec is None or not spec.origin or type(spec.loader) is not importlib.machinery.SourceFileLoader:
-            return None
-        data = self._sources.get(os.path.realpath(spec.origin))
-        if data is None:
-            return None
-        spec.loader = _Loader(name, spec.origin, data)
-        return spec
-
-
-def _main_module(script: str) -> types.ModuleType:
-    module = types.ModuleType("__main__")
-    module.__dict__.update(
-        __file__=script,
-        __builtins__=sys.modules["builtins"],
-        __spec__=None,
-        __package__=None,
-        __cached__=None,
-        __loader__=importlib.machinery.SourceFileLoader("__main__", script),
-        __annotations__={},
-    )
-    return module
 
 
 def _show(error: BaseException) -> None:

@@ -24,6 +24,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
+from tqdm import tqdm
+
 Plan = Dict[str, Any]
 CONTEXT = multiprocessing.get_context("forkserver" if hasattr(os, "fork") else "spawn")
 LOADED = ["libcst", "legs_adapters.cli"]  # once, in the process that the others are forked from
@@ -83,7 +85,8 @@ def plan_all(folders: List[Path], jobs: int, limit: float) -> Tuple[Dict[str, Pl
     if CONTEXT.get_start_method() == "forkserver":
         CONTEXT.set_forkserver_preload(LOADED)
     with ThreadPoolExecutor(jobs) as pool:  # a thread only waits for its process
-        found = list(pool.map(lambda folder: plan(folder, limit), folders))
+        planned = pool.map(lambda folder: plan(folder, limit), folders)
+        found = list(tqdm(planned, total=len(folders), unit="checkout", disable=None))  # no bar where nobody looks
     names = [folder.name for folder in folders]
     return dict(zip(names, (one for one, _ in found))), dict(zip(names, (taken for _, taken in found)))
 

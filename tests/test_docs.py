@@ -1,0 +1,57 @@
+"""The documents: every file, folder, heading and command that they name is there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Set
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TEMPLATES = {ROOT / "docs/compatibility/page.md"}  # its links are those of the page that is made of it
+PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/**/*.md")} - TEMPLATES)
+PATH = r"(?<![\w/.-])((?:legs_loss|adapters|tests|docs|benchmarks|examples)/[\w./-]*[\w/])"
+
+
+def prose(page: Path) -> str:
+    return re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+
+
+def anchors(page: Path) -> Set[str]:
+    """The anchors that GitHub gives a page's headings: lower case, spaces as hyphens, no punctuation."""
+    heads = re.findall(r"^#+ (.*)$", prose(page), re.M)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_what_a_page_links_to_is_there(page: Path) -> None:
+    for target, anchor in re.findall(r"\]\(([^)#\s:]*)(?:#([^)\s]+))?\)", prose(page)):
+        file = page.parent / target if target else page
+        assert file.exists(), target
+        assert not anchor or anchor in anchors(file), f"{target}#{anchor}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_path_of_the_project_that_a_page_names_is_there(page: Path) -> None:
+    named = {path for code in re.findall(r"`([^`\n]+)`", prose(page)) for path in re.findall(PATH, code)}
+    assert [path for path in sorted(named) if not (ROOT / path).exists()] == []
+
+
+def test_the_map_has_every_folder_of_the_core_and_of_the_adapters() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    packages = [*(ROOT / "legs_loss").iterdir(), *(ROOT / "adapters/legs_adapters").iterdir()]
+    folders = [f"{path.relative_to(ROOT).as_posix()}/" for path in packages if (path / "__init__.py").exists()]
+    assert len(folders) > 10
+    assert [folder for folder in folders if folder not in text] == []
+
+
+def test_the_make_targets_and_modules_of_contributing_are_there() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"\bmake (test-slow|\w+)", text)) - {"the"}
+    assert {"test", "test-slow", "lint"} <= targets
+    assert [target for target in targets if not re.search(rf"^{target}:", makefile, re.M)] == []
+    for module in re.findall(r"python -m (benchmarks[\w.]*)", text):
+        path = ROOT.joinpath(*module.split("."))
+        assert path.with_suffix(".py").exists() or (path / "__main__.py").exists(), module

@@ -17,7 +17,7 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, Dict, Generator, Iterator, List, NamedTuple, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Dict, Generator, Iterator, List, NamedTuple, Optional, Sequence, Tuple, Union
 
 import numpy as np
 import torch
@@ -61,6 +61,7 @@ def precompute(
     white_background: bool = False,
     workers: int = 1,
     progress: bool = False,
+    on_progress: Optional[Callable[[int, int], None]] = None,
 ) -> Report:
     """Write the normalised response of every view of a scene to a store.
 
@@ -72,6 +73,7 @@ def precompute(
         resolution, white_background: 3DGS's ``-r`` and ``-w``, as the training will have them.
         workers: processes; 1 computes in this one. With more, a script needs its ``if __name__ == "__main__"``.
         progress: show a bar on stderr.
+        on_progress: called after each view with the number of views that are done, and of all.
 
     Returns:
         What was made, kept and skipped. A photograph that cannot be read is skipped, not raised.
@@ -98,6 +100,8 @@ def precompute(
         with closing(results):
             try:
                 for result in tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress):
+                    if result.unwritable is not None:
+                        raise LegsError(f"cannot write to {out}: {result.unwritable}")
                     if result.problem is not None:
                         report.skipped[result.view] = result.problem
                     elif result.entry is None:
@@ -105,6 +109,8 @@ def precompute(
                     else:
                         report.made.append(result.view)
                         staged.append(result.entry)
+                    if on_progress is not None:
+                        on_progress(len(report.made) + len(report.kept) + len(report.skipped), len(tasks))
                     if staged and time.monotonic() >= due:
                         _commit(writer, staged)
                         due = time.monotonic() + _COMMIT_SECONDS
@@ -174,11 +180,15 @@ class _Task(NamedTuple):
 
 
 class _Result(NamedTuple):
-    """Of one view: a staged entry, or a problem, or neither where the store's map is up to date."""
+    """Of one view: a staged entry, or a problem, or neither where the store's map is up to date.
+
+    ``problem`` is the photograph's and costs the view; ``unwritable`` is the store's and ends the run.
+    """
 
     view: str
     entry: Optional[Entry] = None
     problem: Optional[str] = None
+    unwritable: Optional[str] = None
 
 
 def _make(job: _Job, task: _Task) -> _Result:
@@ -200,8 +210,11 @@ def _make(job: _Job, task: _Task) -> _Result:
         if any(wanted.items() <= vars(entry).items() and is_intact(job.store, entry) for entry in task.known):
             return _Result(view.name)
         image = load_training_image(view, job.resolution, job.white_background, _resized_pixels)
-        entry = Entry(fingerprint=fingerprint(image), **wanted)
-        return _Result(view.name, stage(job.staging, entry, normalised_map(image, job.spec)))
+        entry, made = Entry(fingerprint=fingerprint(image), **wanted), normalised_map(image, job.spec)
+        try:
+            return _Result(view.name, stage(job.staging, entry, made))
+        except OSError as error:  # a full disk, a folder that went away: no later view fares better
+            return _Result(view.name, unwritable=error.strerror or str(error))
     except LegsError as error:
         return _Result(view.name, problem=str(error))
     except (OSError, MemoryError) as error:

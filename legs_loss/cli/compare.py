@@ -69,6 +69,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one a core"
     )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a dask cluster that shares the file system; a training is a task"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -114,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
             reached[name] = progress.iteration
             bar.set_postfix_str(f"{name}: {progress.psnr:.2f} dB, {progress.gaussians} Gaussians", refresh=False)
 
-        comparison.train(arms, seeds, args.processes, show)
+        comparison.train(arms, seeds, args.processes, show, args.scheduler)
     rows = [row for row in read_rows(args.out)[1] if row["seed"] in seeds]
     print(study_text(rows, study))
     print()

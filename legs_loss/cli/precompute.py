@@ -1,8 +1,10 @@
-"""Compute the weight maps of a scene once, for every later training.
+"""Compute the weight maps of scenes once, for every later training.
 
-SCENE is a folder with a COLMAP model, with transforms.json, or just with images. The maps go to SCENE/legs_weights,
-where a training script that is given the scene finds them by itself. Give -r, -w and --images as the training will have
-them: a map is used only for the very image that it was made from.
+SCENE is a folder with a COLMAP model, with transforms.json, or just with images; a glob pattern of such folders; or a
+.txt file with one of these a line. The maps go to SCENE/legs_weights, where a training script that is given the scene
+finds them by itself. Give -r, -w and --images as the training will have them: a map is used only for the very image
+that it was made from. With --scheduler the scenes are shared out to the workers of a dask cluster, which must all see
+them under the same path.
 """
 
 from __future__ import annotations
@@ -11,18 +13,25 @@ import argparse
 import os
 import shlex
 import sys
-from collections import Counter
-from pathlib import PurePosixPath
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Dict, Iterable
 
-HELP = "compute the weight maps of a scene once, for every later training"
+if TYPE_CHECKING:
+    from legs_loss.many_scenes import SceneDone, SceneTask
+
+HELP = "compute the weight maps of scenes once, for every later training"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    from legs_loss.cli.demo import cores
     from legs_loss.spec import PRESETS
 
     parser.add_argument(
-        "scene", metavar="SCENE", help="a COLMAP scene, a scene with transforms.json or a folder of images"
+        "scene",
+        metavar="SCENE",
+        nargs="+",
+        help="a COLMAP scene, a scene with transforms.json or a folder of images; a glob; a .txt file of these",
     )
     parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
     parser.add_argument(
@@ -36,54 +45,158 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-w", "--white_background", action="store_true", help="as in 3DGS: lay alpha over white")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="whose operator to use; default: legs")
     parser.add_argument(
-        "--out", metavar="DIR", help="the store's folder; default: SCENE/legs_weights, where a training finds it"
+        "--out",
+        metavar="DIR",
+        help="the store's folder, or of several scenes the folder of their stores; default: SCENE/legs_weights, where "
+        "a training finds it",
     )
-    parser.add_argument("--workers", type=int, default=_cores(), metavar="N", help="processes; default: one a core")
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a dask cluster that shares the file system; a scene is a task"
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help=f"processes a scene; default: one a core ({cores()}), with --scheduler 1",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the store; 1 when a photograph was skipped."""
-    from legs_loss.cli.checks import check_resolution
-    from legs_loss.config import STORE_FOLDER
+    """Write the stores; 1 when a photograph was skipped, or one of several scenes failed."""
     from legs_loss.errors import LegsError
-    from legs_loss.precompute import precompute
+    from legs_loss.executors import executor, in_the_order_they_end
+    from legs_loss.many_scenes import precompute_scene
+
+    tasks = _tasks(args)
+    failed = 0
+    with _Bar(len(tasks)) as bar, executor(args.scheduler, bar.listen) as (runs, tell):
+        for task, done in in_the_order_they_end(runs, precompute_scene, tasks, tell):
+            with bar.above():
+                if isinstance(done, LegsError) and len(tasks) == 1:
+                    raise done
+                if isinstance(done, LegsError):
+                    print(f"legs: error: {task.scene}: {done}", file=sys.stderr)
+                    failed += 1
+                else:
+                    failed += _say(tasks[task], done)
+            bar.finish_one()
+    if args.out is not None:
+        _say_where(tasks)
+    return 1 if failed else 0
+
+
+def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
+    """Check what can be checked before anything is computed; return the tasks, and their stores as they were named."""
+    from legs_loss.cli.checks import check_resolution
+    from legs_loss.cli.demo import cores
+    from legs_loss.errors import LegsError
+    from legs_loss.many_scenes import SceneTask, find_scenes, stores_of
     from legs_loss.scenes import read_scene
 
-    if args.workers < 1:
-        raise LegsError(f"--workers must be at least 1, got {args.workers}")
-    scene = read_scene(args.scene, args.images)
-    check_resolution(args.resolution, scene.views)
-    report = precompute(
-        scene,
-        out=args.out,
-        spec=args.preset,
-        resolution=args.resolution,
-        white_background=args.white_background,
-        workers=args.workers,
-        progress=True,
-    )
+    workers = args.workers if args.workers is not None else cores() if args.scheduler is None else 1
+    if workers < 1:
+        raise LegsError(f"--workers must be at least 1, got {workers}")
+    scenes = find_scenes(args.scene)
+    stores = stores_of(scenes, args.out)
+    try:
+        views = read_scene(scenes[0], args.images).views
+    except LegsError:
+        if len(scenes) == 1:
+            raise
+        views = ()
+    check_resolution(args.resolution, views)
+    if args.out is not None:
+        _make(stores[0].parent)
+    images = None if args.images is None or not os.path.isdir(args.images) else os.path.abspath(args.images)
+    return {
+        SceneTask(
+            Path(os.path.abspath(str(scene))),
+            Path(os.path.abspath(str(store))),
+            images if images is not None and not (scene / args.images).is_dir() else args.images,
+            args.preset,
+            args.resolution,
+            args.white_background,
+            workers,
+        ): store
+        for scene, store in zip(scenes, stores)
+    }
+
+
+def _make(folder: Path) -> None:
+    from legs_loss.errors import LegsError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LegsError(f"cannot write to {folder}: {error.strerror or error}") from None
+
+
+def _say(store: Path, done: SceneDone) -> int:
+    """Print what was done of a scene; return 1 if any of it failed."""
+    from legs_loss.store import MANIFEST
+
+    report = done.report
     for view, reason in report.skipped.items():
         print(f"legs: skipped {view}: {reason}", file=sys.stderr)
-    # 3DGS names a view by its file's name up to the first dot.
-    short = Counter(PurePosixPath(view.name).name.split(".")[0] for view in scene.views)
-    alike = sum(count for count in short.values() if count > 1)
-    if alike:
+    if done.alike:
         print(
-            f"legs: note: {alike} views share a name in 3DGS, which knows no folders and no extensions; "
+            f"legs: note: {done.alike} views share a name in 3DGS, which knows no folders and no extensions; "
             "code that names views so will compute their weights instead",
             file=sys.stderr,
         )
-    print(f"{report.store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")
-    if not report.store.resolve().parent.samefile(scene.root) or report.store.name != STORE_FOLDER:
+    print(f"{store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")
+    if report.made and not (report.store / MANIFEST).is_file():
         print(
-            f"legs: note: a training that is given the scene looks in {scene.root / STORE_FOLDER}, not there: name the "
-            f"store with LEGS_STORE={shlex.quote(str(report.store.resolve()))}, or as `store` in legs.toml",
+            f"legs: error: a worker wrote {report.store}, which is not seen here: the file system is not shared",
             file=sys.stderr,
         )
+        return 1
     return 1 if report.skipped else 0
 
 
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def _say_where(tasks: Iterable[SceneTask]) -> None:
+    from legs_loss.config import STORE_FOLDER
+
+    away = [task for task in tasks if task.store != task.scene / STORE_FOLDER]
+    if away:
+        print(
+            f"legs: note: a training that is given the scene looks in {away[0].scene / STORE_FOLDER}, not there: name "
+            f"the store with LEGS_STORE={shlex.quote(str(away[0].store))}, or as `store` in legs.toml",
+            file=sys.stderr,
+        )
+
+
+class _Bar:
+    """One bar for the views of all scenes, wherever they are computed."""
+
+    def __init__(self, scenes: int) -> None:
+        self._scenes, self._finished = scenes, 0
+        self._views: Dict[str, Any] = {}
+
+    def __enter__(self) -> _Bar:
+        from tqdm import tqdm
+
+        self._bar = tqdm(total=0, desc=self._title(), unit="view")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def listen(self, message: Dict[str, Any]) -> None:
+        """Take a task's news: of a task that was begun again they replace the earlier ones."""
+        self._views[message["scene"]] = message["done"], message["of"]
+        views = list(self._views.values())
+        self._bar.total = sum(of for _, of in views)
+        self._bar.update(sum(done for done, _ in views) - self._bar.n)
+
+    def above(self) -> Any:
+        """Print within this without breaking the bar."""
+        return self._bar.external_write_mode()
+
+    def finish_one(self) -> None:
+        """Count a scene that has ended."""
+        self._finished += 1
+        self._bar.set_description(self._title())
+
+    def _title(self) -> str:
+        return "weight maps" if self._scenes == 1 else f"weight maps, {self._finished} of {self._scenes} scenes"

@@ -23,6 +23,7 @@ from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import ArmSpec, needed, parse_arm
 from legs_loss.experiments.baseline import prove_unweighted
 from legs_loss.experiments.losses import LOSSES
+from legs_loss.experiments.on_cluster import train_on_cluster
 from legs_loss.experiments.weighting import WEIGHTINGS
 from legs_loss.reference.training.dataset import Dataset, load_dataset
 from legs_loss.reference.training.side_by_side import Arm, train_arm, train_side_by_side
@@ -97,8 +98,11 @@ class Comparison:
         seeds: Sequence[int],
         processes: int,
         on_progress: Callable[[str, Progress], None],
+        scheduler: Optional[str] = None,
     ) -> List[Row]:
         """Train the rows that are missing, each in a process of its own with one thread; return all, seed by seed.
+
+        With ``scheduler``, the address of a dask scheduler, they are shared out to its workers.
 
         Arms that others take their numbers of Gaussians from are trained too, and before them.
 
@@ -118,7 +122,10 @@ class Comparison:
                 arm, seed = plans[name]
                 self._finish(arm, seed, metrics)
 
-            train_side_by_side(trainings, processes, on_progress, done)
+            if scheduler is None:
+                train_side_by_side(trainings, processes, on_progress, done)
+            else:
+                train_on_cluster(trainings, scheduler, on_progress, done)
         rows = [self.row(arm, seed) for seed in seeds for arm in needed(arms)]
         return [row for row in rows if row is not None]
 

@@ -1,0 +1,123 @@
+"""Weight maps of many scenes: a scene a task, here or on a cluster that shares the file system."""
+
+from __future__ import annotations
+
+import glob
+import os
+import time
+from collections import Counter
+from pathlib import Path, PurePosixPath
+from typing import List, NamedTuple, Optional, Sequence
+
+from legs_loss.config import STORE_FOLDER
+from legs_loss.errors import LegsError
+from legs_loss.executors import Listener
+from legs_loss.precompute import Report, precompute
+from legs_loss.scenes import read_scene
+from legs_loss.spec import Spec
+
+__all__ = ["SceneDone", "SceneTask", "find_scenes", "precompute_scene", "stores_of"]
+
+_TELL_SECONDS = 0.25
+
+
+class SceneTask(NamedTuple):
+    """A scene and the settings of :func:`~legs_loss.precompute.precompute`; paths are absolute, the same everywhere."""
+
+    scene: Path
+    store: Path
+    images: Optional[str]
+    spec: Spec
+    resolution: int
+    white_background: bool
+    workers: int
+
+
+class SceneDone(NamedTuple):
+    """What was done of a scene; ``alike`` is the number of its views that share a name in 3DGS with another."""
+
+    report: Report
+    alike: int
+
+
+def find_scenes(given: Sequence[str]) -> List[Path]:
+    """Return the scenes that are meant by folders, glob patterns, and .txt files with one of these a line.
+
+    Relative lines of a file are relative to the file. Empty lines and lines that begin with # say nothing.
+
+    Raises:
+        LegsError: a pattern or a file means no scene, or a scene is not there.
+    """
+    found: List[Path] = []
+    for one in given:
+        path = Path(one)
+        if path.suffix == ".txt" and path.is_file():
+            found += _listed(path)
+        elif path.exists() or not glob.has_magic(one):
+            found.append(path)
+        else:
+            matches = sorted(Path(match) for match in glob.glob(one, recursive=True) if os.path.isdir(match))
+            if not matches:
+                raise LegsError(f"no folder fits {one}")
+            found += matches
+    return list(dict.fromkeys(found))
+
+
+def _listed(path: Path) -> List[Path]:
+    try:
+        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise LegsError(f"cannot read {path}: {error}") from None
+    scenes = [str(path.parent / line) for line in lines if line and not line.startswith("#")]
+    if not scenes:
+        raise LegsError(f"{path} names no scene: it should have a folder a line")
+    return find_scenes(scenes)
+
+
+def stores_of(scenes: Sequence[Path], out: Optional[str]) -> List[Path]:
+    """Return where each scene's store goes: into the scene, or to ``out`` for one scene and ``out/NAME`` for several.
+
+    Raises:
+        LegsError: two scenes would have the same store.
+    """
+    if out is None:
+        return [scene / STORE_FOLDER for scene in scenes]
+    if len(scenes) == 1:
+        return [Path(out)]
+    names = Counter(scene.resolve().name for scene in scenes)
+    twice = [name for name, count in names.items() if count > 1]
+    if twice:
+        raise LegsError(f"--out {out}: {names[twice[0]]} scenes have the name {twice[0]}: leave --out away for them")
+    return [Path(out) / scene.resolve().name for scene in scenes]
+
+
+def precompute_scene(task: SceneTask, tell: Listener) -> SceneDone:
+    """Precompute a scene, and tell ``{"scene": path, "done": views, "of": views}`` a few times a second.
+
+    Raises:
+        LegsError: as :func:`~legs_loss.precompute.precompute`, or this machine does not see the scene.
+    """
+    if not task.scene.is_dir():
+        raise LegsError(f"there is no folder {task.scene} here: is the file system with the scenes mounted?")
+    if not task.store.parent.is_dir():  # made here it would be on this machine's own disk
+        raise LegsError(f"there is no folder {task.store.parent} here: is the file system for the stores mounted?")
+    scene = read_scene(task.scene, task.images)
+    due = 0.0
+
+    def on_progress(done: int, of: int) -> None:
+        nonlocal due
+        if time.monotonic() >= due or done == of:
+            due = time.monotonic() + _TELL_SECONDS
+            tell({"scene": str(task.scene), "done": done, "of": of})
+
+    report = precompute(
+        scene,
+        task.store,
+        task.spec,
+        task.resolution,
+        task.white_background,
+        task.workers,
+        on_progress=on_progress,
+    )
+    short = Counter(PurePosixPath(view.name).name.split(".")[0] for view in scene.views)
+    return SceneDone(report, sum(count for count in short.values() if count > 1))

@@ -20,10 +20,10 @@ from legs_adapters.lexicon.views import View
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.doubts import Doubt, Doubts
 from legs_adapters.rules.verdict import Verdicts, left
-from legs_adapters.terms.callbacks import Callback
 from legs_adapters.terms.findings import Findings, Left, Problem, Site
-from legs_adapters.terms.forms import Form
-from legs_adapters.terms.run_time import chosen_at_run_time
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.kinds.callback import Callback
+from legs_adapters.terms.kinds.run_time import chosen_at_run_time
 from legs_adapters.terms.sides import pair_of
 from legs_adapters.terms.ssim import STRUCTURAL
 from legs_adapters.upstreams import registered

@@ -109,6 +109,11 @@ class Function:
         names = [param.name.value for param in (*self.node.params.posonly_params, *self.node.params.params)]
         return names[1:] if self.owner is not None and not self.static and names else names
 
+    def is_parameter(self, node: cst.CSTNode) -> bool:
+        """Return whether a name is a parameter of the function and nothing else."""
+        known = isinstance(node, cst.Name) and node.value in self.parameters
+        return known and all(definition.kind == "parameter" for definition in self.flow.reaching(node))
+
     def given(self, call: cst.Call, parameter: str) -> Optional[cst.BaseExpression]:
         """What a call of it gives for a parameter; None where it leaves that out, or it cannot be seen."""
         positional, keywords, _ = arguments(call)

@@ -82,6 +82,11 @@ class Reaching:
         """Return the definitions that this use of a place can come from; empty for what is not local."""
         return frozenset(self._reaching.get(id(node), ()))
 
+    def value_of(self, node: cst.CSTNode) -> Optional[cst.CSTNode]:
+        """Return what a name was assigned, where one assignment alone can reach it; else None."""
+        found = list(self.reaching(node)) if isinstance(node, cst.Name) else []
+        return found[0].value if len(found) == 1 and found[0].kind == "assign" else None
+
     def names_at(self, node: cst.CSTNode, place: str) -> FrozenSet[Definition]:
         """Return the definitions of a place that reach a call or an operation, whether or not it reads it."""
         found: Set[Definition] = set()

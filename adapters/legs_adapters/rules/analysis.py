@@ -12,9 +12,9 @@ from legs_adapters.rules.reasons import Reasons
 from legs_adapters.rules.uses import Uses
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.modules import TORCH
-from legs_adapters.terms.callbacks import Callbacks
 from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.functions import L1Functions
+from legs_adapters.terms.kinds.callback import Callbacks
 from legs_adapters.terms.prospects import Prospects
 
 __all__ = ["Analysis"]

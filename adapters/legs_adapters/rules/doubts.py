@@ -16,7 +16,7 @@ from legs_adapters.rules.verdict import Verdicts
 from legs_adapters.tensors.gradients import detaches
 from legs_adapters.terms.error_maps import is_asked, is_huber, is_measured
 from legs_adapters.terms.findings import Left, Problem
-from legs_adapters.terms.forms import Form
+from legs_adapters.terms.form import Form
 from legs_adapters.terms.sides import is_role, pair_of, same_root
 
 __all__ = ["Doubt", "Doubts"]
@@ -72,7 +72,7 @@ class Doubts:
 
     def is_noise(self, function: Function, form: Form, left: Left) -> bool:
         """An absolute difference that is no loss: of angles, sizes, neighbouring pixels."""
-        if form.callee is not None or form.reduction not in ("none", "wrapped", "signed"):
+        if form.callee is not None or form.is_mean:
             return False
         trained = self.analysis.training.includes(form.node) and left.reason in _PICTURES and not same_root(form)
         if trained or left.reason in ("definition", "tracking", "distillation", "huber"):

@@ -12,7 +12,7 @@ from legs_adapters.code.syntax import arguments, attribute_chain, call_name, con
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.names import kind_of_words
 from legs_adapters.tensors.operations import JOINS
-from legs_adapters.terms.forms import Form
+from legs_adapters.terms.form import Form
 
 __all__ = [
     "is_change",

@@ -21,7 +21,8 @@ from legs_adapters.code.syntax import (
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.renderings import is_rendering
-from legs_adapters.terms.forms import Form, Forms
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.forms import Forms
 
 __all__ = ["is_always_the_same", "is_another_map", "is_under_mask"]
 

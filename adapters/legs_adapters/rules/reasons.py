@@ -30,7 +30,8 @@ from legs_adapters.rules.splats import Splats
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.gradients import is_detached, is_without_grad
 from legs_adapters.terms.error_maps import is_rescaled, takes_no_gradient
-from legs_adapters.terms.forms import Form, Forms
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.sides import Pair, are_counterparts, of_rays, same_root
 from legs_adapters.terms.ssim import is_beside_ssim
 

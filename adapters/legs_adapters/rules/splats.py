@@ -12,7 +12,7 @@ from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import code, words
 from legs_adapters.rules.no_pictures import made_of
 from legs_adapters.tensors.backward import Training
-from legs_adapters.terms.forms import Form
+from legs_adapters.terms.form import Form
 
 __all__ = ["Splats"]
 

@@ -16,11 +16,13 @@ from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.uses import Use
 from legs_adapters.tensors.layout import is_channels_last, lies_last
-from legs_adapters.terms.advice import advice, difference_of, is_torch_l1
 from legs_adapters.terms.error_maps import is_huber, shared_of
 from legs_adapters.terms.findings import Kept, Left, Problem, Site
-from legs_adapters.terms.forms import Form
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.kinds.named import Named
+from legs_adapters.terms.kinds.reread import Reread
 from legs_adapters.terms.sides import pair_of
+from legs_adapters.terms.writing import Writing
 
 __all__ = ["Verdicts", "left"]
 
@@ -57,7 +59,7 @@ class Verdicts:
         flipped = bool(target_first)
         picked = None if pair.selection else self._picked(function, form)
         if picked is not None:
-            form = _of_whole_pictures(form, *picked)
+            form = Named.of(form, picked[0].value, picked[1].value, _index(picked[0]))
             pair = pair._replace(first=form.first, second=form.second)
         prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
         if is_rows(self.analysis.meanings, function, pair.first) or is_rows(
@@ -67,15 +69,9 @@ class Verdicts:
             return self.problem(function, form, place, why, flipped)
         if is_huber(self.analysis.training, function, form):
             return left(function, place, "huber")
-        if form.reduction == "signed":
-            difference = one_line(difference_of(form))
-            why = f"the difference {difference} was weighted where it was made, which l1_loss would lose"
-            return self.problem(function, form, place, why, flipped)
-        if form.reduction == "taken":
-            assert form.callee is not None
-            why = f"{one_line(form.callee)} takes the absolute value of the difference"
-            return self.problem(function, form, place, why, flipped)
-        if not form.direct and not function.flow.unchanged_at(form.call, form.first, form.second):
+        if form.why_by_hand():
+            return self.problem(function, form, place, form.why_by_hand(), flipped)
+        if form.is_named and not function.flow.unchanged_at(form.call, form.first, form.second):
             return self.problem(function, form, place, "the difference has a name of its own", flipped)
         uses = self.analysis.uses.of(function, prediction, target)
         others = [(use, use.purpose) for use in uses if use.purpose is not None]
@@ -93,7 +89,7 @@ class Verdicts:
         if shared is not None and not shared.trains:
             return left(function, place, "weighting" if self.analysis.training.touches(function) else "untrained")
         if shared is not None and shared.loss:
-            form = form._replace(node=shared.loss[0], reduction="again")
+            form = Reread.of(form, shared.loss[0])
             place = function.place(form.node)
         elif shared is not None and shared.aside:
             aside = tuple(shared.aside)
@@ -116,8 +112,7 @@ class Verdicts:
 
         None where the names stand for anything else, or where image, photo or mask is another by then.
         """
-        of_torch = form.callee is not None and is_torch_l1(form.callee) and not form.extras
-        if not form.direct or not (form.reduction in ("mean", "none") or (form.reduction == "own" and of_torch)):
+        if not form.takes_index:
             return None
         one, other = (picked_from(self.analysis.meanings, function, side) for side in (form.first, form.second))
         if one is None or other is None or not function.flow.unchanged_at(form.call, one, other):
@@ -157,14 +152,8 @@ class Verdicts:
         module = function.module
         last = is_channels_last(self.analysis.training, function, form.first, form.second)
         rows = any(is_rows(self.analysis.meanings, function, side) for side in (form.first, form.second))
-        text = advice(form, flipped, last, rows)
+        text = form.advice(Writing(swapped=flipped, channels_last=last), rows)
         return Problem(module.path, place.line, module.lines.text(place.line), reason, text)
-
-
-def _of_whole_pictures(form: Form, one: cst.Subscript, other: cst.Subscript) -> Form:
-    """The same of image and photo, its result indexed by the mask."""
-    form = form._replace(first=one.value, second=other.value, direct=False, selection=_index(one))
-    return form._replace(reduction="mean") if form.reduction == "own" else form
 
 
 def _index(node: cst.Subscript) -> str:

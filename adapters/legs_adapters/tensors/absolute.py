@@ -2,13 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Optional
+from typing import NamedTuple, Optional
 
 import libcst as cst
 
 from legs_adapters.code.syntax import call_name
 
-__all__ = ["abs_argument", "is_abs", "mean_of"]
+__all__ = ["AbsoluteValue", "abs_argument", "absolute_value", "is_abs", "is_difference", "mean_of"]
+
+
+class AbsoluteValue(NamedTuple):
+    """An absolute value, with or without its mean: the call that takes it, and what of."""
+
+    call: cst.Call
+    argument: cst.BaseExpression
+    mean: bool
+
+
+def absolute_value(node: cst.Call) -> Optional[AbsoluteValue]:
+    """Return the absolute value that a call takes, or takes the mean of; None for any other call."""
+    inner = mean_of(node)
+    call = node if inner is None else inner
+    argument = abs_argument(call)
+    return None if argument is None else AbsoluteValue(call, argument, inner is not None)
+
+
+def is_difference(node: cst.CSTNode) -> bool:
+    """Return whether an expression is ``a - b``."""
+    return isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Subtract)
 
 
 def mean_of(node: cst.Call) -> Optional[cst.Call]:

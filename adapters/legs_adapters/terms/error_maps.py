@@ -12,7 +12,7 @@ from legs_adapters.lexicon.masks import makes_mask
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.gradients import under_no_grad
 from legs_adapters.tensors.operations import SIZES
-from legs_adapters.terms.forms import Form
+from legs_adapters.terms.form import Form
 
 __all__ = ["Shared", "is_asked", "is_huber", "is_measured", "is_rescaled", "shared_of", "takes_no_gradient"]
 
@@ -39,7 +39,7 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
         for definition in definitions
         if definition.kind == "assign" and definition.value is form.node and "." not in definition.place
     ]
-    if form.reduction != "none" or not made:
+    if not form.is_map or not made:
         return None
     reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
     callers = {id(arg.value): call for call in function.flow.calls for arg in call.args}
@@ -85,7 +85,7 @@ def is_huber(training: Training, function: Function, form: Form) -> bool:
     def reads_it(nodes: List[cst.CSTNode]) -> bool:
         return any(node is form.node or form.node in _values(function, node) for node in nodes)
 
-    for node in function.flow.expressions if form.reduction != "mean" else ():
+    for node in function.flow.expressions if not form.is_mean else ():
         if isinstance(node, cst.Call) and call_name(node) == "where":
             parts = [part for arg in node.args for part in walk_expressions(arg.value)]
             named = [value for part in parts if isinstance(part, cst.Name) for value in _values(function, part)]

@@ -10,7 +10,7 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Unreadable
 from legs_adapters.lexicon.views import View
-from legs_adapters.terms.forms import Form
+from legs_adapters.terms.form import Form
 
 __all__ = ["Findings", "Kept", "Left", "Problem", "Site"]
 

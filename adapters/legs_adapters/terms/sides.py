@@ -13,7 +13,7 @@ from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.masks import is_mask
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
-from legs_adapters.terms.forms import Form
+from legs_adapters.terms.form import Form
 
 __all__ = ["Pair", "are_counterparts", "is_role", "of_rays", "pair_of", "same_root"]
 

@@ -14,7 +14,8 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import arguments, call_name, constant, dotted, words
-from legs_adapters.terms.forms import Form
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.kinds.callback import PassedByName
 from legs_adapters.terms.l1_names import is_l1_name
 
 __all__ = ["MENTIONED", "forms_of"]
@@ -35,7 +36,7 @@ def forms_of(program: Program, function: Function, call: cst.Call) -> List[Form]
         return []
     if not set(words(name)) & _COLOUR or set(words(name)) & {"depth", "normal", "alpha", "mask", "flow", "feature"}:
         return []
-    return [Form(metric, call, cst.Name("input"), cst.Name("target"), "registered", metric)]
+    return [PassedByName(metric, call, cst.Name("input"), cst.Name("target"), metric)]
 
 
 def _is_l1(program: Program, function: Function, node: cst.BaseExpression) -> bool:

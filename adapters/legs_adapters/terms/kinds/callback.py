@@ -2,17 +2,45 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Dict, List, NamedTuple, Optional, Set
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
+from legs_adapters.code.syntax import code
 from legs_adapters.tensors.backward import Training
-from legs_adapters.terms.forms import Form, Forms
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.functions import L1Functions
+from legs_adapters.terms.text import Edit, Text
+from legs_adapters.terms.writing import Writing
 
-__all__ = ["Callback", "Callbacks"]
+__all__ = ["Callback", "Callbacks", "PassedByName"]
+
+
+@dataclass(frozen=True)
+class PassedByName(Form):
+    """A function handed over by name; ``node`` is the name, ``call`` the call that it serves.
+
+    Example:
+        before: loss = combined(image, gt_image, [l1_loss])
+        after: [lambda input, target: legs_loss.l1_loss(input, target, own=l1_loss)]
+
+    Attributes:
+        mean: whether the function is known to return the plain mean; else it is kept as ``own=``.
+    """
+
+    mean: bool = False
+
+    def edits(self, text: Text, writing: Writing) -> List[Edit]:
+        """Write the weighted function in the name's place."""
+        assert self.callee is not None
+        function = f"{writing.package}.l1_loss"
+        if not self.mean:
+            function = f"lambda input, target: {function}(input, target, own={code(self.callee)})"
+        return [text.replace(*text.span(self.node, True), function)]
 
 
 class Callback(NamedTuple):
@@ -61,8 +89,8 @@ class Callbacks:
                     self.functions.add(function)
                     near = [(c, call) for c, call in unknown if c.module is holder.module] or unknown
                     caller, call = near[0]
-                    reduction = "callable" if shape == "mean" else "registered"
-                    form = Form(value, call, call.args[0].value, call.args[1].value, reduction, value)
+                    sides = call.args[0].value, call.args[1].value
+                    form = PassedByName(value, call, *sides, value, mean=shape == "mean")
                     self.by_holder.setdefault(holder, []).append(Callback(form, caller))
         for function in list(training.sites):
             self._in_lists(own, training, function)
@@ -80,7 +108,7 @@ class Callbacks:
                 for element in given.elements if isinstance(given, cst.List) else ():
                     if own.is_l1(caller, element.value):
                         sides = call.args[0].value, call.args[1].value
-                        form = Form(element.value, call, *sides, "registered", element.value)
+                        form = PassedByName(element.value, call, *sides, element.value)
                         self.by_holder.setdefault(caller, []).append(Callback(form, function, outer))
 
 

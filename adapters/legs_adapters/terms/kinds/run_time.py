@@ -10,7 +10,8 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import arguments, call_name, constant, key_of, same
 from legs_adapters.tensors.backward import Training
-from legs_adapters.terms.forms import Form
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.l1_names import is_l1_name
 from legs_adapters.terms.ssim import STRUCTURAL, is_given
 
@@ -28,7 +29,7 @@ def chosen_at_run_time(program: Program, training: Training, function: Function,
     structural = [
         call for call in function.flow.calls if STRUCTURAL.search(call_name(call)) and training.includes(call)
     ]
-    found = []
+    found: List[Form] = []
     for call in function.flow.calls if structural else ():
         positional, keywords, starred = arguments(call)
         if len(positional) != 2 or keywords or starred or not training.includes(call):
@@ -37,7 +38,7 @@ def chosen_at_run_time(program: Program, training: Training, function: Function,
         beside = any(is_given(function, other, first) and is_given(function, other, second) for other in structural)
         settled = any(same(form.first, first) and same(form.second, second) for form in known)
         if beside and not settled and _is_looked_up(program, function, call):
-            found.append(Form(call, call, first, second, "own", call.func))
+            found.append(Called(call, call, first, second, call.func))
     return found
 
 

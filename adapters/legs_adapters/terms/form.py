@@ -1,0 +1,101 @@
+"""The form of a photometric term: what it compares, how it is edited, what is advised where it cannot be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, List, Optional, Tuple, TypeVar
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.syntax import one_line
+from legs_adapters.lexicon.masks import without_rows
+from legs_adapters.terms.functions import L1Functions
+from legs_adapters.terms.text import Edit, Text
+from legs_adapters.terms.writing import Writing
+
+__all__ = ["Form"]
+
+_F = TypeVar("_F", bound="Form")
+
+
+@dataclass(frozen=True)
+class Form:
+    """An L1 between two expressions; each kind of it is a subclass in ``terms/kinds``.
+
+    Attributes:
+        node: all of the expression that is the L1 term.
+        call: the call in it that has the two arguments, or that takes the absolute value.
+        first, second: the two arguments, as written.
+        callee: what is called, for a form that is a call of a function; None for ``abs``.
+        extras: the call's further arguments.
+        difference: the ``a - b``, for a form that is an absolute value.
+        selection: for a difference with a name of its own, the index that it is taken with, ``[mask]``; empty without.
+        order: of the kinds that recognise one call, the least is taken.
+        is_named: whether the difference has a name of its own, so that there is no one expression to replace.
+    """
+
+    node: cst.BaseExpression
+    call: cst.Call
+    first: cst.BaseExpression
+    second: cst.BaseExpression
+    callee: Optional[cst.BaseExpression] = None
+    extras: Tuple[cst.Arg, ...] = ()
+    difference: Optional[cst.BinaryOperation] = None
+    selection: str = ""
+
+    order: ClassVar[int] = 0
+    is_named: ClassVar[bool] = False
+
+    @classmethod
+    def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
+        """Return the form that a call is, or None; a kind that is not found in calls has nothing to say."""
+        return None
+
+    @property
+    def is_map(self) -> bool:
+        """Whether the term is an unreduced error map."""
+        return False
+
+    @property
+    def is_mean(self) -> bool:
+        """Whether the term is the plain mean."""
+        return False
+
+    @property
+    def takes_index(self) -> bool:
+        """Whether `indexed` keeps the term's value."""
+        return False
+
+    def why_by_hand(self) -> str:
+        """Return why the form cannot be edited, empty where it can."""
+        return ""
+
+    def edits(self, text: Text, writing: Writing) -> List[Edit]:
+        """Return the edits that weight the term.
+
+        Raises:
+            LegsError: the term has to be weighted by hand.
+        """
+        raise NotImplementedError(type(self).__name__)
+
+    def advice(self, writing: Writing, rows: bool) -> str:
+        """Return what to write by hand; ``rows`` where the images are lists of pixels."""
+        prediction, target = writing.ordered(self.first, self.second)
+        whole, other = without_rows(prediction), without_rows(target)
+        if whole is not prediction and other is not target:
+            image, photo = one_line(whole), one_line(other)
+            return writing._replace(channels_last=True).call(image, f"{photo}.reshape({image}.shape)")
+        return self._advice(writing, one_line(prediction), one_line(target), rows)
+
+    def _advice(self, writing: Writing, prediction: str, target: str, rows: bool) -> str:
+        if rows:
+            return f"{writing.package}.l1_loss(rendering, photograph), with the pictures before they became lists"
+        return writing.call(prediction, target, self.is_map, self._own(writing))
+
+    def _own(self, writing: Writing) -> str:
+        return ""
+
+    def moved(self: _F, selection: str) -> _F:
+        """Return the form with its selection written otherwise."""
+        return replace(self, selection=selection)

@@ -1,0 +1,86 @@
+"""``torch.abs(a - b).mean()``, and the map ``(a - b).abs()``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import List, Optional
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.tensors.absolute import absolute_value, is_difference
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.functions import L1Functions
+from legs_adapters.terms.text import Edit, Text, residue
+from legs_adapters.terms.writing import Writing
+
+__all__ = ["Absolute"]
+
+
+@dataclass(frozen=True)
+class Absolute(Form):
+    """An absolute difference: the words around it go, and the difference becomes two arguments.
+
+    Example:
+        before: loss = torch.abs(image - gt_image).mean()
+        after: loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name)
+
+    Attributes:
+        mean: whether its mean is taken.
+    """
+
+    mean: bool = False
+
+    order = 10
+
+    @classmethod
+    def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
+        """Find ``abs`` of a difference that is not of numbers."""
+        found = absolute_value(call)
+        if found is None or not is_difference(found.argument):
+            return None
+        difference = found.argument
+        assert isinstance(difference, cst.BinaryOperation)
+        if _is_number(difference.left) or _is_number(difference.right):
+            return None
+        return cls(call, found.call, difference.left, difference.right, difference=difference, mean=found.mean)
+
+    @property
+    def is_map(self) -> bool:
+        """Whether no mean is taken."""
+        return not self.mean
+
+    @property
+    def is_mean(self) -> bool:
+        """Whether the mean is taken."""
+        return self.mean
+
+    @property
+    def takes_index(self) -> bool:
+        """The absolute value is taken pixel by pixel."""
+        return True
+
+    def edits(self, text: Text, writing: Writing) -> List[Edit]:
+        """Replace what stands before, between and after the two sides, comments kept."""
+        difference = self.difference
+        assert difference is not None
+        start, end = text.span(self.node)
+        left, right = text.span(difference.left, True), text.span(difference.right, True)
+        sides = writing.ordered(
+            *(text.argument(side, writing.selection) for side in (difference.left, difference.right))
+        )
+        middle = residue(text.between(left[1], right[0]))
+        settings = writing.settings(as_map=bool(writing.selection) or self.is_map)
+        tail = writing.selection + (".mean()" if writing.selection and self.mean else "")
+        before, after = residue(text.between(start, left[0])), residue(text.between(right[1], end))
+        return [
+            text.replace(start, left[0], f"{writing.package}.l1_loss({before}"),
+            text.replace(left[0], left[1], sides[0]),
+            text.replace(left[1], right[0], f",{middle}" if middle else ", "),
+            text.replace(right[0], right[1], sides[1]),
+            text.replace(right[1], end, f"{settings}{after}){tail}"),
+        ]
+
+
+def _is_number(node: cst.CSTNode) -> bool:
+    return isinstance(node, cst.Call) and isinstance(node.func, cst.Name) and node.func.value in ("int", "float", "len")

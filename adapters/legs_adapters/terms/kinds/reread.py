@@ -1,0 +1,36 @@
+"""``error = abs(a - b)``, of which one read is the loss and others are not: that read alone is replaced."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import List
+
+import libcst as cst
+
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.text import Edit, Text, on_one_line
+from legs_adapters.terms.writing import Writing
+
+__all__ = ["Reread"]
+
+
+@dataclass(frozen=True)
+class Reread(Form):
+    """The read of an error map that is the loss; ``node`` is that read.
+
+    Example:
+        before: error = torch.abs(image - gt_image); seen = error.detach() > 0.1; loss = error.mean(); log(seen)
+        after: loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name, reduction="none").mean(); log(seen)
+    """
+
+    @classmethod
+    def of(cls, form: Form, read: cst.BaseExpression) -> Reread:
+        """Return the read of a form's map as a form of its own."""
+        return cls(read, form.call, form.first, form.second, selection=form.selection)
+
+    def edits(self, text: Text, writing: Writing) -> List[Edit]:
+        """Write the weighted map in the read's place."""
+        carried = writing.selection[: len(writing.selection) - len(self.selection)]
+        first, second = (on_one_line(text.argument(side, carried)) for side in (self.first, self.second))
+        call = writing.call(*writing.ordered(first, second), as_map=True)
+        return [text.replace(*text.span(self.node, True), call + writing.selection)]

@@ -1,0 +1,89 @@
+"""Read and replace spans of a file's text: what stands between two nodes, and what must stay of it."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple, Tuple
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.sources import Source
+from legs_adapters.code.syntax import code
+
+__all__ = ["Edit", "Text", "flat", "names_for_two", "on_one_line", "residue"]
+
+_STRING = r"""("(?:\\.|[^"\\\r\n])*"|'(?:\\.|[^'\\\r\n])*')"""  # no comment begins inside
+_GAP = re.compile(_STRING + r"|(?:\s|\\(?=[\r\n])|#[^\r\n]*)+")
+_KEPT = re.compile(_STRING + r"|([ \t]*#[^\r\n]*|\\?(?:\r\n|\r|\n)[ \t]*)")
+
+
+class Edit(NamedTuple):
+    """Bytes from ``start`` to ``end`` of a file (its byte order mark counted) become ``after``."""
+
+    start: int
+    end: int
+    before: bytes
+    after: bytes
+
+
+class Text:
+    """A file's bytes, and where the nodes of one function stand in them."""
+
+    def __init__(self, source: Source, function: Function) -> None:
+        self.source = source
+        self.function = function
+        self.module = function.module
+        self.bytes = self.module.lines.data
+        self._shift = len(source.bom)
+
+    def span(self, node: cst.CSTNode, brackets: bool = False) -> Tuple[int, int]:
+        """Return where a node begins and ends, on request with the brackets around it."""
+        place = self.function.place(node, brackets)
+        return place.start, place.end
+
+    def between(self, start: int, end: int) -> str:
+        """Return what stands from one byte to another."""
+        return self.bytes[start:end].decode("utf-8")
+
+    def of(self, node: cst.CSTNode, brackets: bool = False) -> str:
+        """Return a node as written."""
+        return self.between(*self.span(node, brackets))
+
+    def replace(self, start: int, end: int, after: str) -> Edit:
+        """Return the edit that puts a text in place of what stands from one byte to another."""
+        start, end = start + self._shift, end + self._shift
+        return Edit(start, end, self.source.data[start:end], after.encode("utf-8"))
+
+    def argument(self, node: cst.BaseExpression, index: str) -> str:
+        """Return an image as written, without the index that it carries."""
+        start, end = self.span(node, True)
+        if not index or not isinstance(node, cst.Subscript):
+            return self.between(start, end)
+        start, end = self.span(node.value, True)
+        return self.between(start, end) + residue(self.between(end, self.span(node)[1]))
+
+
+def names_for_two(text: str) -> Tuple[str, str]:
+    """Return two names for a lambda's parameters that a text does not use."""
+    used = set(re.findall(r"\w+", text))
+    pairs = [("a", "b"), ("prediction", "target"), ("prediction_", "target_")]
+    return next((pair for pair in pairs if not used & set(pair)), ("_prediction", "_target"))
+
+
+def flat(arg: cst.Arg) -> str:
+    """Return an argument on one line, with its keyword or stars."""
+    value = on_one_line(code(arg.value))
+    return f"{arg.keyword.value}={value}" if arg.keyword is not None else f"{arg.star}{value}"
+
+
+def on_one_line(text: str) -> str:
+    """Return an expression on one line, without its comments."""
+    return _GAP.sub(lambda gap: gap.group(1) or " ", text).strip()
+
+
+def residue(text: str) -> str:
+    """Return what must stay of text that goes: its comments and its line breaks."""
+    if "\n" not in text and "\r" not in text:
+        return ""
+    return "".join(kept for _, kept in _KEPT.findall(text))

@@ -1,0 +1,71 @@
+"""Write the weighted call: the one place where its text is made, for edits and for advice."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Optional, Sequence, Tuple, TypeVar
+
+import libcst as cst
+
+from legs_adapters.code.syntax import code
+from legs_adapters.terms.text import flat, names_for_two, on_one_line
+
+__all__ = ["PACKAGE", "Writing"]
+
+PACKAGE = "legs_loss"
+
+_Side = TypeVar("_Side")
+
+
+class Writing(NamedTuple):
+    """How a term is written at one call site.
+
+    Attributes:
+        package: the name that legs_loss has in the file.
+        swapped: whether the target is the first of the two sides.
+        selection: the index by a mask that both images carry, with its brackets; empty without.
+        channels_last: whether the images are [H, W, C].
+        view: the expression that names the view, if one does.
+        where: the file and line, for errors.
+    """
+
+    package: str = PACKAGE
+    swapped: bool = False
+    selection: str = ""
+    channels_last: bool = False
+    view: Optional[str] = None
+    where: str = ""
+
+    def ordered(self, first: _Side, second: _Side) -> Tuple[_Side, _Side]:
+        """Return the two sides as prediction and target."""
+        return (second, first) if self.swapped else (first, second)
+
+    def call(self, prediction: str, target: str, as_map: bool = False, own: str = "", residue: str = "") -> str:
+        """Return the whole call of two images."""
+        return f"{self.package}.l1_loss({prediction}, {target}{self.settings(as_map, own)}{residue})"
+
+    def settings(self, as_map: bool = False, own: str = "") -> str:
+        """Return the arguments after the two images, each with its comma.
+
+        Args:
+            as_map: whether the unreduced map is asked for.
+            own: the codebase's own L1, where that is more than a mean.
+        """
+        parts = [] if self.view is None else [f"view={self.view}"]
+        parts += ["channels_last=True"] if self.channels_last else []
+        parts += ['reduction="none"'] if as_map else []
+        parts += [f"own={own}"] if own else []
+        return "".join(f", {part}" for part in parts)
+
+    def weight_map(self, target: str) -> str:
+        """Return the call that makes the weight map of a target."""
+        return f"{self.package}.weight_map({target}{', channels_last=True' if self.channels_last else ''})"
+
+    def own(self, callee: cst.BaseExpression, extras: Sequence[cst.Arg]) -> str:
+        """Return the codebase's own function of (prediction, target), with what else it is given."""
+        name = on_one_line(code(callee))
+        if not extras and not self.selection and not self.swapped:
+            return name
+        others = ", ".join(flat(arg) for arg in extras)
+        a, b = names_for_two(f"{name} {others} {self.selection}")
+        first, second = (f"{side}{self.selection}" for side in self.ordered(a, b))
+        return f"lambda {a}, {b}: {name}({first}, {second}{', ' + others if others else ''})"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import sys
+from typing import Optional, TextIO
 
-__all__ = ["printable"]
+__all__ = ["never_fail_to_print", "printable", "say"]
 
 # Control characters but tab and line feed, the marks that turn the direction of text, and halves of characters.
 _OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -18,3 +20,16 @@ def printable(text: str) -> str:
         train\x1b[2J.py
     """
     return _OBEYED.sub(lambda found: ascii(found.group())[1:-1], text)
+
+
+def never_fail_to_print() -> None:
+    """Let the process print what its terminal's encoding lacks, as escapes: a name is no reason to end."""
+    for stream in (sys.stdout, sys.stderr):
+        reconfigure = getattr(stream, "reconfigure", None)  # what stands in for them in tests and notebooks has none
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
+
+
+def say(text: str, stream: Optional[TextIO] = None, end: str = "\n") -> None:
+    """Print to stdout, or another stream, what a terminal may be shown (:func:`printable`)."""
+    print(printable(text), file=stream, end=end)

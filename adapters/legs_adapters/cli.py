@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Optional, Sequence, Tuple
 
 from legs_loss import OPERATORS, LegsError, __version__
+from legs_loss.terminal import never_fail_to_print, say
 
 if TYPE_CHECKING:
     from legs_adapters.terms.findings import Problem
@@ -30,29 +31,26 @@ EXIT_CODES = (
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
-    parser = _parser()
-    args = parser.parse_args(argv)
-    if args.undo and (args.check or args.verify):
-        parser.error("--undo goes with --diff, --force and --trust only")
-    if args.trust is not None and not args.undo:
-        parser.error("--trust goes with --undo")
-    before = _journal(args.folder)
+    folder, undoing, before = "", False, b""
     try:
+        never_fail_to_print()
+        args = _arguments(argv)
+        folder, undoing, before = args.folder, args.undo, _journal(args.folder)
         if args.verify:
             return _patch(args) or _verify(args)
         return _undo(args) if args.undo else _patch(args)
     except LegsError as error:
-        print(f"legs-patch: error: {error}", file=sys.stderr)
+        say(f"legs-patch: error: {error}", sys.stderr)
         return 2
     except KeyboardInterrupt:
         # What is written is written with the journal, all of it or nothing: the journal knows.
-        if _journal(args.folder) == before:
+        if _journal(folder) == before:
             what = "nothing was changed"
-        elif args.undo:
+        elif undoing:
             what = "by then the patch was taken back"
         else:
-            what = f"by then it was patched; take it back with: legs-patch --undo {args.folder}"
-        print(f"legs-patch: interrupted; {what}", file=sys.stderr)
+            what = f"by then it was patched; take it back with: legs-patch --undo {folder}"
+        say(f"legs-patch: interrupted; {what}", sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()
@@ -60,8 +58,18 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     except ModuleNotFoundError as error:
         if error.name != "libcst":
             raise
-        print("legs-patch: error: LibCST is missing: pip install 'legs-loss[patch]'", file=sys.stderr)
+        say("legs-patch: error: LibCST is missing: pip install 'legs-loss[patch]'", sys.stderr)
         return 2
+
+
+def _arguments(argv: Optional[Sequence[str]]) -> argparse.Namespace:
+    parser = _parser()
+    args = parser.parse_args(argv)
+    if args.undo and (args.check or args.verify):
+        parser.error("--undo goes with --diff, --force and --trust only")
+    if args.trust is not None and not args.undo:
+        parser.error("--trust goes with --undo")
+    return args
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -136,16 +144,17 @@ def _patch(args: argparse.Namespace) -> int:
     found = found._replace(settings=settings)
     if problems and not args.partial:
         if args.json:
-            print(as_json(found, []), end="")
+            say(as_json(found, []), end="")
         else:
-            print(as_table(found), end="")
+            say(as_table(found), end="")
         _left_to_the_user(problems)
-        print(
-            "legs-patch: nothing was changed (--partial patches the rest, --exclude leaves files out)", file=sys.stderr
+        say(
+            "legs-patch: nothing was changed (--partial patches the rest, --exclude leaves files out)",
+            stream=sys.stderr,
         )
         return 2
     if nothing and not found.findings.patched and not problems:
-        print(as_json(found, []) if args.json else as_table(found), end="")
+        say(as_json(found, []) if args.json else as_table(found), end="")
         raise LegsError(
             f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
             + _not_looked_into(root, args.exclude)
@@ -156,19 +165,19 @@ def _patch(args: argparse.Namespace) -> int:
         print(as_json(found, []) if args.json else as_diff(found, _colour()), end="")
         return _left_to_the_user(problems)
     if args.check:
-        print(as_json(found, []) if args.json else as_table(found), end="")
+        say(as_json(found, []) if args.json else as_table(found), end="")
         if not args.json:
-            print("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
+            say("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
         return _left_to_the_user(problems) or (1 if found.after else 0)
     wrote = write(found, args.force) if changes else []
     if args.json:
-        print(as_json(found, wrote), end="")
+        say(as_json(found, wrote), end="")
     else:
-        print(as_table(found), end="")
+        say(as_table(found), end="")
         if wrote:
-            print(f"\nwrote {', '.join(wrote)}; take it back with: legs-patch --undo {shlex.quote(args.folder)}")
+            say(f"\nwrote {', '.join(wrote)}; take it back with: legs-patch --undo {shlex.quote(args.folder)}")
         else:
-            print(f"\nnothing to do: {'it is patched' if found.findings.patched else 'nothing could be decided'}")
+            say(f"\nnothing to do: {'it is patched' if found.findings.patched else 'nothing could be decided'}")
     return _left_to_the_user(problems)
 
 
@@ -192,11 +201,9 @@ def _verify(args: argparse.Namespace) -> int:
 
     verdict = verify(args.folder, args.script, args.arguments, args.iterations)
     if args.json:
-        print(
-            json.dumps({"holds": verdict.claims, "runs": {name: run._asdict() for name, run in verdict.runs.items()}})
-        )
+        say(json.dumps({"holds": verdict.claims, "runs": {name: run._asdict() for name, run in verdict.runs.items()}}))
     else:
-        print("\n" + verdict.text(), end="")
+        say("\n" + verdict.text(), end="")
     return 0 if verdict.holds else 1
 
 
@@ -208,16 +215,16 @@ def _undo(args: argparse.Namespace) -> int:
 
     done = undo(args.folder, args.force, args.trust, look=args.diff)
     if args.json:
-        print(json.dumps({"restored": done.restored, "removed": done.removed, "kept": done.kept}, indent=2))
+        say(json.dumps({"restored": done.restored, "removed": done.removed, "kept": done.kept}, indent=2))
         return 0
     if args.diff:
         print(changes_as_diff(done.changes, _colour()), end="")
     for name in () if args.diff else done.restored:
-        print(f"restored {name}")
+        say(f"restored {name}")
     for name in () if args.diff else done.removed:
-        print(f"removed {name}")
+        say(f"removed {name}")
     for name, reason in done.kept:
-        print(f"kept {name}: {reason}", file=sys.stderr if args.diff else sys.stdout)
+        say(f"kept {name}: {reason}", stream=sys.stderr if args.diff else sys.stdout)
     return 0
 
 
@@ -233,12 +240,12 @@ def _journal(folder: str) -> bytes:
 def _left_to_the_user(problems: Sequence[Problem]) -> int:
     """Say on stderr what to write by hand; return the exit code of that."""
     for problem in problems:
-        print(
+        say(
             f"legs-patch: error: {problem.path}:{problem.line}: {problem.reason}\n"
             f"    {problem.text}\n"
             f"  if this is the loss between rendering and photograph, write there: {problem.advice}\n"
             f"  (rendering first), and import legs_loss at the top",
-            file=sys.stderr,
+            stream=sys.stderr,
         )
     return 1 if problems else 0
 
@@ -246,11 +253,11 @@ def _left_to_the_user(problems: Sequence[Problem]) -> int:
 def _left_in_doubt(doubts: Sequence[Problem]) -> None:
     """Say on stderr which lines were left although a file trains that nothing else of was weighted."""
     for doubt in doubts:
-        print(
+        say(
             f"legs-patch: left, though its file trains: {doubt.path}:{doubt.line}: {doubt.reason}\n"
             f"    {doubt.text}\n"
             f"  if it is the loss between rendering and photograph, write there: {doubt.advice}",
-            file=sys.stderr,
+            stream=sys.stderr,
         )
 
 

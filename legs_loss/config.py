@@ -9,18 +9,22 @@ import os
 import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional
+from typing import Any, Dict, List, Mapping, Optional, Tuple
 
-from legs_loss.errors import LegsError
+from legs_loss.errors import LegsError, did_you_mean
 from legs_loss.spec import PRESETS, WeightSpec, as_spec
 
 __all__ = ["CONFIG_FILE", "STORE_FOLDER", "Config", "find_config"]
 
 CONFIG_FILE = "legs.toml"
 STORE_FOLDER = "legs_weights"
+_DEFAULTS = "defaults"
 
-_SPEC_FIELDS = {field.name: field for field in fields(WeightSpec)}
+# The keys of legs.toml, and in capitals the variables LEGS_*. The preset is the first: the others change it.
+_SETTINGS = ("preset", "store", *(field.name for field in fields(WeightSpec)))
 _TEXT_FIELDS = ("operator", "curve", "normalise")
+_OTHER_VARIABLES = ("off", "backend")
+_TRUE, _FALSE = ("1", "true", "yes", "on"), ("", "0", "false", "no", "off")
 
 
 @dataclass(frozen=True)
@@ -33,13 +37,15 @@ class Config:
         store: the folder of precomputed maps, or None.
         off: the codebase's own loss, unweighted.
         source: where the settings were found, in words.
+        notes: what the user should be told: a variable LEGS_* that is not known, a legs.toml that was not read.
     """
 
     spec: WeightSpec = PRESETS["legs"]
     preset: str = "legs"
     store: Optional[Path] = None
     off: bool = False
-    source: str = "defaults"
+    source: str = _DEFAULTS
+    notes: Tuple[str, ...] = ()
 
     @property
     def active(self) -> bool:
@@ -56,7 +62,8 @@ def find_config(
 
     Args:
         start: a file or folder of the codebase: legs.toml is looked for there and in the folders above it, up to the
-            root of its git checkout. None looks nowhere.
+            root of its git checkout, the user's home folder, or the first legs.toml of another owner, which is not
+            read. None looks nowhere.
         environ: in place of ``os.environ``: LEGS_PRESET, LEGS_BETA, LEGS_CURVE, LEGS_OPERATOR, LEGS_P,
             LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_SCALE, LEGS_EPS, LEGS_ERROR, LEGS_ERROR_BLUR, LEGS_STORE, LEGS_OFF.
         argv: in place of ``sys.argv``: the scene after ``-s`` / ``--source_path`` is where the store is looked for.
@@ -65,12 +72,18 @@ def find_config(
         LegsError: a value is unknown or out of range, or the file cannot be read; the message says where it stands.
     """
     environ = os.environ if environ is None else environ
-    config = Config()
-    path = _find_file(start) if start is not None else None
-    if path is not None:
-        config = _apply(config, _read_toml(path), str(path), path.parent)
-    config = _apply(config, _from_environment(environ), "environment variable LEGS_*", Path.cwd())
-    if environ.get("LEGS_OFF", "0") not in ("", "0"):
+    config = Config(notes=_unknown_variables(environ))
+    if start is not None:
+        path, note = _find_file(start.resolve())
+        if note:
+            config = replace(config, notes=(*config.notes, note))
+        if path is not None:
+            config = _apply(config, _read_toml(path), str(path), path.parent)
+    for name in _SETTINGS:
+        variable = "LEGS_" + name.upper()
+        if environ.get(variable):
+            config = _apply(config, {name: environ[variable]}, f"environment variable {variable}", Path.cwd())
+    if _is_true(environ.get("LEGS_OFF", "")):
         config = replace(config, off=True)
     if config.store is None:
         config = replace(config, store=_store_of_scene(sys.argv if argv is None else argv))
@@ -82,11 +95,12 @@ def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> 
         return config
     settings = dict(settings)
     try:
+        for key in settings:
+            if key not in _SETTINGS:
+                known = ", ".join(_SETTINGS)
+                raise LegsError(f"unknown setting {key!r}; there are {known}{did_you_mean(key, _SETTINGS)}")
         preset = settings.pop("preset", None)
         store = settings.pop("store", None)
-        unknown = [key for key in settings if key not in _SPEC_FIELDS]
-        if unknown:
-            raise LegsError(f"unknown setting {unknown[0]!r}; there are preset, store, {', '.join(_SPEC_FIELDS)}")
         spec = config.spec if preset is None else as_spec(preset)
         spec = replace(spec, **{key: _typed(key, value) for key, value in settings.items()})
     except LegsError as error:
@@ -96,7 +110,7 @@ def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> 
         spec=spec,
         preset=config.preset if preset is None else preset,
         store=config.store if not store else (base / Path(str(store)).expanduser()),
-        source=where,
+        source=where if config.source == _DEFAULTS else f"{config.source}, {where}",
     )
 
 
@@ -109,19 +123,47 @@ def _typed(key: str, value: Any) -> Any:
         raise LegsError(f"{key} must be a number, got {value!r}") from None
 
 
-def _from_environment(environ: Mapping[str, str]) -> Dict[str, Any]:
-    names = ["preset", "store", *_SPEC_FIELDS]
-    return {name: environ["LEGS_" + name.upper()] for name in names if environ.get("LEGS_" + name.upper())}
+def _is_true(value: str) -> bool:
+    word = value.strip().lower()
+    if word not in _TRUE + _FALSE:
+        raise LegsError(
+            f"environment variable LEGS_OFF must be 1 or 0 (or true, false, yes, no, on, off), got {value!r}"
+        )
+    return word in _TRUE
 
 
-def _find_file(start: Path) -> Optional[Path]:
-    start = start.resolve()
+def _unknown_variables(environ: Mapping[str, str]) -> Tuple[str, ...]:
+    known = ["LEGS_" + name.upper() for name in (*_SETTINGS, *_OTHER_VARIABLES)]
+    return tuple(
+        f"environment variable {name} is not known and has no effect{did_you_mean(name, known)}"
+        for name in sorted(environ)
+        if name.startswith("LEGS_") and name not in known and not name.startswith("LEGS_TEST")
+    )
+
+
+def _find_file(start: Path) -> Tuple[Optional[Path], str]:
+    """Return the legs.toml of a script or folder, and a note where one was found that is not to be read."""
+    home = Path(os.path.expanduser("~"))
     for folder in [start, *start.parents] if start.is_dir() else start.parents:
-        if (folder / CONFIG_FILE).is_file():
-            return folder / CONFIG_FILE
-        if (folder / ".git").exists():
-            return None
-    return None
+        path = folder / CONFIG_FILE
+        if path.is_file():
+            if _owner(path) not in (_owner(start), _user()):
+                return None, f"{path} belongs to another user: it is not read"
+            return path, ""
+        if (folder / ".git").exists() or folder == home:
+            break
+    return None, ""
+
+
+def _owner(path: Path) -> Optional[int]:
+    try:
+        return path.stat().st_uid if os.name == "posix" else None
+    except OSError:
+        return None
+
+
+def _user() -> Optional[int]:
+    return os.getuid() if os.name == "posix" else None  # type: ignore[attr-defined,unused-ignore]
 
 
 def _read_toml(path: Path) -> Dict[str, Any]:
@@ -131,7 +173,7 @@ def _read_toml(path: Path) -> Dict[str, Any]:
         import tomli as tomllib
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise LegsError(f"{path} cannot be read: {error}") from None
 
 

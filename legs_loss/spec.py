@@ -13,6 +13,10 @@ from legs_loss.operators import check_operator
 __all__ = ["PRESETS", "Spec", "WeightSpec", "as_spec"]
 
 
+# In float32 a larger factor overflows in the sum over an image, and a smaller eps is 0: both give NaN.
+_LARGEST_FACTOR, _LEAST_EPS = 1e6, 1e-30
+
+
 def _check_number(name: str, value: float, fits: bool, range_: str) -> None:
     if not fits:
         raise LegsError(f"{name} must be {range_}, got {value!r}")
@@ -26,14 +30,15 @@ class WeightSpec:
         operator: of the response, a name of :data:`legs_loss.OPERATORS`.
         p: the norm over channels (and over a gradient's directions): 1, 2 or inf.
         curve: a registered curve's name, "C1" to "C5" or one of your own.
-        beta: >= 0, how far the strongest response lifts the weight; 0 is 3DGS's own loss.
+        beta: in [0, 1e6], how far the strongest response lifts the weight; 0 is 3DGS's own loss.
         percentile: in (0, 100]: the response that counts as 1; 100 is the maximum, as in the paper. Stronger
             responses are clamped to 1.
         normalise: "none", as in the paper, or "mean": each map is divided by its mean, so that it moves weight
             between pixels without scaling the L1 term.
-        scale: > 0, multiplies the map. In a loss with lambda 0.2 a map of mean 1 times 0.6 has the balance of L1 and
-            SSIM of lambda 0.3; gradients, which many codebases compare with a threshold to densify, shrink with it.
-        eps: > 0, in the normalisation's denominator.
+        scale: in (0, 1e6], multiplies the map. In a loss with lambda 0.2 a map of mean 1 times 0.6 has the balance of
+            L1 and SSIM of lambda 0.3; gradients, which many codebases compare with a threshold to densify, shrink
+            with it.
+        eps: >= 1e-30, in the normalisation's denominator.
         error: in [0, 1], how much of the rendering's own error joins the response: the curve is applied to
             E^ ** (1 - error) * e ** error, normalised to [0, 1], where e is the mean absolute error around a pixel. 0
             is the paper's weight, 1 looks at the error alone. Such weights change at every step; none are stored.
@@ -62,10 +67,10 @@ class WeightSpec:
     def __post_init__(self) -> None:
         check_operator(self.operator, self.p)
         curve(self.curve)
-        _check_number("beta", self.beta, 0.0 <= self.beta < float("inf"), "at least 0")
+        _check_number("beta", self.beta, 0.0 <= self.beta <= _LARGEST_FACTOR, "at least 0 and at most 1e6")
         _check_number("percentile", self.percentile, 0.0 < self.percentile <= 100.0, "above 0 and at most 100")
-        _check_number("scale", self.scale, 0.0 < self.scale < float("inf"), "above 0")
-        _check_number("eps", self.eps, 0.0 < self.eps < float("inf"), "above 0")
+        _check_number("scale", self.scale, 0.0 < self.scale <= _LARGEST_FACTOR, "above 0 and at most 1e6")
+        _check_number("eps", self.eps, _LEAST_EPS <= self.eps < float("inf"), f"at least {_LEAST_EPS:g}")
         _check_number("error", self.error, 0.0 <= self.error <= 1.0, "in [0, 1]")
         _check_number("error_blur", self.error_blur, 0.0 <= self.error_blur < float("inf"), "at least 0")
         if self.normalise not in ("none", "mean"):

@@ -109,7 +109,10 @@ class WeightStore:
             )
         self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in _read_manifest(self.path)}
         self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
+        self._by_image: Dict[Tuple[Any, ...], Entry] = {}
         for entry in self.entries.values():
+            image = (entry.fingerprint, *entry.key[1:])
+            self._by_image[image] = entry
             for name in view_names(entry.view):
                 key = (name, *entry.key[1:])
                 self._by_name[key] = None if key in self._by_name else entry
@@ -125,6 +128,10 @@ class WeightStore:
         """
         name = view.replace("\\", "/")
         return self._by_name.get((name, height, width, spec.operator, spec.p, spec.eps))
+
+    def find_image(self, fingerprint: str, height: int, width: int, spec: WeightSpec) -> Optional[Entry]:
+        """Return the entry that was made from an image with a fingerprint, whatever its view is called, or None."""
+        return self._by_image.get((fingerprint, height, width, spec.operator, spec.p, spec.eps))
 
     def normalised_response(self, entry: Entry) -> np.ndarray:
         """Return an entry's map E^, float16 [H, W], after checking its checksum.
@@ -259,7 +266,10 @@ def stage(staging: Path, entry: Entry, normalised: np.ndarray) -> Entry:
 
 
 def fingerprint(image: Union[Tensor, np.ndarray]) -> str:
-    """Return a short name of what an image shows, to 8 bits a value.
+    """Return a short name of an image's values: two images have the same one only where they have the same map.
+
+    Values that are whole 255ths, as those of 8-bit photographs are, count as such however they were divided; values
+    that are whole 65535ths likewise; an image with any other value has a name by its float32 values, to the last bit.
 
     Args:
         image: floats in [0, 1], [C, H, W], on any device; or uint8 or uint16 [H, W, C].
@@ -269,14 +279,30 @@ def fingerprint(image: Union[Tensor, np.ndarray]) -> str:
         >>> fingerprint(pixels) == fingerprint(torch.from_numpy(pixels).permute(2, 0, 1) / 255.0)
         True
     """
-    if isinstance(image, np.ndarray) and image.dtype == np.uint16:
-        image = np.rint(image / np.float32(257)).astype(np.uint8)
-    elif not (isinstance(image, np.ndarray) and image.dtype == np.uint8):
-        values = torch.as_tensor(image).detach().float().clamp(0.0, 1.0) * 255.0
-        image = values.round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
-    digest = hashlib.sha256(repr(image.shape).encode())
-    digest.update(np.ascontiguousarray(image).data)
+    if isinstance(image, np.ndarray) and image.dtype in (np.uint8, np.uint16):
+        values = image
+    else:
+        tensor = torch.as_tensor(image).detach()
+        values = _whole_numbers(tensor.float().permute(1, 2, 0).cpu().numpy(), tensor.dtype == torch.float16)
+    if values.dtype == np.uint16 and not (values % 257).any():
+        values = (values // 257).astype(np.uint8)  # an 8-bit photograph in 16 bits
+    kind = "" if values.dtype == np.uint8 else values.dtype.name
+    digest = hashlib.sha256(f"{values.shape!r}{kind}".encode())
+    digest.update(np.ascontiguousarray(values).data)
     return digest.hexdigest()[:32]
+
+
+def _whole_numbers(image: np.ndarray, halves: bool) -> np.ndarray:
+    """Return an image's values as the 8- or 16-bit numbers that they are fractions of; else as they are."""
+    # float32 rounds values up to 1 by 6e-8, float16 by 2^-12.
+    for kind, tolerance in ((np.uint8, 255 / 4096 if halves else 1e-4), (np.uint16, 2e-2)):
+        scaled = image * np.float32(np.iinfo(kind).max)
+        whole = np.rint(scaled)
+        with np.errstate(invalid="ignore"):  # of an infinity
+            near = np.abs(scaled - whole).max() <= tolerance
+        if near and whole.min() >= 0 and whole.max() <= np.iinfo(kind).max:
+            return whole.astype(kind)
+    return image
 
 
 def _manifest(entries: Iterable[Entry]) -> bytes:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from legs_loss import PRESETS, LegsError
@@ -42,11 +44,23 @@ def test_the_environment_wins_over_the_file(tmp_path):
     assert find(tmp_path, LEGS_PRESET="eggs").spec == PRESETS["eggs"]
 
 
-@pytest.mark.parametrize(("value", "off"), [("1", True), ("true", True), ("0", False), ("", False)])
+@pytest.mark.parametrize(
+    ("value", "off"),
+    [
+        *[(value, True) for value in ("1", "true", "True", "yes", "on", " 1 ")],
+        *[(value, False) for value in ("0", "", "false", "False", "no", "off")],
+    ],
+)
 def test_legs_off(value, off):
     config = find(LEGS_OFF=value)
     assert config.off is off
     assert config.active is not off
+
+
+@pytest.mark.parametrize("value", ["2", "of", "disabled", "-1"])
+def test_legs_off_that_is_neither_yes_nor_no(value):
+    with pytest.raises(LegsError, match=f"LEGS_OFF must be 1 or 0 .*got '{value}'"):
+        find(LEGS_OFF=value)
 
 
 def test_beta_zero_is_not_active():
@@ -68,7 +82,10 @@ def test_the_store_of_the_scripts_scene_is_found(tmp_path, form):
         ("beta = -1", "legs.toml: beta must be at least 0"),
         ('beta = "many"', "legs.toml: beta must be a number, got 'many'"),
         ('curve = "C9"', "legs.toml: no curve is named 'C9'"),
-        ('prest = "legs"', "legs.toml: unknown setting 'prest'; there are preset, store, operator"),
+        (
+            'prest = "legs"',
+            "legs.toml: unknown setting 'prest'; there are preset, store, operator.*; did you mean 'preset'",
+        ),
         ("beta = ", "legs.toml cannot be read"),
     ],
 )
@@ -78,6 +95,53 @@ def test_a_bad_file_is_named(tmp_path, text, message):
         find(tmp_path)
 
 
-def test_a_bad_variable_is_named():
-    with pytest.raises(LegsError, match=r"LEGS_\*: no preset is named 'best'"):
-        find(LEGS_PRESET="best")
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("LEGS_PRESET", "legz", "environment variable LEGS_PRESET: no preset is named 'legz': .*did you mean 'legs'"),
+        ("LEGS_BETA", "1e300", "environment variable LEGS_BETA: beta must be at least 0 and at most 1e6, got 1e.300"),
+        ("LEGS_BETA", "inf", "environment variable LEGS_BETA: beta must be"),
+        ("LEGS_BETA", "nan", "environment variable LEGS_BETA: beta must be"),
+        ("LEGS_EPS", "1e-60", "environment variable LEGS_EPS: eps must be at least 1e-30"),
+        ("LEGS_OPERATOR", "lapacian", "environment variable LEGS_OPERATOR: .*did you mean 'laplacian'"),
+    ],
+)
+def test_a_bad_variable_is_named(name, value, message):
+    with pytest.raises(LegsError, match=message):
+        find(**{name: value})
+
+
+def test_an_unknown_variable_is_told_and_has_no_effect():
+    config = find(LEGS_BETAA="3", LEGS_TEST_SCENE="fox", LEGS_BACKEND="torch")
+    assert config.spec.beta == 10.0
+    assert config.notes == (
+        "environment variable LEGS_BETAA is not known and has no effect; did you mean 'LEGS_BETA'?",
+    )
+
+
+def test_the_search_outside_git_ends_at_the_home_folder(tmp_path, monkeypatch):
+    home = tmp_path / "home"
+    script = home / "code" / "train.py"
+    script.parent.mkdir(parents=True)
+    script.write_text("")
+    (tmp_path / "legs.toml").write_text("beta = 3")
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.setenv("USERPROFILE", str(home))
+    assert find(script).spec.beta == 10.0
+    (home / "legs.toml").write_text("beta = 4")
+    assert find(script).spec.beta == 4.0
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs root to give a file away")
+def test_a_file_of_another_owner_is_not_read(tmp_path):
+    planted = tmp_path / "legs.toml"
+    planted.write_text("beta = 3")
+    script = tmp_path / "code" / "train.py"
+    script.parent.mkdir()
+    script.write_text("")
+    os.chown(planted, 12345, -1)
+    config = find(script)
+    assert config.spec.beta == 10.0
+    assert config.notes == (f"{planted} belongs to another user: it is not read",)
+    os.chown(script, 12345, -1)  # a checkout of another user that is mounted: its script runs too
+    assert find(script).spec.beta == 3.0

@@ -20,14 +20,14 @@ def test_presets_are_the_designs():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"beta": -1.0}, "beta must be at least 0, got -1.0"),
+        ({"beta": -1.0}, "beta must be at least 0 and at most 1e6, got -1.0"),
         ({"beta": float("nan")}, "beta"),
         ({"beta": float("inf")}, "beta"),
         ({"percentile": 0.0}, "percentile"),
         ({"percentile": 101.0}, "percentile"),
         ({"eps": 0.0}, "eps"),
         ({"normalise": "max"}, '"none" or "mean"'),
-        ({"operator": "log"}, "operator"),
+        ({"operator": "canny"}, "operator"),
         ({"p": 0.5}, "1, 2 or inf"),
         ({"curve": "c3"}, "no curve is named 'c3'"),
     ],

@@ -335,6 +335,20 @@ class TestFingerprint:
         assert fingerprint(pixels.astype(np.uint16) * 257) == name
         assert fingerprint(tensor.clone().requires_grad_()) == name
 
+    def test_sees_what_8_bits_do_not(self):
+        pixels = np.tile(np.arange(100, 116, dtype=np.uint8), (16, 3, 1)).transpose(0, 2, 1)
+        image = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1) / 255.0
+        shifted = image.clone()
+        shifted[0, 5, 5] += 0.4 / 255  # rounds to the same 8 bits
+        finer = pixels.astype(np.uint16) * 257
+        finer[5, 5, 0] += 100
+        names = [
+            fingerprint(form) for form in (image, shifted, finer, torch.from_numpy(finer / 65535).permute(2, 0, 1))
+        ]
+        assert names[2] == names[3]
+        assert len(set(names)) == 3
+        assert fingerprint(image * float("inf")) != names[0]
+
     def test_differs_for_any_other_image(self):
         pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
         others = [pixels[::-1], pixels.reshape(4, 2, 3), pixels[..., :1], pixels ^ 1, pixels[:, :, ::-1]]

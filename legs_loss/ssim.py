@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Tuple
+from typing import Any, Dict, Optional, Tuple, Union
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.images import channels_first, check_pair, shape_of
+from legs_loss.images import channels_first, check_pair, is_compiling, shape_of
+from legs_loss.kernels.backends import fused_ssim
 
 __all__ = ["d_ssim", "ssim"]
 
@@ -20,34 +21,66 @@ C1 = 0.01**2
 C2 = 0.03**2
 
 
-def ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: bool = False) -> Tensor:
-    """Return the mean structural similarity of two images, 1 for equal ones.
+def ssim(
+    prediction: Tensor,
+    target: Tensor,
+    padding: Union[str, int] = "zeros",
+    channels_last: Optional[bool] = None,
+    *,
+    window_size: int = WINDOW_SIZE,
+    size_average: bool = True,
+) -> Tensor:
+    """Return the mean structural similarity of two images, 1 for equal ones; a drop-in for the ``ssim`` of 3DGS.
 
-    An 11x11 Gaussian window of sigma 1.5, each channel by itself, C1 = 0.01^2, C2 = 0.03^2. With the default
-    padding it is 3DGS's own value to the last bit (source: Inria's utils/loss_utils.py; Wang et al. 2004).
+    A Gaussian window of 11x11 and sigma 1.5, each channel by itself, C1 = 0.01^2, C2 = 0.03^2 (source: Inria's
+    utils/loss_utils.py; Wang et al. 2004). Where neither image is trained on (``no_grad``, evaluation) it is 3DGS's own
+    value to the last bit. In a training step value and gradient come from a backend where one takes the images
+    (docs/performance.md): equal up to rounding, differentiable once.
 
     Args:
         prediction: floats in [0, 1], [C, H, W] or [B, C, H, W]; channels-last on request.
         target: the same shape.
-        padding: "zeros" as in 3DGS's code, "reflect", "replicate", or "valid" (only windows inside the image).
+        padding: "zeros" as in 3DGS's code, "reflect", "replicate", or "valid" (only windows inside the image). A
+            number is taken for 3DGS's third argument, ``window_size``, and what follows it for ``size_average``.
         channels_last: where the channel stands.
+        window_size: the window's side in pixels, odd.
+        size_average: the mean over all images; False is one value an image, [B].
 
     Returns:
-        A scalar, differentiable in both images. Half precision is computed in float32, with autocast off: the
+        A scalar (or [B]), differentiable in both images. Half precision is computed in float32, with autocast off: the
         variances are differences of near-equal numbers.
 
     Raises:
-        LegsError: the shapes differ, the padding is unknown, or the image is too small for it.
+        LegsError: the shapes differ, the padding is unknown, the window is even, or the image is too small for it.
 
     Example:
         >>> image = torch.rand(3, 16, 16)
         >>> round(float(ssim(image, image)), 5)
         1.0
     """
-    return ssim_map(prediction, target, padding, channels_last).mean()
+    if not isinstance(padding, str):
+        if channels_last is not None:
+            size_average = bool(channels_last)
+        window_size, padding, channels_last = padding, "zeros", None
+    last = bool(channels_last)
+    if window_size == WINDOW_SIZE and size_average and torch.is_grad_enabled():
+        check_pair(prediction, target)
+        trained, constant = (prediction, target) if prediction.requires_grad else (target, prediction)
+        if trained.requires_grad:
+            fused = fused_ssim(trained, constant, padding, last)
+            if fused is not None:
+                return fused
+    similarity = ssim_map(prediction, target, padding, last, window_size)
+    return similarity.mean() if size_average else similarity.mean(-3).mean(-2).mean(-1)
 
 
-def ssim_map(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: bool = False) -> Tensor:
+def ssim_map(
+    prediction: Tensor,
+    target: Tensor,
+    padding: str = "zeros",
+    channels_last: bool = False,
+    window_size: int = WINDOW_SIZE,
+) -> Tensor:
     """Return the SSIM of every pixel and channel, channels first, whose mean :func:`ssim` is; arguments as there.
 
     Padding "valid" leaves out the pixels whose window is not inside the image.
@@ -57,19 +90,21 @@ def ssim_map(prediction: Tensor, target: Tensor, padding: str = "zeros", channel
     second = channels_first(target, channels_last)
     dtype = torch.promote_types(torch.promote_types(first.dtype, second.dtype), torch.float32)
     with _no_autocast(first):
-        return _ssim_map(first.to(dtype), second.to(dtype), padding)
+        return _ssim_map(first.to(dtype), second.to(dtype), padding, window_size)
 
 
 def d_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: bool = False) -> Tensor:
-    """Return 1 - SSIM, the structural term of 3DGS's loss; arguments as for :func:`ssim`."""
-    return 1.0 - ssim(prediction, target, padding, channels_last)
+    """Return 1 - SSIM, the structural term of 3DGS's loss, always to the last bit; arguments as for :func:`ssim`."""
+    return 1.0 - ssim_map(prediction, target, padding, channels_last).mean()
 
 
-def _ssim_map(first: Tensor, second: Tensor, padding: str) -> Tensor:
+def _ssim_map(first: Tensor, second: Tensor, padding: str, window_size: int) -> Tensor:
     # The order of operations is 3DGS's: another one rounds differently, and beta = 0 would not be 3DGS's loss.
-    first, second, margin = _padded(first, second, padding)
+    if not isinstance(window_size, int) or window_size < 1 or window_size % 2 == 0:
+        raise LegsError(f"window_size must be an odd number of pixels, got {window_size!r}")
+    first, second, margin = _padded(first, second, padding, window_size)
     channels = first.shape[-3]
-    window = _window(channels).to(first)
+    window = _window(channels, window_size, first)
 
     def blur(image: Tensor) -> Tensor:
         return F.conv2d(image, window, padding=margin, groups=channels)
@@ -82,21 +117,38 @@ def _ssim_map(first: Tensor, second: Tensor, padding: str) -> Tensor:
     return ((2 * mean12 + C1) * (2 * covariance + C2)) / ((mean1_sq + mean2_sq + C1) * (variance1 + variance2 + C2))
 
 
-def _window(channels: int) -> Tensor:
+_windows: Dict[Tuple[Any, ...], Tensor] = {}  # made on the CPU once, not uploaded at every call
+
+
+def _window(channels: int, size: int, like: Tensor) -> Tensor:
+    """Return the window [channels, 1, size, size] on the device and of the type of an image."""
+    if is_compiling():
+        return _new_window(channels, size).to(like)  # part of the graph
+    key = channels, size, like.device, like.dtype
+    window = _windows.get(key)
+    if window is None:
+        with torch.inference_mode(False):  # autograd saves no tensor of inference mode
+            window = _new_window(channels, size).to(like)
+        if type(window) is Tensor:  # of a fake mode it stands for no values
+            _windows[key] = window
+    return window
+
+
+def _new_window(channels: int, size: int) -> Tensor:
     taps = torch.tensor(
-        [math.exp(-((x - WINDOW_SIZE // 2) ** 2) / float(2 * SIGMA**2)) for x in range(WINDOW_SIZE)],
+        [math.exp(-((x - size // 2) ** 2) / float(2 * SIGMA**2)) for x in range(size)],
         dtype=torch.float32,
     )
     taps = (taps / taps.sum()).unsqueeze(1)
-    return taps.mm(taps.t()).expand(channels, 1, WINDOW_SIZE, WINDOW_SIZE).contiguous()
+    return taps.mm(taps.t()).expand(channels, 1, size, size).contiguous()
 
 
-def _padded(first: Tensor, second: Tensor, padding: str) -> Tuple[Tensor, Tensor, int]:
-    margin = WINDOW_SIZE // 2
+def _padded(first: Tensor, second: Tensor, padding: str, window_size: int) -> Tuple[Tensor, Tensor, int]:
+    margin = window_size // 2
     if padding == "zeros":
         return first, second, margin
     height, width = first.shape[-2:]
-    smallest = {"reflect": margin + 1, "replicate": 1, "valid": WINDOW_SIZE}
+    smallest = {"reflect": margin + 1, "replicate": 1, "valid": window_size}
     if padding not in smallest:
         raise LegsError(f"no padding is named {padding!r}: choose zeros, {', '.join(smallest)}")
     if min(height, width) < smallest[padding]:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import gc
+import subprocess
+import sys
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from legs_loss import memo as memo_module
-from legs_loss.memo import WeightMemo, _identity_key, _storage_owner
+from legs_loss.runtime import memo as memo_module
+from legs_loss.runtime.memo import _OVERHEAD, WeightMemo, _identity_key, _storage_owner
+from tests.support import legs_environment
 
 
 class Maker:
@@ -113,14 +116,14 @@ class TestByIdentity:
 
 class TestBound:
     def test_it_never_holds_more(self):
-        memo = WeightMemo(limit=3 * 64)
+        memo = WeightMemo(limit=3 * (64 + _OVERHEAD))
         for i in range(10):
             memo.recall(torch.full((1, 1, 16), float(i)), Maker())
-            assert memo.bytes <= 3 * 64
+            assert memo.bytes <= memo.limit
         assert len(memo) == 3
 
     def test_a_used_map_stays_and_the_rest_is_computed(self):
-        memo, make = WeightMemo(limit=2 * 64), Maker()
+        memo, make = WeightMemo(limit=2 * (64 + _OVERHEAD)), Maker()
         used = [torch.full((1, 1, 16), float(i)) for i in range(2)]
         for target in used + used:
             memo.recall(target, make)
@@ -135,6 +138,39 @@ class TestBound:
         memo = WeightMemo(limit=10)
         memo.recall(torch.rand(3, 4, 4), Maker())
         assert (len(memo), memo.bytes) == (0, 0)
+
+    @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+    def test_it_takes_what_it_counts(self):
+        script = """
+import os, torch
+from legs_loss.runtime.memo import WeightMemo
+from legs_loss.weights import weight_map
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGESIZE")
+
+torch.set_num_threads(1)
+memo = WeightMemo(160 << 20)
+for _ in range(5):
+    weight_map(torch.rand(3, 400, 600))
+before = resident()
+while memo.bytes < 150 << 20:
+    target = torch.rand(3, 400, 600)
+    memo.recall(target, lambda: weight_map(target))
+took = resident() - before
+print(took / memo.bytes)
+raise SystemExit(not 0.9 < took / memo.bytes < 1.5)
+"""
+        done = subprocess.run([sys.executable, "-c", script], env=legs_environment(), capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    def test_the_forms_of_a_target_are_remembered_apart(self):
+        memo, target = WeightMemo(), torch.rand(3, 4, 4)
+        range_, map_ = torch.zeros(1, 2), torch.ones(1, 4, 4)
+        assert memo.recall(target, lambda: range_, True) is range_
+        assert memo.recall(target, lambda: map_, False) is map_
+        assert memo.recall(target, lambda: torch.zeros(1), True) is range_
+        assert memo.bytes == 8 + 64 + 2 * _OVERHEAD
 
     def test_clear(self):
         memo, make, target = WeightMemo(), Maker(), torch.rand(3, 4, 4)

@@ -11,7 +11,8 @@ import textwrap
 import pytest
 import torch
 
-from legs_loss import runtime, weight_map
+from legs_loss import weight_map
+from legs_loss.runtime import state
 from tests.support import ROOT, legs_environment
 
 FAKE = {
@@ -110,7 +111,7 @@ def nerfstudio(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     for name in [name for name in os.environ if name.startswith("LEGS_")]:
         monkeypatch.delenv(name)
-    monkeypatch.setattr(runtime, "_run", None)
+    state.reset()
     monkeypatch.setattr(sys, "argv", ["ns-train"])
     monkeypatch.chdir(tmp_path)
     yield tmp_path
@@ -160,7 +161,7 @@ def test_off_and_evaluation_are_splatfacto_s_own_to_the_last_bit(nerfstudio, mon
             own.get_loss_dict(evaluated, batch)["main_loss"], legs.get_loss_dict(evaluated, batch)["main_loss"]
         )
     monkeypatch.setenv("LEGS_OFF", "1")
-    monkeypatch.setattr(runtime, "_run", None)
+    state.reset()
     losses = [model.get_loss_dict(outputs, batch)["main_loss"] for model in (own, legs)]
     assert torch.equal(*losses)
     assert torch.equal(*(torch.autograd.grad(loss, outputs["rgb"])[0] for loss in losses))

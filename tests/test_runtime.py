@@ -12,10 +12,11 @@ import pytest
 import torch
 from PIL import Image
 
-from legs_loss import LegsError, WeightSpec, configure, l1_loss, memo, runtime, weight_map
+from legs_loss import LegsError, WeightSpec, configure, l1_loss, weight_map
 from legs_loss.precompute import precompute
-from legs_loss.runtime import counts
+from legs_loss.runtime import counts, memo, sources, state
 from legs_loss.scenes import read_scene
+from legs_loss.weights import error_weight_map
 
 
 @pytest.fixture(autouse=True)
@@ -23,8 +24,7 @@ def fresh(monkeypatch, tmp_path):
     """Each test is a run of its own, started in an empty folder."""
     for name in [name for name in os.environ if name.startswith("LEGS_")]:
         monkeypatch.delenv(name)
-    monkeypatch.setattr(runtime, "_run", None)
-    monkeypatch.setattr(runtime, "_counts", runtime.Counts())
+    state.reset()
     monkeypatch.setattr(sys, "argv", ["train.py"])
     monkeypatch.chdir(tmp_path)
 
@@ -137,6 +137,11 @@ class TestWhenItWeights:
 
 
 class TestMemo:
+    @pytest.fixture(autouse=True)
+    def with_torch(self, monkeypatch):
+        """Numba computes the range of a response sooner than the memo knows an image again."""
+        monkeypatch.setenv("LEGS_BACKEND", "torch")
+
     def test_a_target_that_stays_is_computed_once(self):
         prediction, target = pair(3, 9, 8)
         for _ in range(4):
@@ -159,12 +164,12 @@ class TestMemo:
         assert (counts().computed, counts().remembered) == (2, 2)
 
     def test_when_it_is_full_it_computes(self):
-        configure("legs", memo_bytes=9 * 8 * 4)
+        configure("legs", memo_bytes=9 * 8 * 4 + 1024)
         targets = [torch.rand(3, 9, 8) for _ in range(3)]
         prediction = torch.rand(3, 9, 8, requires_grad=True)
         for target in targets + targets:
             torch.testing.assert_close(l1_loss(prediction, target), weighted(prediction, target))
-        assert runtime._run.memo.bytes <= 9 * 8 * 4
+        assert state.current_run().source.memo.bytes <= 9 * 8 * 4 + 1024
 
     @pytest.mark.parametrize("by", ["content", "identity"])
     def test_any_order_of_changing_targets_gets_its_own_weight(self, monkeypatch, by):
@@ -216,23 +221,39 @@ class TestStore:
         l1_loss(torch.rand(3, 9, 8, requires_grad=True), photograph(scene, "b.png"), view="images/b.png")
         assert counts().stored == 1
 
+    def test_on_the_cpu_it_is_found_without_a_name_or_under_another(self, scene, capsys):
+        configure("legs", store=scene / "legs_weights")
+        for name, view in (("a", None), ("b", "a"), ("c", "nowhere")):
+            l1_loss(torch.rand(3, 9, 8, requires_grad=True), photograph(scene, name + ".png"), view=view)
+        assert (counts().stored, counts().computed) == (3, 0)
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1 and f"maps from {scene / 'legs_weights'}" in lines[0]
+
+    def test_the_first_line_says_what_was_used(self, scene, capsys):
+        configure("legs", store=scene / "legs_weights")
+        l1_loss(torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8))
+        assert "weights computed from the training images" in capsys.readouterr().err
+        configure("legs", store=scene / "legs_weights")
+        state.reset_counts()
+        batch = torch.stack([photograph(scene, "a.png"), torch.rand(3, 9, 8)])
+        l1_loss(torch.rand(2, 3, 9, 8, requires_grad=True), batch)
+        assert "but for 1 image(s), whose weight is computed" in capsys.readouterr().err
+
     def test_it_is_not_used_for_another_image_under_its_name(self, scene, capsys):
         configure("legs", store=scene / "legs_weights")
         prediction = torch.rand(3, 9, 8, requires_grad=True)
         for shift in (1, 2):
             target = torch.roll(photograph(scene, "a.png"), shift, dims=2)
             torch.testing.assert_close(l1_loss(prediction, target, view="a"), weighted(prediction, target))
-        other = photograph(scene, "b.png")
-        torch.testing.assert_close(l1_loss(prediction, other, view="a"), weighted(prediction, other))
-        assert (counts().stored, counts().computed) == (0, 3)
+        assert (counts().stored, counts().computed) == (0, 2)
         assert capsys.readouterr().err.count("is not the one that the stored map was made from") == 1
 
-    def test_nor_for_another_size_or_an_unnamed_or_unknown_view(self, scene, capsys):
+    def test_nor_for_another_size_or_finer_values_or_an_unknown_view(self, scene, capsys):
         configure("legs", store=scene / "legs_weights")
         target = photograph(scene, "a.png")
-        l1_loss(torch.rand(3, 9, 8, requires_grad=True), target)
+        l1_loss(torch.rand(3, 9, 8, requires_grad=True), target + 0.3 / 255)  # the same to 8 bits
         l1_loss(torch.rand(3, 8, 8, requires_grad=True), target[:, :8], view="a")
-        l1_loss(torch.rand(3, 9, 8, requires_grad=True), photograph(scene, "b.png"), view="z")
+        l1_loss(torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8), view="z")
         assert (counts().stored, counts().computed) == (0, 3)
         assert "no map of view 'a' at 8x8" in capsys.readouterr().err
 
@@ -279,6 +300,78 @@ def test_it_can_be_compiled():
     compiled = torch.compile(lambda p, t: l1_loss(p, t))
     prediction, target = pair(3, 16, 16)
     torch.testing.assert_close(compiled(prediction, target), weighted(prediction, target))
+
+
+@pytest.mark.skipif(not hasattr(torch, "compile"), reason="this torch has no torch.compile")
+def test_its_graph_is_whole_from_the_first_call(monkeypatch):
+    monkeypatch.setenv("LEGS_BETA", "4")
+    compiled = torch.compile(lambda p, t: l1_loss(p, t), fullgraph=True, backend="aot_eager")
+    prediction, target = pair(3, 16, 16)
+    torch.testing.assert_close(compiled(prediction, target), weighted(prediction, target, WeightSpec(beta=4.0)))
+    configure("legs-l")
+    torch.testing.assert_close(compiled(prediction, target), weighted(prediction, target, "legs-l"))
+    with torch.no_grad():
+        assert torch.equal(compiled(prediction, target), plain(prediction, target))
+
+
+class TestBackends:
+    @pytest.fixture(autouse=True)
+    def needs_numba(self):
+        pytest.importorskip("numba")
+
+    def test_the_mean_is_one_fused_pass(self):
+        prediction, target = pair(3, 30, 40)
+        mask = torch.rand(30, 40)
+        for options, expected in (({}, weighted(prediction, target)), ({"mask": mask}, None)):
+            loss = l1_loss(prediction, target, **options)
+            assert type(loss.grad_fn).__name__ == "_FusedLossBackward"
+            if expected is None:
+                expected = (mask * weight_map(target) * torch.abs(prediction - target)).mean()
+            torch.testing.assert_close(loss, expected)
+            gradients = [torch.autograd.grad(one, prediction)[0] for one in (loss, expected)]
+            torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-9)
+        assert state.current_run().source.memo.bytes == 0
+
+    @pytest.mark.parametrize("options", [{"reduction": "none"}, {"own": plain}])
+    def test_what_needs_the_map_gets_it(self, options):
+        prediction, target = pair(3, 30, 40)
+        loss = l1_loss(prediction, target, **options)
+        torch.testing.assert_close(loss.mean(), weighted(prediction, target))
+        l1_loss(prediction, target)
+        assert (counts().computed, counts().remembered) == (2, 0)
+
+    @pytest.mark.parametrize("spec", [WeightSpec(curve="C5"), WeightSpec(percentile=90.0), WeightSpec(error=0.5)])
+    def test_specs_that_need_a_map(self, spec):
+        configure(spec)
+        prediction, target = pair(3, 30, 40)
+        expected = error_weight_map(prediction, target, spec) if spec.error else weight_map(target, spec)
+        for _ in range(2):
+            loss = l1_loss(prediction, target)
+            torch.testing.assert_close(loss, (expected * torch.abs(prediction - target)).mean())
+        assert (counts().computed, counts().remembered) == (1, 1)
+
+
+class TestCapture:
+    """While a CUDA graph is captured nothing is remembered: replays have other pixels in the same memory."""
+
+    def test_each_call_computes_its_own_weight(self, monkeypatch, scene):
+        monkeypatch.setenv("LEGS_BACKEND", "torch")
+        configure("legs", store=scene / "legs_weights")
+        run = state.current_run()
+        monkeypatch.setattr(sources, "is_capturing", lambda device: True)
+        prediction, target = torch.rand(3, 9, 8, requires_grad=True), photograph(scene, "a.png")
+        for _ in range(2):
+            torch.testing.assert_close(l1_loss(prediction, target, view="a"), weighted(prediction, target))
+            target.copy_(torch.rand(3, 9, 8))  # as a replay would find it
+        assert (counts().computed, counts().stored, counts().remembered) == (2, 0, 0)
+        assert len(run.source.memo) == 0
+
+    def test_only_a_cuda_device_is_asked(self, monkeypatch):
+        monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)
+        assert sources.is_capturing(torch.device("cuda"))
+        assert not sources.is_capturing(torch.device("cpu"))
+        monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: False)
+        assert not sources.is_capturing(torch.device("cuda"))
 
 
 class TestOtherDevices:

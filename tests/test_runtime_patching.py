@@ -10,8 +10,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from legs_loss import LegsError, configure, l1_loss, runtime, unweighted, weight_map
-from legs_loss.runtime import active, counts
+from legs_loss import LegsError, configure, l1_loss, unweighted, weight_map
+from legs_loss.runtime import active, counts, state
 
 
 @pytest.fixture(autouse=True)
@@ -19,7 +19,7 @@ def fresh(monkeypatch, tmp_path):
     """Each test is a run of its own, started in an empty folder."""
     for name in [name for name in os.environ if name.startswith("LEGS_")]:
         monkeypatch.delenv(name)
-    monkeypatch.setattr(runtime, "_run", None)
+    state.reset()
     monkeypatch.setattr(sys, "argv", ["train.py"])
     monkeypatch.chdir(tmp_path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 
 import pytest
@@ -9,6 +10,8 @@ import torch
 import torch.nn.functional as F
 
 from legs_loss import LegsError, d_ssim, ssim
+
+module = importlib.import_module("legs_loss.ssim")
 
 
 def formula_of_3dgs(first, second):
@@ -111,3 +114,76 @@ def test_bad_input_is_named():
         ssim(torch.rand(3, 8, 8), torch.rand(3, 8, 8), padding="same")
     with pytest.raises(LegsError, match="at least 11 pixels"):
         ssim(torch.rand(3, 8, 8), torch.rand(3, 8, 8), padding="valid")
+
+
+class TestDropIn:
+    """It stands in for `ssim(img1, img2, window_size=11, size_average=True)` of 3DGS."""
+
+    def test_3dgs_arguments_by_place_and_by_name(self):
+        prediction, target = pair(2, 3, 24, 31)
+        value = formula_of_3dgs(prediction, target)
+        assert torch.equal(ssim(prediction, target, 11), value)
+        assert torch.equal(ssim(prediction, target, 11, True), value)
+        assert torch.equal(ssim(prediction, target, window_size=11, size_average=True), value)
+        each = torch.stack([formula_of_3dgs(*images) for images in zip(prediction, target)])
+        torch.testing.assert_close(ssim(prediction, target, size_average=False), each)
+        torch.testing.assert_close(ssim(prediction, target, 11, False), each)
+
+    def test_another_window(self):
+        kornia = pytest.importorskip("kornia")
+        prediction, target = pair(1, 3, 24, 31, dtype=torch.float64)
+        kernel = kornia.filters.get_gaussian_kernel2d((7, 7), (1.5, 1.5)).double()
+        blur = lambda image: kornia.filters.filter2d(image, kernel, "constant")
+        mean1, mean2 = blur(prediction), blur(target)
+        variances = blur(prediction**2) - mean1**2 + blur(target**2) - mean2**2
+        covariance = blur(prediction * target) - mean1 * mean2
+        expected = (2 * mean1 * mean2 + 1e-4) * (2 * covariance + 9e-4)
+        expected = expected / ((mean1**2 + mean2**2 + 1e-4) * (variances + 9e-4))
+        assert float(ssim(prediction, target, 7)) == pytest.approx(float(expected.mean()), abs=1e-6)
+        with pytest.raises(LegsError, match="odd number of pixels, got 8"):
+            ssim(prediction, target, 8)
+
+    @pytest.mark.parametrize("trained", ["first", "second"])
+    def test_a_training_step_is_fused_with_the_same_gradient(self, trained):
+        pytest.importorskip("numba")
+        images = list(pair(3, 40, 50))
+        index = 0 if trained == "first" else 1
+        images[index].requires_grad_()
+        value = ssim(*images)
+        assert "_FusedLossBackward" in {type(node).__name__ for node, _ in value.grad_fn.next_functions}
+        exact = [image.detach().double() for image in images]
+        exact[index].requires_grad_()
+        expected = formula_of_3dgs(*exact)
+        assert value.item() == pytest.approx(expected.item(), abs=1e-5)
+        gradient = torch.autograd.grad(value, images[index])[0]
+        reference = torch.autograd.grad(expected, exact[index])[0]
+        assert float((gradient - reference).norm() / reference.norm()) < 1e-4
+
+    def test_evaluation_is_3dgs_own_to_the_last_bit(self):
+        prediction, target = pair(3, 24, 31)
+        with torch.no_grad():
+            assert torch.equal(ssim(prediction.requires_grad_(), target), formula_of_3dgs(prediction, target))
+
+    def test_both_images_may_learn(self):
+        images = [image.requires_grad_() for image in pair(3, 24, 31)]
+        assert all(gradient.abs().sum() > 0 for gradient in torch.autograd.grad(ssim(*images), images))
+
+
+def test_the_window_is_made_once_and_never_in_a_mode_that_spoils_it(monkeypatch):
+    monkeypatch.setattr(module, "_windows", {})
+    made = []
+    new_window = module._new_window
+    monkeypatch.setattr(module, "_new_window", lambda *args: made.append(args) or new_window(*args))
+    prediction, target = pair(3, 16, 16)
+    with torch.inference_mode():
+        ssim(prediction, target)
+    for _ in range(3):
+        d_ssim(prediction.requires_grad_(), target).backward()
+    assert made == [(3, 11)]
+    ssim(prediction.detach().double(), target.double())
+    assert len(made) == 2  # one a type
+    fake = pytest.importorskip("torch._subclasses.fake_tensor").FakeTensorMode()
+    monkeypatch.setattr(module, "_windows", {})
+    with fake:
+        ssim(torch.empty(1, 12, 12), torch.empty(1, 12, 12))
+    assert not module._windows

@@ -10,6 +10,7 @@ from torch import Tensor
 from legs_loss.kernels import numba_loss
 from legs_loss.kernels.contract import Backend, Weights
 from legs_loss.kernels.numba_response import CURVES, NORMS, STENCILS
+from legs_loss.kernels.numba_weights import response_range
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
 
@@ -18,16 +19,22 @@ __all__ = ["BACKEND"]
 
 class _NumbaBackend(Backend):
     name = "numba"
-    offers = frozenset({"loss"})
+    offers = frozenset({"loss", "l1", "ssim"})
     operators = frozenset(STENCILS)
     norms = frozenset(NORMS)
     curves = frozenset(CURVES)
 
     def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
-        return torch.from_numpy(numba_loss.response_range(target, spec))
+        return torch.from_numpy(response_range(target, spec))
 
     def loss(self, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
-        return numba_loss.fused_loss(prediction, target, _one_source(target, weights), lambda_dssim)
+        return numba_loss.fused_loss(prediction, target, _one_source(target, weights), lambda_dssim, weights.range)
+
+    def weighted_l1(self, prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
+        return numba_loss.fused_l1(prediction, target, _one_source(target, weights), weights.range)
+
+    def ssim(self, prediction: Tensor, target: Tensor) -> Tensor:
+        return 1.0 - numba_loss.fused_loss(prediction, target, None, 1.0)
 
 
 def _one_source(target: Tensor, weights: Weights) -> Union[Tensor, WeightSpec, None]:

@@ -46,7 +46,7 @@ def difference_from_torch(backend: Backend, device: torch.device) -> Optional[st
 
 def _operations(backend: Backend, target: Tensor) -> Iterator[Tuple[str, _Loss, _Loss]]:
     """Yield of each operation with each kind of weight: its name, the backend's function, and the reference."""
-    from legs_loss.ssim import ssim  # which itself asks backends.py
+    from legs_loss.ssim import d_ssim  # whose module itself asks backends.py
 
     exact = target.double()
     spec = WeightSpec()
@@ -57,7 +57,7 @@ def _operations(backend: Backend, target: Tensor) -> Iterator[Tuple[str, _Loss, 
         return lambda image: (weight * (image - exact).abs()).mean()
 
     def whole(weight: Tensor) -> _Loss:
-        return lambda image: (1.0 - _SHARE) * l1(weight)(image) + _SHARE * (1.0 - ssim(image, exact))
+        return lambda image: (1.0 - _SHARE) * l1(weight)(image) + _SHARE * d_ssim(image, exact)
 
     def of_backend(operation: Callable[..., Tensor], *rest: object) -> _Loss:
         return lambda image: operation(image, target, *rest)
@@ -68,4 +68,4 @@ def _operations(backend: Backend, target: Tensor) -> Iterator[Tuple[str, _Loss, 
         if "l1" in backend.offers:
             yield "weighted L1", of_backend(backend.weighted_l1, kind), l1(weight)
     if "ssim" in backend.offers:
-        yield "SSIM", of_backend(backend.ssim), lambda image: ssim(image, exact)
+        yield "SSIM", of_backend(backend.ssim), lambda image: 1.0 - d_ssim(image, exact)

@@ -1,4 +1,4 @@
-"""Weight maps in memory, bounded, each valid only for the very target that it was made from.
+"""Weight maps in memory, or the two numbers that make one, bounded, each valid only for the target it was made from.
 
 The weight belongs to the target, not to the name of a view: a codebase may shift, shrink or composite a view's target
 from one step to the next, and a wrong weight never fails loudly. So a map is remembered under what the target *is*:
@@ -12,10 +12,11 @@ from one step to the next, and a wrong weight never fails loudly. So a map is re
 from __future__ import annotations
 
 import hashlib
+import mmap
 import threading
 import weakref
 from collections import OrderedDict
-from typing import Callable, Hashable, Optional
+from typing import Callable, Hashable, Optional, Union
 
 import torch
 from torch import Tensor
@@ -23,17 +24,19 @@ from torch import Tensor
 __all__ = ["DEFAULT_LIMIT", "WeightMemo"]
 
 DEFAULT_LIMIT = 1 << 30  # bytes
+_LARGE = 1 << 16  # bytes
+_OVERHEAD = 1 << 10  # bytes of an entry beside its values: key, tensor, bookkeeping
 
 
 class WeightMemo:
-    """A mapping from targets to weight maps that holds at most ``limit`` bytes of maps.
+    """A mapping from targets to weight maps, or to ranges of responses, that takes at most ``limit`` bytes.
 
     When it is full, a map that was never asked for again makes room; where there is none, nothing is kept and the
     caller computes. (Training visits every view once an epoch: evicting the least recently used would evict each map
     just before its next use.)
 
     Args:
-        limit: bytes of weight maps.
+        limit: bytes of memory.
 
     Example:
         >>> memo, target = WeightMemo(), torch.rand(3, 4, 4)
@@ -53,18 +56,25 @@ class WeightMemo:
     def __len__(self) -> int:
         return len(self._entries)
 
-    def recall(self, target: Tensor, make: Callable[[], Tensor]) -> Tensor:
-        """Return the map remembered for this target; or make it, and remember it if the target can be known again."""
-        key = _key(target)
-        if key is None:
+    def recall(self, target: Tensor, make: Callable[[], Tensor], form: Hashable = None) -> Tensor:
+        """Return what is remembered of this target; or make it, and remember it if the target can be known again.
+
+        Args:
+            target: the image.
+            make: makes its weight map, or the range of its response.
+            form: what is made, if there are several kinds; each is remembered by itself.
+        """
+        found = _key(target)
+        if found is None:
             return make()
+        key = found, form
         with self._lock:
             entry = self._entries.get(key)
             if entry is not None:
                 entry.used = True
                 return entry.weight
         weight = make()
-        size = weight.numel() * weight.element_size()
+        size = _size(weight)
         with self._lock:
             self._drop(key)
             if self._make_room(size):
@@ -107,14 +117,36 @@ class WeightMemo:
         return self.bytes + size <= self.limit
 
 
+def _size(weight: Tensor) -> int:
+    """Return the bytes that an entry takes."""
+    size = weight.numel() * weight.element_size()
+    return _OVERHEAD + (-(-size // mmap.PAGESIZE) * mmap.PAGESIZE if size >= _LARGE else size)
+
+
 class _Entry:
-    __slots__ = ("owner", "size", "used", "weight")
+    """What is remembered of a target; of a large map of the CPU the bytes, in pages of their own.
+
+    A tensor that is kept on the heap lies among the temporaries that it was made from, and what they leave does not fit
+    the next ones: a memo of such tensors took twice what it counted.
+    """
+
+    __slots__ = ("_dtype", "_shape", "_values", "owner", "size", "used")
 
     def __init__(self, weight: Tensor, size: int, owner: Optional[weakref.ref[Tensor]]) -> None:
-        self.weight = weight
         self.size = size
         self.owner = owner
         self.used = False
+        self._dtype, self._shape = weight.dtype, tuple(weight.shape)
+        self._values: Union[Tensor, mmap.mmap] = weight
+        if weight.device.type == "cpu" and type(weight) is Tensor and weight.numel() * weight.element_size() >= _LARGE:
+            self._values = mmap.mmap(-1, weight.numel() * weight.element_size())
+            self.weight.copy_(weight)
+
+    @property
+    def weight(self) -> Tensor:
+        if isinstance(self._values, Tensor):
+            return self._values
+        return torch.frombuffer(self._values, dtype=self._dtype).reshape(self._shape)
 
 
 def _key(target: Tensor) -> Optional[Hashable]:

@@ -1,0 +1,121 @@
+"""What a training script talks to: ``l1_loss``, in place of the codebase's own.
+
+It weights only a prediction that is being trained on; under ``no_grad`` it is the plain mean, so that reported metrics
+do not change. call.py is the call and the loss, sources.py where its weights come from, memo.py what is remembered of
+them, state.py the settings and counts of the process.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Callable, Optional, TypeVar
+
+import torch
+from torch import Tensor
+
+from legs_loss.images import is_compiling
+from legs_loss.kernels.contract import Weights
+from legs_loss.runtime.call import Call, Own, View
+from legs_loss.runtime.sources import Counts
+from legs_loss.runtime.state import active, configure, counted, counts, current_run, spec_to_compile, thread, version
+from legs_loss.weights import error_weight_map, weight_map
+
+__all__ = ["Counts", "active", "configure", "counts", "l1_loss", "unweighted"]
+
+Result = TypeVar("Result")
+
+
+def l1_loss(
+    prediction: Tensor,
+    target: Tensor,
+    view: View = None,
+    mask: Optional[Tensor] = None,
+    channels_last: bool = False,
+    reduction: str = "mean",
+    own: Optional[Own] = None,
+) -> Tensor:
+    """Return the LEGS-weighted L1 loss; a drop-in for the ``l1_loss`` of a 3DGS codebase.
+
+    Args:
+        prediction: the rendering, [C, H, W], [B, C, H, W], or with more axes in front, as the views of several
+            scenes [B, V, C, H, W]; channels-last on request. Where it requires no gradient (evaluation,
+            ``no_grad``) the result is ``torch.abs(prediction - target).mean()``, unweighted.
+        target: the photograph as this step supervises it, the same shape; of [C, H, W] beside [1, C, H, W] both are
+            taken for a batch of one, as ``torch.abs(prediction - target)`` takes them.
+        view: the name of the view, or its number (for a batch: one a view), if the target is that view's own stored
+            image. It lets maps from ``legs precompute`` be used; they are used only where the target's fingerprint says
+            that they were made from it. On the CPU a stored map is found by the fingerprint alone.
+        mask: one value a pixel, zeroes the weight where it is 0.
+        channels_last: where the channel stands.
+        reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.
+        own: the codebase's own L1 of (prediction, target), where that is more than a mean: what it makes of the
+            difference (a mask, another mean) it makes of the weighted difference: it is given the target, and a
+            prediction moved away from it by the weight. Unweighted it is called as it is.
+
+    Returns:
+        A scalar, or what ``reduction`` or ``own`` say. With beta 0 or LEGS_OFF it is
+        ``torch.abs(prediction - target).mean()``, or ``own(prediction, target)``, to the last bit.
+
+    Raises:
+        LegsError: shapes that do not fit (both are named), images that lie the other way around than
+            ``channels_last`` says, on the CPU a target with NaN or infinity,
+            a setting in legs.toml or LEGS_* that is out of range.
+
+    Example:
+        >>> target = torch.rand(3, 8, 8)
+        >>> prediction = torch.rand(3, 8, 8, requires_grad=True)
+        >>> l1_loss(prediction, target) > torch.abs(prediction - target).mean()
+        tensor(True)
+    """
+    call = Call(prediction, target, view, mask, channels_last, reduction, own)
+    call.check_options()
+    if is_compiling():
+        return _compiled(call)
+    if thread.unweighted or not call.trains() or not current_run().config.active:
+        counted.plain += 1
+        return call.plain()
+    run, call = current_run(), call.aligned()
+    counted.weighted += 1
+    with torch.no_grad():
+        weights = run.source.weights(call, counted)
+    run.say_what_is_used()
+    return call.weighted(weights)
+
+
+def _compiled(call: Call) -> Tensor:
+    """Return the loss as torch.compile traces it: without a memory, the weight becomes part of the graph."""
+    spec = None if thread.unweighted or not call.trains() else spec_to_compile(version[0])
+    if spec is None:
+        return call.plain()
+    call = call.aligned()
+    if spec.error > 0.0:
+        weight = error_weight_map(call.prediction, call.target, spec, call.channels_last)
+    else:
+        weight = weight_map(call.target, spec, call.channels_last)
+    return call.weighted(Weights(map=weight))
+
+
+def unweighted(function: Callable[..., Result]) -> Callable[..., Result]:
+    """Return a function that calls another, in which ``l1_loss`` is meanwhile plain, as with LEGS_OFF.
+
+    For a loss that compares a rendering with its photograph in one call and with another rendering in the next: in that
+    one nothing is to be weighted. Only this thread is concerned, and only until the call returns or raises.
+
+    Args:
+        function: what is to be called, a module too.
+
+    Example:
+        >>> def photometric(image, gt_image):
+        ...     return 0.8 * l1_loss(image, gt_image) + 0.2 * (image - gt_image).square().mean()
+        >>> image, other = torch.rand(3, 8, 8, requires_grad=True), torch.rand(3, 8, 8)
+        >>> unweighted(photometric)(image, other) < photometric(image, other)
+        tensor(True)
+    """
+
+    def plain(*args: Any, **kwargs: Any) -> Result:
+        thread.unweighted += 1
+        try:
+            return function(*args, **kwargs)
+        finally:
+            thread.unweighted -= 1
+
+    return plain

@@ -1,0 +1,174 @@
+"""The state of this process's run: its settings, found once, where its weights come from, what it counted and said."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Optional, Set, Union
+
+from legs_loss.config import Config, find_config
+from legs_loss.distributed import is_first_process
+from legs_loss.runtime.memo import DEFAULT_LIMIT
+from legs_loss.runtime.sources import Counts, WeightSource
+from legs_loss.spec import Spec, WeightSpec, as_spec
+
+__all__ = [
+    "Run",
+    "active",
+    "configure",
+    "counted",
+    "counts",
+    "current_run",
+    "reset",
+    "reset_counts",
+    "spec_to_compile",
+    "thread",
+    "version",
+]
+
+
+class Run:
+    """A training run.
+
+    Attributes:
+        config: its settings.
+        source: where its weights come from.
+    """
+
+    def __init__(self, config: Config, memo_bytes: int = DEFAULT_LIMIT) -> None:
+        self.config = config
+        self.source = WeightSource(config, memo_bytes, self.say_once)
+        self._said: Set[str] = set()
+        for note in config.notes:
+            self.say_once(note, note)
+
+    def say_once(self, kind: str, message: str) -> None:
+        """Print a line on stderr, the first time that this kind of thing happens; of "active" only rank 0 does."""
+        if kind not in self._said:
+            self._said.add(kind)
+            if kind == "active" and not is_first_process():
+                return
+            print(f"legs-loss: {message}", file=sys.stderr, flush=True)
+
+    def say_what_is_used(self) -> None:
+        """Print, once, the settings and where the weights of the first step came from: after it, so that it is true."""
+        if "active" in self._said:
+            return
+        spec = self.config.spec
+        if counted.stored == 0:
+            weights = "weights computed from the training images"
+        elif counted.computed == 0:
+            weights = f"maps from {self.config.store}"
+        else:
+            weights = f"maps from {self.config.store}, but for {counted.computed} image(s), whose weight is computed"
+        self.say_once(
+            "active",
+            f"L1 weighted, preset {self.config.preset}: {spec.operator}, {spec.curve}, beta {spec.beta:g}; {weights}; "
+            f"settings from {self.config.source}",
+        )
+
+
+class _Thread(threading.local):
+    """How many calls of `unweighted` functions a thread is in."""
+
+    def __init__(self) -> None:
+        self.unweighted = 0  # on the instance: torch.compile does not ask again what the class says
+
+
+counted = Counts()
+thread = _Thread()
+version = [0]  # how often the settings were replaced; what was compiled before is compiled anew
+_run: Optional[Run] = None
+_lock = threading.RLock()
+
+
+def current_run() -> Run:
+    """Return this process's run; its settings are found at the first call."""
+    global _run
+    if _run is None:
+        with _lock:
+            if _run is None:
+                _run = Run(find_config(_main_file()))
+    return _run
+
+
+def spec_to_compile(version: int) -> Optional[WeightSpec]:
+    """Return the spec that a compiled call weights with, None for a plain one."""
+    config = current_run().config
+    return config.spec if config.active else None
+
+
+# torch.compile calls it while it traces, and takes its result as a constant: it cannot trace a lock, or a file that is
+# read. What torch.compiler.assume_constant_result would set, without the seconds that importing the compiler takes.
+spec_to_compile._dynamo_marked_constant = True  # type: ignore[attr-defined]
+
+
+def reset() -> None:
+    """Begin anew, as a new process would: the next call finds the settings again, and nothing is counted yet."""
+    global _run
+    with _lock:
+        _run = None
+        version[0] += 1
+        reset_counts()
+
+
+def reset_counts() -> None:
+    """Count from nothing."""
+    vars(counted).update(vars(Counts()))
+
+
+def configure(
+    spec: Optional[Spec] = None,
+    store: Union[str, Path, None] = None,
+    memo_bytes: int = DEFAULT_LIMIT,
+) -> None:
+    """Set what ``l1_loss`` uses in this process, in place of legs.toml; LEGS_OFF still turns it off.
+
+    Args:
+        spec: a preset's name or a spec; None keeps what legs.toml and the environment say.
+        store: a folder that ``legs precompute`` made.
+        memo_bytes: how much memory remembered weight maps may take.
+
+    Raises:
+        LegsError: an unknown preset, or settings elsewhere that are out of range.
+
+    Example:
+        >>> configure("legs-l")
+        >>> configure(replace(as_spec("legs"), curve="C5", beta=4.0))
+        >>> configure("legs")
+    """
+    global _run
+    config = find_config(_main_file())
+    if spec is not None:
+        config = replace(
+            config,
+            spec=as_spec(spec),
+            preset=spec if isinstance(spec, str) else "own spec",
+            source="configure()",
+        )
+    if store is not None:
+        config = replace(config, store=Path(store))
+    with _lock:
+        _run = Run(config, memo_bytes)
+        version[0] += 1
+
+
+def active() -> bool:
+    """Return whether ``l1_loss`` weights what is trained: not with beta 0, nor with LEGS_OFF.
+
+    Raises:
+        LegsError: a setting in legs.toml or LEGS_* that is out of range.
+    """
+    return current_run().config.active
+
+
+def counts() -> Counts:
+    """Return a copy of this process's counts so far."""
+    return replace(counted)
+
+
+def _main_file() -> Path:
+    path = getattr(sys.modules.get("__main__"), "__file__", None)
+    return Path(path) if path else Path.cwd()

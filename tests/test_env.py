@@ -40,7 +40,7 @@ def test_a_forced_backend():
 def test_an_unknown_backend():
     done = legs("env", env=dict(legs_environment(), LEGS_BACKEND="metal"))
     assert done.returncode == 2
-    assert "legs: error: LEGS_BACKEND must be one of torch, numba, got 'metal'" in done.stderr
+    assert "legs: error: LEGS_BACKEND must be one of torch, numba, cuda, got 'metal'" in done.stderr
 
 
 def test_a_broken_and_a_missing_package(tmp_path):

@@ -224,8 +224,8 @@ class TestSelection:
         assert capfd.readouterr().err == ""
 
     def test_an_unknown_backend_is_an_error(self, chosen):
-        chosen("cuda")
-        with pytest.raises(LegsError, match="LEGS_BACKEND must be one of torch, numba, got 'cuda'"):
+        chosen("metal")
+        with pytest.raises(LegsError, match="LEGS_BACKEND must be one of torch, numba, cuda, got 'metal'"):
             legs_loss(*images((3, 20, 30)))
 
     @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 A backend is tried once before it is used, on a small image against torch. One that is not installed is passed over in
 silence; one that fails, then or later, is named once on stderr; torch does the work then.
-``LEGS_BACKEND=torch|numba`` forces one; what that one does not take is torch's all the same.
+``LEGS_BACKEND=torch|numba|cuda`` forces one; what that one does not take is torch's all the same.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.images import as_map, channels_first, is_compiling
-from legs_loss.kernels.contract import Backend, Weights
+from legs_loss.kernels.contract import Backend, NotNow, Weights
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
 
@@ -35,8 +35,11 @@ __all__ = [
     "runs_on",
 ]
 
-# A backend: the package it needs, the module whose BACKEND it is, and the type of the devices it is for.
-_KNOWN = {"numba": ("numba", "legs_loss.kernels.numba_backend", "cpu")}
+# A backend: the module whose BACKEND it is, and the type of the devices it is for.
+_KNOWN = {
+    "numba": ("legs_loss.kernels.numba_backend", "cpu"),
+    "cuda": ("legs_loss.kernels.cuda.backend", "cuda"),
+}
 BACKENDS = ("torch", *_KNOWN)
 _OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 
@@ -85,7 +88,7 @@ def finding(name: str, device: torch.device) -> Finding:
 
 def runs_on(name: str, device: torch.device) -> bool:
     """Return whether a backend is for a device."""
-    return device.type == _KNOWN[name][2] and not _forked
+    return device.type == _KNOWN[name][1] and not _forked
 
 
 def fused_loss(
@@ -177,11 +180,16 @@ def _fused(
     if backend is None or operation not in backend.offers:
         return None
     first, second = channels_first(prediction, channels_last), channels_first(target, channels_last)
-    if first.shape[-3] > backend.most_channels or not {first.dtype, second.dtype} <= backend.dtypes:
+    channels, height, width = first.shape[-3:]
+    if channels > backend.most_channels or height * width > backend.most_pixels:
+        return None
+    if not {first.dtype, second.dtype} <= backend.dtypes:
         return None
     try:
         resolved = _resolved(backend, weights, target, channels_last, with_maps)
         return run(backend, first, second, resolved)
+    except NotNow:
+        return None
     except (LegsError, MemoryError, _OUT_OF_MEMORY):
         raise
     except Exception as error:  # a size or type that its trial did not meet
@@ -193,8 +201,7 @@ def _ready_backend(device: torch.device) -> Optional[Backend]:
     if _capturing(device) and not _tried(device):
         return None  # a trial waits for the device, which a capture does not survive
     name = backend_for(device)
-    backend = None if name == "torch" else finding(name, device).backend
-    return backend if backend is not None and backend.is_ready(device) else None
+    return None if name == "torch" else finding(name, device).backend
 
 
 def _capturing(device: torch.device) -> bool:
@@ -250,21 +257,30 @@ def _forced() -> Optional[str]:
 
 
 def _try(name: str, device: torch.device) -> Finding:
-    package, module, _ = _KNOWN[name]
     try:
-        if importlib.util.find_spec(package) is None:
-            return Finding(None, False, "it is not installed")
-        if name == "numba" and sys.version_info < (3, 8):
-            return Finding(None, False, "the last numba for Python 3.7 takes minutes to compile the weights")
+        missing = _missing(name)
+        if missing:
+            return Finding(None, False, missing)
         from legs_loss.kernels.trial import difference_from_torch
 
-        backend = importlib.import_module(module).BACKEND
+        backend = importlib.import_module(_KNOWN[name][0]).BACKEND
         threads = torch.get_num_threads()
         problem = difference_from_torch(backend, device)
         torch.set_num_threads(threads)  # numba's first parallel loop sets OpenMP's number, which is torch's too
     except Exception as error:  # whatever a broken install, compiler or driver raises
         return Finding(None, True, _in_words(error))
     return Finding(None if problem else backend, True, problem or "its trial agreed with torch")
+
+
+def _missing(name: str) -> Optional[str]:
+    """Say why a backend is none for this installation."""
+    if name == "cuda":
+        return None if torch.version.cuda else "this torch is built without CUDA"
+    if importlib.util.find_spec(name) is None:
+        return "it is not installed"
+    if sys.version_info < (3, 8):
+        return "the last numba for Python 3.7 takes minutes to compile the weights"
+    return None
 
 
 def _record(name: str, device: torch.device, found: Finding) -> None:

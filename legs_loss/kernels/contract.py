@@ -13,7 +13,11 @@ from torch import Tensor
 
 from legs_loss.spec import WeightSpec
 
-__all__ = ["Backend", "Weights"]
+__all__ = ["Backend", "NotNow", "Weights"]
+
+
+class NotNow(Exception):
+    """An operation cannot be launched now, as in a capture that loading its kernel would break: torch does it once."""
 
 
 class Weights(NamedTuple):
@@ -46,7 +50,7 @@ class Backend:
         name: as in LEGS_BACKEND.
         offers: of "loss", "l1" and "ssim": which of :meth:`loss`, :meth:`weighted_l1` and :meth:`ssim` there are.
         dtypes: of the images.
-        most_channels: how many channels an image may have.
+        most_channels, most_pixels: how many channels and pixels an image may have.
         operators, norms, curves: of the specs whose weights the backend makes by itself; torch makes a map for others.
     """
 
@@ -54,6 +58,7 @@ class Backend:
     offers: FrozenSet[str] = frozenset()
     dtypes: FrozenSet[torch.dtype] = frozenset({torch.float32, torch.float16, torch.bfloat16})
     most_channels: int = 4
+    most_pixels: int = 2**31 - 1
     operators: FrozenSet[str] = frozenset()
     norms: FrozenSet[float] = frozenset()
     curves: FrozenSet[str] = frozenset()
@@ -62,10 +67,6 @@ class Backend:
         """Return whether the weights of a spec need no map: it differs from the defaults in what is known here only."""
         known = WeightSpec(operator=spec.operator, p=spec.p, curve=spec.curve, beta=spec.beta, eps=spec.eps)
         return spec == known and spec.operator in self.operators and spec.p in self.norms and spec.curve in self.curves
-
-    def is_ready(self, device: torch.device) -> bool:
-        """Return whether an operation may be launched now; False where that must not load or compile anything."""
-        return True
 
     def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
         """Return the least response of each view, and the greatest less the least: float32 [B, 2] on its device.

@@ -1,0 +1,59 @@
+"""Compiled kernels on disk: bytes under a key, each file with a checksum; damaged ones are compiled again."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Mapping, Optional
+
+__all__ = ["BinaryCache", "cache_folder"]
+
+_DIGEST = hashlib.sha256().digest_size
+
+
+def cache_folder(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> Path:
+    """Return the folder of compiled kernels: in XDG_CACHE_HOME, LOCALAPPDATA (Windows) or ~/.cache."""
+    if platform == "win32" and environment.get("LOCALAPPDATA"):
+        return Path(environment["LOCALAPPDATA"]) / "legs-loss" / "kernels"
+    base = environment.get("XDG_CACHE_HOME", "")
+    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "legs-loss" / "kernels"
+
+
+class BinaryCache:
+    """A folder of compiled kernels. What cannot be read or written is as if it were not there.
+
+    Args:
+        folder: is made when something is kept.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def get(self, key: bytes) -> Optional[bytes]:
+        """Return what is kept under a key; None where there is nothing, or it is not what was written."""
+        try:
+            content = self._path(key).read_bytes()
+        except OSError:
+            return None
+        digest, binary = content[:_DIGEST], content[_DIGEST:]
+        return binary if binary and hashlib.sha256(key + binary).digest() == digest else None
+
+    def put(self, key: bytes, binary: bytes) -> None:
+        """Keep a binary: the file appears whole or not at all, whoever else writes it meanwhile."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            handle, name = tempfile.mkstemp(dir=str(self.folder))
+        except OSError:
+            return
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(key + binary).digest() + binary)
+            os.replace(name, str(self._path(key)))
+        except OSError:
+            os.unlink(name)
+
+    def _path(self, key: bytes) -> Path:
+        return self.folder / f"{hashlib.sha256(key).hexdigest()}.bin"

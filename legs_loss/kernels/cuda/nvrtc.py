@@ -1,0 +1,180 @@
+"""The compiler: NVRTC, found among torch's own wheels, called through ctypes."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+
+__all__ = ["Compiled", "Compiler", "CompilerError", "NotFound", "candidates", "find_compiler", "resources"]
+
+_LINUX = re.compile(r"libnvrtc(-[0-9a-f]+)?\.so(\.[0-9.]+)?$")
+_WINDOWS = re.compile(r"nvrtc64_[0-9]+_0\.dll$")
+_BUILTINS = re.compile(r"(libnvrtc-builtins(-[0-9a-f]+)?\.so\.[0-9.]+|nvrtc-builtins64_[0-9]+\.dll)$")
+
+
+class NotFound(Exception):
+    """There is no NVRTC; the message says where it was looked for."""
+
+
+class CompilerError(Exception):
+    """NVRTC refused; the message is its log's first error."""
+
+
+class Compiled(NamedTuple):
+    """What a compilation gave.
+
+    Attributes:
+        binary: for ``cuModuleLoadData``: machine code, or PTX where the compiler is older than the GPU.
+        log: what the compiler said.
+    """
+
+    binary: bytes
+    log: str
+
+
+def candidates(folders: Iterable[Path], major: str, platform: str = sys.platform) -> Iterator[Path]:
+    """Yield the NVRTC libraries that lie in folders, those of a major version of CUDA only where the name says it.
+
+    Args:
+        folders: torch's ``lib`` folder, then those that hold packages named ``nvidia``.
+        major: of CUDA, as "12".
+        platform: as ``sys.platform``.
+    """
+    pattern = _WINDOWS if platform == "win32" else _LINUX
+    for folder in folders:
+        nested = [folder] if folder.name == "lib" else sorted((folder / "nvidia").glob("*/*"))
+        for place in nested:
+            if not place.is_dir():
+                continue
+            for path in sorted(place.iterdir()):
+                if pattern.match(path.name) and _of_major(path, major):
+                    yield path
+
+
+def _of_major(path: Path, major: str) -> bool:
+    # CUDA 11 kept the number 11.2 (Windows: 112_0) in all of its versions.
+    version = re.search(r"\.so\.(\d+)|nvrtc64_(\d+)_0", path.name)
+    if version is None:
+        return True
+    number = version.group(1) or version.group(2)[:2]
+    return number == major
+
+
+def find_compiler(folders: Optional[Sequence[Path]] = None, version: Optional[str] = None) -> Compiler:
+    """Return the NVRTC of the CUDA that torch was built with; failing that the one that the system finds by name.
+
+    Raises:
+        NotFound: no library is there, or none of them loads; the message has the last one's reason.
+    """
+    import torch
+
+    version = version or torch.version.cuda or ""
+    major = version.split(".")[0]
+    if folders is None:
+        folders = [Path(torch.__file__).parent / "lib", *(Path(place) for place in sys.path if place)]
+    plain = {"win32": f"nvrtc64_{major}0_0.dll"}.get(sys.platform, f"libnvrtc.so.{'11.2' if major == '11' else major}")
+    reason = "none lies beside torch or in a package named nvidia"
+    for path in [*map(str, candidates(folders, major)), plain]:
+        try:
+            return Compiler(_loaded(path))
+        except (OSError, CompilerError) as error:
+            reason = str(error).splitlines()[0]
+    raise NotFound(f"no NVRTC of CUDA {version} was found: {reason}")
+
+
+def _loaded(path: str) -> Any:
+    folder = os.path.dirname(path)
+    if folder:
+        # NVRTC asks for its builtins by name alone, which the system need not find.
+        for name in sorted(os.listdir(folder)):
+            if _BUILTINS.match(name):
+                ctypes.CDLL(os.path.join(folder, name))
+    return ctypes.CDLL(path)
+
+
+class Compiler:
+    """NVRTC.
+
+    Args:
+        library: as ``ctypes.CDLL`` returns it.
+    """
+
+    def __init__(self, library: Any) -> None:
+        self._library = library
+        major, minor = ctypes.c_int(), ctypes.c_int()
+        self._check(library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)), "nvrtcVersion")
+        self.version = f"{major.value}.{minor.value}"
+
+    def target(self, architecture: int) -> str:
+        """Return what to compile for on a GPU, as "sm_86"; "compute_86" (PTX) where the GPU is newer than NVRTC."""
+        known = self._architectures()
+        if architecture in known:
+            return f"sm_{architecture}"
+        older = [number for number in known if number < architecture]
+        if not older:
+            raise CompilerError(f"NVRTC {self.version} does not compile for sm_{architecture}")
+        return f"compute_{max(older)}"
+
+    def compile(self, source: bytes, options: Sequence[str], target: str) -> Compiled:
+        """Compile a source.
+
+        Raises:
+            CompilerError: it does not compile.
+        """
+        library, program = self._library, ctypes.c_void_p()
+        created = library.nvrtcCreateProgram(ctypes.byref(program), source, b"legs.cu", 0, None, None)
+        self._check(created, "nvrtcCreateProgram")
+        try:
+            given = [option.encode() for option in (f"--gpu-architecture={target}", *options)]
+            code = library.nvrtcCompileProgram(program, len(given), (ctypes.c_char_p * len(given))(*given))
+            log = self._text(program, "ProgramLog").rstrip(b"\0").decode("utf-8", "replace")
+            if code != 0:
+                errors = [line for line in log.splitlines() if "error" in line]
+                raise CompilerError(errors[0] if errors else self._message(code))
+            return Compiled(self._text(program, "CUBIN" if target.startswith("sm_") else "PTX"), log)
+        finally:
+            library.nvrtcDestroyProgram(ctypes.byref(program))
+
+    def _text(self, program: ctypes.c_void_p, what: str) -> bytes:
+        size = ctypes.c_size_t()
+        self._check(getattr(self._library, f"nvrtcGet{what}Size")(program, ctypes.byref(size)), f"nvrtcGet{what}Size")
+        text = ctypes.create_string_buffer(size.value)
+        self._check(getattr(self._library, f"nvrtcGet{what}")(program, text), f"nvrtcGet{what}")
+        return text.raw
+
+    def _architectures(self) -> List[int]:
+        count = ctypes.c_int()
+        code = self._library.nvrtcGetNumSupportedArchs(ctypes.byref(count))
+        self._check(code, "nvrtcGetNumSupportedArchs")
+        numbers = (ctypes.c_int * count.value)()
+        self._check(self._library.nvrtcGetSupportedArchs(numbers), "nvrtcGetSupportedArchs")
+        return list(numbers)
+
+    def _check(self, code: int, what: str) -> None:
+        if code != 0:
+            raise CompilerError(f"{what} failed: {self._message(code)}")
+
+    def _message(self, code: int) -> str:
+        self._library.nvrtcGetErrorString.restype = ctypes.c_char_p
+        return (self._library.nvrtcGetErrorString(code) or b"unknown error").decode()
+
+
+def resources(log: str) -> List[Tuple[str, int, int, int, int]]:
+    """Return of each kernel in the log of ``--ptxas-options=-v``: name, registers, stack, spills, shared bytes."""
+    found = []
+    for part in re.split(r"Compiling entry function '", log)[1:]:
+        numbers = [
+            sum(map(int, re.findall(pattern, part)))
+            for pattern in (
+                r"Used (\d+) registers",
+                r"(\d+) bytes stack frame",
+                r"(\d+) bytes spill (?:stores|loads)",
+                r"(\d+) bytes smem",
+            )
+        ]
+        found.append((part.split("'")[0], numbers[0], numbers[1], numbers[2], numbers[3]))
+    return found

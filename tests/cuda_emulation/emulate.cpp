@@ -1,0 +1,46 @@
+// legs.cu on a CPU: a block's threads run one after the other through each phase, in either order.
+#include <cmath>
+#include <cstring>
+
+#define EMULATED
+#define THREADS 128
+#define DEVICE static inline
+#define SHARED alignas(16)
+#define LANES(type, name) type name[THREADS]
+#define __align__(n) alignas(n)
+#define BLOCK block_index
+#define BLOCKS block_count
+#define KERNEL(name, least_blocks)                                                  \
+    static void name##_block(const Task& k);                                        \
+    extern "C" void name(long long blocks, const Task* task, int backwards) {       \
+        block_count = blocks;                                                       \
+        reversed = backwards != 0;                                                  \
+        for (block_index = 0; block_index < blocks; ++block_index) name##_block(*task); \
+    }                                                                               \
+    static void name##_block(const Task& k)
+
+static long long block_index, block_count;
+static bool reversed;
+
+template <class Lane, class Body>
+static inline void phase(Lane (&lanes)[THREADS], Body body) {
+    for (int i = 0; i < THREADS; ++i) {
+        const int t = reversed ? THREADS - 1 - i : i;
+        body(lanes[t], t);
+    }
+}
+
+template <class To, class From>
+static inline To same_bits(From from) {
+    To to;
+    static_assert(sizeof to == sizeof from, "");
+    std::memcpy(&to, &from, sizeof to);
+    return to;
+}
+static inline float as_float(unsigned bits) { return same_bits<float>(bits); }
+static inline unsigned as_bits(float value) { return same_bits<unsigned>(value); }
+static inline float half_to_float(unsigned short bits) { return (float)same_bits<_Float16>(bits); }
+static inline unsigned short float_to_half(float value) { return same_bits<unsigned short>((_Float16)value); }
+
+#include SOURCE
+extern "C" unsigned long long size_of_task() { return sizeof(Task); }

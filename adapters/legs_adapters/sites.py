@@ -19,12 +19,13 @@ from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.lexicon.views import View
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.doubts import Doubt, Doubts
+from legs_adapters.rules.order import first, first_of_call
+from legs_adapters.rules.rule import CallOfTerm, Term
 from legs_adapters.rules.verdict import Verdicts, left
-from legs_adapters.terms.findings import Findings, Left, Problem, Site
+from legs_adapters.terms.findings import Evidence, Findings, Left, Problem, Site
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import Callback
 from legs_adapters.terms.kinds.run_time import chosen_at_run_time
-from legs_adapters.terms.sides import pair_of
 from legs_adapters.terms.ssim import STRUCTURAL
 from legs_adapters.upstreams import registered
 
@@ -80,7 +81,7 @@ class _Finder:
         settled |= {problem.path for problem in self.found.problems}
         path = doubt.problem.path
         trains = any(root.module.path == path for root in self.analysis.training.roots)
-        return trains and doubt.reason not in ("other", "definition") and path not in settled
+        return trains and doubt.is_told_beside_sites and path not in settled
 
     def _module(self, module: Module) -> None:
         entries: List[_Entry] = []
@@ -121,7 +122,7 @@ class _Finder:
             chosen = self._is_chosen(function, place)
             verdict = self.verdicts.of(function, form, place, chosen)
             if isinstance(verdict, Left) and self.doubts.is_doubtful(function, form, verdict):
-                self.doubtful.append(self.doubts.of(function, form, place, verdict.reason))
+                self.doubtful.append(self.doubts.of(function, form, place, verdict))
             if self.by_hand and not chosen and not isinstance(verdict, Left):
                 verdict = left(function, place, "not chosen")
             if not (isinstance(verdict, Left) and self.doubts.is_noise(function, form, verdict)):
@@ -168,7 +169,7 @@ class _Finder:
                 why = f"nothing shows where {definition.place} is called"
                 advice = f"legs_loss.l1_loss(rendering, photograph, own={one_line(value)}), where it is called"
                 problem = Problem(module.path, line, module.lines.text(line), why, advice)
-                self.doubtful.append(Doubt(problem, "uncalled"))
+                self.doubtful.append(Doubt(problem))
 
     def _is_called(self, function: Function, place: str) -> bool:
         """Whether ``self.loss`` is called by another method of its class."""
@@ -196,13 +197,13 @@ class _Finder:
         return Problem(module.path, place.line, module.lines.text(place.line), why, advice)
 
     def _of_any(self, function: Function, form: Form, place: Place) -> Left | Problem:
-        pair = pair_of(self.analysis.meanings, function, form)
-        reason = self.analysis.reasons.why(function, form, pair)
-        if reason is not None:
-            return left(function, place, reason)
+        term = Term(self.analysis, function, form)
+        evidence = first(term)
+        if evidence is not None:
+            return left(function, place, evidence)
         assert form.callee is not None
         why = f"{one_line(form.callee)} is settled at run time, and may be no L1"
-        return self.verdicts.problem(function, form, place, why, bool(swapped(pair.a, pair.b)))
+        return self.verdicts.problem(function, form, place, why, bool(swapped(term.pair.a, term.pair.b)))
 
     def _is_chosen(self, function: Function, place: Place) -> bool:
         path = function.module.path
@@ -214,13 +215,14 @@ class _Finder:
         where = (function.module.path, place.line, place.column, place.line)
         return Site(*where, form, False, "", False, view, function)
 
-    def _why_not_handed(self, holder: Function, entry: Callback) -> Optional[str]:
-        pair = pair_of(self.analysis.meanings, entry.caller, entry.form)
-        reason = self.analysis.reasons.why(entry.caller, entry.form, pair)
-        if reason is None and entry.outer is not None:
+    def _why_not_handed(self, holder: Function, entry: Callback) -> Optional[Evidence]:
+        term = Term(self.analysis, entry.caller, entry.form)
+        unknown = Evidence("unknown", "unknown", term.here)
+        evidence = first(term)
+        if evidence is None and entry.outer is not None:
             given = [self.analysis.meanings.of(holder, value) for value in arguments(entry.outer)[0][:2]]
-            reason = self.analysis.reasons.use(holder, entry.outer, given) if given else "unknown"
-        return "unknown" if reason is None and swapped(pair.a, pair.b) is not False else reason
+            evidence = first_of_call(CallOfTerm(self.analysis, holder, entry.outer, given)) if given else unknown
+        return unknown if evidence is None and swapped(term.pair.a, term.pair.b) is not False else evidence
 
     def _patched(self, function: Function) -> List[Left]:
         """What refers to legs_loss already: calls, and names that it is given."""

@@ -8,8 +8,8 @@ from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.views import Views
-from legs_adapters.rules.reasons import Reasons
-from legs_adapters.rules.uses import Uses
+from legs_adapters.rules.purpose import Purposes
+from legs_adapters.rules.splats import Splats
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.modules import TORCH
 from legs_adapters.terms.forms import Forms
@@ -30,8 +30,8 @@ class Analysis:
         meanings: what its expressions depict.
         views: whose images its targets are.
         forms: its L1 expressions.
-        reasons: why a form is left.
-        uses: what its functions that compare pictures are called for.
+        purposes: what its backward passes are for.
+        splats: which of its functions are about Gaussian splatting.
         callbacks: the L1 functions that are passed by name.
     """
 
@@ -42,6 +42,6 @@ class Analysis:
         self.meanings = Meanings(self.program, self.training)
         self.views = Views(self.program)
         self.forms = Forms(L1Functions(self.program, self.prospects))
-        self.reasons = Reasons(self.program, self.training, self.meanings, self.forms)
-        self.uses = Uses(self.program, self.training, self.meanings, self.reasons)
+        self.purposes = Purposes(self.program, self.training)
+        self.splats = Splats(self.program, self.training)
         self.callbacks = Callbacks(self.program, self.training, self.forms)

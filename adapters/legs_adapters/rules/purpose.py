@@ -6,7 +6,7 @@ whose gradients are read and thrown away scores Gaussians. Only where something 
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional, Set
+from typing import Dict, List, NamedTuple, Optional, Set
 
 import libcst as cst
 
@@ -27,9 +27,22 @@ from legs_adapters.tensors.steps import (
     only_reads_gradients,
 )
 
-__all__ = ["Purposes"]
+__all__ = ["Purpose", "Purposes"]
 
 _DEPTH = 3
+
+
+class Purpose(NamedTuple):
+    """The purpose of a backward pass that does not train: "tracking", "evaluation" or "scoring"; and what shows it.
+
+    Attributes:
+        word: the purpose.
+        function, node: the step of the optimiser, or the backward pass that no step follows.
+    """
+
+    word: str
+    function: Function
+    node: cst.CSTNode
 
 
 class Purposes:
@@ -40,10 +53,11 @@ class Purposes:
         self.training = training
         self._optimised = Optimised(program)
 
-    def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[str]:
-        """Return "tracking", "evaluation" or "scoring" for an expression that does not train; None where it may."""
+    def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Purpose]:
+        """Return the purpose of an expression that does not train; None where it may."""
         calls = {id(call): call for call in function.flow.calls}
-        if not any(is_backward(call) for call in calls.values()):
+        passes = [call for call in function.flow.calls if is_backward(call)]
+        if not passes:
             return self._of_callers(function, depth)
         scopes = [*loops_around(function.body, node), function.body]
         stepped = False
@@ -55,24 +69,24 @@ class Purposes:
             optimisers = [call for call, elsewhere in inside if is_step(call) and not elsewhere]
             if optimisers:
                 spoken = [self._optimised.words(function, call) for call in optimisers]
-                if all(some & POSES and not some & MODELS for some in spoken):
-                    return "tracking"
-                if all(some & EMBEDDINGS and not some & MODELS for some in spoken):
-                    return "evaluation"
+                for word, moved in (("tracking", POSES), ("evaluation", EMBEDDINGS)):
+                    if all(some & moved and not some & MODELS for some in spoken):
+                        return Purpose(word, function, optimisers[0])
                 return None
             here = {id(call) for call, _ in inside}
             if self._is_stepped_later(function, node, here, calls):
                 continue
             asked = [call for call in function.flow.calls if id(call) in here]
             for_good = self._nobody_steps(function, 0)
-            if only_reads_gradients(scope, asked, for_good) or (for_good and self._read_by_callers(function)):
-                return "scoring"
-            if self._emptied_by_callers(function):
-                return "scoring"
-            if self._reads_its_own(function, scope):
-                return "scoring"
+            if (
+                only_reads_gradients(scope, asked, for_good)
+                or (for_good and self._read_by_callers(function))
+                or self._emptied_by_callers(function)
+                or self._reads_its_own(function, scope)
+            ):
+                return Purpose("scoring", function, next(call for call in asked if is_backward(call)))
         # At a module's top nobody else can take the step.
-        return "scoring" if stepped or function.parent is None else None
+        return Purpose("scoring", function, passes[0]) if stepped or function.parent is None else None
 
     @staticmethod
     def _is_stepped_later(function: Function, node: cst.CSTNode, here: Set[int], calls: Dict[int, cst.Call]) -> bool:
@@ -159,9 +173,9 @@ class Purposes:
         made = [definition.value for definition in function.flow.reaching(model) if definition.kind != "store"]
         return bool(made) and all(isinstance(v, cst.Call) and set(words(call_name(v))) & GAUSSIANS for v in made)
 
-    def _of_callers(self, function: Function, depth: int) -> Optional[str]:
+    def _of_callers(self, function: Function, depth: int) -> Optional[Purpose]:
         sites = self.training.sites.get(function, [])
         if not sites or depth >= _DEPTH:
             return None
-        purposes = {self.purpose(caller, call, depth + 1) for caller, call in sites}
-        return purposes.pop() if len(purposes) == 1 else None
+        purposes = [self.purpose(caller, call, depth + 1) for caller, call in sites]
+        return purposes[0] if len({purpose and purpose.word for purpose in purposes}) == 1 else None

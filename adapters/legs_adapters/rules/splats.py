@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import re
-from typing import Dict, Set
+from typing import Dict, List, Set
 
 import libcst as cst
 
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import code, words
-from legs_adapters.rules.no_pictures import made_of
+from legs_adapters.code.syntax import code, walk_expressions, words
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 
-__all__ = ["Splats"]
+__all__ = ["Splats", "made_of"]
 
 _SPLATS = re.compile(
     r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_gaussian|render_pkg|3dgs|surfel", re.I
@@ -87,3 +86,14 @@ class Splats:
         if path not in self._splats:
             self._splats[path] = _SPLATS.search(self.program.sources[path].text) is not None
         return self._splats[path]
+
+
+def made_of(function: Function, form: Form) -> List[cst.CSTNode]:
+    """The parts of both sides, and of what their names were made from."""
+    parts: List[cst.CSTNode] = [*walk_expressions(form.first), *walk_expressions(form.second)]
+    for part in list(parts):
+        if isinstance(part, cst.Name):
+            for definition in function.flow.reaching(part):
+                if definition.value is not None:
+                    parts.extend(walk_expressions(definition.value))
+    return parts

@@ -8,25 +8,29 @@ import libcst as cst
 
 from legs_adapters.code.calls import calls_of
 from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import arguments, attribute_chain, key_of
-from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.meaning import Meaning, swapped
-from legs_adapters.rules.reasons import Reasons
-from legs_adapters.tensors.backward import Training
+from legs_adapters.rules.analysis import Analysis
+from legs_adapters.rules.order import first_of_call
+from legs_adapters.rules.rule import CallOfTerm
 from legs_adapters.tensors.gradients import detaches, is_without_grad
+from legs_adapters.terms.findings import Evidence
 
 __all__ = ["Use", "Uses"]
 
-_UNKNOWN = "something unknown"
-
 
 class Use(NamedTuple):
-    """One call: what it is for, None for the loss; and whether what it is given says so."""
+    """A call of a function that compares pictures.
+
+    Attributes:
+        caller, call: the call, and the function that it stands in.
+        other: the evidence that it is not for the loss; None where it is.
+        sure: whether what it passes says so.
+    """
 
     caller: Function
     call: cst.Call
-    purpose: Optional[str]
+    other: Optional[Evidence]
     sure: bool
 
     @property
@@ -38,11 +42,8 @@ class Use(NamedTuple):
 class Uses:
     """Answers for one program."""
 
-    def __init__(self, program: Program, training: Training, meanings: Meanings, reasons: Reasons) -> None:
-        self.program = program
-        self.training = training
-        self.meanings = meanings
-        self.reasons = reasons
+    def __init__(self, analysis: Analysis) -> None:
+        self.analysis = analysis
 
     def of(self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> List[Use]:
         """What the calls of a function that compares two parameters of its own are for, as far as training goes."""
@@ -50,22 +51,22 @@ class Uses:
         prediction, target = _whole(prediction), _whole(target)
         if not isinstance(target, cst.Name):
             return []
-        calls = self.training.sites.get(function, [])
+        calls = self.analysis.training.sites.get(function, [])
         for caller, call in sorted(calls, key=lambda site: (site[0].module.path, site[0].place(site[1]).line)):
             photograph = function.given(call, target.value)
             rendering = function.given(call, prediction.value) if isinstance(prediction, cst.Name) else None
             if photograph is not None:
                 given = [node for node in (rendering, photograph) if node is not None]
-                meanings = [self.meanings.of(caller, node) for node in given]
+                meanings = [self.analysis.meanings.of(caller, node) for node in given]
                 sure = not arguments(call)[2] and not any(self._is_handed_on(caller, node) for node in given)
                 if meanings[-1].role is None and detaches(photograph):  # which no photograph needs
                     meanings[-1], sure = meanings[-1]._replace(role="render"), False
-                purpose = self.reasons.use(caller, call, meanings)
-                sure = sure and (purpose is not None or _are_pair(meanings))
-                found.append((Use(caller, call, purpose, sure), meanings[0].kind))
+                other = first_of_call(CallOfTerm(self.analysis, caller, call, meanings))
+                sure = sure and (other is not None or _are_pair(meanings))
+                found.append((Use(caller, call, other, sure), meanings[0].kind))
         pictures = any(kind == "image" for _, kind in found)
         return [
-            use._replace(purpose=_UNKNOWN, sure=False) if pictures and kind is None and use.purpose is None else use
+            use._replace(other=_unknown(use), sure=False) if pictures and kind is None and use.other is None else use
             for use, kind in found
         ]
 
@@ -75,7 +76,7 @@ class Uses:
         Without gradients nothing is weighted, so that what such a call is for does not matter.
         """
         sure = {id(use.call) for use in uses if use.sure}
-        calls = calls_of(self.program, function)
+        calls = calls_of(self.analysis.program, function)
         for caller, call in calls.known:
             if id(call) not in sure and not is_without_grad(caller, call):
                 return f"{caller.module.path}:{caller.place(call).line}"
@@ -83,9 +84,14 @@ class Uses:
 
     def _is_handed_on(self, caller: Function, node: cst.CSTNode) -> bool:
         """Whether it is what a caller was given by several calls of its own, each of which may mean another thing."""
-        several = len(self.training.sites.get(caller, ())) > 1
+        several = len(self.analysis.training.sites.get(caller, ())) > 1
         given = [made for part in attribute_chain(node) for made in caller.flow.reaching(part)] if several else []
         return any(made.kind == "parameter" for made in given)
+
+
+def _unknown(use: Use) -> Evidence:
+    """Return the evidence that it cannot be told what a call is for."""
+    return Evidence("unknown", "something unknown", [(use.caller, use.call)])
 
 
 def _whole(node: cst.CSTNode) -> cst.CSTNode:

@@ -7,21 +7,21 @@ from typing import Optional, Sequence, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import sure_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.syntax import code, one_line, same, walk_expressions
 from legs_adapters.lexicon.masks import is_rows, picked_from
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.analysis import Analysis
-from legs_adapters.rules.uses import Use
+from legs_adapters.rules.order import AMBIGUOUS, DEFINITION, HUBER, ORDER, UNREAD, first
+from legs_adapters.rules.rule import Term
+from legs_adapters.rules.uses import Use, Uses
 from legs_adapters.tensors.layout import is_channels_last, lies_last
-from legs_adapters.terms.error_maps import is_huber, shared_of
-from legs_adapters.terms.findings import Kept, Left, Problem, Site
+from legs_adapters.terms.error_maps import shared_of
+from legs_adapters.terms.findings import Evidence, Kept, Left, Problem, Site
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.named import Named
 from legs_adapters.terms.kinds.reread import Reread
-from legs_adapters.terms.sides import pair_of
 from legs_adapters.terms.writing import Writing
 
 __all__ = ["Verdicts", "left"]
@@ -29,9 +29,10 @@ __all__ = ["Verdicts", "left"]
 _FORWARD = ("forward", "__call__")
 
 
-def left(function: Function, place: Place, reason: str) -> Left:
-    """Return what stands at a place as left for a reason."""
-    return Left(function.module.path, place.line, function.module.lines.text(place.line), reason)
+def left(function: Function, place: Place, why: str | Evidence) -> Left:
+    """Return what stands at a place as left: for what a rule found, or for a reason that no rule has."""
+    reason, evidence = (why, None) if isinstance(why, str) else (why.reason, why)
+    return Left(function.module.path, place.line, function.module.lines.text(place.line), reason, evidence)
 
 
 class Verdicts:
@@ -39,20 +40,17 @@ class Verdicts:
 
     def __init__(self, analysis: Analysis) -> None:
         self.analysis = analysis
+        self.uses = Uses(analysis)
 
     def of(self, function: Function, form: Form, place: Place, by_hand: bool) -> Site | Left | Problem:
         """Return what becomes of a form; ``by_hand`` where a person says that it is the loss."""
-        pair = pair_of(self.analysis.meanings, function, form)
-        if not by_hand:
-            reason = (
-                "definition" if self._is_definition(function, form) else self.analysis.reasons.why(function, form, pair)
-            )
-            if reason is not None:
-                return left(function, place, reason)
+        term = Term(self.analysis, function, form)
+        pair = term.pair
+        evidence = None if by_hand else first(term, (*DEFINITION, *ORDER, *AMBIGUOUS))
+        if evidence is not None:
+            return left(function, place, evidence)
         target_first = swapped(pair.a, pair.b)
         if target_first is None and not by_hand:
-            if not pair.speaks_of_images:
-                return left(function, place, "unknown")
             sides = f"{one_line(pair.first)} and {one_line(pair.second)}"
             why = f"cannot tell which of {sides} is the rendering and which the photograph"
             return self.problem(function, form, place, why)
@@ -67,27 +65,29 @@ class Verdicts:
         ):
             why = "the images are lists of pixels there, of which there is no weight map"
             return self.problem(function, form, place, why, flipped)
-        if is_huber(self.analysis.training, function, form):
-            return left(function, place, "huber")
+        evidence = first(term, HUBER)
+        if evidence is not None:
+            return left(function, place, evidence)
         if form.why_by_hand():
             return self.problem(function, form, place, form.why_by_hand(), flipped)
         if form.is_named and not function.flow.unchanged_at(form.call, form.first, form.second):
             return self.problem(function, form, place, "the difference has a name of its own", flipped)
-        uses = self.analysis.uses.of(function, prediction, target)
-        others = [(use, use.purpose) for use in uses if use.purpose is not None]
+        uses = self.uses.of(function, prediction, target)
+        others = [(use, use.other) for use in uses if use.other is not None]
         if others and len(others) == len(uses):
             return left(function, place, others[0][1])
-        unsettled = self.analysis.uses.unsettled(function, uses) if others else None
+        unsettled = self.uses.unsettled(function, uses) if others else None
         if unsettled is not None:  # its body cannot be both
-            first, purpose = others[0]
-            why = f"{function.name} also serves {purpose} at {first.where}"
-            why += f"; what it serves at {unsettled} cannot be told" if unsettled != first.where else ""
+            use, other = others[0]
+            why = f"{function.name} also serves {other.reason} at {use.where}"
+            why += f"; what it serves at {unsettled} cannot be told" if unsettled != use.where else ""
             problem = self.problem(function, form, place, why, flipped)
             return problem._replace(advice=problem.advice + _in_a_copy(function, uses))
+        evidence = first(Term(self.analysis, function, form), UNREAD)
+        if evidence is not None:
+            return left(function, place, evidence)
         shared = shared_of(self.analysis.training, function, form)
         aside: Tuple[cst.Name, ...] = ()
-        if shared is not None and not shared.trains:
-            return left(function, place, "weighting" if self.analysis.training.touches(function) else "untrained")
         if shared is not None and shared.loss:
             form = Reread.of(form, shared.loss[0])
             place = function.place(form.node)
@@ -99,7 +99,7 @@ class Verdicts:
         last = last or (picked is not None and lies_last(function, picked[0]))
         view = self.analysis.views.of(function, target, form.call)
         stands = (function.module.path, place.line, place.column, place.last_line)
-        kept = tuple(self._kept(function, *other) for other in others)
+        kept = tuple(self._kept(function, use, other.reason) for use, other in others)
         return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside, kept)
 
     @staticmethod
@@ -137,16 +137,6 @@ class Verdicts:
         )
         return any(lie)
 
-    def _is_definition(self, function: Function, form: Form) -> bool:
-        """Whether this is the body of the codebase's own L1 function, whose calls are what counts."""
-        if self.analysis.forms.functions.shape(function) is None:
-            return False
-        calls = self.analysis.training.sites.get(function) or list(sure_calls(self.analysis.program, function))
-        known = {id(f.call) for caller, _ in calls for f in self.analysis.forms.of(caller)}
-        return function in self.analysis.callbacks.functions or all(
-            id(call) in known or self.analysis.forms.functions.shape(caller) is not None for caller, call in calls
-        )
-
     def problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
         """Return a form as a problem, with the text to write there by hand."""
         module = function.module
@@ -168,7 +158,7 @@ def _is_same_place(function: Function, first: cst.CSTNode, second: cst.CSTNode) 
 
 def _in_a_copy(function: Function, uses: Sequence[Use]) -> str:
     """Where to write it, for a function that some calls need as it is."""
-    calls = [use.where for use in uses if use.purpose is None]
+    calls = [use.where for use in uses if use.other is None]
     shown = ", ".join(calls[:3]) + (f" and {len(calls) - 3} more" if len(calls) > 3 else "")
     return f", in a copy of {_called(function)} for {shown}" if calls else ""
 

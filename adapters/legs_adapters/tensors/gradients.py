@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Optional
+from typing import Optional, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import attribute_chain, call_name, constant, walk_expressions
 
-__all__ = ["detaches", "is_detached", "is_without_grad", "under_no_grad"]
+__all__ = ["detaches", "is_detached", "is_without_grad", "no_grad_around", "under_no_grad"]
 
 _NO_GRAD = {"no_grad", "inference_mode", "set_grad_enabled"}
 
@@ -21,16 +21,19 @@ def under_no_grad(function: Function, node: cst.CSTNode) -> bool:
 
 def is_without_grad(function: Function, *nodes: cst.CSTNode) -> bool:
     """Return whether expressions stand where no gradient is kept: in a block, or by a decorator of a function."""
-    scope: Optional[Function] = function
-    if any(under_no_grad(function, node) for node in nodes):
-        return True
-    while scope is not None:
-        if set(scope.decorators) & {"no_grad", "inference_mode"}:
-            return True
-        if scope.parent is not None and under_no_grad(scope.parent, scope.node):
-            return True
-        scope = scope.parent
-    return False
+    return no_grad_around(function, *nodes) is not None
+
+
+def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Function, cst.CSTNode]]:
+    """Return what keeps no gradient around expressions, with its function: the block's call, or the decorator."""
+    for node in nodes:
+        for context in function.flow.contexts.get(id(node), ()):
+            if _stops_gradients(context):
+                return function, context
+    for decorator, name in zip(getattr(function.node, "decorators", ()), function.decorators):
+        if name in ("no_grad", "inference_mode"):
+            return function.parent or function, decorator.decorator
+    return no_grad_around(function.parent, function.node) if function.parent is not None else None
 
 
 def is_detached(node: cst.CSTNode) -> bool:

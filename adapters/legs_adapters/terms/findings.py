@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Tuple
+from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
 
@@ -12,7 +12,9 @@ from legs_adapters.code.sources import Unreadable
 from legs_adapters.lexicon.views import View
 from legs_adapters.terms.form import Form
 
-__all__ = ["Findings", "Kept", "Left", "Problem", "Site"]
+__all__ = ["Decider", "Evidence", "Findings", "Kept", "Left", "Line", "Problem", "Site"]
+
+Decider = Tuple[Function, cst.CSTNode]
 
 
 class Kept(NamedTuple):
@@ -75,13 +77,48 @@ class Site(NamedTuple):
         return self.line <= line <= self.last_line
 
 
+class Line(NamedTuple):
+    """A line of a checkout: where it is, and what it says."""
+
+    path: str
+    line: int
+    text: str
+
+
+class Evidence(NamedTuple):
+    """The rule for which a term is left, and what decided it.
+
+    Attributes:
+        rule: the rule's id.
+        reason: its word for the report.
+        deciders: the nodes that decided, each with the function that it stands in; never empty.
+    """
+
+    rule: str
+    reason: str
+    deciders: Sequence[Decider]
+
+    @property
+    def lines(self) -> List[Line]:
+        """The lines that decided."""
+        found = [(function.module, function.place(node).line) for function, node in self.deciders]
+        return [Line(module.path, line, module.lines.text(line)) for module, line in found]
+
+
 class Left(NamedTuple):
-    """An L1 that was seen and left, with one word why."""
+    """An L1 that was seen and left.
+
+    Attributes:
+        path, line, text: where it stands, and what that line says.
+        reason: why, in one word.
+        evidence: the rule and what decided; None where no rule did.
+    """
 
     path: str
     line: int
     text: str
     reason: str
+    evidence: Optional[Evidence] = None
 
 
 class Problem(NamedTuple):

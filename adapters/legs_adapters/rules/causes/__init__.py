@@ -1,0 +1,1 @@
+"""One file for each cause for which a term is left."""

@@ -1,0 +1,46 @@
+"""Leave the body of the codebase's own L1 function: its calls are the terms."""
+
+from __future__ import annotations
+
+from typing import List
+
+from legs_adapters.code.calls import sure_calls
+from legs_adapters.code.syntax import words
+from legs_adapters.rules.rule import Rule, Term, header
+from legs_adapters.terms.findings import Decider
+
+__all__ = ["Definition"]
+
+_FORWARD = ("forward", "__call__")
+
+
+class Definition(Rule):
+    """It is the body of the codebase's own L1 function, whose calls are what counts.
+
+    left:
+        def photometric(image, gt):
+            return torch.abs(image - gt).mean()
+
+    weighted: loss = l1_loss(image, gt)
+    """
+
+    id = reason = "definition"
+    is_always_listed = True
+    is_doubted_beside_sites = False
+
+    def evidence(self, term: Term) -> List[Decider]:
+        function, analysis = term.function, term.analysis
+        shape = analysis.forms.functions.shape
+        if shape(function) is None:
+            return []
+        calls = analysis.training.sites.get(function) or list(sure_calls(analysis.program, function))
+        known = {id(form.call) for caller, _ in calls for form in analysis.forms.of(caller)}
+        own = function in analysis.callbacks.functions or all(
+            id(call) in known or shape(caller) is not None for caller, call in calls
+        )
+        return [header(function)] if own else []
+
+    def may_be_loss(self, term: Term) -> bool:
+        """Return whether it is the body of a module, or of a method that is named a loss."""
+        function = term.function
+        return function.name in _FORWARD or (function.owner is not None and "loss" in words(function.name))

@@ -1,0 +1,96 @@
+"""Leave a term that is not the loss of a Gaussian model: of rays, a mesh, a network, a hidden message."""
+
+from __future__ import annotations
+
+import re
+from typing import List
+
+import libcst as cst
+
+from legs_adapters.code.syntax import attribute_chain, code, loops_around, walk_expressions, word_set, words
+from legs_adapters.lexicon.masks import picked_from
+from legs_adapters.lexicon.renderings import is_of_mesh, is_rendering
+from legs_adapters.rules.causes.features import compared
+from legs_adapters.rules.rule import Rule, Term, header
+from legs_adapters.terms.findings import Decider
+from legs_adapters.terms.sides import of_rays
+from legs_adapters.terms.ssim import is_beside_ssim
+
+__all__ = ["FixedTarget", "NotSplats"]
+
+_BUNDLES = {"ray_bundle", "ray_samples"}
+_RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
+_OF_VIEWS = word_set("batch cam camera cameras cams data frame frames item scene view views viewpoint viewpoints")
+
+
+class _Other(Rule):
+    reason = "other"
+    is_doubted_beside_sites = False
+
+    def may_be_loss(self, term: Term) -> bool:
+        return True
+
+
+class FixedTarget(_Other):
+    """The target is made once, before the loop over the views, of nothing that has views.
+
+    left:
+        def training(gaussians, cameras, detector):
+            secret_image = torch.rand(3, 64, 64)
+            for camera in cameras:
+                image = render(camera, gaussians, None, None)["render"]
+                loss = l1_loss(image, camera.original_image)
+                loss = loss + l1_loss(detector(image), secret_image)
+                loss.backward()
+                gaussians.optimizer.step()
+
+    weighted: loss = l1_loss(image, gt)
+    """
+
+    id = "fixed-target"
+
+    def evidence(self, term: Term) -> List[Decider]:
+        function, target = term.function, term.target
+        loops = loops_around(function.body, term.call)
+        made = function.flow.reaching(list(attribute_chain(target))[-1])
+        values = [d.value for d in made if d.kind == "assign" and isinstance(d.value, cst.Call)]
+        if not loops or not values or len(values) != len(made) or is_rendering(function, term.prediction):
+            return []
+        named = [part for value in values for part in walk_expressions(value) if isinstance(part, cst.Name)]
+        inside = {id(part) for part in walk_expressions(loops[-1])}
+        if any(id(name) in inside or set(words(name.value)) & _OF_VIEWS for name in named):
+            return []
+        beside = any(
+            id(call) in inside and (is_rendering(function, one) or is_rendering(function, other))
+            for call, one, other in compared(term.analysis.forms, function)
+        )
+        return [(function, value) for value in values] if beside else []
+
+
+class NotSplats(_Other):
+    """Nothing around the term speaks of Gaussian splatting; or its sides are colours of rays, or of a mesh.
+
+    left: loss = l1_loss(image[ray_indexes], gt[ray_indexes])
+    weighted: loss = l1_loss(image, gt)
+    """
+
+    id = "not-splats"
+
+    def evidence(self, term: Term) -> List[Decider]:
+        function, analysis = term.function, term.analysis
+        if not analysis.splats.about(function, term.form):
+            return [header(function)]
+        picked = all(picked_from(analysis.meanings, function, side) for side in term.sides)
+        by_class = _ray_method(term)
+        if ((of_rays(term.form) and not picked) or by_class) and not is_beside_ssim(function, *term.sides):
+            return by_class or term.here
+        mesh = any(is_of_mesh(analysis.program, function, side) for side in term.sides)
+        eikonal = "eikonal" in function.module.text and _RAY_COLOURS.search(code(term.form.node))
+        return term.here if mesh or eikonal else []
+
+
+def _ray_method(term: Term) -> List[Decider]:
+    """Return the method of its class that takes rays, which make no picture: ``get_outputs(self, ray_bundle)``."""
+    owner = term.analysis.program.owner_of(term.function)
+    methods = owner.methods.values() if owner is not None else ()
+    return [header(method) for method in methods if _BUNDLES & set(method.parameters)][:1]

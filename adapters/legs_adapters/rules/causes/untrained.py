@@ -1,0 +1,196 @@
+"""Leave a term that no backward pass reaches: for scoring, for evaluation, or for what cannot be seen."""
+
+from __future__ import annotations
+
+from typing import AbstractSet, Iterator, List, Tuple
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.syntax import call_name, word_set, words
+from legs_adapters.rules.causes.evaluation import EvaluationRule
+from legs_adapters.rules.rule import ByPurpose, Rule, Term, header
+from legs_adapters.tensors.gradients import is_without_grad, no_grad_around
+from legs_adapters.tensors.operations import JOINS
+from legs_adapters.terms.findings import Decider
+
+__all__ = ["Evaluation", "Leaf", "NoStep", "Scoring", "Untrained"]
+
+_EVALUATION = word_set(
+    """
+    eval evaluate evaluation test testing report reports metric metrics valid validate validation render
+    visualize vis benchmark compare psnr quality
+    """
+)
+_SCORING = word_set(
+    """
+    score scores scoring importance densify densification prune pruning sensitivity sample sampling error
+    """
+)
+
+
+class _Scoring(Rule):
+    reason = "scoring"
+
+
+class Scoring(_Scoring):
+    """No backward pass reaches the term, and it is for densification or pruning, as a name says.
+
+    left:
+        def importance_score(gaussians, camera):
+            image = render(camera, gaussians, None, None)["render"]
+            return torch.abs(image - camera.original_image)
+
+    weighted: loss = torch.abs(image - gt).mean()
+    """
+
+    id = "scoring"
+
+    def evidence(self, term: Term) -> List[Decider]:
+        return _said(term, _SCORING) if _is_untrained(term) else []
+
+
+class NoStep(ByPurpose, _Scoring):
+    """Nothing steps on the gradients: they are read and thrown away, to score the Gaussians.
+
+    left:
+        def drop_unseen(gaussians, cameras):
+            for camera in cameras:
+                image = render(camera, gaussians, None, None)["render"]
+                l1_loss(image, camera.original_image).backward()
+                weight = gaussians.points.grad.norm()
+                gaussians.optimizer.zero_grad()
+
+    weighted: loss = l1_loss(image, gt)
+    """
+
+    id = "no-step"
+
+
+class Evaluation(EvaluationRule):
+    """No backward pass reaches the term, and it stands under ``no_grad``, or in what reports or tests.
+
+    left:
+        with torch.no_grad():
+            error = l1_loss(image, gt)
+
+    weighted: loss = l1_loss(image, gt)
+    """
+
+    id = "evaluation"
+
+    def evidence(self, term: Term) -> List[Decider]:
+        if not _is_untrained(term):
+            return []
+        around = no_grad_around(term.function, term.call, term.form.node)
+        return [around] if around is not None else _said(term, _EVALUATION)
+
+
+class _Untrained(Rule):
+    reason = "untrained"
+    is_listed_for_pictures = True
+
+    def may_be_loss(self, term: Term) -> bool:
+        return True
+
+
+class Untrained(_Untrained):
+    """No backward pass reaches the term, and nothing says what it is for.
+
+    left:
+        def photometric(gaussians, camera):
+            image = render(camera, gaussians, None, None)["render"]
+            return torch.abs(image - camera.original_image).mean()
+
+    weighted: loss = torch.abs(image - gt).mean()
+    """
+
+    id = "untrained"
+
+    def evidence(self, term: Term) -> List[Decider]:
+        return [header(term.function)] if _is_untrained(term) else []
+
+
+class Leaf(_Untrained):
+    """A side is a tensor whose own gradient is asked for: no rendering made it.
+
+    left:
+        image = torch.tensor(camera.pixels).requires_grad_()
+        loss = l1_loss(image, gt)
+
+    weighted: loss = l1_loss(image, gt)
+    """
+
+    id = "leaf"
+
+    def evidence(self, term: Term) -> List[Decider]:
+        return [found for side in term.sides for found in _leaves(term.function, side)][:1]
+
+
+def _is_untrained(term: Term) -> bool:
+    """Return whether no backward pass reaches a term, or no gradient is kept of it."""
+    training, form = term.analysis.training, term.form
+    trained = training.includes(form.node) or training.includes(form.call) or _is_called_by_framework(term)
+    return not trained or is_without_grad(term.function, form.call, form.node) or _is_asked_without_grad(term)
+
+
+def _is_called_by_framework(term: Term) -> bool:
+    """Return whether it makes the loss of a module's ``forward``, whose caller is settled at run time (a registry)."""
+    training = term.analysis.training
+    if not {"loss", "losses"} & set(words(term.function.name)):
+        return False
+    above = [term.function, *_callers(term, term.function)]
+    above += [caller for callee in above[1:] for caller in _callers(term, callee)]
+    if any(set(words(f.name)) & (_EVALUATION | _SCORING) for f in above):
+        return False
+    return bool(training.roots) and any(
+        f.name == "forward" and f.owner is not None and f not in training.sites for f in above
+    )
+
+
+def _is_asked_without_grad(term: Term) -> bool:
+    """Return whether no caller keeps a gradient of it: an error map for the next step's mask."""
+    sites = term.analysis.training.sites.get(term.function, [])
+    return bool(sites) and all(is_without_grad(caller, call) for caller, call in sites)
+
+
+def _said(term: Term, spoken: AbstractSet[str]) -> List[Decider]:
+    """Return the first of the term's function, its class and its callers whose name is one of some words."""
+    for function, name in _names(term):
+        if spoken & set(words(name)):
+            return [header(function)]
+    return []
+
+
+def _names(term: Term) -> Iterator[Tuple[Function, str]]:
+    yield term.function, term.class_name
+    above = queue = [term.function]
+    for _ in range(2):
+        queue = [caller for callee in queue for caller in _callers(term, callee)]
+        above = above + queue
+    for function in above:
+        yield function, function.name
+        yield function, function.module.path.rsplit("/", 1)[-1]
+
+
+def _callers(term: Term, function: Function) -> List[Function]:
+    if not function.name or function.name.startswith("__"):
+        return []
+    return [
+        caller
+        for caller in term.analysis.program.mentioning(function.name, called=True)
+        if caller is not function
+        and caller.parent is not None
+        and any(call_name(call) == function.name for call in caller.flow.calls)
+    ][:8]
+
+
+def _leaves(function: Function, node: cst.CSTNode) -> List[Decider]:
+    """``image = torch.tensor(array).requires_grad_()``: whose gradient is looked at, made by no rendering.
+
+    ``torch.cat(images).requires_grad_()`` has those of the renderings.
+    """
+    values = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
+    calls = [value for value in values if isinstance(value, cst.Call) and call_name(value) == "requires_grad_"]
+    bases = [(call, call.func.value) for call in calls if isinstance(call.func, cst.Attribute)]
+    return [(function, call) for call, of in bases if not (isinstance(of, cst.Call) and call_name(of) in JOINS)]

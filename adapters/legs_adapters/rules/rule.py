@@ -1,0 +1,178 @@
+"""The base class of the rules, each a cause for which a term is left; and what a rule is asked about.
+
+A rule is a class in ``causes/``. Its docstring says why in one sentence, then shows a term that it leaves and one that
+is weighted; both are tests. ``order.py`` lists the rules in the order in which they are asked.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Callable, List, Optional, Sequence
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.syntax import walk_expressions
+from legs_adapters.lexicon.meaning import Meaning, swapped
+from legs_adapters.terms.findings import Decider
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.sides import Pair, pair_of
+
+if TYPE_CHECKING:
+    from legs_adapters.rules.analysis import Analysis
+
+__all__ = ["Asked", "ByPurpose", "CallOfTerm", "Rule", "Term", "header", "source_of"]
+
+_DEPTH = 3
+
+
+class Asked:
+    """A call in a function, and the analyses of its program.
+
+    Attributes:
+        analysis: those analyses.
+        function: the function that the call stands in.
+        call: the call.
+    """
+
+    def __init__(self, analysis: Analysis, function: Function, call: cst.CSTNode) -> None:
+        self.analysis = analysis
+        self.function = function
+        self.call = call
+
+    def serves(self, purpose: str) -> List[Decider]:
+        """Return what shows that its backward pass has this purpose; nothing where that may be another, or training."""
+        found = self.analysis.purposes.purpose(self.function, self.call)
+        return [(found.function, found.node)] if found is not None and found.word == purpose else []
+
+    @property
+    def class_name(self) -> str:
+        """The name of the class that the function is a method of; empty without."""
+        owner = self.analysis.program.owner_of(self.function)
+        return owner.name if owner is not None else ""
+
+
+class Term(Asked):
+    """A photometric term.
+
+    Attributes:
+        form: the expression.
+        pair: its two sides, and what they depict.
+    """
+
+    def __init__(self, analysis: Analysis, function: Function, form: Form, pair: Optional[Pair] = None) -> None:
+        super().__init__(analysis, function, form.call)
+        self.form = form
+        self.pair = pair or pair_of(analysis.meanings, function, form)
+
+    @property
+    def sides(self) -> Sequence[cst.BaseExpression]:
+        """Both sides as they are written."""
+        return self.form.first, self.form.second
+
+    @property
+    def target(self) -> cst.BaseExpression:
+        """The side that is the photograph; the second where neither says so."""
+        return self.pair.first if swapped(self.pair.a, self.pair.b) else self.pair.second
+
+    @property
+    def prediction(self) -> cst.BaseExpression:
+        """The other side."""
+        return self.pair.second if swapped(self.pair.a, self.pair.b) else self.pair.first
+
+    @property
+    def here(self) -> List[Decider]:
+        """The term itself, as what decided."""
+        return [(self.function, self.form.node)]
+
+
+class CallOfTerm(Asked):
+    """A call of a function that compares two of its parameters.
+
+    Attributes:
+        given: what the call passes for the rendering, where that is known, and for the photograph.
+    """
+
+    def __init__(self, analysis: Analysis, caller: Function, call: cst.Call, given: Sequence[Meaning]) -> None:
+        super().__init__(analysis, caller, call)
+        self.given = given
+
+    @property
+    def here(self) -> List[Decider]:
+        """The call itself, as what decided."""
+        return [(self.function, self.call)]
+
+
+class Rule:
+    """One cause for which a term is left.
+
+    Attributes:
+        id: its name, for ``--explain`` and the report.
+        reason: the word in the report; several rules may share it.
+        is_picture: the term compares pictures in a training step, of another kind than photographs.
+        is_always_listed: the report lists the term, also where it is a bare absolute difference.
+        is_listed_for_pictures: the report lists a bare absolute difference where it is of a rendering and a photograph.
+        needs_target: a person is asked about the term only if a side is known to be the photograph.
+        is_doubted_beside_sites: a person is asked about the term also where the codebase has other terms.
+    """
+
+    id = ""
+    reason = ""
+    is_picture = False
+    is_always_listed = False
+    is_listed_for_pictures = False
+    needs_target = True
+    is_doubted_beside_sites = True
+
+    def evidence(self, term: Term) -> List[Decider]:
+        """Return what decides that a term is left; nothing where the rule does not apply."""
+        raise NotImplementedError
+
+    def of_call(self, call: CallOfTerm) -> List[Decider]:
+        """Return what decides that a call is not for the loss; nothing where the rule does not apply."""
+        return []
+
+    def may_be_loss(self, term: Term) -> bool:
+        """Return whether a person is to be asked about a term that this rule left, if nothing else is found."""
+        return False
+
+
+class ByPurpose(Rule):
+    """A rule that leaves a term, or a call, for the purpose of its backward pass: the rule's reason."""
+
+    def evidence(self, term: Asked) -> List[Decider]:
+        """Return the step, or the backward pass without one, that shows the purpose."""
+        return term.serves(self.reason)
+
+    def of_call(self, call: CallOfTerm) -> List[Decider]:
+        """Return the same of a call."""
+        return self.evidence(call)
+
+
+def header(function: Function) -> Decider:
+    """Return the ``def`` of a function as what decided."""
+    name = function.node.name if isinstance(function.node, cst.FunctionDef) else function.node
+    return function.parent or function, name
+
+
+def source_of(
+    function: Function, node: cst.CSTNode, says: Optional[Callable[[str], bool]] = None, depth: int = 0
+) -> Optional[Decider]:
+    """Return where an expression or what it is made from says something: the name, string or definition that does.
+
+    Args:
+        function: where the expression stands.
+        node: the expression.
+        says: a function of a name's or string's text; without, the nearest definition is returned.
+        depth: how many definitions were followed already.
+    """
+    parts = list(walk_expressions(node))
+    for part in parts:
+        if says is not None and isinstance(part, (cst.Name, cst.SimpleString)) and says(part.value):
+            return function, part
+    for part in parts if depth < _DEPTH else ():
+        for made in sorted(function.flow.reaching(part), key=lambda definition: definition.order):
+            if made.value is not None:
+                found = source_of(function, made.value, says, depth + 1) if says else (function, made.value)
+                if found is not None:
+                    return found
+    return None

@@ -8,6 +8,7 @@ A name is imported when it is first asked for: legs-patch, which needs none of t
 torch.
 """
 
+import functools
 import importlib
 import sys
 from types import ModuleType
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from legs_loss.runtime import configure, l1_loss, unweighted
     from legs_loss.spec import PRESETS, WeightSpec
     from legs_loss.ssim import d_ssim, ssim
+    from legs_loss.upstreams import apply_to
     from legs_loss.weights import weight_map
 
 _HOMES = {
@@ -32,6 +34,7 @@ _HOMES = {
     "LegsError": "errors",
     "WeightSpec": "spec",
     "__version__": "_version",
+    "apply_to": "upstreams",
     "configure": "runtime",
     "d_ssim": "ssim",
     "l1_loss": "runtime",
@@ -51,6 +54,7 @@ __all__ = [
     "LegsError",
     "WeightSpec",
     "__version__",
+    "apply_to",
     "configure",
     "d_ssim",
     "l1_loss",
@@ -66,6 +70,10 @@ __all__ = [
 
 class _Package(ModuleType):
     def __getattr__(self, name: str) -> object:
+        if name.startswith("apply_to_"):  # legs_loss.apply_to_gsplat()
+            library = name[len("apply_to_") :]
+            if library in importlib.import_module("legs_loss.plugins").plugins("legs_loss.upstreams"):
+                return functools.partial(self.apply_to, library)
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

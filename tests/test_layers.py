@@ -9,6 +9,7 @@ from typing import Iterator, List, Tuple
 
 import pytest
 
+from legs_loss.plugins import plugins
 from tests.support import ROOT
 
 CORE, ADAPTERS = ROOT / "legs_loss", ROOT / "adapters" / "legs_adapters"
@@ -46,6 +47,17 @@ def test_the_adapters_import_only_the_core_s_public_names() -> None:
     used = from_package(ADAPTERS, "legs_loss")
     assert [line for line in used if not is_public(*line[1:])] == []
     assert len(used) > 20  # the folder was found
+
+
+def test_the_core_imports_nothing_of_the_adapters() -> None:
+    assert from_package(CORE, "legs_adapters") == []
+    assert len(from_package(CORE, "legs_loss")) > 100  # the folder was found
+
+
+def test_what_the_adapters_add_is_found_by_entry_points() -> None:
+    again = "the installed metadata is older than the checkout: pip install -e ."
+    assert "run" in plugins("legs_loss.commands"), again
+    assert {"gsplat", "nerfstudio"} <= set(plugins("legs_loss.upstreams")), again
 
 
 def test_a_private_name_is_told_from_a_public_one() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -22,6 +23,7 @@ from legs_adapters.undo import undo
 
 from legs_loss import LegsError
 from tests.patching_support import NAMES, checkout, expected, files, legs_patch, run_git, snapshot
+from tests.support import ROOT
 
 SITE = "        Ll1 = l1_loss(image, gt_image)\n"
 PATCHED = "        Ll1 = legs_loss.l1_loss(image, gt_image, view=viewpoint_cam.image_name)\n"
@@ -639,3 +641,15 @@ class TestCommandLine:
         assert "legs.toml is there already" in refused.stderr
         assert run("--undo", root).returncode == 0
         assert (root / "legs.toml").read_text() == "beta = 3.0\n"
+
+
+def test_the_pre_commit_hook_fails_until_the_checkout_is_patched(tmp_path):
+    hook = dict(re.findall(r"^[- ] (\w+): (.*)$", (ROOT / ".pre-commit-hooks.yaml").read_text(encoding="utf-8"), re.M))
+    assert hook["id"] == "legs-patch-check" and hook["pass_filenames"] == "false"
+    program, *arguments = hook["entry"].split()
+    assert program == "legs-patch"
+    root = checkout(tmp_path / "fork", files("inria"), git=True)
+    assert legs_patch(*arguments, cwd=str(root)).returncode == 1
+    assert legs_patch(".", cwd=str(root)).returncode == 0
+    done = legs_patch(*arguments, cwd=str(root))
+    assert done.returncode == 0, done.stdout + done.stderr

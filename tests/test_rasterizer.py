@@ -381,7 +381,7 @@ class TestErrors:
 
     def test_without_numba(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "numba", None)
-        with pytest.raises(LegsError, match=r"pip install legs-loss\[cpu\]"):
+        with pytest.raises(LegsError, match=r"pip install 'legs-loss\[cpu\]"):
             rasterize(*scene(), camera(), BACKGROUND, 3)
 
 

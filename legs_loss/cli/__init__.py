@@ -1,8 +1,12 @@
-"""The ``legs`` command. Each sub-command is one module here: HELP, add_arguments(parser), run(args)."""
+"""The ``legs`` command. Each sub-command is one module: HELP, add_arguments(parser), run(args).
+
+It lies here, or another package registers it in the entry point group ``legs_loss.commands``.
+"""
 
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import sys
 from typing import Optional, Sequence
@@ -10,10 +14,11 @@ from typing import Optional, Sequence
 from legs_loss._version import __version__
 from legs_loss.cli.parser import Parser
 from legs_loss.errors import LegsError
+from legs_loss.plugins import plugins
 
 __all__ = ["main"]
 
-COMMANDS = ("scene", "precompute", "show", "info", "train", "demo", "compare", "report", "env", "run")
+COMMANDS = ("scene", "precompute", "show", "info", "train", "demo", "compare", "report", "env")
 
 EXIT_CODES = "exit codes: 0 done; 1 done, but some items failed; 2 bad input or usage; 130 interrupted"
 
@@ -40,8 +45,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_completion(parser)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.required = True
-    for name in COMMANDS:
-        command = importlib.import_module(f"legs_loss.cli.{name}")
+    found = {name: functools.partial(importlib.import_module, f"legs_loss.cli.{name}") for name in COMMANDS}
+    for name, load in {**found, **plugins("legs_loss.commands")}.items():
+        command = load()
         sub = commands.add_parser(name, help=command.HELP, description=command.__doc__, epilog=EXIT_CODES)
         command.add_arguments(sub)
         sub.set_defaults(run=command.run)

@@ -2,31 +2,31 @@
 
 As `python SCRIPT ARGUMENTS`, with the photometric L1 term of its training step weighted: the same edits as legs-patch
 makes, in memory. Settings come from legs.toml and LEGS_* variables, as for a patched script. With --cpu, what the
-script asks of CUDA is answered by the CPU, and its rasterizer by a stand-in: slow, but it trains.
+script asks of CUDA is answered by the CPU, and its rasterizer by a shim: slow, but it trains.
 """
 
 from __future__ import annotations
 
 import argparse
 
+from legs_loss import LegsError
+
 HELP = "run a training script with the LEGS loss, its files untouched"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--cpu", action="store_true", help="run without a GPU, with stand-ins for CUDA modules")
+    parser.add_argument("--cpu", action="store_true", help="run without a GPU, with shims for CUDA modules")
     parser.add_argument("script", metavar="SCRIPT", help="the training script")
     parser.add_argument("arguments", metavar="...", nargs=argparse.REMAINDER, help="its own arguments")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run it, and return its exit code."""
-    from legs_loss.errors import LegsError
-
     try:
         from legs_adapters.runner import run_script
     except ModuleNotFoundError as error:
-        if error.name not in ("libcst", "legs_adapters"):
+        if error.name != "libcst":
             raise
         raise LegsError("legs run wants LibCST: pip install 'legs-loss[patch]'") from None
     return run_script(args.script, args.arguments, args.cpu)

@@ -9,7 +9,7 @@ import argparse
 import functools
 import importlib
 import sys
-from typing import Optional, Sequence
+from typing import Any, Callable, Dict, Optional, Sequence
 
 from legs_loss._version import __version__
 from legs_loss.cli.parser import Parser
@@ -45,8 +45,10 @@ def _parser() -> argparse.ArgumentParser:
     _add_completion(parser)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.required = True
-    found = {name: functools.partial(importlib.import_module, f"legs_loss.cli.{name}") for name in COMMANDS}
-    for name, load in {**found, **plugins("legs_loss.commands")}.items():
+    modules: Dict[str, Callable[[], Any]] = {
+        name: functools.partial(importlib.import_module, f"{__name__}.{name}") for name in COMMANDS
+    }
+    for name, load in {**modules, **plugins("legs_loss.commands")}.items():
         command = load()
         sub = commands.add_parser(name, help=command.HELP, description=command.__doc__, epilog=EXIT_CODES)
         command.add_arguments(sub)

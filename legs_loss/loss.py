@@ -130,7 +130,11 @@ class LEGSLoss(nn.Module):
     """:func:`legs_loss` as a Module: the settings once, then the images of each step.
 
     Args:
-        spec, lambda_dssim, padding, renormalise, channels_last: as for :func:`legs_loss`.
+        spec: as for :func:`legs_loss`, like the others.
+        lambda_dssim: the share of D-SSIM.
+        padding: of SSIM.
+        renormalise: divide the masked L1 term by the mask's mean.
+        channels_last: where the channel stands.
 
     Shape:
         prediction, target: [C, H, W] or [B, C, H, W]; weight, mask: one value a pixel; output: a scalar.

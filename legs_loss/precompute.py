@@ -70,7 +70,8 @@ def precompute(
         out: the store's folder, ``legs_weights`` in the scene by default, where a training script finds it by itself.
             Maps already there are kept: one store holds many sizes and operators.
         spec: its operator, p and eps are used; every curve and beta can be made from the result.
-        resolution, white_background: 3DGS's ``-r`` and ``-w``, as the training will have them.
+        resolution: 3DGS's ``-r``, as the training will have it.
+        white_background: 3DGS's ``-w``, likewise.
         workers: processes; 1 computes in this one. With more, a script needs its ``if __name__ == "__main__"``.
         progress: show a bar on stderr.
         on_progress: called after each view with the number of views that are done, and of all.

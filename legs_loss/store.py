@@ -123,7 +123,8 @@ class WeightStore:
         Args:
             view: the photograph's path in the scene or the last parts of it, with or without the extension, or up to
                 the first dot as 3DGS names views. A name that fits two stored views gets None: it is never guessed.
-            height, width: of the training image in pixels.
+            height: of the training image in pixels.
+            width: likewise.
             spec: its operator, p and eps count.
         """
         name = view.replace("\\", "/")

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 import legs_loss
-from legs_loss import LegsError, weight_map
-from legs_loss.runtime import state
+from legs_loss import LegsError, runtime, weight_map
 from tests.test_patch_nerfstudio import FAKE as NERFSTUDIO
 
 GSPLAT = {
@@ -32,7 +31,7 @@ def library(tmp_path, monkeypatch):
     """Write a package to a folder on sys.path; everything is forgotten afterwards."""
     for name in [name for name in os.environ if name.startswith("LEGS_")]:
         monkeypatch.delenv(name)
-    state.reset()
+    monkeypatch.setattr(runtime, "_run", None)
     monkeypatch.setattr(sys, "argv", ["train.py"])
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))

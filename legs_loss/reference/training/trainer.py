@@ -225,7 +225,8 @@ def train(
             ``point_cloud/iteration_N/point_cloud.ply``; None keeps everything in memory.
         resume: go on from the checkpoint in ``out``; with the same arguments the result is bit-equal to that of an
             uninterrupted run.
-        store, weights: where weight maps come from, see :func:`load_dataset`.
+        store: where weight maps come from, see :func:`load_dataset`.
+        weights: explicit maps instead, likewise.
         checkpoint_every: iterations between checkpoints. Another one is written on Ctrl-C.
         on_progress: called every 10 iterations.
         weighting: makes weights that change during the run, in place of the maps: for experiments.

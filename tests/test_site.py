@@ -1,0 +1,61 @@
+"""The documentation site builds without a warning, its reference is whole, and its notebook runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import legs_loss
+from tests.support import ROOT, legs_environment
+
+
+def test_the_reference_has_every_public_name():
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    shown = {line.split(".")[-1] for line in text.splitlines() if line.startswith("::: ")}
+    data = {"OPERATORS", "PRESETS", "METRICS", "__version__"}
+    assert set(legs_loss.__all__) - data <= shown
+
+
+@pytest.mark.slow
+class TestSite:
+    @pytest.fixture(scope="class")
+    def site(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        for package in ("mkdocs", "material", "mkdocstrings", "mkdocs_jupyter"):
+            pytest.importorskip(package)
+        out = tmp_path_factory.mktemp("site")
+        command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(out)]
+        environment = dict(os.environ, NO_MKDOCS_2_WARNING="1")
+        done = subprocess.run(command, cwd=str(ROOT), env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-3000:]  # strict: every warning is an error
+        return out
+
+    def test_pages_hold_what_they_are_for(self, site):
+        reference = (site / "api.html").read_text(encoding="utf-8")
+        for name in ("l1_loss", "WeightSpec", "register_curve", "percentile"):
+            assert name in reference
+        assert "data:image/png;base64" in (site / "decision.html").read_text(encoding="utf-8")
+        start = (site / "index.html").read_text(encoding="utf-8")
+        assert start.index("legs-patch") < start.index("legs run")
+        for page in site.glob("**/*.html"):
+            text = page.read_text(encoding="utf-8")
+            for host in ("fonts.googleapis.com", "unpkg.com/mermaid"):
+                assert host not in text, page
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_and_comes_to_a_decision(tmp_path, monkeypatch):
+    nbformat = pytest.importorskip("nbformat")
+    client = pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    pytest.importorskip("matplotlib")
+    notebook = nbformat.read(str(ROOT / "docs" / "decision.ipynb"), as_version=4)
+    monkeypatch.setenv("PYTHONPATH", legs_environment()["PYTHONPATH"])
+    client.NotebookClient(notebook, timeout=900, kernel_name="python3").execute(cwd=str(tmp_path))
+    text = json.dumps([cell.get("outputs") for cell in notebook.cells])
+    assert "at equal numbers" in text
+    assert "legs@3dgs" in text

@@ -5,7 +5,8 @@ Each training runs in a process of its own with one thread. An arm is LOSS[:CHAN
 gives it the number of Gaussians that another arm has, densification by densification ("legs@3dgs"). The baseline 3dgs
 is always among the arms, and is proven unweighted first. A comparison that was interrupted goes on when it is given
 again with the same --out; more arms and seeds are added in the same way. Without SCENE it takes a small version of the
-embedded scene, which it makes first.
+embedded scene, which it makes first. With --upstream the arms are trained by another codebase's own script, in a copy
+of its checkout, with its own density control.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Dict
+from typing import TYPE_CHECKING, Dict
 
 from legs_loss.cli.demo import cores, default_resolution
+
+if TYPE_CHECKING:
+    from legs_loss.experiments.studies import Study
 
 HELP = "several losses on a scene, with seeds, controls and intervals"
 
@@ -62,7 +66,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="1|2|4|8|WIDTH",
         help="as in 3DGS; default: about 70,000 pixels, which a CPU trains in minutes",
     )
-    parser.add_argument("--iterations", type=int, default=2000, metavar="N", help="of each training; default: 2000")
+    parser.add_argument(
+        "--iterations",
+        type=int,
+        metavar="N",
+        help="of each training; default: 2000, with --upstream the codebase's own",
+    )
     parser.add_argument(
         "--densify_grad_threshold", type=float, metavar="X", help="of all arms; default: as for legs train"
     )
@@ -71,6 +80,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="of a dask cluster that shares the file system; a training is a task"
+    )
+    upstream = parser.add_argument_group("another codebase's trainings, one at a time")
+    upstream.add_argument("--upstream", type=Path, metavar="FOLDER", help="a checkout, which is copied to OUT/upstream")
+    upstream.add_argument(
+        "--profile", metavar="NAME|FILE", help="how it is trained: built in, or a TOML file; default: the one that fits"
+    )
+    upstream.add_argument("--cpu", action="store_true", help="without a GPU, by legs run --cpu: for small scenes")
+    upstream.add_argument("--gaussians", type=int, metavar="N", help="for codebases that train to a fixed number")
+    upstream.add_argument(
+        "--extra", default="", metavar="WORDS", help="added to every training: --extra='--sh_degree 1'"
     )
 
 
@@ -94,9 +113,14 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, name) < least:
             raise LegsError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     study = STUDIES[args.study] if args.arms is None else these_arms(args.arms)
+    if args.upstream is not None:
+        return _upstream(args, study)
+    for name in ("profile", "cpu", "gaussians", "extra"):
+        if getattr(args, name):
+            raise LegsError(f"--{name} is for --upstream")
     arms = needed(parse_arms([BASELINE, *study.arms]))
     seeds = range(args.first_seed, args.first_seed + args.seeds)
-    base = TrainConfig(iterations=args.iterations, densify_grad_threshold=args.densify_grad_threshold)
+    base = TrainConfig(iterations=args.iterations or 2000, densify_grad_threshold=args.densify_grad_threshold)
     root = _embedded(args.out / "scene") if args.scene is None else Path(args.scene)
     resolution = args.resolution
     if resolution is None:
@@ -118,6 +142,47 @@ def run(args: argparse.Namespace) -> int:
             bar.set_postfix_str(f"{name}: {progress.psnr:.2f} dB, {progress.gaussians} Gaussians", refresh=False)
 
         comparison.train(arms, seeds, args.processes, show, args.scheduler)
+    rows = [row for row in read_rows(args.out)[1] if row["seed"] in seeds]
+    print(study_text(rows, study))
+    print()
+    print(READING)
+    print(f"Rows: {args.out}; as a page: legs report {args.out}")
+    return 0
+
+
+def _upstream(args: argparse.Namespace, study: Study) -> int:
+    import shlex
+
+    from legs_loss.errors import LegsError
+    from legs_loss.experiments.arms import needed, parse_arms
+    from legs_loss.experiments.running import BASELINE, read_rows
+    from legs_loss.experiments.tables import study_text
+    from legs_loss.experiments.upstream.comparison import UpstreamComparison
+    from legs_loss.experiments.upstream.profile import find_profile
+
+    if args.scene is None:
+        raise LegsError("give the scene that --upstream is to be trained on")
+    if args.scheduler is not None:
+        raise LegsError("with --upstream trainings run here, one at a time: leave --scheduler out")
+    if args.densify_grad_threshold is not None:
+        raise LegsError("with --upstream give its own option for the threshold, by --extra")
+    profile = find_profile(args.upstream, args.profile)
+    comparison = UpstreamComparison(
+        args.upstream,
+        profile,
+        Path(args.scene),
+        args.out,
+        images=args.images,
+        resolution=args.resolution,
+        iterations=args.iterations,
+        gaussians=args.gaussians,
+        extra=shlex.split(args.extra),
+        cpu=args.cpu,
+    )
+    arms = needed(parse_arms([BASELINE, *study.arms]))
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    print(f"{profile.name}: {len(arms)} arms, {len(seeds)} seed(s), one training at a time", flush=True)
+    comparison.train(arms, seeds, lambda name: print(name, flush=True))
     rows = [row for row in read_rows(args.out)[1] if row["seed"] in seeds]
     print(study_text(rows, study))
     print()
@@ -153,6 +218,6 @@ def _again(args: argparse.Namespace) -> int:
 
 READING = """\
 Means ± standard deviations over seeds. "strongest 10%" and "the rest" split each held-out photograph's pixels by their
-Laplacian response, which favours the weighted losses. Differences are paired by view; brackets are 95% bootstrap
-intervals over views; ? marks a difference whose interval holds 0, or whose seeds differ in sign. Times are this
-machine's, as busy as it was."""
+Laplacian response, which favours the weighted losses. Differences are paired by view and seed; brackets are 95%
+intervals of a hierarchical bootstrap over seeds and views; ? marks a difference whose interval holds 0, or whose seeds
+differ in sign. Times are this machine's, as busy as it was."""

@@ -32,7 +32,20 @@ from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
 
-__all__ = ["BASELINE", "Comparison", "Row", "read_row", "read_rows", "scene_of", "train_again", "versions"]
+__all__ = [
+    "BASELINE",
+    "Comparison",
+    "Row",
+    "identity",
+    "keep",
+    "read_json",
+    "read_row",
+    "read_rows",
+    "scene_of",
+    "train_again",
+    "versions",
+    "write_json",
+]
 
 BASELINE = "3dgs"
 EVALUATIONS = 10  # of the held-out views during a run, for the plots
@@ -90,7 +103,7 @@ class Comparison:
     def row(self, arm: ArmSpec, seed: int) -> Optional[Row]:
         """The row of an arm and seed, None if it is not trained yet."""
         path = self.folder(arm, seed) / "row.json"
-        return _read(path, _ROW) if path.is_file() else None
+        return read_json(path, _ROW) if path.is_file() else None
 
     def train(
         self,
@@ -149,7 +162,7 @@ class Comparison:
             "loss": arm.loss,
             "caps": None if caps is None else sorted(caps.items()),
         }
-        _keep(folder / "plan.json", json.loads(json.dumps(plan)), "row", _PLAN)
+        keep(folder / "plan.json", json.loads(json.dumps(plan)), "row", _PLAN)
         return _planned(name, plan, self.root, self.images, folder)
 
     def _config(self, arm: ArmSpec, seed: int) -> Tuple[TrainConfig, Optional[Dict[int, int]]]:
@@ -166,22 +179,22 @@ class Comparison:
         folder = self.folder(arm, seed)
         if arm.name == BASELINE and metrics["mean_weight"] != 1.0:
             raise LegsError(f"the baseline was trained with weights of mean {metrics['mean_weight']}")
-        row = dict(_read(folder / "plan.json", _PLAN), versions=versions(), metrics=metrics)
-        _write(folder / "row.json", row)
+        row = dict(read_json(folder / "plan.json", _PLAN), versions=versions(), metrics=metrics)
+        write_json(folder / "row.json", row)
         (folder / CHECKPOINT).unlink()
 
     def _begin(self) -> None:
         settings = {
-            "scene": _identity(self.scene),
+            "scene": identity(self.scene),
             "path": os.path.abspath(str(self.root)),
             "images": self.images,
             "base": replace(self.base, densify_grad_threshold=self.threshold).as_dict(),
         }
         path = self.out / "comparison.json"
-        _keep(path, dict(settings, baseline=None), "comparison", _SETTINGS, ("path", "baseline"))
+        keep(path, dict(settings, baseline=None), "comparison", _SETTINGS, ("path", "baseline"))
         # Anew each time: a comparison that goes on may do so with other code than it was begun with.
         self.proof: Dict[str, Any] = prove_unweighted(self.data.train, self.base)
-        _write(path, dict(_read(path, _SETTINGS), baseline=self.proof))
+        write_json(path, dict(read_json(path, _SETTINGS), baseline=self.proof))
 
 
 def read_rows(out: Path) -> Tuple[Dict[str, Any], List[Row]]:
@@ -192,10 +205,10 @@ def read_rows(out: Path) -> Tuple[Dict[str, Any], List[Row]]:
     """
     if not (out / "comparison.json").is_file():
         raise LegsError(f"{out}: there is no comparison here (comparison.json): `legs compare` makes one")
-    rows = [_read(path, _ROW) for path in sorted(out.glob("*/seed-*/row.json"))]
+    rows = [read_json(path, _ROW) for path in sorted(out.glob("*/seed-*/row.json"))]
     if not rows:
         raise LegsError(f"{out}: none of this comparison's rows is trained yet")
-    return _read(out / "comparison.json", _SETTINGS), sorted(rows, key=lambda row: (row["arm"], row["seed"]))
+    return read_json(out / "comparison.json", _SETTINGS), sorted(rows, key=lambda row: (row["arm"], row["seed"]))
 
 
 def scene_of(settings: Mapping[str, Any], moved: Optional[Path] = None) -> Scene:
@@ -208,7 +221,7 @@ def scene_of(settings: Mapping[str, Any], moved: Optional[Path] = None) -> Scene
     if not root.is_dir():
         raise LegsError(f"{root}: the scene is not there: say where it lies now (--scene)")
     scene = read_scene(root, settings["images"])
-    if _identity(scene)["sha256"] != settings["scene"]["sha256"]:
+    if identity(scene)["sha256"] != settings["scene"]["sha256"]:
         raise LegsError(f"{root}: this is not the scene of the comparison: it has other views or points")
     return scene
 
@@ -221,7 +234,7 @@ def read_row(path: Path) -> Row:
     """
     if path.name != "row.json" or not path.is_file():
         raise LegsError(f"{path}: there is no row here: a row is COMPARISON/ARM/seed-N/row.json")
-    return _read(path, _ROW)
+    return read_json(path, _ROW)
 
 
 def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progress], None]) -> Row:
@@ -231,7 +244,7 @@ def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progre
         LegsError: it is no row, or its scene is not there.
     """
     row = read_row(path)
-    settings = _read(path.resolve().parents[2] / "comparison.json", _SETTINGS)
+    settings = read_json(path.resolve().parents[2] / "comparison.json", _SETTINGS)
     training = _planned(row["arm"], row, scene_of(settings, moved).root, settings["images"], None)
     return dict(row, versions=versions(), metrics=train_arm(training, on_progress))
 
@@ -278,20 +291,20 @@ def _planned(name: str, plan: Mapping[str, Any], root: Path, images: Optional[st
     )
 
 
-def _identity(scene: Scene) -> Dict[str, Any]:
-    """What tells this scene from others, wherever it lies."""
+def identity(scene: Scene) -> Dict[str, Any]:
+    """Return what tells this scene from others, wherever it lies."""
     digest = hashlib.sha256("\n".join(view.name for view in scene.views).encode())
     if scene.points is not None:
         digest.update(np.ascontiguousarray(scene.points.xyz).tobytes())
     return {"name": scene.root.resolve().name, "views": len(scene.views), "sha256": digest.hexdigest()[:16]}
 
 
-def _keep(path: Path, values: Dict[str, Any], what: str, names: Sequence[str], free: Sequence[str] = ()) -> None:
+def keep(path: Path, values: Dict[str, Any], what: str, names: Sequence[str], free: Sequence[str] = ()) -> None:
     """Write values, or find the same there already; those of the names in ``free`` may differ."""
     if not path.is_file():
-        _write(path, values)
+        write_json(path, values)
         return
-    there = _read(path, names)
+    there = read_json(path, names)
     different = [
         name for name, text in _flat(values) if name.split(".")[0] not in free and dict(_flat(there)).get(name) != text
     ]
@@ -310,7 +323,8 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[Tuple[str, An
             yield prefix + name, value
 
 
-def _read(path: Path, names: Sequence[str]) -> Dict[str, Any]:
+def read_json(path: Path, names: Sequence[str]) -> Dict[str, Any]:
+    """Return the values of a JSON file that must have these names."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -322,7 +336,8 @@ def _read(path: Path, names: Sequence[str]) -> Dict[str, Any]:
     return values
 
 
-def _write(path: Path, values: Mapping[str, Any]) -> None:
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write values to a JSON file, all at once."""
     part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -155,7 +155,7 @@ def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
         times = (MISSING, _sortable(math.nan)) if ratio is None else (times_cell(ratio), _sortable(ratio))
         body.append([(arm, arm), *cells, times])
     return _table(
-        f"Each arm minus {BASELINE}, paired by view. Brackets: 95% bootstrap interval over views. ? where it holds 0, "
+        f"Each arm minus {BASELINE}, paired by view. Brackets: 95% interval of a bootstrap over seeds and views. ? where it holds 0, "
         "or where seeds differ in sign.",
         ["arm", *columns, "Gaussians"],
         body,
@@ -182,7 +182,11 @@ def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> str:
         row = first[arm]
         config, spec = row["config"], row["config"]["spec"]
         values = [spec[name] for name in ("operator", "p", "curve", "beta", "percentile", "normalise")]
-        values += [f"{config['l1_scale']:.4g}", f"{config['densify_grad_threshold']:.4g}"]
+        threshold = config["densify_grad_threshold"]
+        values += [
+            f"{config['l1_scale'] * spec.get('scale', 1.0):.4g}",
+            "–" if threshold is None else f"{threshold:.4g}",
+        ]
         values += [row["weighting"] or "the spec's", parse_arm(arm).loss or "3DGS's", parse_arm(arm).at or "its own"]
         body.append([(arm, arm)] + [(str(value), "") for value in values])
     return _table("", heads, body, sortable=False)
@@ -208,11 +212,10 @@ def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> str:
     base, proof, scene = settings["base"], settings["baseline"], settings["scene"]
     shared = {
         "scene": f"{scene['name']}: {scene['views']} views, sha256 {scene['sha256']}",
-        "proof of the baseline": (
-            f"over {proof['views']} views its loss is {proof['loss']:.6f}, 3DGS's own {proof['loss_3dgs']:.6f}; "
-            f"gradients agree to {proof['gradient_error']:.0e} of the largest"
-        ),
+        "proof of the baseline": _proof(proof),
     }
+    if "upstream" in settings:
+        shared.update({f"upstream {name}": str(value) for name, value in settings["upstream"].items()})
     shared.update({name: str(base[name]) for name in base if name not in ("spec", "seed", "max_gaussians")})
     versions = {name: sorted({str(row["versions"].get(name)) for row in rows}) for name in rows[0]["versions"]}
     shared.update(
@@ -221,12 +224,27 @@ def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> str:
     return "".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd>" for name, value in shared.items())
 
 
+def _proof(proof: Mapping[str, Any]) -> str:
+    if "plain_calls" in proof:
+        return f"its L1 was taken {proof['plain_calls']} times, {proof['weighted_calls']} of them weighted"
+    return (
+        f"over {proof['views']} views its loss is {proof['loss']:.6f}, 3DGS's own {proof['loss_3dgs']:.6f}; "
+        f"gradients agree to {proof['gradient_error']:.0e} of the largest"
+    )
+
+
 def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[int], run: Path) -> str:
     base = settings["base"]
     words = ["legs", "compare", settings["scene"]["name"], "--arms", *(arm for arm in arms if arm != BASELINE)]
     if seeds[0] != 0:
         words += ["--first_seed", str(seeds[0])]
     words += ["--seeds", str(len(seeds)), "-r", str(base["resolution"]), "--iterations", str(base["iterations"])]
+    if "upstream" in settings:
+        own = settings["upstream"]
+        words += ["--upstream", "CHECKOUT", "--profile", own["profile"], *(["--cpu"] if own["cpu"] else [])]
+        words += ["--gaussians", str(own["gaussians"])] if own["gaussians"] is not None else []
+        words += ["--extra", shlex.join(own["extra"])] if own["extra"] else []
+        return " ".join(shlex.quote(word) for word in [*words, "--out", run.name])
     words += ["--densify_grad_threshold", f"{base['densify_grad_threshold']!r}", "--out", run.name]
     return " ".join(shlex.quote(word) for word in words)
 

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from legs_loss.errors import LegsError
+from legs_loss.experiments.upstream.training import read_picture
 from legs_loss.experiments.weighting import WEIGHTINGS
 from legs_loss.reference.ply import read_ply
 from legs_loss.reference.training.dataset import TrainingView
@@ -59,12 +61,23 @@ class Pictures(NamedTuple):
 def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Drawn:
     """Draw a view with a row's Gaussians, and make the weight map that its run would have ended with there."""
     config = TrainConfig.from_dict(row["config"])
-    rendering = draw(read_ply(point_cloud(folder, config)), view, config)
+    if "upstream" in row:
+        rendering = _upstreams_own(row, view)
+    else:
+        rendering = draw(read_ply(point_cloud(folder, config)), view, config)
     weight = _weight(config.weights, view.image, rendering)
     if row["weighting"] is not None:
         weight = WEIGHTINGS[row["weighting"]]([replace(view, weight=weight)], config)(0, 1.0, rendering)
     weight = step_weight(weight, view, config)
     return Drawn(rendering.clamp(0, 1), torch.ones_like(view.image[:1]) if weight is None else weight)
+
+
+def _upstreams_own(row: Mapping[str, Any], view: TrainingView) -> Tensor:
+    """The codebase's own rendering of a held-out view."""
+    path = row["upstream"]["pictures"].get(view.name)
+    if path is None or not Path(path).is_file():
+        raise LegsError(f"{row['arm']} left no rendering of {view.name}: choose held-out views (--views)")
+    return read_picture(Path(path))
 
 
 def _weight(spec: WeightSpec, photograph: Tensor, rendering: Tensor) -> Optional[Tensor]:

@@ -1,0 +1,228 @@
+"""A comparison whose arms a codebase trains: the same folder, rows and tables as one of the package's own trainer.
+
+OUT/upstream/                     the copy of the checkout that all trainings run in
+OUT/comparison.json               the scene, the settings that all arms share, the profile
+OUT/ARM/seed-N/row.json           a row with its scores
+OUT/ARM/seed-N/output/            what the codebase wrote
+OUT/ARM/seed-N/factor-X/          a trial of the control of the number of Gaussians, in place of output/
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
+
+from legs_loss.errors import LegsError
+from legs_loss.experiments.arms import ArmSpec, needed, parse_arm
+from legs_loss.experiments.running import BASELINE, Row, identity, keep, read_json, versions, write_json
+from legs_loss.experiments.upstream.profile import Profile
+from legs_loss.experiments.upstream.training import Checkout, copy_checkout, train_and_score
+from legs_loss.reference.training.dataset import load_view, split_views
+from legs_loss.reference.training.trainer import TrainConfig
+from legs_loss.scenes import read_scene
+from legs_loss.spec import WeightSpec
+from legs_loss.weights import weight_map
+
+__all__ = ["UpstreamComparison", "next_factor"]
+
+CLOSE = 0.01  # of the number of Gaussians: what the count control is to meet
+TRIALS = 6
+CHANGES = ("scale", "mean1")  # of arms: what a codebase can be told by the settings of its loss
+
+
+class UpstreamComparison:
+    """The comparison in a folder, new or begun.
+
+    Args:
+        root: a checkout of the codebase; nothing is written there.
+        profile: how it is trained.
+        scene: the scene's folder.
+        out: the comparison's folder.
+        images, resolution, iterations, gaussians, extra, cpu: as for :class:`Checkout`.
+
+    Raises:
+        LegsError: the checkout is patched, the scene cannot be read, or the folder holds another comparison.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        profile: Profile,
+        scene: Path,
+        out: Path,
+        images: Optional[str] = None,
+        resolution: Optional[int] = None,
+        iterations: Optional[int] = None,
+        gaussians: Optional[int] = None,
+        extra: Sequence[str] = (),
+        cpu: bool = False,
+    ) -> None:
+        self.out, self.profile = Path(out), profile
+        self.scene = read_scene(scene, images)
+        if profile.number and gaussians is None:
+            raise LegsError(f"{profile.name} trains to a fixed number of Gaussians: give it with --gaussians")
+        base = TrainConfig(spec=BASELINE, iterations=iterations or profile.iterations, resolution=resolution or -1)
+        settings = {
+            "scene": identity(self.scene),
+            "path": str(Path(scene).resolve()),
+            "images": images,
+            "base": base.as_dict(),
+            "baseline": None,
+            "upstream": {
+                "profile": profile.name,
+                "resolution": resolution,
+                "iterations": iterations,
+                "gaussians": gaussians,
+                "extra": list(extra),
+                "cpu": cpu,
+            },
+        }
+        self.base = base
+        keep(self.out / "comparison.json", settings, "comparison", tuple(settings), ("path", "baseline"))
+        copy = self.out / "upstream"
+        if not copy.is_dir():
+            copy_checkout(root, copy)
+        self.checkout = Checkout(
+            copy.resolve(), profile, Path(scene).resolve(), images, resolution, iterations, gaussians, extra, cpu
+        )
+        self._mean_weights: Dict[WeightSpec, float] = {}
+
+    def check(self, arms: Sequence[ArmSpec]) -> None:
+        """Raise a LegsError for an arm that a codebase cannot be told to train, before anything is trained."""
+        for arm in arms:
+            other = [change for change in arm.changes if change not in CHANGES]
+            if other:
+                raise LegsError(
+                    f"{arm.name}: {other[0]} needs the package's own trainer; here there are {', '.join(CHANGES)}"
+                )
+            if arm.at is not None and self.profile.number:
+                raise LegsError(f"{arm.name}: with {self.profile.name} every arm has as many Gaussians as every other")
+            if arm.at is not None and not self.profile.threshold:
+                raise LegsError(f"{arm.name}: the profile {self.profile.name} names no threshold to change")
+
+    def row(self, arm: ArmSpec, seed: int) -> Optional[Row]:
+        """The row of an arm and seed, None if it is not trained yet."""
+        path = self._folder(arm, seed) / "row.json"
+        return read_json(path, ("arm", "seed", "metrics")) if path.is_file() else None
+
+    def train(self, arms: Sequence[ArmSpec], seeds: Sequence[int], tell: Callable[[str], None]) -> List[Row]:
+        """Train the rows that are missing, one after the other; return all, seed by seed.
+
+        Raises:
+            LegsError: a training failed; rows that are done stay, and the next call goes on.
+        """
+        self.check(arms)
+        rows = []
+        for seed in seeds:
+            for arm in needed([parse_arm(BASELINE), *arms]):
+                row = self.row(arm, seed)
+                if row is None:
+                    row = self._train(arm, seed, tell)
+                    write_json(self._folder(arm, seed) / "row.json", row)
+                if arm.name == BASELINE and seed == seeds[0]:
+                    self._prove(row)
+                rows.append(row)
+        return rows
+
+    def spec_of(self, arm: ArmSpec) -> WeightSpec:
+        """The settings that the drop-in is given for an arm."""
+        if "scale" not in arm.changes:
+            return arm.spec
+        return WeightSpec(beta=0.0, scale=self.mean_weight(arm.spec))
+
+    def mean_weight(self, spec: WeightSpec) -> float:
+        """The mean weight of a spec's maps over the training views; NaN where they follow the rendering's error."""
+        if spec.error > 0.0:
+            return spec.scale if spec.normalise == "mean" else math.nan
+        if spec not in self._mean_weights:
+            images = (load_view(self.scene, view, self.base.resolution).image for view in split_views(self.scene)[0])
+            means = [float(weight_map(image, spec).double().mean()) for image in images]
+            self._mean_weights[spec] = sum(means) / len(means)
+        return self._mean_weights[spec]
+
+    def _prove(self, row: Row) -> None:
+        """Write down what shows that the baseline is the codebase's own loss."""
+        proof = {name: row["metrics"][name] for name in ("weighted_calls", "plain_calls")}
+        path = self.out / "comparison.json"
+        write_json(path, dict(read_json(path, ("scene", "upstream")), baseline=proof))
+
+    def _folder(self, arm: ArmSpec, seed: int) -> Path:
+        return self.out / arm.folder / f"seed-{seed}"
+
+    def _train(self, arm: ArmSpec, seed: int, tell: Callable[[str], None]) -> Row:
+        spec, folder = self.spec_of(arm), self._folder(arm, seed)
+        if arm.at is None:
+            tell(f"{arm.name}, seed {seed}")
+            return self._row(arm, seed, spec, 1.0, train_and_score(self.checkout, spec, seed, folder, 1.0))
+        leader, own = self.row(parse_arm(arm.at), seed), self._plain(arm, seed)
+        assert leader is not None  # trained before, see `needed`
+        wanted = leader["metrics"]["gaussians"]
+        tried: List[Tuple[float, int]] = [] if own is None else [(1.0, own["metrics"]["gaussians"])]
+        best: Optional[Tuple[float, Dict[str, Any]]] = None
+        for _ in range(TRIALS):
+            factor = next_factor(tried, wanted)
+            tell(f"{arm.name}, seed {seed}: thresholds times {factor:.4g} for {wanted:,} Gaussians")
+            metrics = train_and_score(self.checkout, spec, seed, folder / f"factor-{factor:.6g}", factor)
+            tried.append((factor, metrics["gaussians"]))
+            if best is None or abs(math.log(metrics["gaussians"] / wanted)) < abs(
+                math.log(best[1]["gaussians"] / wanted)
+            ):
+                best = factor, metrics
+            if abs(best[1]["gaussians"] / wanted - 1) <= CLOSE:
+                break
+        assert best is not None
+        return self._row(arm, seed, spec, best[0], best[1])
+
+    def _plain(self, arm: ArmSpec, seed: int) -> Optional[Row]:
+        """The row of the same loss at its own number, where it is there: a first point for the search."""
+        return self.row(replace(arm, name=arm.name.partition("@")[0], at=None), seed)
+
+    def _row(self, arm: ArmSpec, seed: int, spec: WeightSpec, factor: float, metrics: Dict[str, Any]) -> Row:
+        threshold = factor * self.profile.threshold[0].value if self.profile.threshold else None
+        config = replace(self.base, spec=spec, seed=seed, densify_grad_threshold=threshold)
+        mean = 1.0 if spec.unweighted else self.mean_weight(spec)
+        pictures = metrics.pop("pictures")
+        held_out = [view.name for view in split_views(self.scene)[1]]
+        if len(held_out) != len(pictures):  # the codebase holds other views out
+            held_out = []
+        return {
+            "arm": arm.name,
+            "seed": seed,
+            "config": config.as_dict(),
+            "weighting": None,
+            "loss": None,
+            "caps": None,
+            "upstream": {
+                "profile": self.profile.name,
+                "threshold_factor": factor,
+                "pictures": dict(zip(held_out, pictures)),
+            },
+            "versions": versions(),
+            "metrics": dict(metrics, mean_weight=mean),
+        }
+
+
+def next_factor(tried: Sequence[Tuple[float, int]], wanted: int) -> float:
+    """Return the next factor of the thresholds, from those tried and the Gaussians that they led to.
+
+    By a line through the two nearest in logarithms, and never more than ten times away from the nearest.
+
+    >>> next_factor([], 200), next_factor([(1.0, 100)], 200), next_factor([(1.0, 400)], 200)
+    (1.0, 0.5, 2.0)
+    >>> round(next_factor([(1.0, 100), (0.5, 200)], 400), 3)  # the number goes with 1 / factor
+    0.25
+    """
+    if not tried:
+        return 1.0
+    nearest = sorted(dict(tried).items(), key=lambda one: abs(math.log(one[1] / wanted)))
+    first, first_count = nearest[0]
+    if len(nearest) == 1:
+        return first * (0.5 if first_count < wanted else 2.0)
+    second, second_count = nearest[1]
+    if first_count == second_count:
+        return first * (0.7 if first_count < wanted else 1.4)
+    slope = math.log(first / second) / math.log(first_count / second_count)
+    factor = first * math.exp(slope * math.log(wanted / first_count))
+    return min(10.0 * first, max(0.1 * first, factor))

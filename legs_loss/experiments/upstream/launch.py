@@ -1,0 +1,73 @@
+"""Run one script of a codebase with a seed of our own, and report what was weighted.
+
+    python -m legs_loss.experiments.upstream.launch REPORT SEED [--cpu] SCRIPT ...
+
+3DGS and its forks set their seeds to 0 in their code. Here whatever seed a script sets is moved by SEED, so that runs
+with the same SEED agree and others differ; with 0 the script has its own. The report is written when the script ends.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import sys
+import time
+from pathlib import Path
+from typing import Any, Callable, List
+
+STRIDE = 1_000_003  # between the seeds of two runs: a script that counts its seeds up meets none twice
+
+
+def move_seeds(seed: int) -> None:
+    """From here on, seed every generator with what is asked for plus a multiple of ``seed``."""
+    import numpy as np
+    import torch
+
+    def moved(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
+        def seeded(value: Any = 0, *args: Any, **kwargs: Any) -> Any:
+            return function((int(value) + seed * STRIDE) % limit, *args, **kwargs)
+
+        return seeded
+
+    # A script that sets no seed has one all the same.
+    for module, name, limit in (
+        (random, "seed", 1 << 63),
+        (np.random, "seed", 1 << 32),
+        (torch, "manual_seed", 1 << 63),
+        (torch.cuda, "manual_seed", 1 << 63),
+        (torch.cuda, "manual_seed_all", 1 << 63),
+    ):
+        function = moved(getattr(module, name), limit)
+        setattr(module, name, function)
+        if not name.startswith("manual_seed_all") and module is not torch.cuda:
+            function(0)
+
+
+def main(report: str, seed: str, *words: str) -> int:
+    """Run the script by `legs run`, and write the report, whatever happens."""
+    from legs_loss.cli import main as legs
+
+    move_seeds(int(seed))
+    started = time.perf_counter(), time.process_time()
+    try:
+        return legs(["run", *words])
+    finally:
+        from legs_loss.runtime import counts
+
+        found = counts()
+        Path(report).write_text(
+            json.dumps(
+                {
+                    "weighted": found.weighted,
+                    "plain": found.plain,
+                    "seconds": time.perf_counter() - started[0],
+                    "processor_seconds": time.process_time() - started[1],
+                }
+            ),
+            encoding="utf-8",
+        )
+
+
+if __name__ == "__main__":
+    arguments: List[str] = sys.argv[1:]
+    sys.exit(main(*arguments))

@@ -1,0 +1,170 @@
+"""How a codebase is trained and rendered, as a TOML file says it: one a codebase in profiles/, and a user's own."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Dict, List, Mapping, Optional, Tuple
+
+from legs_loss.errors import LegsError
+
+__all__ = ["PROFILES", "Profile", "Threshold", "find_profile", "read_profile"]
+
+PROFILES = Path(__file__).with_name("profiles")
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """An option that says from which gradient on Gaussians are added: its words with {value}, and its usual value."""
+
+    words: str
+    value: float
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A codebase's own commands. Each command is a script of the checkout and its words, with places to fill in.
+
+    Attributes:
+        name: the codebase's.
+        files: those that a checkout of it has.
+        text: a file's name, and what stands in it: what tells this codebase from others with the same files.
+        iterations: of a training that is not told how many.
+        train: commands, of which the last one trains. {scene}, {output} and {name} (of the run) are filled in.
+        images, resolution: words for a folder of photographs {images} and 3DGS's -r {resolution}; "" where it has none.
+        shorter: words for a run of {iterations}, with 3DGS's schedule in proportion: {densify_from}, {densify_until},
+            {densify_every}, {reset_every}; "" where it cannot be told.
+        number: words for a fixed number of {gaussians}, for codebases that have as many whatever the loss.
+        results: where a run lies in the checkout, a pattern with {name}; "" where it is {output}.
+        render: commands that draw the training and the held-out views; {results} is filled in too.
+        renders, truths: by "train" and "test", the folders of the drawn views and of their photographs, as patterns.
+        cloud: the .ply of the Gaussians, as a pattern.
+        threshold: the options that the control of the number of Gaussians changes, all by one factor.
+    """
+
+    name: str
+    files: Tuple[str, ...]
+    text: Mapping[str, str]
+    iterations: int
+    train: Tuple[str, ...]
+    render: Tuple[str, ...]
+    renders: Mapping[str, str]
+    truths: Mapping[str, str]
+    cloud: str
+    images: str = ""
+    resolution: str = ""
+    shorter: str = ""
+    number: str = ""
+    results: str = ""
+    threshold: Tuple[Threshold, ...] = ()
+
+    def fits(self, root: Path) -> bool:
+        """Return whether a checkout is of this codebase."""
+        return all((root / name).is_file() for name in self.files) and all(
+            (root / name).is_file() and words in (root / name).read_text(encoding="utf-8", errors="replace")
+            for name, words in self.text.items()
+        )
+
+
+def read_profile(path: Path) -> Profile:
+    """Read a profile; what it does not say is that of the built-in one which it ``extends``, if any.
+
+    Raises:
+        LegsError: it cannot be read, or something in it is missing, unknown or of the wrong kind.
+    """
+    return _profile(path, _read(path))
+
+
+def find_profile(root: Path, asked: Optional[str] = None) -> Profile:
+    """Return the profile of a checkout.
+
+    Args:
+        root: the checkout.
+        asked: a built-in profile's name or the path of a TOML file; None: the built-in one that fits.
+
+    Raises:
+        LegsError: none fits, or the one that was asked for cannot be read.
+    """
+    built_in = {path.stem: path for path in sorted(PROFILES.glob("*.toml"))}
+    if asked is not None:
+        return read_profile(built_in.get(asked, Path(asked)))
+    fitting = [profile for profile in map(read_profile, built_in.values()) if profile.fits(root)]
+    # A fork of 3DGS has 3DGS's options too: the fork's own profile says more.
+    fitting = [profile for profile in fitting if profile.name != "3dgs"] or fitting
+    if len(fitting) != 1:
+        found = " and ".join(profile.name for profile in fitting) or "none"
+        raise LegsError(
+            f"{root}: of the built-in profiles ({', '.join(built_in)}) {found} fit: name one with --profile, or a TOML "
+            'file that says how this codebase is trained; two lines do for a fork of 3DGS: name and extends = "3dgs"'
+        )
+    return fitting[0]
+
+
+def _profile(path: Path, values: Dict[str, Any]) -> Profile:
+    parent = values.pop("extends", None)
+    if parent is not None:
+        base = PROFILES / f"{parent}.toml"
+        if not base.is_file():
+            raise LegsError(f"{path}: there is no built-in profile {parent!r} to extend")
+        values = {**_read(base), **values}
+    kinds = {field.name: str(field.type) for field in fields(Profile)}
+    for name, value in values.items():
+        if name not in kinds:
+            raise LegsError(f"{path}: unknown setting {name!r}; there are {', '.join(kinds)}")
+        if not _is(value, kinds[name]):
+            raise LegsError(f"{path}: {name} is not what it should be: {value!r}")
+    missing = [field.name for field in fields(Profile) if field.name not in values and not _has_default(field)]
+    if missing:
+        raise LegsError(f"{path}: {', '.join(missing)} missing")
+    for name in ("renders", "truths"):
+        if set(values[name]) != {"train", "test"}:
+            raise LegsError(f"{path}: {name} must have train and test")
+    made: Dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    thresholds = []
+    for one in values.get("threshold", ()):
+        if set(one) != {"words", "value"} or "{value}" not in str(one["words"]) or not _is(one["value"], "float"):
+            raise LegsError(f"{path}: a threshold has words with {{value}}, and a value: {one!r}")
+        thresholds.append(Threshold(one["words"], float(one["value"])))
+    made["threshold"] = tuple(thresholds)
+    return Profile(**made)
+
+
+def fill(words: str, places: Mapping[str, Any]) -> List[str]:
+    """Return words with their places filled in, as a command has them; what is filled in is never split.
+
+    >>> fill("train.py -s {scene} --lr {value:.2g}", {"scene": "my scene", "value": 0.00123})
+    ['train.py', '-s', 'my scene', '--lr', '0.0012']
+    """
+    unknown = sorted(set(re.findall(r"{(\w+)", words)) - set(places))
+    if unknown:
+        raise LegsError(f"{words!r}: {{{unknown[0]}}} is not known here; there are {', '.join(sorted(places))}")
+    return [word.format(**places) for word in shlex.split(words)]
+
+
+def _has_default(field: Any) -> bool:
+    return field.default is not field.default_factory  # both are MISSING where there is none
+
+
+def _is(value: Any, kind: str) -> bool:
+    if kind in ("int", "float"):
+        return isinstance(value, (int, float) if kind == "float" else int) and not isinstance(value, bool) and value > 0
+    if kind == "str":
+        return isinstance(value, str)
+    if kind.startswith("Mapping"):
+        return isinstance(value, dict) and all(isinstance(one, str) for one in value.values())
+    each = dict if "Threshold" in kind else str
+    return isinstance(value, list) and all(isinstance(one, each) for one in value)
+
+
+def _read(path: Path) -> Dict[str, Any]:
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise LegsError(f"{path} cannot be read: {error}") from None

@@ -155,8 +155,8 @@ def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
         times = (MISSING, _sortable(math.nan)) if ratio is None else (times_cell(ratio), _sortable(ratio))
         body.append([(arm, arm), *cells, times])
     return _table(
-        f"Each arm minus {BASELINE}, paired by view. Brackets: 95% interval of a bootstrap over seeds and views. ? where it "
-        "holds 0, or where seeds differ in sign.",
+        f"Each arm minus {BASELINE}, paired by view. Brackets: 95% interval over seeds and views. ? where it holds 0, "
+        "or where seeds differ in sign.",
         ["arm", *columns, "Gaussians"],
         body,
     )

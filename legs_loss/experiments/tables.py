@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
-from typing import Any, List, Mapping, Optional, Sequence, Tuple
+from typing import Any, List, Mapping, Optional, Sequence, Tuple, TypeVar
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE
@@ -24,9 +24,11 @@ __all__ = [
     "scores_table",
     "study_text",
     "times_cell",
+    "with_values",
 ]
 
 Rows = Sequence[Mapping[str, Any]]
+Cell = TypeVar("Cell", str, Tuple[str, str])
 
 LABELS = [column.label for column in COLUMNS]
 MISSING = "–"  # of a row that is older than the metric, or of held-out views where there are none
@@ -75,7 +77,19 @@ def scores_table(rows: Rows, arms: Sequence[str]) -> str:
     for arm in arms:
         for summary in summarise_all(rows, [parse_arm(arm).name]):
             lines.append([label(arm), *score_cells(summary.mean, summary.spread), str(summary.seeds)])
-    return markdown(["arm", *LABELS, "seeds"], lines)
+    return markdown(*with_values(["arm", *LABELS, "seeds"], lines))
+
+
+def with_values(heads: Sequence[str], lines: Sequence[Sequence[Cell]]) -> Tuple[List[str], List[List[Cell]]]:
+    """Return a table without the columns of optional metrics that no row has; a cell is a text, or begins with it."""
+    optional = {column.label for column in COLUMNS if column.metric and METRICS[column.metric[1]].available}
+
+    def shown(place: int) -> bool:
+        texts = [line[place] if isinstance(line[place], str) else line[place][0] for line in lines]
+        return heads[place] not in optional or any(text != MISSING for text in texts)
+
+    places = [place for place in range(len(heads)) if shown(place)]
+    return [heads[place] for place in places], [[line[place] for place in places] for line in lines]
 
 
 # A column of differences, and the split and key of its metric.
@@ -102,7 +116,7 @@ def differences_table(rows: Rows, study: Study) -> str:
         ratio = times_gaussians(rows, name, reference)
         if ratio is not None:
             lines.append([f"{label(arm)} − {reference}", *cells, times_cell(ratio)])
-    return markdown(["difference", *DIFFERENCES, "Gaussians"], lines)
+    return markdown(*with_values(["difference", *DIFFERENCES, "Gaussians"], lines))
 
 
 def _pairs_table(rows: Rows, study: Study) -> str:

@@ -14,7 +14,7 @@ from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE, read_rows, scene_of
 from legs_loss.experiments.statistics import COLUMNS, difference, summarise_all, times_gaussians
-from legs_loss.experiments.tables import LABELS, MISSING, difference_cell, score_cells, times_cell
+from legs_loss.experiments.tables import LABELS, MISSING, difference_cell, score_cells, times_cell, with_values
 from legs_loss.reference.training.dataset import load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
 from legs_loss.report.html_pictures import FORMATS as IMAGE_FORMATS
@@ -137,8 +137,7 @@ def _scores(rows: Sequence[Row], arms: Sequence[str]) -> str:
     return _table(
         "Mean ± standard deviation over seeds. PSNR in dB. “strongest 10%” and “the rest” split each held-out "
         "photograph's pixels by their Laplacian response, which favours the weighted losses.",
-        ["arm", *LABELS, "seeds"],
-        body,
+        *with_values(["arm", *LABELS, "seeds"], body),
     )
 
 
@@ -157,8 +156,7 @@ def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
     return _table(
         f"Each arm minus {BASELINE}, paired by view. Brackets: 95% interval over seeds and views. ? where it holds 0, "
         "or where seeds differ in sign.",
-        ["arm", *columns, "Gaussians"],
-        body,
+        *with_values(["arm", *columns, "Gaussians"], body),
     )
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
+from legs_loss.reference.training import perceptual
 from legs_loss.response import response
 
 __all__ = ["METRICS", "Metric", "mean_scores", "psnr", "score", "strongest"]
@@ -28,6 +29,8 @@ class Metric(NamedTuple):
         compute: (rendering, photograph), each [3, H, W] in [0, 1], to the value.
         differences: the splits for which `legs compare` tells differences between arms in the terminal; the HTML page
             tells all.
+        available: whether what it needs is installed; None for one that needs nothing. Rows lack what was not, and
+            tables leave a column out that no row has.
     """
 
     key: str
@@ -36,6 +39,7 @@ class Metric(NamedTuple):
     splits: Tuple[str, ...]
     compute: Callable[[Tensor, Tensor], float]
     differences: Tuple[str, ...] = ()
+    available: Optional[Callable[[], bool]] = None
 
     def column(self, split: str) -> str:
         """Return the head of its column: with the split in front, where it has two."""
@@ -100,6 +104,10 @@ METRICS: Mapping[str, Metric] = {
             ("test",),
             lambda prediction, target: psnr(prediction, target, ~strongest(target)),
         ),
+        Metric("flip", "FLIP", ".4f", ("test",), perceptual.flip, ("test",), perceptual.has_flip),
+        Metric("gmsd", "GMSD", ".4f", ("test",), perceptual.gmsd, ("test",), perceptual.has_piq),
+        Metric("haarpsi", "HaarPSI", ".4f", ("test",), perceptual.haarpsi, ("test",), perceptual.has_piq),
+        Metric("lpips", "LPIPS", ".4f", ("test",), perceptual.lpips, ("test",), perceptual.has_lpips),
     )
 }
 
@@ -107,7 +115,11 @@ METRICS: Mapping[str, Metric] = {
 def score(prediction: Tensor, target: Tensor, split: str = "test") -> Dict[str, float]:
     """Return by key the metrics of one rendering [3, H, W] (clipped to [0, 1]) of a photograph of a split."""
     prediction = prediction.clamp(0.0, 1.0)
-    return {key: metric.compute(prediction, target) for key, metric in METRICS.items() if split in metric.splits}
+    return {
+        key: metric.compute(prediction, target)
+        for key, metric in METRICS.items()
+        if split in metric.splits and (metric.available is None or metric.available())
+    }
 
 
 def mean_scores(scores: Sequence[Mapping[str, float]]) -> Dict[str, float]:

@@ -23,8 +23,8 @@ import numpy as np
 import torch
 
 from legs_loss.config import STORE_FOLDER
+from legs_loss.ctrl_c import kept_from_children
 from legs_loss.errors import LegsError
-from legs_loss.interrupts import kept_from_children
 from legs_loss.kernels.backends import backend_for
 from legs_loss.operators import OPERATORS
 from legs_loss.origin import note_scene
@@ -38,7 +38,7 @@ __all__ = ["Report", "normalised_map", "precompute"]
 
 _COMMIT_SECONDS = 1.0
 _PATIENCE = 5.0  # seconds; a process that is killed leaves numba's semaphore behind, and Python warns
-# A photograph of up to 16 megapixels in one piece, which can be read where it is, and kept for the next one.
+# The memory of a photograph of up to 16 megapixels in one piece, and kept for the next one.
 _PILLOW = {"PILLOW_BLOCK_SIZE": "64m", "PILLOW_BLOCKS_MAX": "2"}
 _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 

@@ -404,7 +404,7 @@ def test_without_a_place_for_the_cache(monkeypatch):
 def test_exp2():
     import numba
 
-    from legs_loss.kernels.vectors import LANES, load, store
+    from legs_loss.kernels.simd import LANES, load, store
     from legs_loss.reference.rasterizer.strips import exp2
 
     @numba.njit

@@ -16,7 +16,7 @@ from legs_loss.store import WeightStore, fingerprint
 from tests.support import save
 
 pytest.importorskip("numba")
-from legs_loss.kernels import numba_resize, pillow_rows
+from legs_loss.kernels import numba_resize
 
 
 def noise(width, height, seed=0):
@@ -41,37 +41,6 @@ class TestResized:
     def test_a_photograph_s_size(self, size):
         image = Image.fromarray(noise(2016, 1513))
         assert np.array_equal(numba_resize.resized(image, size), np.asarray(image.resize(size)))
-
-
-class TestStrips:
-    """A photograph's memory, in place or copied strip by strip."""
-
-    def pixels(self, image):
-        found = [(top, pixels.copy()) for top, pixels in pillow_rows.strips(image)]
-        return [top for top, _ in found], np.concatenate([pixels for _, pixels in found])
-
-    def expected(self, image):
-        return np.frombuffer(image.tobytes("raw", "RGBX"), np.uint8)
-
-    def test_in_one_piece(self):
-        image = Image.fromarray(noise(90, 70))
-        tops, pixels = self.pixels(image)
-        assert np.array_equal(pixels, self.expected(image))
-        assert tops == ([0] if hasattr(image, "__arrow_c_array__") else [0, 32, 64])
-
-    def test_in_several_pieces(self):
-        image = Image.fromarray(noise(2500, 2000))  # 20 MB; a piece has 16
-        tops, pixels = self.pixels(image)
-        assert np.array_equal(pixels, self.expected(image))
-        assert tops == list(range(0, 2000, 32))
-
-    def test_of_a_pillow_that_hands_out_nothing(self, monkeypatch):
-        monkeypatch.setattr(pillow_rows, "_capsule", lambda image: None)
-        image = Image.fromarray(noise(90, 70))
-        tops, pixels = self.pixels(image)
-        assert np.array_equal(pixels, self.expected(image))
-        assert tops == [0, 32, 64]
-        assert np.array_equal(numba_resize.resized(image, (45, 30)), two_passes(image, (45, 30)))
 
 
 class TestResizedAs:

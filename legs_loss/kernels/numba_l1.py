@@ -7,7 +7,7 @@ from numba import njit, prange
 
 from legs_loss.kernels.compiling import compiled
 from legs_loss.kernels.numba_weights import weights_of_row
-from legs_loss.kernels.vectors import LANES, absolute, load, multiply_add, sign, splat, store, total
+from legs_loss.kernels.simd import LANES, absolute, load, multiply_add, sign, splat, store, total
 
 __all__ = ["ROWS", "all_strips"]
 

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, Callable, Dict, NamedTuple, Tuple
+from typing import Any, Callable, Dict, Iterator, NamedTuple, Tuple
 
 import numpy as np
 from numba import njit
 
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.pillow_rows import BYTES, strips
-from legs_loss.kernels.vectors import (
+from legs_loss.kernels.simd import (
     LANES,
     halves_added,
     load,
@@ -31,6 +30,8 @@ from legs_loss.kernels.vectors import (
 
 __all__ = ["resized", "resized_as"]
 
+_BYTES = 4  # of a pixel, as Pillow hands out RGB in whole words
+_STRIP = 32  # rows that are copied out of Pillow at a time
 _BITS = np.int32(22)  # of a weight's fraction
 _HALF = np.int32(1 << 21)
 _ZERO, _MOST = np.int32(0), np.int32(255)
@@ -65,11 +66,18 @@ def resized(image: Any, size: Tuple[int, int]) -> np.ndarray:
     across, down = _taps(width, columns), _taps(height, rows)
     weights, first = _in_pairs(across, width)
     narrow = np.empty((height, 3 * columns + LANES), np.uint8)
-    for top, pixels in strips(image):
-        _across(pixels, width * BYTES, weights.reshape(-1), first, narrow[top:].reshape(-1), narrow.shape[1])
+    for top, pixels in _strips(image):
+        _across(pixels, width * _BYTES, weights.reshape(-1), first, narrow[top:].reshape(-1), narrow.shape[1])
     out = np.empty((rows, columns, 3), np.uint8)
     _down(narrow.reshape(-1), narrow.shape[1], *down, out.reshape(-1))
     return out
+
+
+def _strips(image: Any) -> Iterator[Tuple[int, np.ndarray]]:
+    """Yield the pixels of an RGB image in strips from the top: a strip's first row, and uint8 [rows * width * 4]."""
+    for top in range(0, image.height, _STRIP):
+        strip = image.crop((0, top, image.width, min(top + _STRIP, image.height)))
+        yield top, np.frombuffer(strip.tobytes("raw", "RGBX"), np.uint8)
 
 
 class _Taps(NamedTuple):
@@ -117,7 +125,7 @@ def _in_pairs(taps: _Taps, length: int) -> Tuple[np.ndarray, np.ndarray]:
     weights = np.zeros((pixels + pixels % 2, 2 * pairs), np.int32)
     pixel, tap = np.nonzero(np.arange(taps.weights.shape[1]) < taps.counts[:, None])
     weights[pixel, tap + (taps.first - first)[pixel]] = taps.weights[pixel, tap]
-    return np.repeat(weights, BYTES, 1), np.pad(first, (0, pixels % 2), "edge")
+    return np.repeat(weights, _BYTES, 1), np.pad(first, (0, pixels % 2), "edge")
 
 
 @compiled(fastmath=False)
@@ -129,7 +137,7 @@ def _across(pixels, stride, weights, first, out, apart):  # type: ignore[no-unty
         below = min(i + 1, rows - 1)
         step = (below - i) * stride
         for j in range(0, columns, 2):
-            left, right = i * stride + first[j] * BYTES, i * stride + first[j + 1] * BYTES
+            left, right = i * stride + first[j] * _BYTES, i * stride + first[j + 1] * _BYTES
             left0, right0, left1, right1 = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
             for k in range(0, reach, LANES):
                 weight = load(weights, j * reach + k)

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit, prange
 
 from legs_loss.kernels.compiling import ONE_AT_A_TIME, compiled
-from legs_loss.kernels.vectors import (
+from legs_loss.kernels.simd import (
     LANES,
     absolute,
     lane,

@@ -19,7 +19,7 @@ from numba import njit, prange
 
 from legs_loss.kernels.compiling import compiled
 from legs_loss.kernels.numba_weights import weights_of_row
-from legs_loss.kernels.vectors import LANES, absolute, load, multiply_add, prefetch, shifted, sign, splat, store, total
+from legs_loss.kernels.simd import LANES, absolute, load, multiply_add, prefetch, shifted, sign, splat, store, total
 from legs_loss.ssim import C1, C2, SIGMA, WINDOW_SIZE
 
 __all__ = ["TILE_HEIGHT", "TILE_WIDTH", "all_tiles"]

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Dict, Iterator, List, Mapping, Optional, Tuple
 
 from legs_loss import LegsError
+from legs_loss.ctrl_c import held_back
 from legs_loss.files import read_regular
-from legs_loss.interrupts import held_back
 from legs_loss.locks import FileLock, HeldError
 
 __all__ = ["LARGEST", "Changes", "check_name", "locked", "read_file", "replace_files"]

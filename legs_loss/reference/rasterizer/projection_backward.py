@@ -9,7 +9,7 @@ import numpy as np
 from numba import prange
 
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.vectors import lane, load
+from legs_loss.kernels.simd import lane, load
 from legs_loss.reference.rasterizer.geometry import (
     centre_gradient,
     covariance_gradient,

@@ -15,7 +15,7 @@ from numba import njit
 
 from legs_loss.errors import LegsError
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.vectors import prefetch
+from legs_loss.kernels.simd import prefetch
 
 BAND = 16  # strips
 MOST_BANDS = 1 << 15  # in an image: of 8 x 32 pixel strips, 134 million pixels

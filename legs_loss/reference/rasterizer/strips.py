@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit, prange
 
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.vectors import (
+from legs_loss.kernels.simd import (
     absolute,
     as_floats,
     as_integers,

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit, prange
 
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.vectors import (
+from legs_loss.kernels.simd import (
     above,
     at_least,
     equal,

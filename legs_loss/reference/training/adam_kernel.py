@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.vectors import LANES, load, splat, square_root, store
+from legs_loss.kernels.simd import LANES, load, splat, square_root, store
 
 __all__ = ["BETA1", "BETA2", "LANES", "update"]
 

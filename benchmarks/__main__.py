@@ -2,6 +2,7 @@
 
     python -m benchmarks                                      # all of them: an hour on a slow machine
     python -m benchmarks --parts loss-1 memory --json all.json
+    python -m benchmarks --parts cuda-compile                 # the CUDA kernels for seven GPUs, without one
     python -m benchmarks --parts gpu-800x533 gpu-1297x840     # on a machine with a GPU, where they are among all
 
 What is measured again replaces what the file has of it; the rest stays, so a long measurement may be divided, by parts
@@ -40,6 +41,8 @@ PARTS: Dict[str, List[str]] = {
     "rasterizer-2": ["rasterizer.py", "--threads", "2"],
     "cpu-1": ["cpu.py", "--threads", "1"],
 }
+# Needs the compilers of CUDA, no GPU.
+COMPILE = {"cuda-compile": ["cuda_compile.py"]}
 GPU = {
     f"gpu-{size}": ["loss.py", "--device", "cuda", "--parts", "loss", "memory", "--size", size]
     for size in ("800x533", "1297x840", "1600x1066", "3840x2160")
@@ -48,8 +51,8 @@ GPU = {
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = {**PARTS, **GPU}
-    default = list(parts if torch.cuda.is_available() else PARTS)
+    parts = {**PARTS, **COMPILE, **GPU}
+    default = list({**PARTS, **GPU} if torch.cuda.is_available() else PARTS)
     parser.add_argument("--parts", nargs="+", choices=parts, default=default, metavar="PART", help=", ".join(parts))
     parser.add_argument("--json", default="benchmarks.json", help="the file of results (default: %(default)s)")
     args, extra = parser.parse_known_args()  # what is left is for the scripts: --rounds 3

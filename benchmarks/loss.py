@@ -4,19 +4,20 @@
     python benchmarks/loss.py --parts growth
     python benchmarks/loss.py --device cuda --parts loss memory   # fused-ssim too, where it is installed
 
-The contenders take turns in every round, on the same tensors and threads; a ratio is taken within a round, and the
-table shows the median and the least and greatest of them. On one thread the processor's own time counts. kornia,
-pytorch-msssim and torchmetrics are measured where they are installed. "3DGS" is Inria's l1_loss + ssim: |a - b|.mean()
-and legs_loss.ssim, which tests/test_ssim.py holds equal to theirs to the last bit. torch.compile compiles the reference
-before it is timed. Contenders of more than two seconds get three rounds. On a GPU a time is that of ten steps between
-two events, and beside the table stands what the bytes that must move would take at the
-bandwidth of a copy.
+The contenders take turns in every round, on the same eight pairs of images and the same threads; a ratio is taken
+within a round, and the table shows the median and the least and greatest of them. On one thread the processor's own
+time counts. kornia, pytorch-msssim and torchmetrics are measured where they are installed. "3DGS" is Inria's
+l1_loss + ssim: |a - b|.mean() and torch's SSIM, which tests/test_ssim.py holds equal to theirs to the last bit.
+torch.compile compiles the reference before it is timed. Contenders of more than two seconds get three rounds. On
+a GPU a time is that of ten steps between two events, and beside the table stands what the bytes that must move would
+take at the bandwidth of a copy.
 """
 
 from __future__ import annotations
 
 import argparse
 import ctypes
+import itertools
 import json
 import os
 import platform
@@ -24,15 +25,16 @@ import statistics
 import subprocess
 import sys
 import time
-from typing import Any, Callable, Dict, List, Tuple
+from typing import Any, Callable, Dict, List, Sequence, Tuple
 
 import torch
 from torch import Tensor
 
-from legs_loss import legs_loss, ssim, weight_map
+from legs_loss import legs_loss, weight_map
 from legs_loss.kernels.backends import backend_for, finding
 from legs_loss.kernels.contract import Weights
 from legs_loss.spec import PRESETS
+from legs_loss.ssim import ssim_map
 
 LAMBDA = 0.2
 LEGS = PRESETS["legs"]
@@ -44,7 +46,11 @@ COPIED = 1 << 28  # bytes
 # Bytes a value of RGB, and a pixel: prediction and target are read, the gradient is written; where weights come from.
 MUST_MOVE = {"LEGS, weights in the kernel": (16, 0), "LEGS, stored map": (12, 4), "3DGS by the kernel": (12, 0)}
 
+PAIRS = 8  # of images that take turns: one alone would stay in a GPU's cache, which no training's does
+
 Contenders = Dict[str, Callable[[], Any]]
+Loss = Callable[[Tensor, Tensor, Tensor], Tensor]  # of prediction, target and the target's weight map
+Pairs = Sequence[Tuple[Tensor, Tensor]]
 
 
 def main() -> None:
@@ -67,8 +73,7 @@ def main() -> None:
 
 def loss(args: argparse.Namespace) -> Any:
     print(f"\nforward and backward, {args.size[0]}x{args.size[1]} RGB, {where(args)}")
-    prediction, target = images(args.size, args.device)
-    contenders = losses(prediction, target)
+    contenders = losses(some_images(args.size, args.device))
     if args.only:
         contenders = {name: contenders[name] for name in args.only}
     table = side_by_side(contenders, args.rounds, "LEGS, weights in the kernel", args.device)
@@ -107,7 +112,7 @@ def weights(args: argparse.Namespace) -> Any:
 def memory(args: argparse.Namespace) -> Any:
     print(f"\npeak memory beyond the images, forward and backward, {args.size[0]}x{args.size[1]} RGB")
     found = {}
-    for name in args.only or losses(*images((32, 32), args.device)):
+    for name in args.only or losses([images((32, 32), args.device)]):
         command = [sys.executable, __file__, "--memory-of", name, "--threads", str(args.threads)]
         command += ["--device", str(args.device)]
         command += ["--size", f"{args.size[0]}x{args.size[1]}"]
@@ -127,7 +132,7 @@ def growth(args: argparse.Namespace) -> Any:
     left = {"LEGS, weights in the kernel", "3DGS (torch)", "kornia SSIM + L1", "pytorch-msssim SSIM + L1"}
     found = []
     for size in GROWTH:
-        contenders = losses(*images(size, args.device))
+        contenders = losses([images(size, args.device)])
         for name in [name for name in contenders if name in left and (not args.only or name in args.only)]:
             row: Dict[str, Any] = {"size": f"{size[0]}x{size[1]}", "megapixels": size[0] * size[1] / 1e6, "name": name}
             for threads in sorted({1, os.cpu_count() or 1}) if args.device.type == "cpu" else (1,):
@@ -146,76 +151,83 @@ def growth(args: argparse.Namespace) -> Any:
     return found
 
 
-def losses(prediction: Tensor, target: Tensor) -> Contenders:
-    """Return each loss as a function that computes it and its gradient."""
-    stored = weight_map(target, LEGS)
-    batched = target.unsqueeze(0)
+def losses(pairs: Pairs) -> Contenders:
+    """Return each loss as a function that computes it and its gradient, each time of the next pair of images."""
+    stored = [weight_map(target, LEGS) for _, target in pairs]
+    device = pairs[0][0].device
 
-    def l1(image: Tensor) -> Tensor:
+    def l1(image: Tensor, target: Tensor) -> Tensor:
         return torch.abs(image - target).mean()
 
-    def mixed(similarity: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-        return lambda image: (1.0 - LAMBDA) * l1(image) + LAMBDA * (1.0 - similarity(image))
+    def mixed(similarity: Callable[[Tensor, Tensor], Tensor]) -> Loss:
+        return lambda image, target, _: (1.0 - LAMBDA) * l1(image, target) + LAMBDA * (1.0 - similarity(image, target))
 
-    contenders: Dict[str, Callable[[Tensor], Tensor]] = {}
-    backend = backend_for(prediction.device)
-    kernel = finding(backend, prediction.device).backend if backend != "torch" else None
+    def batched(similarity: Callable[..., Tensor], *rest: Any, **settings: Any) -> Callable[[Tensor, Tensor], Tensor]:
+        return lambda image, target: similarity(image.unsqueeze(0), target.unsqueeze(0), *rest, **settings)
+
+    contenders: Dict[str, Loss] = {}
+    backend = backend_for(device)
+    kernel = finding(backend, device).backend if backend != "torch" else None
     if kernel is not None:
-        contenders["LEGS, weights in the kernel"] = lambda image: legs_loss(image, target, LEGS)
-        contenders["LEGS, stored map"] = lambda image: legs_loss(image, target, weight=stored)
-        contenders["3DGS by the kernel"] = lambda image: kernel.loss(image, target, Weights(), LAMBDA)
-    contenders["LEGS by torch"] = lambda image: (
+        contenders["LEGS, weights in the kernel"] = lambda image, target, _: legs_loss(image, target, LEGS)
+        contenders["LEGS, stored map"] = lambda image, target, stored: legs_loss(image, target, weight=stored)
+        contenders["3DGS by the kernel"] = lambda image, target, _: kernel.loss(image, target, Weights(), LAMBDA)
+    contenders["LEGS by torch"] = lambda image, target, _: (
         (1.0 - LAMBDA) * (weight_map(target, LEGS) * torch.abs(image - target)).mean()
-        + LAMBDA * (1.0 - ssim(image, target))
+        + LAMBDA * (1.0 - reference_ssim(image, target))
     )
-    contenders["3DGS (torch)"] = mixed(lambda image: ssim(image, target))
-    if not prediction.is_cuda:
+    contenders["3DGS (torch)"] = mixed(reference_ssim)
+    if device.type != "cuda":
         contenders["3DGS (torch, oneDNN off)"] = contenders["3DGS (torch)"]
     contenders["LEGS by torch.compile"] = torch.compile(contenders["LEGS by torch"])
     try:
         import kornia
 
         # kornia's value is (1 - SSIM) / 2
-        contenders["kornia SSIM + L1"] = mixed(
-            lambda image: 1.0 - 2.0 * kornia.losses.ssim_loss(image.unsqueeze(0), batched, 11)
-        )
+        half = batched(kornia.losses.ssim_loss, 11)
+        contenders["kornia SSIM + L1"] = mixed(lambda image, target: 1.0 - 2.0 * half(image, target))
     except ImportError:
         pass
     try:
         import pytorch_msssim
 
-        contenders["pytorch-msssim SSIM + L1"] = mixed(
-            lambda image: pytorch_msssim.ssim(image.unsqueeze(0), batched, data_range=1.0)
-        )
+        contenders["pytorch-msssim SSIM + L1"] = mixed(batched(pytorch_msssim.ssim, data_range=1.0))
     except ImportError:
         pass
     try:
         from torchmetrics.functional.image import structural_similarity_index_measure
 
-        contenders["torchmetrics SSIM + L1"] = mixed(
-            lambda image: structural_similarity_index_measure(image.unsqueeze(0), batched, data_range=1.0)
-        )
+        contenders["torchmetrics SSIM + L1"] = mixed(batched(structural_similarity_index_measure, data_range=1.0))
     except ImportError:
         pass
-
     try:
         from fused_ssim import fused_ssim
 
-        if prediction.is_cuda:
-            contenders["fused-ssim alone"] = lambda image: 1.0 - fused_ssim(image.unsqueeze(0), batched)
-            contenders["fused-ssim + L1"] = mixed(lambda image: fused_ssim(image.unsqueeze(0), batched))
+        if device.type == "cuda":
+            alone = batched(fused_ssim)
+            contenders["fused-ssim alone"] = lambda image, target, _: 1.0 - alone(image, target)
+            contenders["fused-ssim + L1"] = mixed(alone)
     except ImportError:
         pass
 
-    def step(name: str, function: Callable[[Tensor], Tensor]) -> Callable[[], None]:
+    def step(name: str, function: Loss) -> Callable[[], None]:
+        turn = itertools.cycle(range(len(pairs)))
+
         def run() -> None:
-            prediction.grad = None
+            i = next(turn)
+            image, target = pairs[i]
+            image.grad = None
             torch.backends.mkldnn.enabled = name != "3DGS (torch, oneDNN off)"  # type: ignore[assignment]
-            function(prediction).backward()
+            function(image, target, stored[i]).backward()
 
         return run
 
     return {name: step(name, function) for name, function in contenders.items()}
+
+
+def reference_ssim(image: Tensor, target: Tensor) -> Tensor:
+    """3DGS's own SSIM: torch's, whatever backend computes :func:`legs_loss.ssim`."""
+    return ssim_map(image, target).mean()
 
 
 def weightings(target: Tensor) -> Contenders:
@@ -274,9 +286,8 @@ def peak_memory(name: str, size: Tuple[int, int], device: torch.device) -> int:
 
     Of a GPU it is the peak of what torch allocated there.
     """
-    losses(*images((64, 64), device))[name]()
-    prediction, target = images(size, device)
-    step = losses(prediction, target)[name]
+    losses([images((64, 64), device)])[name]()
+    step = losses([images(size, device)])[name]
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         allocated = torch.cuda.memory_allocated(device)
@@ -305,6 +316,12 @@ def images(size: Tuple[int, int], device: torch.device) -> Tuple[Tensor, Tensor]
     target = (255.0 * target).round() / 255.0
     prediction = 0.9 * target + 0.05 * torch.rand(3, height, width, generator=generator)
     return prediction.to(device).requires_grad_(), target.to(device)
+
+
+def some_images(size: Tuple[int, int], device: torch.device) -> Pairs:
+    """Return pairs of images that differ."""
+    prediction, target = images(size, device)
+    return [(prediction.detach().roll(31 * i, -1).requires_grad_(), target.roll(31 * i, -1)) for i in range(PAIRS)]
 
 
 def timed(step: Callable[[], Any], device: torch.device) -> float:

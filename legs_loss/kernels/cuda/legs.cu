@@ -484,7 +484,13 @@ DEVICE void stream(const Task& k) {
                     raw[r * PITCH + REACH + t] = ok ? 2.f * inverse * mixed : 0.f;
                     raw[(ROWS + r) * PITCH + REACH + t] = ok ? -2.f * similarity * (d1 * inverse) : 0.f;
                     raw[(2 * ROWS + r) * PITCH + REACH + t] = ok ? 2.f * a1_inverse : 0.f;
-                } else if (L1 && mine && row >= first && row < last) {
+                }
+            }
+            if (L1 && !WANTED) {  // a loop of its own keeps the weight's registers out of the blur's way
+#pragma unroll 1
+                for (int r = 0; r < ROWS; ++r) {
+                    const int row = base + r - REACH;
+                    if (!(mine && row >= first && row < last)) continue;
                     const float d = read(xs + row * k.of_prediction.row + column * k.of_prediction.column)
                                     - read(ys + row * k.of_target.row + column * k.of_target.column);
                     lane.absolute = fmaf(weight_at(k, weights, row, column), fabsf(d), lane.absolute);
@@ -504,7 +510,7 @@ DEVICE void stream(const Task& k) {
         phase(lanes, [&](Stream& lane, int t) {  // the vertical blur of the slopes, and the gradient of row base + r - 10
             const int column = left + t;
             const bool mine = t >= halo && t < halo + core && column < k.width;
-            if (L1) {  // a loop of its own keeps the weight's registers out of the blur's way; raw is free until the next step
+            if (L1) {  // again a loop of its own; raw is free until the next step
 #pragma unroll 1
                 for (int r = 0; r < ROWS; ++r) {
                     const int row = base + r - halo;

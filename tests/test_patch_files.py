@@ -425,7 +425,10 @@ class TestCommandLine:
 
         done = legs_patch(root, "--preset", "legs-l", "--beta", "4")
         assert done.returncode == 0, done.stderr
-        assert "weighted  view=viewpoint_cam.image_name: viewpoint_cam.original_image, untouched\n" in done.stdout
+        assert (
+            "patched               view=viewpoint_cam.image_name: viewpoint_cam.original_image, untouched\n"
+            in done.stdout
+        )
         assert "legs-patch --undo" in done.stdout
         assert 'preset = "legs-l"' in (root / "legs.toml").read_text()
         assert "\nbeta = 4.0" in (root / "legs.toml").read_text()
@@ -513,7 +516,7 @@ class TestCommandLine:
         assert "slam.py" in content["wrote"]
         again = run(root)
         assert "nothing to do: it is patched" in again.stdout
-        assert "slam.py:8                is there  patched before" in again.stdout
+        assert "slam.py:8                already patched\n" in again.stdout
         assert run("--undo", root).returncode == 0
         assert snapshot(root) == before
 

@@ -124,7 +124,7 @@ def test_a_script_that_trains_without_a_site_is_named_beside_the_sites_of_others
     assert [(doubt.path, doubt.line) for doubt in found.findings.doubts] == [("refine.py", 8)]
     done = legs_patch("--diff", tmp_path)
     assert done.returncode == 0
-    assert "left, though its file trains: refine.py:8" in done.stderr
+    assert "warning: a possible loss was not weighted: refine.py:8" in done.stderr
 
 
 def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path):

@@ -72,6 +72,17 @@ def _arguments(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     return args
 
 
+class _Explain(argparse.Action):
+    """Print what a rule does, or without a name the list of rules, and exit; no FOLDER is needed."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *given: object) -> None:
+        from legs_adapters.rules.document import explain, listed
+
+        rule = given[1]
+        say(explain(rule) if isinstance(rule, str) else listed(), end="")
+        parser.exit()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="legs-patch", description=__doc__, epilog=EXIT_CODES)
     parser.add_argument("folder", metavar="FOLDER", help="the checkout")
@@ -107,6 +118,9 @@ def _parser() -> argparse.ArgumentParser:
         "--exclude", action="append", default=[], metavar="GLOB", help="files or folders not to look at; repeatable"
     )
     parser.add_argument("--json", action="store_true", help="report as JSON")
+    parser.add_argument(
+        "--explain", action=_Explain, nargs="?", metavar="RULE", help="say why a rule skips a term, with examples; exit"
+    )
     proof = parser.add_argument_group("with --verify")
     proof.add_argument("--script", metavar="FILE", help="the training script; default: where the term is")
     proof.add_argument("--iterations", type=int, default=40, metavar="N", help="steps to compare; default: 40")
@@ -254,7 +268,7 @@ def _left_in_doubt(doubts: Sequence[Problem]) -> None:
     """Say on stderr which lines were left although a file trains that nothing else of was weighted."""
     for doubt in doubts:
         say(
-            f"legs-patch: left, though its file trains: {doubt.path}:{doubt.line}: {doubt.reason}\n"
+            f"legs-patch: warning: a possible loss was not weighted: {doubt.path}:{doubt.line}: {doubt.reason}\n"
             f"    {doubt.text}\n"
             f"  if it is the loss between rendering and photograph, write there: {doubt.advice}",
             stream=sys.stderr,

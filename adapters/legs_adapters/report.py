@@ -9,6 +9,7 @@ from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 from legs_adapters.code.syntax import one_line
 from legs_adapters.patch import Plan
 from legs_adapters.settings import SETTINGS_FILE
+from legs_adapters.terms.findings import Left
 from legs_loss.terminal import printable
 
 __all__ = ["as_diff", "as_json", "as_table", "changes_as_diff"]
@@ -23,20 +24,30 @@ def as_table(plan: Plan) -> str:
     found = plan.findings
     for site in found.sites:
         verdict = f"view={site.view.text}" if site.view.text else "no view="
-        rows.append((site.path, site.line, "weighted", f"{verdict}: {site.view.reason}"))
+        rows.append((site.path, site.line, "patched", f"{verdict}: {site.view.reason}"))
     for kept, site in found.kept.items():
         why = f"{kept.reason}: {kept.function} is weighted at {site.path}:{site.line}, in this call it is not"
         rows.append((kept.path, kept.line, "plain", why))
-    rows += [(entry.path, entry.line, "is there", "patched before") for entry in found.patched]
-    rows += [(entry.path, entry.line, "left", entry.reason) for entry in found.left]
+    rows += [(entry.path, entry.line, "already patched", "") for entry in found.patched]
+    rows += [(entry.path, entry.line, f"skipped ({entry.reason})", _decided(entry)) for entry in found.left]
     rows += [(entry.path, entry.line, "ERROR", entry.reason) for entry in found.problems]
     rows.sort()
     table = [(f"{path}:{line}", what, why) for path, line, what, why in rows]
     table += [(entry.path, "not read", entry.reason) for entry in found.unreadable]
     if not table:
         return ""
-    wide = max(len(where) for where, _, _ in table)
-    return "".join(f"{where:<{wide}}  {what:<8}  {why}\n" for where, what, why in table)
+    wide, wider = (max(len(row[column]) for row in table) for column in (0, 1))
+    return "".join(f"{where:<{wide}}  {what:<{wider}}  {why}".rstrip() + "\n" for where, what, why in table)
+
+
+def _decided(left: Left) -> str:
+    """Return the rule that left a term, and the first line that decided."""
+    if left.evidence is None:
+        return ""
+    path, line, text = left.evidence.lines[0]
+    here = f"line {line}" if path == left.path else f"{path}:{line}"
+    text = text if len(text) <= 60 else text[:57] + "..."
+    return f"rule {left.evidence.rule}, {here}: {text}"
 
 
 def as_json(plan: Plan, wrote: Sequence[str]) -> str:
@@ -67,7 +78,9 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
             }
             for kept, site in found.kept.items()
         ],
-        "left": [{"file": e.path, "line": e.line, "code": e.text, "reason": e.reason} for e in found.left],
+        "left": [
+            {"file": e.path, "line": e.line, "code": e.text, "reason": e.reason, **_evidence(e)} for e in found.left
+        ],
         "patched": [{"file": e.path, "line": e.line, "code": e.text} for e in found.patched],
         "problems": [
             {"file": e.path, "line": e.line, "code": e.text, "reason": e.reason, "advice": e.advice}
@@ -82,6 +95,12 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
         "wrote": list(wrote),
     }
     return json.dumps(content, indent=2) + "\n"
+
+
+def _evidence(left: Left) -> Dict[str, object]:
+    found = left.evidence
+    lines = [{"file": line.path, "line": line.line, "code": line.text} for line in found.lines] if found else []
+    return {"rule": found.rule if found else None, "because": lines}
 
 
 def as_diff(plan: Plan, colour: bool) -> str:

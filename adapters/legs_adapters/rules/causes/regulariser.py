@@ -42,8 +42,8 @@ class Literal(_Regulariser):
 class Statistic(_Regulariser):
     """A side is a constant tensor, or one number made of a picture; or both are parts of one picture.
 
-    left: loss = torch.abs(image.mean() - gt.mean())
-    weighted: loss = torch.abs(image - gt).mean()
+    left: loss = l1_loss(image.mean(), gt.mean())
+    weighted: loss = l1_loss(image, gt)
     """
 
     id = "statistic"

@@ -39,9 +39,9 @@ class Scoring(_Scoring):
     left:
         def importance_score(gaussians, camera):
             image = render(camera, gaussians, None, None)["render"]
-            return torch.abs(image - camera.original_image)
+            return l1_loss(image, camera.original_image)
 
-    weighted: loss = torch.abs(image - gt).mean()
+    weighted: loss = l1_loss(image, gt)
     """
 
     id = "scoring"

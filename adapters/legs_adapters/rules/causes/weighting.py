@@ -36,12 +36,12 @@ class ErrorMask(Rule):
     """The error map has a name, and what reads it makes a mask.
 
     left:
-        error = torch.abs(image - gt)
+        error = F.l1_loss(image, gt, reduction="none")
         mask = robust_mask(error)
         loss = ((image - gt) ** 2 * mask).mean()
 
     weighted:
-        error = torch.abs(image - gt)
+        error = F.l1_loss(image, gt, reduction="none")
         loss = error.mean()
     """
 
@@ -56,20 +56,20 @@ class ErrorMask(Rule):
 
 
 class UnreadError(Rule):
-    """The error map has a name, and nothing that reads it trains.
+    """The error map of a loss module has a name, and no backward pass in sight reaches what reads it.
 
     left:
-        def photometric(image, gt_image):
-            error = torch.abs(image - gt_image)
-            print(error.max())
+        class ImageLoss(torch.nn.Module):
+            def forward(self, outputs, batch):
+                return self.image_loss(outputs, batch)
 
-        def training(gaussians, camera):
-            image = render(camera, gaussians, None, None)["render"]
-            photometric(image, camera.original_image)
+            def image_loss(self, outputs, batch):
+                error = F.l1_loss(outputs["image"], batch["gt_image"], reduction="none")
+                return (error * 2).mean()
 
     weighted:
-        error = torch.abs(image - gt)
-        loss = error.mean()
+        error = F.l1_loss(image, gt, reduction="none")
+        loss = (error * 2).mean()
     """
 
     id = "unread-error"

@@ -1,0 +1,70 @@
+"""Say in words what the rules do, from their docstrings: for ``--explain``, for the documentation, for the tests."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import re
+from textwrap import dedent, indent
+from typing import List, NamedTuple
+
+from legs_adapters.rules.order import RULES
+from legs_adapters.rules.rule import Rule
+from legs_loss import LegsError
+
+__all__ = ["Description", "describe", "explain", "listed", "table"]
+
+
+class Description(NamedTuple):
+    """The docstring of a rule: why it leaves a term, code that it leaves, and code that is weighted."""
+
+    why: str
+    left: str
+    weighted: str
+
+
+def describe(rule: Rule) -> Description:
+    """Return the docstring of a rule in its three parts."""
+    why, left, weighted = re.split(r"^(?:left|weighted):", inspect.getdoc(rule) or "", flags=re.M)
+    return Description(" ".join(why.replace("``", "`").split()), dedent(left).strip(), dedent(weighted).strip())
+
+
+def explain(name: str) -> str:
+    """Return what ``--explain`` prints of a rule, or of each rule with a reason.
+
+    Raises:
+        LegsError: there is no such rule; the message lists them, and names one that is written alike.
+    """
+    rules = [rule for rule in RULES.values() if name == rule.id] or [r for r in RULES.values() if name == r.reason]
+    if not rules:
+        near = difflib.get_close_matches(name.lower(), [*RULES, *(rule.reason for rule in RULES.values())], 1)
+        guess = f"; did you mean {near[0]}?" if near else ""
+        raise LegsError(f"there is no rule {name!r}{guess}\n{listed()}".rstrip())
+    return "\n".join(_explained(rule) for rule in rules)
+
+
+def table() -> str:
+    """Return the table of reasons in docs/patching.md."""
+    reasons = dict.fromkeys(rule.reason for rule in RULES.values())
+    rows = [
+        (reason, rule.id, describe(rule).why) for reason in reasons for rule in RULES.values() if rule.reason == reason
+    ]
+    head = ["| reason | rule | a term is skipped where |", "| --- | --- | --- |"]
+    return "\n".join([*head, *(f"| {reason} | `{name}` | {_clause(why)} |" for reason, name, why in rows)]) + "\n"
+
+
+def _explained(rule: Rule) -> str:
+    why, left, weighted = describe(rule)
+    parts = [f"{rule.id}: skipped ({rule.reason})", f"  {why}", "\n  skipped:", indent(left, "    ")]
+    return "\n".join([*parts, "\n  weighted:", indent(weighted, "    "), ""])
+
+
+def listed() -> str:
+    """Return the rules, a line each."""
+    wide = max(map(len, RULES))
+    lines: List[str] = [f"  {name:<{wide}}  {describe(rule).why}" for name, rule in RULES.items()]
+    return "\n".join(["rules, in the order in which they are asked:", *lines, ""])
+
+
+def _clause(sentence: str) -> str:
+    return sentence[0].lower() + sentence[1:].rstrip(".")

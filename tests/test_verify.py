@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from legs_adapters.verify import Run, Verdict
 
 from tests.patching_support import checkout, legs_patch, snapshot
 from tests.test_run_cpu import texts
@@ -64,6 +65,20 @@ class TestVerify:
         assert done.returncode == 1
         assert "FAILS      all three trained" in done.stdout
         assert "ZeroDivisionError" in done.stdout
+
+
+class TestReport:
+    def test_both_steps_times_are_compared(self):
+        plain = Run(0, ["0x1p+0"] * 4, [0.05, 0.04, 0.01], 0, 0, 4, 0, 0, 0, "")
+        patched = plain._replace(seconds=[0.05, 0.06, 0.9])
+        found = Verdict({"unpatched": plain, "patched": patched, "LEGS_OFF": plain}, {}).text()
+        assert "unpatched  4 steps, 40 ms a step" in found
+        assert "step       patched takes 1.50 times the unpatched one's time (medians)" in found
+
+    def test_a_run_without_steps_is_not_compared(self):
+        ended = Run(1, [], [], 0, 0, 0, 0, 0, 0, "error")
+        found = Verdict({"unpatched": ended, "patched": ended, "LEGS_OFF": ended}, {}).text()
+        assert "no step, exit code 1" in found and "times the" not in found
 
 
 class TestUsage:

@@ -1,4 +1,4 @@
-"""Proof on the CPU that a patch took: the patched and the unpatched script are trained, and what they did compared.
+"""Prove on the CPU that a patch took: train the patched and the unpatched script, and compare what they did.
 
 Three runs of copies of the checkout, on the embedded scene, from the same seed: unpatched, patched, and patched with
 LEGS_OFF=1. Each is a process of its own, which is watched (see :func:`watch`) and otherwise runs the script as it is.
@@ -44,7 +44,7 @@ ARGUMENTS = (
 
 
 class Run(NamedTuple):
-    """What one run did.
+    """The record of one run.
 
     Attributes:
         code: its exit code.
@@ -68,14 +68,14 @@ class Run(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """The runs, and what was to hold: each claim with whether it does."""
+    """The runs, and each claim with whether it holds."""
 
     runs: Dict[str, Run]
     claims: Dict[str, bool]
 
     @property
     def holds(self) -> bool:
-        """Whether all of it does."""
+        """Whether all claims hold."""
         return all(self.claims.values())
 
     def text(self) -> str:
@@ -85,7 +85,10 @@ class Verdict(NamedTuple):
             step = f"{1000 * statistics.median(run.seconds):.0f} ms a step" if run.seconds else "no step"
             ended = "" if run.code == 0 else f", exit code {run.code}"
             lines.append(f"{name:<10} {len(run.losses)} steps, {step}{ended}")
-        patched = self.runs["patched"]
+        patched, unpatched = self.runs["patched"], self.runs["unpatched"]
+        if patched.seconds and unpatched.seconds:
+            ratio = statistics.median(patched.seconds) / statistics.median(unpatched.seconds)
+            lines.append(f"{'step':<10} patched takes {ratio:.2f} times the unpatched one's time (medians)")
         lines.append(
             f"{'l1_loss':<10} {patched.weighted} calls weighted in training, {patched.weighted_without_gradient} in "
             f"no-grad code; {patched.plain} plain"
@@ -194,7 +197,7 @@ def _arguments(script: Path, given: Optional[str], iterations: int, **places: Pa
 
 
 def _unneeded(folder: str, names: List[str]) -> List[str]:
-    """What a copy can do without: histories, caches, and anything large."""
+    """Return what a copy can do without: histories, caches, and anything large."""
     left = {".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs"} & set(names)
     for name in names:
         path = os.path.join(folder, name)

@@ -13,12 +13,23 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from legs_loss import LegsError, WeightSpec, legs_loss, register_curve, ssim, weight_map, weighted_l1
+from legs_loss import (
+    LegsError,
+    WeightSpec,
+    configure,
+    l1_loss,
+    legs_loss,
+    register_curve,
+    ssim,
+    weight_map,
+    weighted_l1,
+)
 from legs_loss.kernels import backends
 from legs_loss.kernels.contract import Weights
 from legs_loss.kernels.cuda.launch import STENCILS
 from legs_loss.kernels.trial import difference_from_torch
 from legs_loss.response import response
+from legs_loss.runtime import state
 from legs_loss.spec import PRESETS
 from tests.cuda_emulation import COMPILER, EmulatedDriver, emulated
 from tests.kernels_support import compare, images, used
@@ -284,7 +295,27 @@ class TestSelection:
         expected = weighted_l1(prediction, target, weight_map(target, LEGS, channels_last), channels_last=channels_last)
         assert found.item() == pytest.approx(expected.item(), rel=1e-5)
         found = backends.fused_ssim(prediction, target, "zeros", channels_last)
-        assert found.item() == pytest.approx(ssim(prediction, target, "zeros", channels_last).item(), rel=1e-5)
+        with torch.no_grad():  # then it is torch's
+            expected = ssim(prediction, target, "zeros", channels_last)
+        assert found.item() == pytest.approx(expected.item(), rel=1e-5)
+
+    @pytest.mark.parametrize("channels_last", [False, True])
+    def test_the_drop_ins_are_fused(self, chosen, channels_last):
+        state.reset()
+        configure("legs")
+        driver = chosen[1]
+        prediction, target = images((2, 3, 24, 31))
+        if channels_last:
+            prediction, target = prediction.detach().movedim(1, -1).requires_grad_(), target.movedim(1, -1)
+        weight = weight_map(target, LEGS, channels_last)
+        loss = l1_loss(prediction, target, channels_last=channels_last)
+        expected = weighted_l1(prediction, target, weight, channels_last=channels_last)
+        assert used(loss) == "fused" and "legs_range" in dict(driver.launches)
+        assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+        gradients = [torch.autograd.grad(value, prediction)[0] for value in (loss, expected)]
+        torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-8)
+        assert used(ssim(prediction, target, channels_last=channels_last)) == "fused"
+        state.reset()
 
     @pytest.mark.parametrize(
         "changes", [{"percentile": 90.0}, {"normalise": "mean"}, {"scale": 0.6}, {"curve": "test-cube"}]

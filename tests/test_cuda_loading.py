@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from legs_loss import LegsError, legs_loss
+from legs_loss import LegsError, configure, l1_loss, legs_loss, ssim
 from legs_loss.kernels import backends
 from legs_loss.kernels.contract import NotNow, Weights
 from legs_loss.kernels.cuda import driver as driver_module
@@ -23,6 +23,8 @@ from legs_loss.kernels.cuda.launch import Layout, Task, chunks_of, strip_of
 from legs_loss.kernels.cuda.modules import PLAIN, Modules, Variant
 from legs_loss.kernels.cuda.nvrtc import Compiled, Compiler, CompilerError, NotFound, candidates, find_compiler
 from legs_loss.kernels.cuda.operations import Shares, fused_loss
+from legs_loss.runtime import counts, sources, state
+from legs_loss.runtime.memo import _OVERHEAD
 from legs_loss.spec import PRESETS
 from tests.kernels_support import images, used
 
@@ -414,6 +416,40 @@ class TestNothingWaits:
         assert on_meta.launches[4:] == ["legs_scale"]
 
 
+class TestDropIn:
+    """`l1_loss` and `ssim`, what a patched script calls."""
+
+    @pytest.fixture(autouse=True)
+    def fresh(self):
+        state.reset()
+        configure("legs")
+        yield
+        state.reset()
+
+    def test_a_step_waits_for_nothing_and_remembers_two_numbers_a_view(self, on_meta):
+        stored = [torch.empty(4, 40, 50, device="meta") for _ in range(2)]
+        prediction = torch.empty(3, 40, 50, device="meta", requires_grad=True)
+        with Watched() as watched:
+            for step in range(4):
+                target = stored[step % 2][:3]  # a new view of the same memory at each step
+                loss = 0.8 * l1_loss(prediction, target, view="a") + 0.2 * (1.0 - ssim(prediction, target))
+                loss.backward()
+        assert used(loss) == "fused" and watched.seen > 0 and not watched.waits
+        assert on_meta.launches.count("legs_range") == 2
+        assert (counts().computed, counts().remembered) == (2, 2)
+        assert state.current_run().source.memo.bytes == 2 * (_OVERHEAD + 8)
+
+    def test_a_capture_makes_the_range_part_of_the_graph(self, on_meta, monkeypatch):
+        target = torch.empty(3, 40, 50, device="meta")
+        prediction = torch.empty(3, 40, 50, device="meta", requires_grad=True)
+        l1_loss(prediction, target)
+        monkeypatch.setattr(sources, "is_capturing", lambda device: True)
+        for _ in range(2):
+            assert used(l1_loss(prediction, target)) == "fused"
+        assert on_meta.launches.count("legs_range") == 3
+        assert (counts().computed, counts().remembered) == (3, 0)
+
+
 class TestCapture:
     def test_a_kernel_that_is_not_loaded_is_torchs_while_a_capture_lasts(self, monkeypatch, tmp_path):
         driver = FakeDriver()
@@ -432,7 +468,7 @@ class TestCapture:
 
     def test_the_trial_does_not_run_in_a_capture(self, monkeypatch):
         monkeypatch.setattr(backends, "_findings", {})
-        monkeypatch.setattr(backends, "_capturing", lambda device: True)
+        monkeypatch.setattr(backends, "is_capturing", lambda device: True)
         monkeypatch.setattr(backends, "_try", lambda *_: pytest.fail("a trial waits for the device"))
         assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         assert not backends._findings

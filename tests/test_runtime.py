@@ -13,10 +13,12 @@ import torch
 from PIL import Image
 
 from legs_loss import LegsError, WeightSpec, configure, l1_loss, weight_map
+from legs_loss.kernels.backends import is_capturing
 from legs_loss.precompute import precompute
 from legs_loss.runtime import counts, memo, sources, state
 from legs_loss.scenes import read_scene
 from legs_loss.weights import error_weight_map
+from tests.support import legs_environment
 
 
 @pytest.fixture(autouse=True)
@@ -368,10 +370,10 @@ class TestCapture:
 
     def test_only_a_cuda_device_is_asked(self, monkeypatch):
         monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)
-        assert sources.is_capturing(torch.device("cuda"))
-        assert not sources.is_capturing(torch.device("cpu"))
+        assert is_capturing(torch.device("cuda"))
+        assert not is_capturing(torch.device("cpu"))
         monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: False)
-        assert not sources.is_capturing(torch.device("cuda"))
+        assert not is_capturing(torch.device("cuda"))
 
 
 class TestOtherDevices:
@@ -404,3 +406,40 @@ class TestOtherDevices:
     def test_devices_that_differ_are_named(self):
         with pytest.raises(LegsError, match="prediction is on cpu and target on meta"):
             l1_loss(torch.rand(3, 4, 4, requires_grad=True), torch.empty(3, 4, 4, device="meta"))
+
+
+class TestScripts:
+    """A training script in a process of its own, with settings in its environment."""
+
+    SCRIPT = """
+import torch
+from legs_loss import l1_loss
+image, target = torch.linspace(0, 1, 192, requires_grad=True).reshape(3, 8, 8), torch.ones(3, 8, 8) * 0.25
+target[:, 4:] = 0.75
+print(bool(l1_loss(image, target) > (image - target).abs().mean() + 1e-3))
+"""
+
+    def run(self, tmp_path, **variables):
+        (tmp_path / "train.py").write_text(self.SCRIPT)
+        environment = {name: value for name, value in legs_environment().items() if not name.startswith("LEGS_")}
+        environment.update(variables, LEGS_BACKEND="torch")
+        command = [sys.executable, str(tmp_path / "train.py")]
+        return subprocess.run(command, env=environment, capture_output=True, text=True)
+
+    @pytest.mark.parametrize(("value", "weighted"), [("false", True), ("no", True), ("yes", False), ("1", False)])
+    def test_legs_off(self, tmp_path, value, weighted):
+        done = self.run(tmp_path, LEGS_OFF=value)
+        assert (done.returncode, done.stdout.strip()) == (0, str(weighted)), done.stderr
+
+    def test_a_mistyped_variable_is_told(self, tmp_path):
+        done = self.run(tmp_path, LEGS_BETAA="0")
+        assert done.stdout.strip() == "True"
+        assert "LEGS_BETAA is not known and has no effect; did you mean 'LEGS_BETA'?" in done.stderr
+
+    @pytest.mark.parametrize(
+        "variables", [{"LEGS_PRESET": "legz"}, {"LEGS_BETA": "1e300"}, {"LEGS_BETA": "nan"}, {"LEGS_OFF": "maybe"}]
+    )
+    def test_a_bad_variable_ends_the_script_with_its_name(self, tmp_path, variables):
+        done = self.run(tmp_path, **variables)
+        assert done.returncode == 1
+        assert f"LegsError: environment variable {next(iter(variables))}" in done.stderr.splitlines()[-1]

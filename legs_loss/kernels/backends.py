@@ -32,6 +32,7 @@ __all__ = [
     "fused_loss",
     "fused_range",
     "fused_ssim",
+    "is_capturing",
     "runs_on",
 ]
 
@@ -198,13 +199,14 @@ def _fused(
 
 
 def _ready_backend(device: torch.device) -> Optional[Backend]:
-    if _capturing(device) and not _tried(device):
+    if is_capturing(device) and not _tried(device):
         return None  # a trial waits for the device, which a capture does not survive
     name = backend_for(device)
     return None if name == "torch" else finding(name, device).backend
 
 
-def _capturing(device: torch.device) -> bool:
+def is_capturing(device: torch.device) -> bool:
+    """Return whether what is launched on a device now is recorded into a CUDA graph."""
     probe = getattr(torch.cuda, "is_current_stream_capturing", None)
     return device.type == "cuda" and probe is not None and bool(probe())
 

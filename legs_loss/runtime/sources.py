@@ -15,7 +15,7 @@ from torch import Tensor
 
 from legs_loss.config import Config
 from legs_loss.errors import LegsError
-from legs_loss.kernels.backends import fused_range
+from legs_loss.kernels.backends import fused_range, is_capturing
 from legs_loss.kernels.contract import Weights
 from legs_loss.response import normalise_response, response
 from legs_loss.runtime.call import Call
@@ -186,12 +186,6 @@ _RENEWED = (
     "view {view!r}: its training image is a new tensor at each step, which on a GPU cannot be proven to be the stored "
     "map's without waiting for the device, so its weight is computed (said once; see docs/precompute.md)"
 )
-
-
-def is_capturing(device: torch.device) -> bool:
-    """Return whether what is launched on a device now is recorded into a CUDA graph."""
-    probe = getattr(torch.cuda, "is_current_stream_capturing", None)
-    return device.type == "cuda" and probe is not None and bool(probe())
 
 
 def _is_range(weight: Tensor) -> bool:

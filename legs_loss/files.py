@@ -46,7 +46,7 @@ def read_regular(path: PathLike, limit: int) -> bytes:
         OSError: as :func:`open_regular`, or the file is larger; ``strerror`` says which.
     """
     with open_regular(path) as file:
-        data = file.read(limit + 1)
-    if len(data) > limit:
-        raise OSError(errno.EFBIG, f"larger than {limit >> 20} MiB, which no file of its kind is", os.fspath(path))
-    return data
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise OSError(errno.EFBIG, f"{size} bytes, and no file of its kind has more than {limit}", os.fspath(path))
+        return file.read(size)

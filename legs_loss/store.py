@@ -12,16 +12,12 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
-import math
 import os
 import re
 import shutil
-import sys
 import tempfile
-import time
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Tuple, Union
 
@@ -30,57 +26,18 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
+from legs_loss.files import read_regular
+from legs_loss.locks import FileLock, is_held
+from legs_loss.manifest import MANIFEST, DamagedStoreError, Entry, is_map_name, manifest_bytes, read_manifest
 from legs_loss.scenes.model import view_names
 from legs_loss.spec import WeightSpec
 
 __all__ = ["DamagedStoreError", "Entry", "StoreWriter", "WeightStore", "fingerprint", "is_intact", "read_map", "stage"]
 
-MANIFEST = "manifest.json"
-VERSION = 1
 _STAGING = ".writing-"
 _LOCK = ".lock"
-_FILE_NAME = re.compile(r"[0-9a-z_]+-[0-9a-f]{16}\.npy")
 _PIECE = 1 << 20  # bytes; for larger ones Linux may look for larger free pages, which took six times as long
 _REPAIR = "run legs precompute again to repair it"
-
-
-class DamagedStoreError(LegsError):
-    """What a store holds is not what was written to it."""
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A stored map, and what it was made from.
-
-    Attributes:
-        view: the photograph's path relative to the scene, forward slashes.
-        width, height: of the map in pixels.
-        operator, p, eps: the settings of its response.
-        background: "black" or "white" where the photograph was laid on one, else None.
-        fingerprint: of the training image (:func:`fingerprint`).
-        source_bytes, source_mtime_ns: size and time of the photograph's file.
-        file: the map's file in the store.
-        bytes, sha256: size and checksum of that file.
-    """
-
-    view: str
-    width: int
-    height: int
-    operator: str
-    p: float
-    eps: float
-    background: Optional[str]
-    fingerprint: str
-    source_bytes: int
-    source_mtime_ns: int
-    file: str = ""
-    bytes: int = 0
-    sha256: str = ""
-
-    @property
-    def key(self) -> Tuple[Any, ...]:
-        """What there is one map of: a view at a size with an operator."""
-        return self.view, self.height, self.width, self.operator, self.p, self.eps
 
 
 class Damage(NamedTuple):
@@ -103,11 +60,11 @@ class WeightStore:
 
     def __init__(self, path: Union[str, Path]) -> None:
         self.path: Path = Path(path)
-        if not (self.path / MANIFEST).is_file():
+        if not os.path.lexists(str(self.path / MANIFEST)):
             raise LegsError(
                 f"{self.path} is no store of weight maps: it has no {MANIFEST} (legs precompute writes one)"
             )
-        self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in _read_manifest(self.path)}
+        self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in read_manifest(self.path)}
         self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
         self._by_image: Dict[Tuple[Any, ...], Entry] = {}
         for entry in self.entries.values():
@@ -179,7 +136,7 @@ class StoreWriter:
             for leftover in _leftovers(self.path, self.entries()):
                 _remove(leftover)
             self.staging: Path = Path(tempfile.mkdtemp(prefix=_STAGING, dir=str(self.path)))
-            self._alive = _Lock(self.staging / _LOCK)
+            self._alive = FileLock(self.staging / _LOCK)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -196,7 +153,7 @@ class StoreWriter:
                 _sync(self.staging / entry.file)
                 os.replace(str(self.staging / entry.file), str(self.path / entry.file))
                 entries[entry.key] = entry
-            _write(self.staging / MANIFEST, _manifest(entries.values()))
+            _write(self.staging / MANIFEST, manifest_bytes(entries.values()))
             _sync(self.staging / MANIFEST)
             os.replace(str(self.staging / MANIFEST), str(self.path / MANIFEST))
             if os.name == "posix":  # elsewhere a folder cannot be opened
@@ -206,13 +163,13 @@ class StoreWriter:
 
     def entries(self) -> List[Entry]:
         """Return what the store lists now."""
-        return _read_manifest(self.path) if (self.path / MANIFEST).is_file() else []
+        return read_manifest(self.path) if os.path.lexists(str(self.path / MANIFEST)) else []
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            lock = _Lock(self.path / _LOCK)
+            lock = FileLock(self.path / _LOCK)
             try:
                 yield
             finally:
@@ -225,15 +182,33 @@ def read_map(folder: Path, entry: Entry) -> np.ndarray:
     """Return the map E^ of an entry of the store in ``folder``: :meth:`WeightStore.normalised_response`."""
     path = folder / entry.file
     try:
-        data = path.read_bytes()
+        data = read_regular(path, entry.bytes)
     except OSError as error:
         raise DamagedStoreError(f"{path} cannot be read ({error.strerror}); {_REPAIR}") from None
     if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise DamagedStoreError(f"{path} is damaged: its checksum differs; {_REPAIR}")
+    return _checked_map(path, data, entry)
+
+
+def _checked_map(path: Path, data: bytes, entry: Entry) -> np.ndarray:
+    """The array of an .npy file, which a stranger may have written, if it can be a normalised response."""
+    file = io.BytesIO(data)
     try:
-        return np.load(io.BytesIO(data), allow_pickle=False)
-    except ValueError as error:
-        raise DamagedStoreError(f"{path} holds no plain array: {error}") from None
+        version = np.lib.format.read_magic(file)
+        shape, by_columns, kind = np.lib.format.read_array_header_1_0(file)
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as error:
+        raise DamagedStoreError(f"{path} holds no plain array ({error}); {_REPAIR}") from None
+    body = data[file.tell() :]
+    wanted = (entry.height, entry.width)
+    if (version, by_columns, kind) != ((1, 0), False, np.float16) or len(body) != 2 * entry.height * entry.width:
+        raise DamagedStoreError(f"{path} holds no float16 array of {list(wanted)}; {_REPAIR}")
+    if tuple(shape) != wanted:
+        raise DamagedStoreError(f"{path} has the shape {list(shape)}, its entry says {list(wanted)}; {_REPAIR}")
+    values = np.frombuffer(bytearray(body), np.float16).reshape(wanted)
+    # Bits of float16 are in the order of the numbers from 0 to 1; those of all others, NaN too, are larger.
+    if values.view(np.uint16).max() > np.float16(1).view(np.uint16):
+        raise DamagedStoreError(f"{path} has values that are not in [0, 1]; {_REPAIR}")
+    return values
 
 
 def is_intact(folder: Path, entry: Entry) -> bool:
@@ -306,46 +281,14 @@ def _whole_numbers(image: np.ndarray, halves: bool) -> np.ndarray:
     return image
 
 
-def _manifest(entries: Iterable[Entry]) -> bytes:
-    """The manifest's one spelling for these entries: JSON, a line an entry, sorted, under its own checksum."""
-    rows = []
-    for entry in sorted(entries, key=lambda entry: entry.key):
-        values = dict(vars(entry), p=entry.p if math.isfinite(entry.p) else "inf")
-        rows.append(json.dumps(values, sort_keys=True, allow_nan=False))
-    body = '"entries": [\n' + ",\n".join(rows) + f'\n],\n"version": {VERSION}'
-    return f'{{"checksum": "{hashlib.sha256(body.encode()).hexdigest()}",\n{body}}}\n'.encode()
-
-
-def _read_manifest(folder: Path) -> List[Entry]:
-    path = folder / MANIFEST
-    try:
-        data = path.read_bytes()
-        document = json.loads(data)
-        if document["version"] > VERSION:
-            raise LegsError(
-                f"{path} was written by a newer legs-loss (format {document['version']}, this one reads {VERSION}): "
-                "update legs-loss, or precompute to another folder"
-            )
-        entries = [Entry(**dict(row, p=float(row["p"]))) for row in document["entries"]]
-        # Whatever byte was changed, these entries would not be written like this.
-        intact = _manifest(entries) == data and all(_FILE_NAME.fullmatch(entry.file) for entry in entries)
-    except LegsError:
-        raise
-    except (OSError, ValueError, TypeError, LookupError, AttributeError):
-        intact = False
-    if not intact:
-        raise DamagedStoreError(f"{path} is damaged: delete the folder {folder} and run legs precompute again")
-    return entries
-
-
 def _leftovers(folder: Path, entries: Iterable[Entry]) -> List[Path]:
     """What killed writers left in a store: maps of no entry, and staging folders that no one holds."""
     listed = {entry.file for entry in entries}
     return [
         path
         for path in folder.iterdir()
-        if (_FILE_NAME.fullmatch(path.name) and path.name not in listed)
-        or (path.name.startswith(_STAGING) and not _is_locked(path / _LOCK))
+        if (is_map_name(path.name) and path.name not in listed)
+        or (path.name.startswith(_STAGING) and (path.is_symlink() or not is_held(path / _LOCK)))
     ]
 
 
@@ -373,50 +316,8 @@ def _sync(path: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    """Delete a file or a folder; of a link, the link."""
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(str(path), ignore_errors=True)
-    elif path.exists():
+    elif os.path.lexists(str(path)):
         path.unlink()
-
-
-class _Lock:
-    """An exclusive lock on a file, waited for; the system releases it when its process dies."""
-
-    def __init__(self, path: Path, wait: bool = True) -> None:
-        self._file = open(str(path), "ab")  # noqa: SIM115 (held open until release)
-        try:
-            _lock_file(self._file.fileno(), wait)
-        except OSError:
-            self._file.close()
-            raise
-
-    def release(self) -> None:
-        """Let the next one in; closing the file does."""
-        self._file.close()
-
-
-def _is_locked(path: Path) -> bool:
-    try:
-        _Lock(path, wait=False).release()
-    except OSError:
-        return True
-    return False
-
-
-if sys.platform == "win32":
-    import msvcrt
-
-    def _lock_file(descriptor: int, wait: bool) -> None:
-        while True:
-            try:
-                msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-                return
-            except OSError:
-                if not wait:
-                    raise
-                time.sleep(0.05)
-else:
-    import fcntl
-
-    def _lock_file(descriptor: int, wait: bool) -> None:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))

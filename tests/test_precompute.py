@@ -228,7 +228,7 @@ class TestCommand:
         (tmp_path / "legs_weights" / "manifest.json").write_text("{")
         done = legs("precompute", tmp_path, "--workers", 1)
         assert done.returncode == 2
-        assert "manifest.json is damaged: delete the folder" in done.stderr
+        assert "manifest.json is damaged: delete that file" in done.stderr
 
 
 @needs_proc

@@ -19,6 +19,7 @@ import torch
 
 from legs_loss import store as store_module
 from legs_loss.errors import LegsError
+from legs_loss.manifest import manifest_bytes
 from legs_loss.spec import WeightSpec
 from legs_loss.store import (
     MANIFEST,
@@ -194,7 +195,7 @@ class TestDamage:
     def test_a_manifest_cannot_lead_out_of_the_store(self, tmp_path, file):
         put(tmp_path, BLANK)
         forged = [replace(BLANK, file=file, sha256="0" * 64)]
-        (tmp_path / MANIFEST).write_bytes(store_module._manifest(forged))
+        (tmp_path / MANIFEST).write_bytes(manifest_bytes(forged))
         with pytest.raises(DamagedStoreError):
             WeightStore(tmp_path)
 

@@ -148,10 +148,10 @@ def progress_bar(iterations: int, name: str, position: int = 0) -> Iterator[Call
 def _resumed(checkpoint: Path, given: Dict[str, Any]) -> TrainConfig:
     """The settings of the run in the output folder; the flags that were given must be the same."""
     from legs_loss.errors import LegsError
-    from legs_loss.reference.training.checkpoint import read_checkpoint
+    from legs_loss.reference.training.checkpoint import read_state
     from legs_loss.reference.training.trainer import TrainConfig
 
-    stored = read_checkpoint(checkpoint)[1]["config"]
+    stored = read_state(checkpoint)[1]["config"]
     wanted = TrainConfig.from_dict(dict(stored, **given))
     different = [name for name in given if wanted.as_dict()[name] != stored.get(name)]
     if different:

@@ -10,9 +10,12 @@ import numpy as np
 import torch
 
 from legs_loss.errors import LegsError
+from legs_loss.files import read_regular
 from legs_loss.reference.gaussians import Gaussians
 
 __all__ = ["read_ply", "write_ply"]
+
+_LARGEST = 64 << 30  # bytes: some 270 million Gaussians
 
 
 def _properties(coefficients: int) -> List[str]:
@@ -49,7 +52,7 @@ def read_ply(path: Union[str, Path]) -> Gaussians:
         LegsError: not a binary little-endian .ply of Gaussians, or its size is not what the header says.
     """
     try:
-        data = Path(path).read_bytes()
+        data = read_regular(path, _LARGEST)
     except OSError as error:
         raise LegsError(f"{path}: cannot be read ({error.strerror})") from None
     head, end, body = data.partition(b"end_header\n")

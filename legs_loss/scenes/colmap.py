@@ -10,6 +10,7 @@ from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Opt
 import numpy as np
 
 from legs_loss.errors import LegsError
+from legs_loss.files import read_regular
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
 
 __all__ = ["find_model", "read_colmap", "read_points", "write_colmap"]
@@ -29,6 +30,11 @@ MODELS = (
     ("THIN_PRISM_FISHEYE", 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 )
+
+
+_LARGEST = 16 << 30  # bytes: images.bin holds every feature of every image
+_SIDE = 1 << 20  # pixels
+_FARTHEST = float(np.finfo(np.float32).max)
 
 
 class _Intrinsics(NamedTuple):
@@ -129,10 +135,10 @@ def write_colmap(root: Path, cameras: Mapping[str, Camera], points: PointCloud) 
 
 def _parse(path: Path, parser: Callable[[bytes], Any]) -> Any:
     try:
-        return parser(path.read_bytes())
+        return parser(read_regular(path, _LARGEST))
     except OSError as error:
         raise LegsError(f"cannot read {path}: {error.strerror}") from None
-    except (struct.error, ValueError, IndexError) as error:
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise LegsError(f"{path} is damaged or is not a COLMAP file: {error}") from None
 
 
@@ -192,6 +198,8 @@ class _Cursor:
         return name
 
     def skip(self, size: int) -> None:
+        if size > len(self.data) - self.at:
+            raise ValueError(f"it ends {size - len(self.data) + self.at} bytes too early")
         self.at += size
 
     def finish(self) -> None:
@@ -268,20 +276,27 @@ def _points_txt(data: bytes) -> PointCloud:
 def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) -> _Intrinsics:
     if len(params) != dict(MODELS).get(model, len(params)):
         raise ValueError(f"a camera of model {model} has {len(params)} parameters")
-    if not (width and height and np.isfinite(params).all()):
+    if not (0 < width <= _SIDE and 0 < height <= _SIDE and np.isfinite(params).all()):
         raise ValueError(f"a camera of {width}x{height} pixels with parameters {params}")
     return _Intrinsics(model, width, height, params)
 
 
 def _image(name: str, camera_id: int, quaternion: Tuple[float, ...], translation: Tuple[float, ...]) -> _Image:
-    if not np.isfinite(quaternion + translation).all() or not np.any(quaternion):
+    if not name or "\0" in name:
+        raise ValueError(f"an image has the name {name!r}, which no file can have")
+    if len(quaternion) != 4 or len(translation) != 3:
+        raise ValueError(f"the pose of {name} has {len(quaternion) + len(translation)} numbers, not 7")
+    length = float(np.linalg.norm(quaternion))
+    if not np.isfinite(quaternion + translation).all() or not 1e-150 < length < 1e150:
         raise ValueError(f"the pose of {name} is not a number")
     return _Image(name, camera_id, quaternion, translation)
 
 
 def _cloud(xyz: List[Any], rgb: List[Any]) -> PointCloud:
-    positions = np.asarray(xyz, dtype=np.float32).reshape(-1, 3)
+    positions = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
     colours = np.asarray(rgb).reshape(-1, 3)
+    if len(positions) != len(colours) or not (np.abs(positions) <= _FARTHEST).all():
+        raise ValueError("a point is nowhere: its position is no number, or none that float32 can hold")
     if colours.size and (colours.min() < 0 or colours.max() > 255):
         raise ValueError("a point's colour is outside of 0..255")
-    return PointCloud(positions, colours.astype(np.uint8))
+    return PointCloud(positions.astype(np.float32), colours.astype(np.uint8))

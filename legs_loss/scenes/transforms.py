@@ -13,14 +13,20 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from legs_loss.errors import LegsError
+from legs_loss.files import read_regular
 from legs_loss.scenes.folder import SUFFIXES
 from legs_loss.scenes.images import image_size
 from legs_loss.scenes.model import Camera, Scene, View
 
 __all__ = ["find_transforms", "read_transforms"]
 
+_LARGEST = 1 << 30  # bytes
+_SIDE = 1 << 20  # pixels
 # OpenGL's camera looks along -z with y up; OpenCV's along z with y down.
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+# What reading a document of any other shape raises.
+_WRONG = (ArithmeticError, ValueError, TypeError, LookupError, AttributeError, RecursionError, LinAlgError)
 
 
 def find_transforms(root: Path) -> List[Path]:
@@ -44,14 +50,16 @@ def read_transforms(root: Path) -> Scene:
         try:
             for view in _read_file(root, file):
                 views.setdefault(view.name, view)
-        except (OSError, ValueError, TypeError, LookupError, AttributeError, LinAlgError) as error:
+        except OSError as error:
+            raise LegsError(f"{file} cannot be read: {error.strerror}") from None
+        except _WRONG as error:
             message = f"no {error}" if isinstance(error, KeyError) else error
             raise LegsError(f"{file} is damaged or is no file of camera poses: {message}") from None
     return Scene(root, "transforms", tuple(sorted(views.values(), key=lambda view: view.name)))
 
 
 def _read_file(root: Path, file: Path) -> List[View]:
-    common = json.loads(file.read_text(encoding="utf-8"))
+    common = json.loads(read_regular(file, _LARGEST).decode("utf-8"))
     one_split = file.stem.partition("_")[2] or None
     splits = {
         _image_name(root, name): split
@@ -79,6 +87,8 @@ def _read_file(root: Path, file: Path) -> List[View]:
 
 def _image_name(root: Path, file_path: str) -> str:
     """The image's path relative to the scene, with the extension that the file on disk has."""
+    if "\0" in file_path or not file_path:
+        raise ValueError(f"a frame has the file_path {file_path!r}, which no file can have")
     name = posixpath.normpath(file_path.replace("\\", "/"))
     if os.path.isabs(name):
         name = Path(os.path.relpath(name, str(root.resolve()))).as_posix()
@@ -112,10 +122,14 @@ def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
         angle = intrinsics.get("camera_angle_y")
         fy = fx if angle is None else height / 2 / math.tan(angle / 2)
     cx, cy = float(intrinsics.get("cx", width / 2)), float(intrinsics.get("cy", height / 2))
+    if not (0 < width <= _SIDE and 0 < height <= _SIDE and np.isfinite([fx, fy, cx, cy]).all() and fx and fy):
+        raise ValueError(f"{image} has a camera of {width}x{height} pixels, focal lengths {fx:g}, {fy:g}")
     camera_to_world = np.asarray(intrinsics["transform_matrix"], dtype=np.float64)
     if camera_to_world.shape == (3, 4):
         camera_to_world = np.vstack([camera_to_world, [0, 0, 0, 1]])
     if camera_to_world.shape != (4, 4) or not np.isfinite(camera_to_world).all():
         raise ValueError(f"the transform_matrix of {image} is no 4x4 matrix of numbers")
     pose = np.linalg.inv(camera_to_world @ _OPENGL_TO_OPENCV)
+    if not np.isfinite(pose).all():
+        raise ValueError(f"the transform_matrix of {image} cannot be inverted")
     return Camera(width, height, fx, fy, cx, cy, pose)

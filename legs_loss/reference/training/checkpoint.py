@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
 from pathlib import Path
-from typing import Any, Dict, Mapping, Tuple
+from typing import Any, Dict, Mapping, Optional, Tuple
 
 import numpy as np
+import torch
 
 from legs_loss.errors import LegsError
+from legs_loss.files import open_regular
 
-__all__ = ["read_checkpoint", "write_checkpoint"]
+__all__ = ["read_checkpoint", "read_state", "write_checkpoint"]
 
 
 def write_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
@@ -33,10 +34,80 @@ def read_checkpoint(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:
         LegsError: there is none, or the file is damaged.
     """
     try:
-        with np.load(str(path), allow_pickle=False) as file:
+        with open_regular(path) as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        return arrays, json.loads(arrays.pop("__facts__").tobytes().decode())
+        facts = json.loads(arrays.pop("__facts__").tobytes().decode())
     except FileNotFoundError:
         raise LegsError(f"{path}: there is no such checkpoint") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise LegsError(f"{path}: this checkpoint is damaged ({error}): delete it and train anew") from None
+    except PermissionError as error:
+        raise LegsError(f"{path}: cannot be read ({error.strerror})") from None
+    except Exception as error:  # numpy, zipfile and zlib raise nearly anything on a damaged file
+        why = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise LegsError(f"{path}: this checkpoint is damaged ({why}): delete it and train anew") from None
+    return arrays, facts
+
+
+def read_state(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:
+    """Read a checkpoint that a training goes on from: its arrays and its facts, all there and of one size.
+
+    Raises:
+        LegsError: there is none, or it is no training's state.
+    """
+    arrays, facts = read_checkpoint(path)
+    wrong = _what_is_wrong(arrays, facts)
+    if wrong is not None:
+        raise LegsError(f"{path}: this checkpoint is damaged ({wrong}): delete it and train anew")
+    return arrays, facts
+
+
+# What a checkpoint has to hold, and as what; the shapes of arrays with "n" Gaussians of "k" coefficients.
+FACTS: Dict[str, Tuple[type, ...]] = {
+    "config": (dict,),
+    "views": (list,),
+    "iteration": (int,),
+    "clocks": (list,),
+    "order": (list,),
+    "loss": (float, int, type(None)),
+    "psnr": (float, int, type(None)),
+    "weight_sum": (float, int),
+    "growth": (list,),
+    "history": (list,),
+}
+_GAUSSIANS: Dict[str, Tuple[Any, ...]] = {
+    "means": ("n", 3),
+    "log_scales": ("n", 3),
+    "quaternions": ("n", 4),
+    "opacity_logits": ("n",),
+    "sh": ("n", "k", 3),
+}
+
+
+def _what_is_wrong(arrays: Mapping[str, np.ndarray], facts: Any) -> Optional[str]:
+    """Say what of a checkpoint cannot be a training's state; None where all of it can."""
+    if not isinstance(facts, dict):
+        return "its facts are none"
+    for name, kinds in FACTS.items():
+        if not isinstance(facts.get(name, ...), kinds):
+            return f"no {name}" if name not in facts else f"{name} is {facts[name]!r:.40}"
+    if facts["iteration"] < 0 or any(type(i) is not int or not 0 <= i < len(facts["views"]) for i in facts["order"]):
+        return "its views have other numbers"
+    if not all(isinstance(seconds, (int, float)) for seconds in facts["clocks"]):
+        return "its clocks are no numbers"
+    sets = ("gaussians", "moment1", "moment2")
+    shapes = {f"{label}.{name}": shape for label in sets for name, shape in _GAUSSIANS.items()}
+    shapes.update(gradient_sum=("n",), times_seen=("n",), steps=(), generator=(len(torch.Generator().get_state()),))
+    missing = sorted(set(shapes) - set(arrays))
+    if missing:
+        return f"no {missing[0]}"
+    count, coefficients = (arrays["gaussians.sh"].shape + (0, 0))[:2]
+    sizes = {"n": count, "k": coefficients}
+    for name, shape in shapes.items():
+        if arrays[name].shape != tuple(sizes.get(side, side) for side in shape) or arrays[name].dtype.kind not in "fiu":
+            return f"{name} is {arrays[name].dtype} of shape {list(arrays[name].shape)}"
+    if coefficients not in (1, 4, 9, 16):
+        return f"gaussians.sh has {coefficients} coefficients"
+    try:
+        torch.Generator().set_state(torch.from_numpy(arrays["generator"]))
+    except (RuntimeError, TypeError) as error:
+        return str(error).splitlines()[0]
+    return None

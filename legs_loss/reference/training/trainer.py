@@ -28,7 +28,7 @@ from legs_loss.reference.gaussians import Gaussians
 from legs_loss.reference.ply import write_ply
 from legs_loss.reference.rasterizer import Rendering, rasterize
 from legs_loss.reference.training.adam import Adam, position_rate
-from legs_loss.reference.training.checkpoint import read_checkpoint, write_checkpoint
+from legs_loss.reference.training.checkpoint import read_state, write_checkpoint
 from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, load_dataset
 from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.reference.training.metrics import mean_scores, psnr, score
@@ -121,11 +121,20 @@ class TrainConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
-        """The settings that :meth:`as_dict` gave; ``spec`` may also be a preset's name."""
-        spec = values["spec"]
-        if not isinstance(spec, str):
-            spec = WeightSpec(**dict(spec, p=float(spec["p"])))
-        return cls(**dict(values, spec=spec))
+        """The settings that :meth:`as_dict` gave; ``spec`` may also be a preset's name.
+
+        Raises:
+            LegsError: they are none.
+        """
+        try:
+            spec = values["spec"]
+            if not isinstance(spec, str):
+                spec = WeightSpec(**dict(spec, p=float(spec["p"])))
+            return cls(**dict(values, spec=spec))
+        except LegsError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise LegsError(f"these are no settings of a training: {error}") from None
 
     @property
     def weights(self) -> WeightSpec:
@@ -302,7 +311,7 @@ class _Run:
 
     @classmethod
     def restore(cls, data: Dataset, config: TrainConfig, path: Path) -> _Run:
-        arrays, facts = read_checkpoint(path)
+        arrays, facts = read_state(path)
         if facts["views"] != [view.name for view in data.train]:
             raise LegsError(f"{path}: this run was made from a scene with other views")
         if TrainConfig.from_dict(facts["config"]) != config:

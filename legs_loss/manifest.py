@@ -1,0 +1,132 @@
+"""The list of a store's maps: what it holds of which view, checked where it is read and nowhere else.
+
+It is JSON, a line an entry, sorted, under its own checksum: whatever byte is changed, it would not be written like
+this. A checksum tells damage, not malice, so every field is checked as well.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Callable, Dict, Iterable, List, Optional, Tuple
+
+from legs_loss.errors import LegsError
+from legs_loss.files import read_regular
+
+__all__ = ["MANIFEST", "DamagedStoreError", "Entry", "is_map_name", "manifest_bytes", "read_manifest"]
+
+MANIFEST = "manifest.json"
+VERSION = 1
+_LARGEST = 256 << 20  # bytes: some 500,000 entries
+_SIDE = 1 << 20  # pixels
+_FILE_NAME = re.compile(r"[0-9a-z_]+-[0-9a-f]{16}\.npy")
+_CHECKSUM = re.compile(r"[0-9a-f]{64}")
+
+
+class DamagedStoreError(LegsError):
+    """What a store holds is not what was written to it."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A stored map, and what it was made from.
+
+    Attributes:
+        view: the photograph's path relative to the scene, forward slashes.
+        width, height: of the map in pixels.
+        operator, p, eps: the settings of its response.
+        background: "black" or "white" where the photograph was laid on one, else None.
+        fingerprint: of the training image (:func:`fingerprint`).
+        source_bytes, source_mtime_ns: size and time of the photograph's file.
+        file: the map's file in the store.
+        bytes, sha256: size and checksum of that file.
+    """
+
+    view: str
+    width: int
+    height: int
+    operator: str
+    p: float
+    eps: float
+    background: Optional[str]
+    fingerprint: str
+    source_bytes: int
+    source_mtime_ns: int
+    file: str = ""
+    bytes: int = 0
+    sha256: str = ""
+
+    @property
+    def key(self) -> Tuple[Any, ...]:
+        """What there is one map of: a view at a size with an operator."""
+        return self.view, self.height, self.width, self.operator, self.p, self.eps
+
+
+# What a field may be. Type by type: JSON's true is an int, and 1.0 == 1.
+_FIELDS: Dict[str, Callable[[Any], bool]] = {
+    "view": lambda value: type(value) is str and value != "" and "\0" not in value,
+    "width": lambda value: type(value) is int and 0 < value <= _SIDE,
+    "height": lambda value: type(value) is int and 0 < value <= _SIDE,
+    "operator": lambda value: type(value) is str,
+    "p": lambda value: type(value) is float and value > 0,
+    "eps": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
+    "background": lambda value: value in (None, "black", "white"),
+    "fingerprint": lambda value: type(value) is str,
+    "source_bytes": lambda value: type(value) is int and value >= 0,
+    "source_mtime_ns": lambda value: type(value) is int,
+    "file": lambda value: type(value) is str and is_map_name(value),
+    "bytes": lambda value: type(value) is int and value > 0,
+    "sha256": lambda value: type(value) is str and _CHECKSUM.fullmatch(value) is not None,
+}
+
+
+def is_map_name(name: str) -> bool:
+    """Return whether a file of this name can be a store's map; it has no folder in it."""
+    return _FILE_NAME.fullmatch(name) is not None
+
+
+def manifest_bytes(entries: Iterable[Entry]) -> bytes:
+    """Return the manifest's one spelling for these entries."""
+    rows = []
+    for entry in sorted(entries, key=lambda entry: entry.key):
+        values = dict(vars(entry), p=entry.p if math.isfinite(entry.p) else "inf")
+        rows.append(json.dumps(values, sort_keys=True, allow_nan=False))
+    body = '"entries": [\n' + ",\n".join(rows) + f'\n],\n"version": {VERSION}'
+    return f'{{"checksum": "{hashlib.sha256(body.encode()).hexdigest()}",\n{body}}}\n'.encode()
+
+
+def read_manifest(folder: Path) -> List[Entry]:
+    """Read the manifest of the store in a folder.
+
+    Raises:
+        LegsError: it cannot be read, or a newer version wrote it.
+        DamagedStoreError: it is not what was written.
+    """
+    path = folder / MANIFEST
+    try:
+        data = read_regular(path, _LARGEST)
+    except OSError as error:
+        raise LegsError(f"{path} cannot be read: {error.strerror}") from None
+    try:
+        document = json.loads(data.decode("utf-8"))
+        if type(document["version"]) is int and document["version"] > VERSION:
+            raise LegsError(
+                f"{path} was written by a newer legs-loss (format {document['version']}, this one reads {VERSION}): "
+                "update legs-loss, or precompute to another folder"
+            )
+        entries = [Entry(**dict(row, p=float(row["p"]))) for row in document["entries"]]
+        wrong = [name for entry in entries for name, fits in _FIELDS.items() if not fits(getattr(entry, name))]
+        intact = not wrong and manifest_bytes(entries) == data
+    except LegsError:
+        raise
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        intact = False
+    if not intact:
+        raise DamagedStoreError(
+            f"{path} is damaged: delete that file and run legs precompute again, which makes the maps anew"
+        )
+    return entries

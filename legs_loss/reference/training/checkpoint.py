@@ -77,7 +77,7 @@ _GAUSSIANS: Dict[str, Tuple[Any, ...]] = {
     "means": ("n", 3),
     "log_scales": ("n", 3),
     "quaternions": ("n", 4),
-    "opacity_logits": ("n",),
+    "opacity_logits": ("n", 1),
     "sh": ("n", "k", 3),
 }
 

@@ -30,6 +30,7 @@ def copy(tmp_path):
     """The data, the page and the documents that name figures, in a folder of their own."""
     shutil.copytree(DATA, tmp_path / "docs/compatibility", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("docs/compatibility.md", *build.SENTENCES):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / name, tmp_path / name)
     return tmp_path
 

@@ -32,6 +32,9 @@ SENTENCES = {
     "README.md": "It was tried on $codebases public codebases. "
     "Of $blind that it had never met, it was right at first contact in $first_right_rate",
     "docs/patching.md": "says what it does to $codebases public codebases",
+    "docs/codebases/3dgs.md": "What was chosen in each of $codebases is in [the list]",
+    "docs/codebases/others.md": "among the $codebases that were tried",
+    "mkdocs.yml": "- $codebases codebases: compatibility.md",
 }
 
 

@@ -44,7 +44,7 @@ def _decided(left: Left) -> str:
     """Return the rule that left a term, and the first line that decided."""
     if left.evidence is None:
         return ""
-    path, line, text = left.evidence.lines[0]
+    path, line, text = left.because[0]
     here = f"line {line}" if path == left.path else f"{path}:{line}"
     text = text if len(text) <= 60 else text[:57] + "..."
     return f"rule {left.evidence.rule}, {here}: {text}"
@@ -79,7 +79,15 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
             for kept, site in found.kept.items()
         ],
         "left": [
-            {"file": e.path, "line": e.line, "code": e.text, "reason": e.reason, **_evidence(e)} for e in found.left
+            {
+                "file": e.path,
+                "line": e.line,
+                "code": e.text,
+                "reason": e.reason,
+                "rule": e.evidence.rule if e.evidence else None,
+                "because": [{"file": at.path, "line": at.line, "code": at.text} for at in e.because],
+            }
+            for e in found.left
         ],
         "patched": [{"file": e.path, "line": e.line, "code": e.text} for e in found.patched],
         "problems": [
@@ -95,12 +103,6 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
         "wrote": list(wrote),
     }
     return json.dumps(content, indent=2) + "\n"
-
-
-def _evidence(left: Left) -> Dict[str, object]:
-    found = left.evidence
-    lines = [{"file": line.path, "line": line.line, "code": line.text} for line in found.lines] if found else []
-    return {"rule": found.rule if found else None, "because": lines}
 
 
 def as_diff(plan: Plan, colour: bool) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
 
@@ -91,7 +91,7 @@ class Evidence(NamedTuple):
     Attributes:
         rule: the rule's id.
         reason: its word for the report.
-        deciders: the nodes that decided, each with the function that it stands in; never empty.
+        deciders: the nodes that decided, each with the function that it stands in.
     """
 
     rule: str
@@ -100,9 +100,16 @@ class Evidence(NamedTuple):
 
     @property
     def lines(self) -> List[Line]:
-        """The lines that decided."""
-        found = [(function.module, function.place(node).line) for function, node in self.deciders]
-        return [Line(module.path, line, module.lines.text(line)) for module, line in found]
+        """The lines that decided; none in a file in which LibCST cannot place them."""
+        return [line for decider in self.deciders for line in _lines(*decider)]
+
+
+def _lines(function: Function, node: cst.CSTNode) -> Iterator[Line]:
+    try:
+        line = function.place(node).line
+    except ValueError:
+        return
+    yield Line(function.module.path, line, function.module.lines.text(line))
 
 
 class Left(NamedTuple):
@@ -119,6 +126,11 @@ class Left(NamedTuple):
     text: str
     reason: str
     evidence: Optional[Evidence] = None
+
+    @property
+    def because(self) -> List[Line]:
+        """The lines that decided; its own where those cannot be placed."""
+        return (self.evidence.lines if self.evidence else []) or [Line(self.path, self.line, self.text)]
 
 
 class Problem(NamedTuple):

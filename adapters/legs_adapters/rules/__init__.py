@@ -1,1 +1,1 @@
-"""The reasons why an L1 term is left unweighted."""
+"""Decide what becomes of each L1 term: weighted, skipped by a rule, or left to a person."""

@@ -1,4 +1,4 @@
-"""The analyses of one program, in the order in which they build on each other."""
+"""Build the analyses of one program, each from those before it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which of the terms that were left a person should look at, and which are not worth a line in the report."""
+"""Pick the skipped terms that a person should look at, and those that the report need not list."""
 
 from __future__ import annotations
 

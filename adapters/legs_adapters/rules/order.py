@@ -1,4 +1,4 @@
-"""The rules in the order in which they are asked: the first that applies is why a term is left."""
+"""List the rules in the order in which they are asked: the first that applies is why a term is left."""
 
 from __future__ import annotations
 

@@ -90,13 +90,13 @@ class Purposes:
 
     @staticmethod
     def _is_stepped_later(function: Function, node: cst.CSTNode, here: Set[int], calls: Dict[int, cst.Call]) -> bool:
-        """Whether a loop further out has a step, and no backward pass but these: one of a batch of views."""
+        """Return whether a loop further out has a step, and no backward pass but these: one of a batch of views."""
         around = list(calls_in(function.body, node, calls))
         other = [call for call, elsewhere in around if is_backward(call) and not elsewhere and id(call) not in here]
         return not other and any(is_step(call) and not elsewhere for call, elsewhere in around)
 
     def _nobody_steps(self, function: Function, depth: int) -> bool:
-        """Whether neither a function nor what calls it, as far as that is known, can step."""
+        """Return whether neither a function nor what calls it, as far as that is known, can step."""
         if may_step(function.flow.calls):
             return False
         if function.parent is None:
@@ -108,7 +108,7 @@ class Purposes:
         return list(dict.fromkeys(caller for caller, _ in likely_calls(self.program, function)))
 
     def _emptied_by_callers(self, function: Function) -> bool:
-        """Whether each caller has the gradients read, and sets them to nothing, before anything can step."""
+        """Return whether each caller has the gradients read, and sets them to nothing, before anything can step."""
         calls = list(likely_calls(self.program, function))
         return bool(calls) and all(self._is_emptied_after(caller, call) for caller, call in calls)
 
@@ -130,13 +130,13 @@ class Purposes:
         return False
 
     def _read_by_callers(self, function: Function) -> bool:
-        """Whether a caller also calls what reads gradients: ``accumulate(scene)``, then ``gaussians.prune(count)``."""
+        """Return whether a caller also reads gradients: ``accumulate(scene)``, then ``gaussians.prune(count)``."""
         called = self._called(function, *self._callers(function))
         read = any("grad" in each.text and gradients_read(list(walk_all(each.body))) for each in called)
         return read and not any(map(has_step, called))
 
     def _called(self, *functions: Function) -> List[Function]:
-        """What functions call: a step may stand there under any name, ``gaussians.post_backward()``."""
+        """Return what functions call: a step may stand there under any name, ``gaussians.post_backward()``."""
         called = [
             reference.target
             for function in functions
@@ -146,7 +146,7 @@ class Purposes:
         return [each for each in called if isinstance(each, Function)]
 
     def _reads_its_own(self, function: Function, scope: cst.CSTNode) -> bool:
-        """Whether the gradients that are read are of models made here, which nobody else gets to step on."""
+        """Return whether the gradients that are read are of models made here, which nobody else gets to step on."""
         roots = [list(attribute_chain(part))[-1] for part in gradients_read(list(walk_all(scope)))]
         names = [root for root in roots if isinstance(root, cst.Name)]
         given = {
@@ -157,7 +157,7 @@ class Purposes:
         return own and not any(map(has_step, self._called(function)))
 
     def trains_its_own(self, function: Function) -> bool:
-        """Whether it makes a Gaussian model and steps that model's optimiser: training, wherever the file lies."""
+        """Return whether it makes a Gaussian model and steps that model's optimiser: it trains, in any file."""
         steps = [call.func for call in function.flow.calls if is_step(call)]
         stepped = [step.value for step in steps if isinstance(step, cst.Attribute)]
         return any(

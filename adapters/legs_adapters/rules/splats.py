@@ -1,4 +1,4 @@
-"""Whether a loss is about Gaussian splatting at all, going by the words of the files around it."""
+"""Tell by the words of the files around a term whether it is about Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Splats:
         return self._speaks_around(function) or self._rendered(function.module, function, form)
 
     def _speaks_around(self, function: Function) -> bool:
-        """Whether the file, or a file that trains through it, is about Gaussian splatting: not a network for depth."""
+        """Return whether the file, or a file that trains through it, speaks of Gaussian splatting."""
         seen: Set[Function] = set()
         queue = [function]
         while queue:
@@ -51,12 +51,12 @@ class Splats:
         return False
 
     def _runs_with(self, module: Module, other: Module) -> bool:
-        """Whether what a function is called by, going by names, can be: it runs with it, or is near it."""
+        """Return whether a module that calls a name can call this one: both run together, or lie near each other."""
         near = other.path.split("/")[0] == module.path.split("/")[0] or "/" not in module.path
         return near or other.path in self.program.together(module)
 
     def _rendered(self, module: Module, function: Function, form: Form) -> bool:
-        """Whether the rendering says so itself, or files beside it do, where the file is not about rays."""
+        """Return whether a name in the term or a file beside it says so, where the file is not about rays."""
         sides = made_of(function, form)
         names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
         if _RAYS.search(module.text) or "mesh" in words(module.path.rpartition("/")[2]):
@@ -74,7 +74,7 @@ class Splats:
         return any(self._speaks_of_splats(path) for path in near)
 
     def _takes_splats(self, module: Module) -> bool:
-        """Whether a file imports something Gaussian, ``GazeGaussianNet``, from one that speaks of splats."""
+        """Return whether a file imports something Gaussian, ``GazeGaussianNet``, from one that speaks of splats."""
         for node in module.top.flow.imports:
             if isinstance(node, cst.ImportFrom) and "gaussian" in code(node).lower():
                 found = self.program.imported_from(module, node)
@@ -89,7 +89,7 @@ class Splats:
 
 
 def made_of(function: Function, form: Form) -> List[cst.CSTNode]:
-    """The parts of both sides, and of what their names were made from."""
+    """Return the parts of both sides, and of what their names were made from."""
     parts: List[cst.CSTNode] = [*walk_expressions(form.first), *walk_expressions(form.second)]
     for part in list(parts):
         if isinstance(part, cst.Name):

@@ -1,4 +1,4 @@
-"""What a function that compares two pictures is called for: the loss in one call, something else in the next."""
+"""Classify the calls of a function that compares two images: for the loss, or for something else."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Uses:
         self.analysis = analysis
 
     def of(self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> List[Use]:
-        """What the calls of a function that compares two parameters of its own are for, as far as training goes."""
+        """Classify the calls, in the training step, of a function that compares two of its parameters."""
         found: List[Tuple[Use, Optional[str]]] = []
         prediction, target = _whole(prediction), _whole(target)
         if not isinstance(target, cst.Name):
@@ -71,7 +71,7 @@ class Uses:
         ]
 
     def unsettled(self, function: Function, uses: Sequence[Use]) -> Optional[str]:
-        """Where a call of the function is, or may be, of which it cannot be told what it is for; None for nowhere.
+        """Return where a call stands, or may stand, of which the purpose cannot be told; None for nowhere.
 
         Without gradients nothing is weighted, so that what such a call is for does not matter.
         """
@@ -83,7 +83,7 @@ class Uses:
         return calls.lost
 
     def _is_handed_on(self, caller: Function, node: cst.CSTNode) -> bool:
-        """Whether it is what a caller was given by several calls of its own, each of which may mean another thing."""
+        """Return whether the caller got it from several calls of its own, which may pass different kinds."""
         several = len(self.analysis.training.sites.get(caller, ())) > 1
         given = [made for part in attribute_chain(node) for made in caller.flow.reaching(part)] if several else []
         return any(made.kind == "parameter" for made in given)
@@ -102,5 +102,5 @@ def _whole(node: cst.CSTNode) -> cst.CSTNode:
 
 
 def _are_pair(meanings: Sequence[Meaning]) -> bool:
-    """Whether the first is the rendering of what the second surely is, a photograph."""
+    """Return whether the first is a rendering and the second surely a photograph."""
     return meanings[-1].role == "target" and swapped(meanings[0], meanings[-1]) is False

@@ -1,4 +1,4 @@
-"""The verdict on one form: a site, a term that is left with the reason, or a problem that a person must settle."""
+"""Decide on one form: a site, a term that a rule leaves, or a problem that a person must settle."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class Verdicts:
     def _is_channels_last(
         self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode, error: cst.CSTNode
     ) -> bool:
-        """Whether the two lie so; or a photograph does that the same rendering is compared with elsewhere."""
+        """Return whether the two are [H, W, C], or another photograph that the same rendering is compared with."""
         others = [
             form.second
             for form in self.analysis.forms.of(function)
@@ -151,18 +151,18 @@ def _index(node: cst.Subscript) -> str:
 
 
 def _is_same_place(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
-    """Whether two expressions that are written alike are of the same values."""
+    """Return whether two expressions that are written alike are of the same values."""
     names = [[part for part in walk_expressions(node) if isinstance(part, cst.Name)] for node in (first, second)]
     return all(function.flow.reaching(one) == function.flow.reaching(other) for one, other in zip(*names))
 
 
 def _in_a_copy(function: Function, uses: Sequence[Use]) -> str:
-    """Where to write it, for a function that some calls need as it is."""
+    """Return advice to weight a copy of a function that some calls need unchanged; empty without such a call."""
     calls = [use.where for use in uses if use.other is None]
     shown = ", ".join(calls[:3]) + (f" and {len(calls) - 3} more" if len(calls) > 3 else "")
     return f", in a copy of {_called(function)} for {shown}" if calls else ""
 
 
 def _called(function: Function) -> str:
-    """What a function is called by: of a ``forward`` the name of its class."""
+    """Return the name that calls use: of a ``forward`` that of its class."""
     return function.owner.name if function.owner is not None and function.name in _FORWARD else function.name

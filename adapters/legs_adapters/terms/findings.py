@@ -1,4 +1,4 @@
-"""What is found in a checkout: terms to weight, terms left alone, and terms that a person must settle."""
+"""Hold what is found in a checkout: terms to weight, terms that are left, and terms that a person must settle."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Site(NamedTuple):
         return self.scope.name
 
     def named_by(self, line: int) -> bool:
-        """Whether a line that a person names is one of its lines."""
+        """Return whether a line that a person names is one of its lines."""
         return self.line <= line <= self.last_line
 
 

@@ -92,7 +92,7 @@ def _is_of_points(sides: Sequence[cst.CSTNode]) -> bool:
 
 
 def _is_number(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int) -> bool:
-    """Whether a side is one number made of a picture, ``image.mean()``, or one of each channel."""
+    """Return whether a side is one number made of a picture, ``image.mean()``, or one of each channel."""
     if isinstance(node, cst.Call):
         positional, keywords, _ = arguments(node)
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
@@ -114,7 +114,7 @@ def _is_number(meanings: Meanings, function: Function, node: cst.CSTNode, depth:
 
 
 def _is_constant_tensor(function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
-    """Whether a side is a tensor of constants, ``torch.eye(3)``, ``torch.tensor([0, 0, 1])[:, None]``.
+    """Return whether a side is a tensor of constants, ``torch.eye(3)``, ``torch.tensor([0, 0, 1])[:, None]``.
 
     Or a name for one, or for one of several, that nothing is written to.
     """

@@ -32,6 +32,8 @@ PARTS: Dict[str, List[str]] = {
     "loss-2": ["loss.py", "--parts", "loss", "--threads", "2"],
     "weights-1": ["loss.py", "--parts", "weights", "--threads", "1"],
     "weights-2": ["loss.py", "--parts", "weights", "--threads", "2"],
+    "drop-in-1": ["drop_in.py", "--threads", "1"],
+    "drop-in-2": ["drop_in.py", "--threads", "2"],
     "memory": ["loss.py", "--parts", "memory"],
     "growth": ["loss.py", "--parts", "growth", "--rounds", "3"],
     "precompute": ["precompute.py"],

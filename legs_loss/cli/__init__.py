@@ -18,7 +18,7 @@ from legs_loss.plugins import plugins
 
 __all__ = ["main"]
 
-COMMANDS = ("scene", "precompute", "show", "info", "train", "demo", "compare", "report", "env")
+COMMANDS = ("scene", "precompute", "show", "info", "train", "demo", "compare", "report", "view", "env")
 
 EXIT_CODES = "exit codes: 0 done; 1 done, but some items failed; 2 bad input or usage; 130 interrupted"
 

@@ -78,6 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one a core"
     )
+    parser.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="of a dask cluster that shares the file system; a training is a task"
     )
@@ -104,6 +105,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.experiments.studies import STUDIES, these_arms
     from legs_loss.experiments.tables import study_text
     from legs_loss.reference.training.trainer import Progress, TrainConfig
+    from legs_loss.report.tensorboard import tensorboard_log
     from legs_loss.scenes import read_scene
 
     set_threads(None)  # without numba there is no training: say so now
@@ -134,12 +136,14 @@ def run(args: argparse.Namespace) -> int:
     missing = sum(comparison.row(arm, seed) is None for arm in arms for seed in seeds)
     print(f"{len(arms)} arms, {len(seeds)} seed(s); {missing} of {len(arms) * len(seeds)} trainings to do", flush=True)
     reached: Dict[str, int] = {}
-    with tqdm(total=missing * args.iterations, desc="iterations", mininterval=0.5, disable=not missing) as bar:
+    bar = tqdm(total=missing * args.iterations, desc="iterations", mininterval=0.5, disable=not missing)
+    with bar, tensorboard_log(args.tensorboard) as log:
 
         def show(name: str, progress: Progress) -> None:
             bar.update(progress.iteration - reached.get(name, 0))
             reached[name] = progress.iteration
             bar.set_postfix_str(f"{name}: {progress.psnr:.2f} dB, {progress.gaussians} Gaussians", refresh=False)
+            log(name, progress)
 
         comparison.train(arms, seeds, args.processes, show, args.scheduler)
     rows = [row for row in read_rows(args.out)[1] if row["seed"] in seeds]

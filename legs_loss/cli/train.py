@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--resume", action="store_true", help="go on with the run in the output folder")
     parser.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")
+    parser.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
     parser.add_argument("--threads", type=int, metavar="N", help="default: one a core")
     parser.add_argument(
         "--checkpoint_every", type=int, default=500, metavar="N", help="iterations between checkpoints; default: 500"
@@ -72,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.cli.checks import check_trainable
     from legs_loss.errors import LegsError
     from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, point_cloud, train
+    from legs_loss.report.tensorboard import tensorboard_log
     from legs_loss.scenes import read_scene
 
     set_threads(args.threads)
@@ -89,7 +91,12 @@ def run(args: argparse.Namespace) -> int:
         config = TrainConfig(**given)
     scene = read_scene(args.scene, args.images)
     check_trainable(scene, config.resolution)
-    with progress_bar(config.iterations, out.name) as show:
+    with progress_bar(config.iterations, out.name) as show, tensorboard_log(args.tensorboard) as log:
+
+        def on_progress(progress: Progress) -> None:
+            show(progress)
+            log(out.name, progress)
+
         result = train(
             scene,
             config,
@@ -97,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
             resume=args.resume,
             store=args.store,
             checkpoint_every=args.checkpoint_every,
-            on_progress=show,
+            on_progress=on_progress,
         )
     _print(result.metrics)
     print(point_cloud(out, config))

@@ -1,0 +1,42 @@
+"""Look at trained Gaussians in the browser.
+
+PATH is a .ply of 3DGS, the output folder of a training (of legs train, 3DGS or its forks), a folder of several, as legs
+demo writes, or a comparison. Methods are switched on and off, and two are wiped against each other; with a scene, its
+cameras are shown with their photographs or weight maps. Colours do not change with the direction (degree 0).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+HELP = "look at trained Gaussians in the browser"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    from legs_loss.spec import PRESETS
+
+    parser.add_argument("path", metavar="RUN|PLY|COMPARISON", type=Path, help="what to look at")
+    parser.add_argument("-s", "--scene", type=Path, metavar="DIR", help="the photographs; a comparison knows its own")
+    parser.add_argument("--preset", choices=PRESETS, default="legs", help="of the weight maps; default: legs")
+    parser.add_argument("--port", type=int, default=8080, metavar="N", help="default: 8080, or the next that is free")
+    parser.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="default: 127.0.0.1, this machine alone can look"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    from legs_loss.viewer.content import find_content
+    from legs_loss.viewer.server import serve
+
+    content = find_content(args.path, args.scene)
+    server = serve(content, args.preset, args.host, args.port)
+    print(f"{', '.join(content.methods)}: http://{args.host}:{server.get_port()} (Ctrl-C ends)", flush=True)
+    try:
+        while True:
+            time.sleep(1)
+    finally:
+        server.stop()

@@ -1,0 +1,206 @@
+"""The page: a viser server with the methods' splats, switches, a wipe between two of them, and the cameras."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Dict, Tuple
+
+import numpy as np
+
+from legs_loss.errors import LegsError
+from legs_loss.reference.ply import read_ply
+from legs_loss.scenes import View, image_tensor, load_training_image
+from legs_loss.viewer.content import Content
+from legs_loss.viewer.splats import Splats, left_of, splats
+
+__all__ = ["serve"]
+
+_CAMERAS = 40  # shown at most, spread evenly
+_PICTURE = 160  # pixels: the width of a camera's picture
+_WIPE_SECONDS = 0.15
+
+
+def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port: int = 8080) -> Any:
+    """Start the server and return it; it runs in threads of its own until it is stopped.
+
+    Args:
+        content: from :func:`~legs_loss.viewer.content.find_content`.
+        preset: whose weight maps the cameras show.
+        host, port: where it listens; the next free port is taken if this one is in use.
+
+    Raises:
+        LegsError: viser is missing, or a .ply cannot be read.
+    """
+    try:
+        import viser
+    except ImportError:
+        raise LegsError("legs view needs viser: pip install 'legs-loss[view]'") from None
+    loaded = {name: splats(read_ply(path)) for name, path in content.methods.items()}
+    server = viser.ViserServer(host=host, port=port, verbose=False)
+    server.gui.configure_theme(control_layout="collapsible", dark_mode=False)
+    server.gui.add_markdown(f"### {content.title}")
+    _Methods(server, loaded)
+    if content.scene is not None:
+        _Cameras(server, content, preset)
+    else:
+        _look_at_all(server, loaded)
+    return server
+
+
+class _Methods:
+    """The splats of each method: shown or not, or two of them on either side of a line."""
+
+    def __init__(self, server: Any, loaded: Dict[str, Splats]) -> None:
+        self.server, self.loaded = server, loaded
+        names = list(loaded)
+        self.handles = {
+            name: server.scene.add_gaussian_splats(f"/methods/{name}", **one.as_arguments(), visible=name == names[0])
+            for name, one in loaded.items()
+        }
+        self.shown: Dict[str, Any] = {}
+        for name in names:
+            count = f"{len(loaded[name].centers):,} Gaussians"
+            box = server.gui.add_checkbox(f"{name}: {count}", initial_value=name == names[0])
+            box.on_update(lambda event: self.draw(event.client))
+            self.shown[name] = box
+        self.wiping = None
+        self.wiped_at = 0.0
+        if len(names) > 1:
+            with server.gui.add_folder("Wipe"):
+                self.wiping = server.gui.add_checkbox("wipe between two", initial_value=False)
+                self.left = server.gui.add_dropdown("left", names, initial_value=names[0])
+                self.right = server.gui.add_dropdown("right", names, initial_value=names[-1])
+                self.share = server.gui.add_slider("line", min=0.0, max=1.0, step=0.01, initial_value=0.5)
+            for control in (self.wiping, self.left, self.right, self.share):
+                control.on_update(lambda event: self.draw(event.client))
+            server.on_client_connect(lambda client: client.camera.on_update(lambda _: self.follow(client)))
+
+    def follow(self, client: Any) -> None:
+        """Keep the line where it is on the screen while the camera moves."""
+        if self.wiping is not None and self.wiping.value and time.monotonic() - self.wiped_at > _WIPE_SECONDS:
+            self.draw(client)
+
+    def draw(self, client: Any) -> None:
+        """Show what the switches say."""
+        wiping = self.wiping is not None and self.wiping.value and client is not None
+        sides = {self.left.value: True, self.right.value: False} if wiping else {}
+        with self.server.atomic():
+            for name, handle in self.handles.items():
+                handle.visible = name in sides if wiping else self.shown[name].value
+                if name in sides:
+                    self._cut(client, name, sides[name])
+                elif self.wiped_at:
+                    handle.opacities = self.loaded[name].opacities
+        self.wiped_at = time.monotonic() if wiping else self.wiped_at
+
+    def _cut(self, client: Any, name: str, keeps_left: bool) -> None:
+        from viser.transforms import SO3
+
+        one, camera = self.loaded[name], client.camera
+        left = left_of(
+            one.centers, SO3(camera.wxyz).as_matrix(), camera.position, camera.fov, camera.aspect, self.share.value
+        )
+        self.handles[name].opacities = one.opacities * (left == keeps_left)[:, None]
+
+
+class _Cameras:
+    """The scene's cameras as frustums, with the photograph or the weight map in each."""
+
+    def __init__(self, server: Any, content: Content, preset: str) -> None:
+        assert content.scene is not None
+        with_camera = [view for view in content.scene.views if view.camera is not None]
+        step = max(1, -(-len(with_camera) // _CAMERAS))
+        self.content, self.preset, self.views = content, preset, with_camera[::step]
+        poses = [_pose(view) for view in self.views]
+        size = 0.08 * float(np.ptp([position for _, position in poses], axis=0).max()) if len(poses) > 1 else 0.2
+        self.handles = [self._add(server, view, *pose, size or 0.2) for view, pose in zip(self.views, poses)]
+        self.what = server.gui.add_dropdown(
+            "cameras", ["none", "outlines", "photograph", "weight map"], initial_value="none"
+        )
+        self.what.on_update(lambda _: self.draw())
+        self.pictures: Dict[Tuple[str, str], np.ndarray] = {}
+        if poses:
+            _start_at(server, *poses[0], np.mean([rotation[:, 1] for rotation, _ in poses], axis=0))
+
+    def _add(self, server: Any, view: View, rotation: np.ndarray, position: np.ndarray, size: float) -> Any:
+        from viser.transforms import SO3
+
+        camera = view.camera
+        assert camera is not None
+        handle = server.scene.add_camera_frustum(
+            f"/cameras/{view.name}",
+            fov=2 * np.arctan(camera.height / (2 * camera.fy)),
+            aspect=camera.width / camera.height,
+            scale=size,
+            wxyz=SO3.from_matrix(rotation).wxyz,
+            position=position,
+            visible=False,
+        )
+        handle.on_click(lambda event: _look_through(event.client, handle.wxyz, position))
+        return handle
+
+    def draw(self) -> None:
+        """Show what the dropdown says."""
+        for view, handle in zip(self.views, self.handles):
+            handle.visible = self.what.value != "none"
+            handle.image = self._picture(view) if self.what.value in ("photograph", "weight map") else None
+
+    def _picture(self, view: View) -> Any:
+        key = self.what.value, view.name
+        if key not in self.pictures:
+            try:
+                self.pictures[key] = _picture(view, self.preset if key[0] == "weight map" else None)
+            except LegsError:
+                return None  # the photograph is missing: the outline stays
+        return self.pictures[key]
+
+
+def _picture(view: View, preset: Any) -> np.ndarray:
+    """A photograph, or its weight map from black (1) to white (1 + beta), uint8 [H, W, 3]."""
+    from legs_loss.spec import as_spec
+    from legs_loss.weights import weight_map
+
+    photograph = load_training_image(view, _PICTURE)
+    image = image_tensor(photograph)
+    if preset is None:
+        return (image.expand(3, -1, -1).permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
+    weight = weight_map(image, preset)[0].numpy()
+    gray = (weight - 1) / max(as_spec(preset).beta, 1e-6)
+    return np.repeat((gray.clip(0, 1) * 255).round().astype(np.uint8)[..., None], 3, axis=2)
+
+
+def _pose(view: View) -> Tuple[np.ndarray, np.ndarray]:
+    """A camera's axes in the world [3, 3], and its position [3]."""
+    assert view.camera is not None
+    rotation = view.camera.world_to_camera[:3, :3].T
+    return rotation, -rotation @ view.camera.world_to_camera[:3, 3]
+
+
+def _start_at(server: Any, rotation: np.ndarray, position: np.ndarray, down: np.ndarray) -> None:
+    from viser.transforms import SO3
+
+    server.scene.set_up_direction(tuple(-down / max(float(np.linalg.norm(down)), 1e-6)))
+    wxyz = SO3.from_matrix(rotation).wxyz
+    server.on_client_connect(lambda client: _look_through(client, wxyz, position))
+
+
+def _look_through(client: Any, wxyz: np.ndarray, position: np.ndarray) -> None:
+    if client is not None:
+        with client.atomic():
+            client.camera.wxyz, client.camera.position = wxyz, position
+
+
+def _look_at_all(server: Any, loaded: Dict[str, Splats]) -> None:
+    """Without cameras: from outside, towards the middle of what is opaque."""
+    points = np.concatenate([one.centers[one.opacities[:, 0] > 0.1] for one in loaded.values()])
+    if not len(points):
+        return
+    low, middle, high = (np.percentile(points, at, axis=0) for at in (5, 50, 95))
+    place = middle + np.array([0.0, -0.4, -1.2]) * max(float((high - low).max()), 1e-3)
+    server.scene.set_up_direction("-y")
+
+    def look(client: Any) -> None:
+        with client.atomic():
+            client.camera.position, client.camera.look_at = place, middle
+
+    server.on_client_connect(look)

@@ -1,0 +1,72 @@
+"""Gaussians as viser draws them, and which of them lie left of a line on the screen."""
+
+from __future__ import annotations
+
+from typing import Any, Dict, NamedTuple
+
+import numpy as np
+import torch
+
+from legs_loss.reference.conventions import SH_C0
+from legs_loss.reference.gaussians import Gaussians
+
+__all__ = ["Splats", "left_of", "splats"]
+
+
+class Splats(NamedTuple):
+    """centers [N, 3], covariances [N, 3, 3], rgbs [N, 3] and opacities [N, 1] in [0, 1], all float32."""
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    rgbs: np.ndarray
+    opacities: np.ndarray
+
+    def as_arguments(self) -> Dict[str, Any]:
+        """Return them by the names of viser's arguments."""
+        return self._asdict()
+
+
+def splats(gaussians: Gaussians) -> Splats:
+    """Return what viser draws of Gaussians. Colours are those of degree 0: they do not change with the direction."""
+    w, x, y, z = torch.nn.functional.normalize(gaussians.quaternions, dim=1).unbind(1)
+    rotation = torch.stack(
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ],
+        dim=1,
+    ).reshape(-1, 3, 3)
+    axes = rotation * gaussians.scales[:, None, :]
+    colours = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
+    parts = (gaussians.means, axes @ axes.transpose(1, 2), colours, gaussians.opacities)
+    return Splats(*(part.detach().float().numpy() for part in parts))
+
+
+def left_of(
+    centers: np.ndarray, rotation: np.ndarray, position: np.ndarray, fov: float, aspect: float, share: float
+) -> np.ndarray:
+    """Return which points lie left of a vertical line on the screen, bool [N].
+
+    Args:
+        centers: [N, 3].
+        rotation: [3, 3], of the camera's axes (x right, y down, z forward) in the world.
+        position: of the camera, [3].
+        fov: vertical, in radians.
+        aspect: width by height.
+        share: of the screen's width that is left of the line, in [0, 1].
+
+    Example:
+        >>> points = np.array([[-1.0, 0.0, 2.0], [1.0, 0.0, 2.0]])
+        >>> left_of(points, np.eye(3), np.zeros(3), 1.0, 1.0, 0.5).tolist()
+        [True, False]
+    """
+    seen = (centers - position) @ rotation
+    edge = (2 * share - 1) * np.tan(fov / 2) * aspect
+    return seen[:, 0] < edge * np.maximum(seen[:, 2], 1e-6)

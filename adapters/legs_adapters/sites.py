@@ -19,7 +19,7 @@ from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.lexicon.views import View
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.doubts import Doubt, Doubts
-from legs_adapters.rules.order import first, first_of_call
+from legs_adapters.rules.order import RULES, first, first_of_call
 from legs_adapters.rules.rule import CallOfTerm, Term
 from legs_adapters.rules.verdict import Verdicts, left
 from legs_adapters.terms.findings import Evidence, Findings, Left, Problem, Site
@@ -217,7 +217,7 @@ class _Finder:
 
     def _why_not_handed(self, holder: Function, entry: Callback) -> Optional[Evidence]:
         term = Term(self.analysis, entry.caller, entry.form)
-        unknown = Evidence("unknown", "unknown", term.here)
+        unknown = RULES["unknown"].found(term.here)
         evidence = first(term)
         if evidence is None and entry.outer is not None:
             given = [self.analysis.meanings.of(holder, value) for value in arguments(entry.outer)[0][:2]]

@@ -4,52 +4,70 @@ from __future__ import annotations
 
 from typing import Optional, Tuple
 
-from legs_adapters.rules.causes.definition import Definition
-from legs_adapters.rules.causes.distillation import Distillation
-from legs_adapters.rules.causes.evaluation import EmbeddingFit, EmbeddingStep, EvaluationName
-from legs_adapters.rules.causes.features import NamedMap, Network, Scan
-from legs_adapters.rules.causes.huber import Huber
-from legs_adapters.rules.causes.kinds import (
-    Depth,
-    Features,
-    Flow,
-    Gradients,
-    ImageChange,
-    Mask,
-    Normals,
-    Parameters,
-    Synthetic,
-    Warping,
+from legs_adapters.rules.causes import (
+    definition,
+    distillation,
+    evaluation,
+    features,
+    huber,
+    kinds,
+    not_torch,
+    other,
+    regulariser,
+    tracking,
+    unknown,
+    untrained,
+    weighting,
 )
-from legs_adapters.rules.causes.not_torch import NotTorch
-from legs_adapters.rules.causes.other import FixedTarget, NotSplats
-from legs_adapters.rules.causes.regulariser import Literal, OfModel, Statistic
-from legs_adapters.rules.causes.tracking import PoseStep, Tracking
-from legs_adapters.rules.causes.unknown import Ambiguous, Unknown
-from legs_adapters.rules.causes.untrained import Evaluation, Leaf, NoStep, Scoring, Untrained
-from legs_adapters.rules.causes.weighting import ErrorMask, UnreadError, Weighting
 from legs_adapters.rules.rule import CallOfTerm, Rule, Term
 from legs_adapters.terms.findings import Evidence
 
 __all__ = ["AMBIGUOUS", "DEFINITION", "HUBER", "ORDER", "RULES", "UNREAD", "first", "first_of_call"]
 
-DEFINITION = (Definition(),)
+DEFINITION = (definition.Definition(),)
 ORDER: Tuple[Rule, ...] = (
     # What is compared, as names say.
-    *(Depth(), Normals(), Features(), Flow(), Mask(), Synthetic(), Gradients(), Parameters(), Literal()),
+    kinds.Depth(),
+    kinds.Normals(),
+    kinds.Features(),
+    kinds.Flow(),
+    kinds.Mask(),
+    kinds.Synthetic(),
+    kinds.Gradients(),
+    kinds.Parameters(),
+    regulariser.Literal(),
     # Whether it is trained.
-    *(Scoring(), Evaluation(), Untrained(), NotTorch()),
+    untrained.Scoring(),
+    untrained.Evaluation(),
+    untrained.Untrained(),
+    not_torch.NotTorch(),
     # What is compared, at a closer look.
-    *(Unknown(), Statistic(), Scan(), ImageChange(), Leaf(), Distillation(), OfModel(), FixedTarget(), Weighting()),
+    unknown.Unknown(),
+    regulariser.Statistic(),
+    features.Scan(),
+    kinds.ImageChange(),
+    untrained.Leaf(),
+    distillation.Distillation(),
+    regulariser.OfModel(),
+    other.FixedTarget(),
+    weighting.Weighting(),
     # What the names around it say.
-    *(Tracking(), EvaluationName(), Warping(), Network(), EmbeddingFit(), NotSplats(), NamedMap()),
+    tracking.Tracking(),
+    evaluation.EvaluationName(),
+    kinds.Warping(),
+    features.Network(),
+    evaluation.EmbeddingFit(),
+    other.NotSplats(),
+    features.NamedMap(),
     # What its optimiser moves.
-    *(PoseStep(), EmbeddingStep(), NoStep()),
+    tracking.PoseStep(),
+    evaluation.EmbeddingStep(),
+    untrained.NoStep(),
 )
-# Asked only once it is known which side is which, of a term that a person chose too.
-AMBIGUOUS = (Ambiguous(),)
-HUBER = (Huber(),)
-UNREAD = (ErrorMask(), UnreadError())
+# Asked by verdict.py in places of their own: HUBER and UNREAD also of a term that a person chose.
+AMBIGUOUS = (unknown.Ambiguous(),)
+HUBER = (huber.Huber(),)
+UNREAD = (weighting.ErrorMask(), weighting.UnreadError())
 RULES = {rule.id: rule for rule in (*DEFINITION, *ORDER, *AMBIGUOUS, *HUBER, *UNREAD)}
 
 
@@ -58,7 +76,7 @@ def first(term: Term, rules: Tuple[Rule, ...] = ORDER) -> Optional[Evidence]:
     for rule in rules:
         deciders = rule.evidence(term)
         if deciders:
-            return Evidence(rule.id, rule.reason, deciders)
+            return rule.found(deciders)
     return None
 
 
@@ -67,5 +85,5 @@ def first_of_call(call: CallOfTerm) -> Optional[Evidence]:
     for rule in ORDER:
         deciders = rule.of_call(call)
         if deciders:
-            return Evidence(rule.id, rule.reason, deciders)
+            return rule.found(deciders)
     return None

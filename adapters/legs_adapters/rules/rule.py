@@ -13,7 +13,7 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import walk_expressions
 from legs_adapters.lexicon.meaning import Meaning, swapped
-from legs_adapters.terms.findings import Decider
+from legs_adapters.terms.findings import Decider, Evidence
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.sides import Pair, pair_of
 
@@ -32,12 +32,14 @@ class Asked:
         analysis: those analyses.
         function: the function that the call stands in.
         call: the call.
+        here: the call, or the term that is asked about, as what decided.
     """
 
     def __init__(self, analysis: Analysis, function: Function, call: cst.CSTNode) -> None:
         self.analysis = analysis
         self.function = function
         self.call = call
+        self.here: List[Decider] = [(function, call)]
 
     def serves(self, purpose: str) -> List[Decider]:
         """Return what shows that its backward pass has this purpose; nothing where that may be another, or training."""
@@ -62,6 +64,7 @@ class Term(Asked):
     def __init__(self, analysis: Analysis, function: Function, form: Form, pair: Optional[Pair] = None) -> None:
         super().__init__(analysis, function, form.call)
         self.form = form
+        self.here = [(function, form.node)]
         self.pair = pair or pair_of(analysis.meanings, function, form)
 
     @property
@@ -79,11 +82,6 @@ class Term(Asked):
         """The other side."""
         return self.pair.second if swapped(self.pair.a, self.pair.b) else self.pair.first
 
-    @property
-    def here(self) -> List[Decider]:
-        """The term itself, as what decided."""
-        return [(self.function, self.form.node)]
-
 
 class CallOfTerm(Asked):
     """A call of a function that compares two of its parameters.
@@ -95,11 +93,6 @@ class CallOfTerm(Asked):
     def __init__(self, analysis: Analysis, caller: Function, call: cst.Call, given: Sequence[Meaning]) -> None:
         super().__init__(analysis, caller, call)
         self.given = given
-
-    @property
-    def here(self) -> List[Decider]:
-        """The call itself, as what decided."""
-        return [(self.function, self.call)]
 
 
 class Rule:
@@ -130,6 +123,10 @@ class Rule:
     def of_call(self, call: CallOfTerm) -> List[Decider]:
         """Return what decides that a call is not for the loss; nothing where the rule does not apply."""
         return []
+
+    def found(self, deciders: Sequence[Decider]) -> Evidence:
+        """Return as evidence what decided by this rule."""
+        return Evidence(self.id, self.reason, deciders)
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether a person is to be asked about a term that this rule left, if nothing else is found."""

@@ -13,7 +13,7 @@ from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.usage import draws, is_box
 from legs_adapters.lexicon.words import RENDERERS
-from legs_adapters.tensors.operations import JOINS
+from legs_adapters.tensors.operations import JOINS, KEEPS_PICTURE, PASSES_ON
 
 __all__ = ["meaning_of_call"]
 
@@ -21,20 +21,6 @@ __all__ = ["meaning_of_call"]
 if TYPE_CHECKING:
     from legs_adapters.lexicon.depiction import Meanings
 
-_SAME = {
-    "cuda", "cpu", "to", "float", "half", "double", "type", "clone", "contiguous", "detach", "clamp", "clip", "clamp_",
-    "clamp_min", "clamp_max", "squeeze", "unsqueeze", "permute", "transpose", "view", "reshape", "flatten", "expand",
-    "repeat", "requires_grad_", "mean", "pow", "flip", "T", "type_as", "movedim", "index_select", "masked_fill", "mul",
-    "mul_", "add", "sub", "div", "div_", "nan_to_num", "round", "narrow", "view_as", "reshape_as", "copy", "cumsum",
-    "roll", "chunk", "split", "sum", "unbind", "select",
-}  # fmt: skip
-_FIRST = {
-    "clamp", "clip", "interpolate", "grid_sample", "pad", "permute", "squeeze", "unsqueeze", "flatten", "reshape",
-    "transpose", "sigmoid", "relu", "from_numpy", "tensor", "as_tensor", "mean", "nan_to_num", "rearrange", "resize",
-    "movedim", "pow", "index_select", "masked_select", "gather", "avg_pool2d", "flip", "rot90", "einsum", "checkpoint",
-    "conv2d", "mul", "where_first", "abs", "array", "enumerate", "iter", "next", "list", "tuple", "reversed", "zip",
-    "tqdm", "DataLoader", "deepcopy", "no_grad", "max_pool2d", "center_crop", "crop", "gaussian_blur",
-}  # fmt: skip
 _MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
 _NUMBERS = {"int", "float", "len", "bool"}
 _STATISTICS = {"histc", "histogram", "bincount", "entropy", "gram", "moments"}  # of a picture, no picture
@@ -73,9 +59,9 @@ def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, dept
         return Meaning("gradient", meanings.of(function, values[0], depth).role)
     if name in JOINS and values:
         return meanings.of(function, values[0], depth)
-    if base is not None and not module and name in _SAME:
+    if base is not None and not module and name in KEEPS_PICTURE:
         return meanings.of(function, base, depth)
-    if (module or base is None) and (name in _FIRST or name in _SAME) and values:
+    if (module or base is None) and name in KEEPS_PICTURE | PASSES_ON and values:
         return meanings.of(function, values[0], depth)
     if base is not None and name in ("pop", "popleft", "__getitem__", "cuda"):
         return meanings.of(function, base, depth)

@@ -10,6 +10,7 @@ from legs_adapters.code.entries import called_makers, written
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import arguments, call_name, constant, key_of, word_set, words
 from legs_adapters.lexicon.depiction import Meanings
+from legs_adapters.tensors.operations import JOINS, LIMITS, MOVES
 
 __all__ = ["is_mask", "is_rows", "makes_mask", "picked_from", "without_rows"]
 
@@ -97,9 +98,9 @@ def is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: in
     if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
         if _to_rows(node) or _flattens(node):
             return True
-        if call_name(node) in ("cat", "concat"):
+        if call_name(node) in JOINS:
             return are((function, arg.value) for arg in node.args[:1])
-        return call_name(node) in ("float", "cuda", "to", "clamp", "detach") and are([(function, node.func.value)])
+        return call_name(node) in MOVES | LIMITS and are([(function, node.func.value)])
     return False
 
 

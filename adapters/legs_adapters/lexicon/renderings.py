@@ -11,15 +11,11 @@ from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, word_set, words
 from legs_adapters.lexicon.names import role_of_words
+from legs_adapters.tensors.operations import AXES, JOINS, LIMITS, MAKES, MOVES
 
 __all__ = ["is_of_mesh", "is_rendering"]
 
-_KEEPS = word_set(
-    """
-    array as_tensor astype cat clamp clip clone contiguous cpu cuda detach flip float from_numpy half numpy permute
-    reshape squeeze stack tensor to transpose type unsqueeze view
-    """
-)
+_KEEPS = MOVES | MAKES | LIMITS | AXES | JOINS
 _MODULES = word_set("torch np numpy")
 _MESH_RASTERIZERS = ("nvdiffrast.", "kaolin.render.", "pytorch3d.renderer")
 

@@ -15,10 +15,10 @@ from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import arguments, brief, call_name, code, constant, dotted, words
 from legs_adapters.lexicon.view_names import NAME, Names
+from legs_adapters.tensors.operations import MOVES
 
 __all__ = ["View", "Views"]
 
-_MOVES = {"cuda", "to", "cpu", "float", "contiguous", "clone", "detach", "type"}
 _IMAGES = {"original_image", "image", "gt_image", "rgb", "original_rgb", "img", "image_tensor"}
 
 
@@ -77,7 +77,7 @@ class Views:
             return None
         if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
             name = node.func.attr.value
-            if name in _MOVES:
+            if name in MOVES:
                 return self._trace(function, node.func.value, images, seen)
             if name in ("clamp", "clip") and _unit_range(node, 0):
                 return self._trace(function, node.func.value, images, seen)

@@ -34,12 +34,12 @@ from legs_adapters.tensors.axes import (
     unsqueezed_axis,
 )
 from legs_adapters.tensors.backward import Training
+from legs_adapters.tensors.operations import LIMITS, MOVES
 
 __all__ = ["Vote", "is_channels_last", "lies_last"]
 
 _LAST_RENDERERS = {"rasterization", "rasterization_2dgs", "rasterize_gaussians", "rasterization_inria_wrapper"}
-# What leaves the axes where they are.
-_KEEPS = {"clip", "clamp", "contiguous", "cpu", "cuda", "detach", "double", "float", "half", "numpy", "to", "type"}
+_KEEPS = MOVES | LIMITS  # leaves the axes where they are
 
 
 class Vote(NamedTuple):

@@ -11,7 +11,7 @@ from legs_adapters.code.syntax import arguments, attribute_chain, call_name, wal
 from legs_adapters.lexicon.masks import makes_mask
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.gradients import under_no_grad
-from legs_adapters.tensors.operations import SIZES
+from legs_adapters.tensors.operations import ENDS_GRADIENT, SIZES
 from legs_adapters.terms.form import Form
 
 __all__ = ["Shared", "is_asked", "is_huber", "is_measured", "is_rescaled", "shared_of", "takes_no_gradient"]
@@ -175,7 +175,7 @@ def _only_measured(training: Training, function: Function, call: cst.Call, given
             names.append(callee.parameters[position])
         silent: Set[int] = set()
         for inner in callee.flow.calls:
-            if call_name(inner) in ("detach", "item", "tolist", "numpy") and isinstance(inner.func, cst.Attribute):
+            if call_name(inner) in ENDS_GRADIENT and isinstance(inner.func, cst.Attribute):
                 silent.update(id(part) for part in walk_expressions(inner.func.value))
         uses = [
             use

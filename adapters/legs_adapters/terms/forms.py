@@ -12,13 +12,12 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import call_name, walk_expressions
 from legs_adapters.tensors.absolute import is_abs
+from legs_adapters.tensors.operations import TRANSFORMS
 from legs_adapters.terms import kinds
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 
 __all__ = ["Forms"]
-
-_TRANSFORMS = {"pow", "square", "log", "log1p", "log2", "log10", "exp", "sqrt", "tanh", "sigmoid"}
 
 
 class Forms:
@@ -71,7 +70,7 @@ def _transformed(function: Function) -> Set[int]:
         parts: List[cst.CSTNode] = []
         if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Power):
             parts = [node.left]
-        elif isinstance(node, cst.Call) and call_name(node) in _TRANSFORMS:
+        elif isinstance(node, cst.Call) and call_name(node) in TRANSFORMS:
             parts = [node.func, *node.args]
         for part in parts:
             found.update(id(n) for n in walk_expressions(part) if isinstance(n, cst.Call) and n is not node)

@@ -402,6 +402,20 @@ class TestNothingWaits:
         assert prediction.grad.shape == shape and prediction.grad.dtype == prediction.dtype
         assert watched.seen > 0 and not watched.waits
 
+    def test_a_patched_scripts_step_launches_six_kernels_and_remembers_its_view(self, on_meta):
+        prediction, target = (torch.empty(3, 40, 50, device="meta") for _ in range(2))
+        prediction.requires_grad_()
+        configure("legs")
+        for step in range(2):
+            with Watched() as watched:
+                loss, similarity = l1_loss(prediction, target, view="a"), ssim(prediction, target)
+                (0.8 * loss + 0.2 * (1.0 - similarity)).backward()
+            assert used(loss) == used(similarity) == "fused" and not watched.waits
+            found = ["legs_range", "legs_range_finish"] if step == 0 else []
+            sums = ["legs_l1_gradient", "legs_finish", "legs_ssim_gradient", "legs_finish"]
+            assert on_meta.launches == [*found, *sums, "legs_scale", "legs_scale"]
+            on_meta.launches.clear()
+
     def test_the_watch_sees_what_waits(self):
         with Watched() as watched:
             bool(torch.ones(1).sum() > 0)

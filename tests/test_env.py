@@ -49,7 +49,6 @@ def test_a_broken_and_a_missing_package(tmp_path):
     environment = legs_environment()
     environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
     environment.pop("LEGS_BACKEND", None)
-    environment.pop("TRITON_INTERPRET", None)
     found = lines(legs("env", env=environment))
     assert found["numba"] == "broken: needs NumPy 1.99 or less"
     assert found["loss on cpu"] == "torch; numba: ImportError: needs NumPy 1.99 or less"

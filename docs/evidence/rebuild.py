@@ -16,9 +16,17 @@ from typing import Any, List, Tuple
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import read_rows
-from legs_loss.experiments.statistics import summarise_all
-from legs_loss.experiments.studies import STUDIES
-from legs_loss.experiments.tables import differences_table, paper_text, scores_table
+from legs_loss.experiments.statistics import pooled_difference, summarise_all
+from legs_loss.experiments.studies import STUDIES, Study
+from legs_loss.experiments.tables import (
+    DIFFERENCES,
+    difference_cell,
+    differences_table,
+    markdown,
+    paper_text,
+    scores_table,
+    with_values,
+)
 from legs_loss.reference.training.metrics import METRICS
 
 HERE = Path(__file__).resolve().parent
@@ -33,6 +41,7 @@ def take(out: Path, path: Path) -> None:
     settings, rows = read_rows(out)
     settings.pop("path")
     for row in rows:
+        row.get("upstream", {}).pop("pictures", None)
         for scores in row["metrics"]["views"]["train"].values():
             for name in [key for key, metric in METRICS.items() if "train" not in metric.splits]:
                 scores.pop(name, None)  # of rows that scored training views with it too
@@ -45,6 +54,8 @@ def tables(text: str) -> str:
 
     def table(match: re.Match[str]) -> str:
         scene, study = match.group(1), STUDIES[match.group(2)]
+        if "+" in scene:
+            return f"<!-- {scene} {match.group(2)} -->\n\n{_pooled(scene.split('+'), study)}\n\n<!-- end -->"
         rows = _rows(scene)
         trained = {row["arm"] for row in rows}
         study = study._replace(arms=tuple(arm for arm in study.arms if parse_arm(arm).name in trained))
@@ -53,7 +64,7 @@ def tables(text: str) -> str:
             parts.append(paper_text(rows, study).partition("\n\n")[2])
         return f"<!-- {scene} {match.group(2)} -->\n\n" + "\n\n".join(parts) + "\n\n<!-- end -->"
 
-    return re.sub(r"<!-- (\w+) ([\w-]+) -->.*?<!-- end -->", table, text, flags=re.DOTALL)
+    return re.sub(r"<!-- ([\w+]+) ([\w-]+) -->.*?<!-- end -->", table, text, flags=re.DOTALL)
 
 
 def plots() -> None:
@@ -81,6 +92,19 @@ def plots() -> None:
             panel.margins(x=0.25, y=0.12)
             panel.grid(alpha=0.3)
     figure.savefig(str(PICTURES / "evidence_gaussians.png"), dpi=110, facecolor="white")
+
+
+def _pooled(scenes: List[str], study: Study) -> str:
+    """Each arm's differences over several scenes, each with the same share."""
+    rows = [_rows(scene) for scene in scenes]
+    lines = []
+    for arm in study.arms:
+        name, reference = parse_arm(arm).name, study.reference(parse_arm(arm).name)
+        found = [pooled_difference(rows, name, reference or name, *place) for place in DIFFERENCES.values()]
+        if reference is not None and found[0] is not None:
+            cells = [difference_cell(each, key) for each, (_, key) in zip(found, DIFFERENCES.values())]
+            lines.append([f"{name} − {reference}", *cells])
+    return markdown(*with_values([f"over {len(scenes)} captures", *DIFFERENCES], lines))
 
 
 def _rows(scene: str) -> List[Any]:

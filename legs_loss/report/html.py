@@ -241,7 +241,7 @@ def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[i
         own = settings["upstream"]
         words += ["--upstream", "CHECKOUT", "--profile", own["profile"], *(["--cpu"] if own["cpu"] else [])]
         words += ["--gaussians", str(own["gaussians"])] if own["gaussians"] is not None else []
-        words += ["--extra", shlex.join(own["extra"])] if own["extra"] else []
+        words += ["--extra", " ".join(map(shlex.quote, own["extra"]))] if own["extra"] else []
         return " ".join(shlex.quote(word) for word in [*words, "--out", run.name])
     words += ["--densify_grad_threshold", f"{base['densify_grad_threshold']!r}", "--out", run.name]
     return " ".join(shlex.quote(word) for word in words)

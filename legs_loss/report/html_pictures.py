@@ -62,7 +62,7 @@ def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Drawn:
     """Draw a view with a row's Gaussians, and make the weight map that its run would have ended with there."""
     config = TrainConfig.from_dict(row["config"])
     if "upstream" in row:
-        rendering = _upstreams_own(row, view)
+        rendering = _upstreams_own(row, folder, view)
     else:
         rendering = draw(read_ply(point_cloud(folder, config)), view, config)
     weight = _weight(config.weights, view.image, rendering)
@@ -72,12 +72,12 @@ def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Drawn:
     return Drawn(rendering.clamp(0, 1), torch.ones_like(view.image[:1]) if weight is None else weight)
 
 
-def _upstreams_own(row: Mapping[str, Any], view: TrainingView) -> Tensor:
+def _upstreams_own(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Tensor:
     """The codebase's own rendering of a held-out view."""
     path = row["upstream"]["pictures"].get(view.name)
-    if path is None or not Path(path).is_file():
+    if path is None or not (folder / path).is_file():
         raise LegsError(f"{row['arm']} left no rendering of {view.name}: choose held-out views (--views)")
-    return read_picture(Path(path))
+    return read_picture(folder / path)
 
 
 def _weight(spec: WeightSpec, photograph: Tensor, rendering: Tensor) -> Optional[Tensor]:

@@ -10,6 +10,7 @@ OUT/ARM/seed-N/factor-X/          a trial of the control of the number of Gaussi
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
@@ -180,10 +181,10 @@ class UpstreamComparison:
         return self.row(replace(arm, name=arm.name.partition("@")[0], at=None), seed)
 
     def _row(self, arm: ArmSpec, seed: int, spec: WeightSpec, factor: float, metrics: Dict[str, Any]) -> Row:
-        threshold = factor * self.profile.threshold[0].value if self.profile.threshold else None
+        threshold = next((factor * value for value in self.checkout.thresholds()), None)
         config = replace(self.base, spec=spec, seed=seed, densify_grad_threshold=threshold)
         mean = 1.0 if spec.unweighted else self.mean_weight(spec)
-        pictures = metrics.pop("pictures")
+        pictures = [os.path.relpath(path, str(self._folder(arm, seed).resolve())) for path in metrics.pop("pictures")]
         held_out = [view.name for view in split_views(self.scene)[1]]
         if len(held_out) != len(pictures):  # the codebase holds other views out
             held_out = []

@@ -7,7 +7,7 @@ import shlex
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Tuple
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
 
@@ -22,6 +22,21 @@ class Threshold:
 
     words: str
     value: float
+
+    def given(self, words: Sequence[str]) -> Optional[float]:
+        """Return the value that the words of a command give it, None where they do not.
+
+        >>> Threshold("--grad {value}", 0.1).given(["-r", "2", "--grad", "0.3"])
+        0.3
+        >>> Threshold("TRAINING.GRAD={value}", 0.1).given(["TRAINING.GRAD=0.2"])
+        0.2
+        """
+        pattern = re.escape(self.words).replace(r"\{value\}", r"(\S+)").replace(r"\ ", r"[ =]")
+        found = re.findall(rf"(?:^| ){pattern}(?= |$)", " ".join(words))
+        try:
+            return float(found[-1]) if found else None
+        except ValueError:
+            return None
 
 
 @dataclass(frozen=True)

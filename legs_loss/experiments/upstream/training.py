@@ -66,11 +66,15 @@ class Checkout:
                 if not words:
                     raise LegsError(f"the profile {self.profile.name} has no words for {option}")
                 commands[-1] += fill(words, {option: value, **more})
-        if factor != 1.0:
-            for threshold in self.profile.threshold:
-                commands[-1] += fill(threshold.words, {"value": f"{factor * threshold.value:.6g}"})
         commands[-1] += self.extra
+        if factor != 1.0:
+            for threshold, usual in zip(self.profile.threshold, self.thresholds()):  # the last word counts
+                commands[-1] += fill(threshold.words, {"value": f"{factor * usual:.6g}"})
         return commands
+
+    def thresholds(self) -> List[float]:
+        """Return the thresholds that the control of the number scales: those in ``extra``, else the codebase's own."""
+        return [threshold.given(self.extra) or threshold.value for threshold in self.profile.threshold]
 
     def results(self, output: Path) -> Path:
         """Return where a run lies: the newest, where its codebase adds the time to its name."""
@@ -128,7 +132,7 @@ def train_and_score(checkout: Checkout, spec: WeightSpec, seed: int, folder: Pat
         "train": mean_scores(list(views["train"].values())),
         "test": mean_scores(list(views["test"].values())) if views["test"] else None,
         "gaussians": gaussians_in(_only(results, checkout.profile.cloud)),
-        "densify_grad_threshold": [factor * one.value for one in checkout.profile.threshold],
+        "densify_grad_threshold": [factor * value for value in checkout.thresholds()],
         "iterations": checkout.iterations or checkout.profile.iterations,
         "weighted_calls": report["weighted"],
         "plain_calls": report["plain"],

@@ -24,6 +24,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the summary; 1 when something is damaged."""
     from legs_loss.config import STORE_FOLDER
     from legs_loss.errors import LegsError
+    from legs_loss.sharpness import unsharp_views
     from legs_loss.store import MANIFEST, DamagedStoreError, WeightStore
 
     path = Path(args.store)
@@ -47,6 +48,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"  operators  {_counted(f'{entry.operator} p={entry.p:g} eps={entry.eps:g}' for entry in entries)}")
     if any(entry.background for entry in entries):
         print(f"  background {_counted(entry.background or 'none' for entry in entries)}")
+    if not damaged:
+        print(f"  unsharp    {', '.join(unsharp_views(store)) or 'none'}")
     print(f"  damaged    {len(damaged) or 'none'}")
     for entry in damaged:
         print(f"    {entry.view} {entry.width}x{entry.height} {entry.operator}: {entry.file}")

@@ -133,7 +133,8 @@ def _make(folder: Path) -> None:
 
 def _say(store: Path, done: SceneDone) -> int:
     """Print what was done of a scene; return 1 if any of it failed."""
-    from legs_loss.store import MANIFEST
+    from legs_loss.sharpness import unsharp_views
+    from legs_loss.store import MANIFEST, WeightStore
 
     report = done.report
     for view, reason in report.skipped.items():
@@ -142,6 +143,13 @@ def _say(store: Path, done: SceneDone) -> int:
         print(
             f"legs: note: {done.alike} views share a name in 3DGS, which knows no folders and no extensions; "
             "code that names views so will compute their weights instead",
+            file=sys.stderr,
+        )
+    unsharp = unsharp_views(WeightStore(report.store)) if (report.store / MANIFEST).is_file() else []
+    if unsharp:
+        print(
+            f"legs: note: {', '.join(unsharp)}: out of focus, moved or noisy beside the others, as it seems; each map "
+            "counts from its own weakest to its strongest response, so that such photographs are weighted more",
             file=sys.stderr,
         )
     print(f"{store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")

@@ -1,0 +1,59 @@
+"""Views whose photograph is out of focus, moved or noisy beside the others of its scene, as their maps show it.
+
+A normalised response E^ counts from an image's weakest to its strongest response. In a sharp photograph few pixels come
+near the strongest; blur weakens the strongest, noise lifts all others, and the mean of E^ rises with either. So the
+views that LEGS weights most as a whole are named here.
+"""
+
+from __future__ import annotations
+
+import math
+from statistics import median
+from typing import Dict, List, Mapping
+
+import numpy as np
+
+from legs_loss.store import Entry, WeightStore
+
+__all__ = ["LEAST", "mean_responses", "outliers", "unsharp_views"]
+
+LEAST = 5  # views: of fewer nobody can say which is the odd one
+DEVIATIONS = 4.0  # of a normal distribution, from the median
+FACTOR = 1.5  # and at least so many times the median: views that are nearly alike have no odd one
+
+
+def outliers(means: Mapping[str, float]) -> List[str]:
+    """Return the names whose mean response is far above the others', the farthest first.
+
+    >>> outliers({"a": 0.05, "b": 0.052, "c": 0.048, "d": 0.051, "e": 0.049, "blurred": 0.15})
+    ['blurred']
+    """
+    logs = {name: math.log(max(mean, 1e-6)) for name, mean in means.items()}
+    if len(logs) < LEAST:
+        return []
+    middle = median(logs.values())
+    spread = 1.4826 * median(abs(value - middle) for value in logs.values())
+    limit = middle + max(DEVIATIONS * spread, math.log(FACTOR))
+    return sorted((name for name, value in logs.items() if value > limit), key=lambda name: -logs[name])
+
+
+def mean_responses(store: WeightStore) -> Dict[str, float]:
+    """Return the mean normalised response of each view, of the operator and size that most of them have.
+
+    Raises:
+        LegsError: a map cannot be read.
+    """
+    groups: Dict[object, List[Entry]] = {}
+    for entry in store.entries.values():
+        groups.setdefault((entry.operator, entry.p, entry.width * entry.height), []).append(entry)
+    largest = max(groups.values(), key=len, default=[])
+    return {entry.view: float(store.normalised_response(entry).mean(dtype=np.float64)) for entry in largest}
+
+
+def unsharp_views(store: WeightStore) -> List[str]:
+    """Return the views of a store whose photographs seem out of focus, moved or noisy.
+
+    Raises:
+        LegsError: a map cannot be read.
+    """
+    return outliers(mean_responses(store))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import re
 import shutil
@@ -274,3 +275,23 @@ def contrast(first: str, second: str) -> float:
     """WCAG's."""
     low, high = sorted((luminance(first), luminance(second)))
     return (high + 0.05) / (low + 0.05)
+
+
+def test_what_a_stranger_named_is_shown_and_not_run(page_path: Path, comparison: Path) -> None:
+    """A row.json may come from anyone: all of it is escaped, and the policy runs the page's own script alone."""
+    attack = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
+    table = report._table(attack, [attack], [[(attack, f'"{attack}')]])
+    assert "<img" not in table
+    assert "<script" not in table
+    settings, rows = read_rows(comparison)
+    first = {row["arm"]: dict(row, seed=attack) for row in rows}
+    named = dict(settings, scene=dict(settings["scene"], name=attack))
+    view = report.Pictures(attack, 8, 6, {}, 1.0, 1.0, {})
+    page = report._page(named, rows, ["3dgs"], [view], first, comparison)
+    assert page.count("<script") == 2
+    assert "<img src=x" not in page
+    assert "&lt;img src=x" in page
+    script = page.rpartition("<script>")[2].partition("</script>")[0]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in page
+    assert "default-src 'none'" in page_path.read_text(encoding="utf-8")

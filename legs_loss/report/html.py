@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import html
-import json
+import base64
+import hashlib
 import math
 import shlex
 from pathlib import Path
-from string import Template
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
@@ -95,7 +94,13 @@ def _page(
     first: Mapping[str, Row],
     run: Path,
 ) -> str:
-    template = Template(Path(__file__).with_name("html_page.html").read_text(encoding="utf-8"))
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+    text = Path(__file__).with_name("html_page.html").read_text(encoding="utf-8")
+    script = text.rpartition("<script>")[2].partition("</script>")[0]
+    # What is given to the page is escaped, all but what was made of escaped parts and says so (Markup).
+    template = Environment(autoescape=True).from_string(text)
     base = settings["base"]
     seeds = sorted({row["seed"] for row in rows})
     others = [arm for arm in arms if arm != BASELINE]
@@ -107,22 +112,22 @@ def _page(
         "right": preferred,
     }
     scene = settings["scene"]
-    return template.substitute(
-        title=html.escape(f"Losses compared on {scene['name']}"),
-        subtitle=html.escape(
+    return template.render(
+        title=f"Losses compared on {scene['name']}",
+        subtitle=(
             f"{len(arms)} arms, {len(seeds)} seed(s), {base['iterations']:,} iterations of 3D Gaussian Splatting each, "
             f"on {views[0].width}x{views[0].height} photographs."
         ),
         scores=_scores(rows, arms),
-        differences=_differences(rows, others) if BASELINE in arms and others else "<p>There is no second arm.</p>",
-        by_iterations=by_iterations(rows, arms),
-        by_gaussians=by_gaussians(rows, arms),
+        differences=_differences(rows, others) if BASELINE in arms and others else "There is no second arm.",
+        by_iterations=Markup(by_iterations(rows, arms)),
+        by_gaussians=Markup(by_gaussians(rows, arms)),
         seed=first[arms[0]]["seed"],
         settings=_settings(settings, rows),
         arms=_own_settings(arms, first),
-        command=html.escape(_command(settings, arms, seeds, run)),
-        # "</script>" in a name must not end the element.
-        data=json.dumps(data).replace("<", "\\u003c"),
+        command=_command(settings, arms, seeds, run),
+        data=data,  # as JSON in which no "</script>" ends the element
+        script=base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii"),
     )
 
 
@@ -192,18 +197,22 @@ def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> str:
 
 def _table(caption: str, heads: Sequence[str], body: Sequence[Sequence[Tuple[str, str]]], sortable: bool = True) -> str:
     """A table; each cell is its text and the value that it sorts by."""
-    if sortable:
-        head = "".join(f'<th scope="col"><button type="button">{html.escape(name)}</button></th>' for name in heads)
-    else:
-        head = "".join(f'<th scope="col" class="plain">{html.escape(name)}</th>' for name in heads)
+    from markupsafe import Markup
+
+    nothing = Markup("")
+    button = Markup('<th scope="col"><button type="button">{}</button></th>')
+    head = nothing.join(
+        (button if sortable else Markup('<th scope="col" class="plain">{}</th>')).format(h) for h in heads
+    )
     lines = []
     for (text, value), *cells in body:
-        first = f'<th scope="row" data-value="{html.escape(value)}">{html.escape(text)}</th>'
-        others = "".join(f'<td data-value="{html.escape(value)}">{html.escape(text)}</td>' for text, value in cells)
-        lines.append(f"<tr>{first}{others}</tr>")
-    kind = ' class="sortable"' if sortable else ""
-    described = f"<caption><span>{html.escape(caption)}</span></caption>" if caption else ""
-    return f"<table{kind}>{described}<thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+        first = Markup('<th scope="row" data-value="{}">{}</th>').format(value, text)
+        others = nothing.join(Markup('<td data-value="{}">{}</td>').format(value, text) for text, value in cells)
+        lines.append(Markup("<tr>{}{}</tr>").format(first, others))
+    kind = Markup(' class="sortable"') if sortable else ""
+    described = Markup("<caption><span>{}</span></caption>").format(caption) if caption else ""
+    table = Markup("<table{}>{}<thead><tr>{}</tr></thead><tbody>{}</tbody></table>")
+    return table.format(kind, described, head, nothing.join(lines))
 
 
 def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> str:
@@ -219,7 +228,9 @@ def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> str:
     shared.update(
         {f"version of {name}" if name != "machine" else name: ", ".join(each) for name, each in versions.items()}
     )
-    return "".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd>" for name, value in shared.items())
+    from markupsafe import Markup
+
+    return Markup("").join(Markup("<dt>{}</dt><dd>{}</dd>").format(name, value) for name, value in shared.items())
 
 
 def _proof(proof: Mapping[str, Any]) -> str:

@@ -76,7 +76,7 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
     for image in entries:
         if image.camera_id not in cameras:
             raise LegsError(
-                f"{model / f'images.{kind}'}: {image.name} has camera {image.camera_id}, "
+                f"{model / f'images.{kind}'}: {image.name!r} has camera {image.camera_id}, "
                 f"which cameras.{kind} does not list"
             )
         name = image.name.replace("\\", "/")
@@ -285,10 +285,10 @@ def _image(name: str, camera_id: int, quaternion: Tuple[float, ...], translation
     if not name or "\0" in name:
         raise ValueError(f"an image has the name {name!r}, which no file can have")
     if len(quaternion) != 4 or len(translation) != 3:
-        raise ValueError(f"the pose of {name} has {len(quaternion) + len(translation)} numbers, not 7")
-    length = float(np.linalg.norm(quaternion))
-    if not np.isfinite(quaternion + translation).all() or not 1e-150 < length < 1e150:
-        raise ValueError(f"the pose of {name} is not a number")
+        raise ValueError(f"the pose of {name!r} has {len(quaternion) + len(translation)} numbers, not 7")
+    largest = max(map(abs, quaternion))
+    if not np.isfinite(quaternion + translation).all() or not 1e-150 < largest < 1e150:
+        raise ValueError(f"the pose of {name!r} is not a number")
     return _Image(name, camera_id, quaternion, translation)
 
 

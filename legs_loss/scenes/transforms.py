@@ -123,13 +123,13 @@ def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
         fy = fx if angle is None else height / 2 / math.tan(angle / 2)
     cx, cy = float(intrinsics.get("cx", width / 2)), float(intrinsics.get("cy", height / 2))
     if not (0 < width <= _SIDE and 0 < height <= _SIDE and np.isfinite([fx, fy, cx, cy]).all() and fx and fy):
-        raise ValueError(f"{image} has a camera of {width}x{height} pixels, focal lengths {fx:g}, {fy:g}")
+        raise ValueError(f"{str(image)!r} has a camera of {width}x{height} pixels, focal lengths {fx:g}, {fy:g}")
     camera_to_world = np.asarray(intrinsics["transform_matrix"], dtype=np.float64)
     if camera_to_world.shape == (3, 4):
         camera_to_world = np.vstack([camera_to_world, [0, 0, 0, 1]])
     if camera_to_world.shape != (4, 4) or not np.isfinite(camera_to_world).all():
-        raise ValueError(f"the transform_matrix of {image} is no 4x4 matrix of numbers")
+        raise ValueError(f"the transform_matrix of {str(image)!r} is no 4x4 matrix of numbers")
     pose = np.linalg.inv(camera_to_world @ _OPENGL_TO_OPENCV)
     if not np.isfinite(pose).all():
-        raise ValueError(f"the transform_matrix of {image} cannot be inverted")
+        raise ValueError(f"the transform_matrix of {str(image)!r} cannot be inverted")
     return Camera(width, height, fx, fy, cx, cy, pose)

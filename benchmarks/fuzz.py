@@ -1,0 +1,300 @@
+"""Damage files at random, read them with every reader of the package, and hold it to what it promises.
+
+    python -m benchmarks.fuzz --minutes 10
+    python -m benchmarks.fuzz --cases 10000 --seed 7 --readers store colmap
+
+Of every case: whatever the bytes are, the reader returns or raises the one error of bad input (LegsError), within
+seconds, and writes nothing outside of its folder. Of a patch, too: what compiled still compiles, and the undo gives
+back every byte. A case is named by the seed and its number; what fails is kept in --keep.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+from typing import Any, Callable, Dict, Iterator, List, Tuple
+
+import numpy as np
+from legs_adapters.journal import JOURNAL, Journal
+from legs_adapters.patch import plan, write
+from legs_adapters.undo import undo
+from PIL import Image
+
+from legs_loss.config import find_config
+from legs_loss.errors import LegsError
+from legs_loss.precompute import precompute
+from legs_loss.reference.embedded import write_embedded_scene
+from legs_loss.reference.gaussians import Gaussians
+from legs_loss.reference.ply import read_ply, write_ply
+from legs_loss.reference.training.checkpoint import read_state, write_checkpoint
+from legs_loss.scenes import View, load_training_image, read_scene
+from legs_loss.store import WeightStore
+
+SECONDS = 30  # that a case may take
+PIECES = [b"\0", b"\xff" * 8, b"-1", b"1e999", b"NaN", b'"', b"[" * 50, b"{", b"(" * 50, b"\n", b"\r", b"#", b"    "]
+PIECES += [b"\xef\xbb\xbf", b"../", b".git", b"lambda: ", (1 << 60).to_bytes(8, "little"), b"\0\0\0\x80"]
+TRAIN = b"""import torch
+from utils import l1_loss, ssim
+from gaussian_renderer import render
+
+
+def training(scene, gaussians, opt):
+    for iteration, viewpoint_cam in enumerate(scene):
+        image = render(viewpoint_cam, gaussians, None, None)["render"]
+        gt_image = viewpoint_cam.original_image.cuda()
+        Ll1 = l1_loss(image, gt_image)
+        loss = (1.0 - opt.lambda_dssim) * Ll1 + opt.lambda_dssim * (1.0 - ssim(image, gt_image))
+        loss.backward()
+"""
+UTILS = b"def l1_loss(network_output, gt):\n    return torch.abs((network_output - gt)).mean()\n"
+TOML = b'preset = "legs"\nbeta = 10.0\ncurve = "C3"\noperator = "laplacian"\nstore = "maps"\n'
+
+# A reader: the folder that is damaged, the files in it that are, and what reads it.
+Reader = Tuple[Callable[[Path], None], List[str], Callable[[Path], Any]]
+
+
+def damage(data: bytes, at: random.Random) -> bytes:
+    """Return bytes with one to four accidents."""
+    changed = bytearray(data)
+    for _ in range(at.randint(1, 4)):
+        place, what = at.randrange(len(changed) + 1), at.randrange(6)
+        if what == 0 and changed:
+            changed[place % len(changed)] ^= 1 << at.randrange(8)
+        elif what == 1:
+            del changed[place : place + at.choice([1, 1, 4, 8, 100, len(changed)])]
+        elif what == 2:
+            changed[place:place] = at.choice(PIECES)
+        elif what == 3:
+            piece = at.choice(PIECES)
+            changed[place : place + len(piece)] = piece
+        elif what == 4:
+            other = at.randrange(len(changed) + 1)
+            changed[place:place] = changed[other : other + at.choice([1, 10, 100])]
+        elif changed:
+            changed[place % len(changed)] = at.randrange(256)
+    return bytes(changed)
+
+
+def make_scene(folder: Path) -> None:
+    write_embedded_scene(folder, views=3, width=24, height=16, points=30, samples=1)
+
+
+def make_text_scene(folder: Path) -> None:
+    """Write a scene in COLMAP's text format, whose files are read as strictly."""
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text("# cameras\n1 PINHOLE 24 16 20 20 12 8\n2 OPENCV 24 16 20 20 12 8 0 0 0 0\n")
+    (model / "images.txt").write_text("# images\n1 1 0 0 0 0 0 1 1 a b.png\n\n2 0.5 0.5 0.5 0.5 1 2 3 2 c.png\n1 2 3\n")
+    (model / "points3D.txt").write_text("# points\n1 0 0 1 255 0 7 0.5 1 0\n2 1 2 3 0 0 0 0.1\n")
+    (folder / "images").mkdir()
+
+
+def make_transforms(folder: Path) -> None:
+    (folder / "images").mkdir(parents=True)
+    Image.new("RGB", (8, 6)).save(str(folder / "images" / "0.png"))
+    pose = np.eye(4).tolist()
+    frames = [{"file_path": "images/0.png", "transform_matrix": pose, "w": 8, "h": 6, "fl_x": 9.0}]
+    frames.append({"file_path": "./images/0", "transform_matrix": pose, "camera_angle_x": 0.7})
+    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.69, "frames": frames}))
+
+
+def make_images(folder: Path) -> None:
+    pixels = np.random.RandomState(0).randint(0, 255, (13, 17, 3)).astype(np.uint8)
+    for suffix in ("png", "jpg", "webp", "tif", "bmp", "gif", "ppm"):
+        Image.fromarray(pixels).save(str(folder / f"a.{suffix}"))
+
+
+def make_store(folder: Path) -> None:
+    make_images(folder)
+    for path in folder.glob("a.[!p]*"):
+        path.unlink()
+    precompute(read_scene(folder), folder / "store")
+
+
+def some_gaussians() -> Gaussians:
+    points = np.random.RandomState(0).rand(9, 3)
+    return Gaussians.from_points(points.astype(np.float32), np.full((9, 3), 9, np.uint8), 1)
+
+
+def make_checkpoint(folder: Path) -> None:
+    import torch
+
+    from legs_loss.reference.training.adam import Adam
+
+    arrays = dict(
+        Adam(some_gaussians()).state(), gradient_sum=np.zeros(9, np.float32), times_seen=np.zeros(9, np.float32)
+    )
+    facts = {"config": {}, "views": ["a"], "iteration": 3, "clocks": [0.0, 0.0], "order": [0], "loss": 0.5}
+    facts.update(psnr=9.0, weight_sum=0.0, growth=[], history=[])
+    write_checkpoint(folder / "c.npz", dict(arrays, generator=torch.Generator().get_state().numpy()), facts)
+    read_state(folder / "c.npz")
+
+
+def make_checkout(folder: Path) -> None:
+    (folder / "train.py").write_bytes(TRAIN)
+    (folder / "utils.py").write_bytes(UTILS)
+
+
+def make_patched(folder: Path) -> None:
+    make_checkout(folder)
+    write(plan(folder))
+
+
+def read_store(folder: Path) -> None:
+    store = WeightStore(folder / "store")
+    store.check()
+    for entry in store.entries.values():
+        values = store.normalised_response(entry)
+        assert values.shape == (entry.height, entry.width) and values.min() >= 0 and values.max() <= 1
+
+
+def read_images(folder: Path) -> None:
+    for path in folder.iterdir():
+        with contextlib.suppress(LegsError):
+            load_training_image(View(path.name, path))
+
+
+def read_points(folder: Path) -> None:
+    scene = read_scene(folder)
+    if scene.points is not None:
+        assert np.isfinite(scene.points.xyz).all()
+
+
+def patch(folder: Path) -> None:
+    """Patch and undo: what compiled still compiles, and every byte comes back."""
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    found = plan(folder)
+    for name, after in found.after.items():
+        if compiles(before[name]):
+            assert compiles(after), f"{name} no longer compiles"
+    if write(found):
+        undo(folder)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def compiles(data: bytes) -> bool:
+    try:
+        compile(data, "x.py", "exec", dont_inherit=True)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return False
+    return True
+
+
+def read_journal(folder: Path) -> None:
+    journal = Journal.read(folder)
+    for trust in (None, journal.name):
+        before = (folder / "train.py").read_bytes()
+        try:
+            undo(folder, force=True, trust=trust)
+        except LegsError:
+            assert (folder / "train.py").read_bytes() == before
+
+
+def read_settings(folder: Path) -> None:
+    find_config(folder, {}, [])
+
+
+READERS: Dict[str, Reader] = {
+    "sources": (make_checkout, ["train.py", "utils.py"], patch),
+    "journal": (make_patched, [JOURNAL], read_journal),
+    "store": (make_store, ["store/manifest.json", "store/*.npy"], read_store),
+    "images": (make_images, ["a.*"], read_images),
+    "colmap": (make_scene, ["sparse/0/*.bin"], read_points),
+    "colmap text": (make_text_scene, ["sparse/0/*.txt"], read_points),
+    "transforms": (make_transforms, ["transforms.json"], read_scene),
+    "ply": (lambda folder: write_ply(folder / "g.ply", some_gaussians()), ["g.ply"], lambda f: read_ply(f / "g.ply")),
+    "checkpoint": (make_checkpoint, ["c.npz"], lambda folder: read_state(folder / "c.npz")),
+    "settings": (lambda folder: void((folder / "legs.toml").write_bytes(TOML)), ["legs.toml"], read_settings),
+}
+
+
+def void(_: Any) -> None:
+    """Return nothing of what was made."""
+
+
+def stop(*_: Any) -> None:
+    raise TimeoutError(f"a case took more than {SECONDS} s")
+
+
+def outside(folder: Path) -> List[str]:
+    return sorted(name for name in os.listdir(str(folder)))
+
+
+def run_case(name: str, good: Path, work: Path, at: random.Random) -> str:
+    """Return what was wrong with a case, or nothing."""
+    _, patterns, read = READERS[name]
+    folder = work / "case"
+    if folder.exists():
+        shutil.rmtree(str(folder))
+    shutil.copytree(str(good), str(folder), symlinks=True)
+    files = sorted(path for pattern in patterns for path in folder.glob(pattern))
+    victim = at.choice(files)
+    victim.write_bytes(damage(victim.read_bytes(), at))
+    there = outside(work)
+    signal.alarm(SECONDS)
+    try:
+        read(folder)
+    except LegsError as error:
+        if not str(error) or "\n" in str(error).strip():
+            return f"its error is no one line: {error}"
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        return "".join(traceback.format_exception(type(error), error, error.__traceback__)[-4:])
+    finally:
+        signal.alarm(0)
+    return "" if outside(work) == there else "something was written outside"
+
+
+def cases(names: List[str], seed: int, until: float, count: int) -> Iterator[Tuple[int, str, random.Random]]:
+    number = 0
+    while time.monotonic() < until and number < count:
+        yield number, names[number % len(names)], random.Random(f"{seed}/{number}")
+        number += 1
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=1e9, help="how long; default: until --cases are done")
+    parser.add_argument("--cases", type=int, help="how many; default: as many as there is time for")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--readers", nargs="+", choices=list(READERS), default=list(READERS))
+    parser.add_argument("--keep", type=Path, default=Path("fuzz-failures"), help="where what fails is kept")
+    args = parser.parse_args()
+    if args.cases is None and args.minutes == 1e9:
+        parser.error("give --minutes or --cases")
+    signal.signal(signal.SIGALRM, stop)
+    counts, failed = dict.fromkeys(args.readers, 0), 0
+    with tempfile.TemporaryDirectory(prefix="legs-fuzz-") as place:
+        work = Path(place).resolve()
+        os.environ["XDG_STATE_HOME"] = str(work / "state")
+        for name in args.readers:
+            (work / "good" / name).mkdir(parents=True)
+            READERS[name][0](work / "good" / name)
+        until = time.monotonic() + 60 * args.minutes
+        for number, name, at in cases(args.readers, args.seed, until, args.cases or sys.maxsize):
+            wrong = run_case(name, work / "good" / name, work, at)
+            counts[name] += 1
+            if wrong:
+                failed += 1
+                kept = args.keep / f"{name.replace(' ', '-')}-{args.seed}-{number}"
+                shutil.rmtree(str(kept), ignore_errors=True)
+                shutil.copytree(str(work / "case"), str(kept), symlinks=True)
+                print(f"seed {args.seed}, case {number} ({name}), kept in {kept}:\n{wrong}", flush=True)
+    print(f"seed {args.seed}: {sum(counts.values())} cases, {failed} failed; "
+          + ", ".join(f"{name} {count}" for name, count in counts.items()))  # fmt: skip
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,44 @@
+"""The open-ended harness itself: a few damaged files of every reader, in every run of the tests."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from benchmarks import fuzz
+from tests.support import legs_environment
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_a_few_cases_of_every_reader(tmp_path):
+    environment = legs_environment()
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), environment["PYTHONPATH"]])
+    command = [sys.executable, "-W", "ignore", "-m", "benchmarks.fuzz", "--cases", "100", "--seed", "3"]
+    done = subprocess.run(
+        [*command, "--keep", str(tmp_path)], cwd=str(ROOT), env=environment, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.startswith(
+        "seed 3: 100 cases, 0 failed; sources 10, journal 10, store 10, images 10, colmap 10,"
+    )
+
+
+def test_what_breaks_a_promise_is_found(tmp_path, monkeypatch):
+    def traceback(folder):
+        raise KeyError("what a reader let through")
+
+    def writes_outside(folder):
+        (folder.parent / "outside").write_text("")
+
+    make = fuzz.READERS["settings"][0]
+    good = tmp_path / "good"
+    good.mkdir()
+    make(good)
+    for read, said in ((traceback, "KeyError"), (writes_outside, "outside"), (fuzz.read_settings, "")):
+        monkeypatch.setitem(fuzz.READERS, "settings", (make, ["legs.toml"], read))
+        (tmp_path / "work").mkdir(exist_ok=True)
+        wrong = fuzz.run_case("settings", good, tmp_path / "work", fuzz.random.Random(1))
+        assert (said in wrong) and bool(wrong) == bool(said)

@@ -518,7 +518,7 @@ DEVICE void stream(const Task& k) {
                         raw[r * PITCH + REACH + t] = weight_at(k, weights, row, column);
                 }
             }
-#pragma unroll
+#pragma unroll 2  // four rows at a time spill a few bytes on some GPUs
             for (int r = 0; r < ROWS; ++r) {
                 const float* from = blurred + r * THREADS + t;
                 const float s1 = push(lane.slopes[0], from[0]), s2 = push(lane.slopes[1], from[ROWS * THREADS]);

@@ -93,6 +93,24 @@ def test_the_report_names_the_rule_and_the_line_that_decided(tmp_path):
     assert left[0]["because"] == [{"file": "train.py", "line": 29, "code": "with torch.no_grad():"}]
 
 
+def test_the_condition_that_decides_is_the_one_around_the_term(tmp_path):
+    example = (
+        "def step(gaussians, camera, tracking):\n"
+        "    if tracking:\n"
+        "        print('tracking')\n"
+        "    image = render(camera, gaussians, None, None)['render']\n"
+        "    if tracking and camera.skipped:\n"
+        "        return\n"
+        "    elif tracking:\n"
+        "        l1_loss(image, camera.original_image).backward()\n"
+        "        gaussians.optimizer.step()\n"
+    )
+    found, first, _ = planned(tmp_path, example)
+    [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert left.evidence.rule == "tracking"
+    assert [(line.line - first, line.text) for line in left.because] == [(6, "elif tracking:")]
+
+
 def test_explain_prints_a_rule_or_all_of_a_reason_or_the_list():
     done = legs_patch("--explain", "huber")
     assert done.returncode == 0

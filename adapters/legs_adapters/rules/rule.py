@@ -6,7 +6,7 @@ is weighted; both are tests. ``order.py`` lists the rules in the order in which 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Callable, List, Optional, Sequence
+from typing import TYPE_CHECKING, Callable, Iterator, List, Optional, Sequence, Tuple
 
 import libcst as cst
 
@@ -51,6 +51,14 @@ class Asked:
         """The name of the class that the function is a method of; empty without."""
         owner = self.analysis.program.owner_of(self.function)
         return owner.name if owner is not None else ""
+
+    @property
+    def names_around(self) -> Iterator[Tuple[str, Decider]]:
+        """The names of the function and of its class, each with where it stands."""
+        yield self.function.name, header(self.function)
+        owner = self.analysis.program.owner_of(self.function)
+        if owner is not None:
+            yield owner.name, (owner.parent, owner.node.name)
 
 
 class Term(Asked):

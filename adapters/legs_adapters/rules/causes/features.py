@@ -79,10 +79,10 @@ class Network(_Feature):
     id = "network"
 
     def evidence(self, term: Term) -> List[Decider]:
-        file = term.function.module.path.rpartition("/")[2]
-        called = {word for name in (term.function.name, term.class_name, file) for word in words(name)}
-        whole = all(_is_given_whole(term.function, side) for side in term.sides)
-        return [header(term.function)] if called & _NETWORKS and not whole else []
+        if all(_is_given_whole(term.function, side) for side in term.sides):
+            return []
+        names = [*term.names_around, (term.function.module.path.rpartition("/")[2], header(term.function))]
+        return [decider for name, decider in names if _NETWORKS & set(words(name))][:1]
 
 
 class NamedMap(_Feature):

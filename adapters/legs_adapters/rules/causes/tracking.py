@@ -7,7 +7,7 @@ from typing import List
 import libcst as cst
 
 from legs_adapters.code.syntax import walk_all, words
-from legs_adapters.rules.rule import Asked, ByPurpose, CallOfTerm, Rule, header
+from legs_adapters.rules.rule import Asked, ByPurpose, CallOfTerm, Rule
 from legs_adapters.terms.findings import Decider
 
 __all__ = ["PoseStep", "Tracking"]
@@ -37,17 +37,8 @@ class Tracking(_Tracking):
     id = "tracking"
 
     def evidence(self, term: Asked) -> List[Decider]:
-        function = term.function
-        if _tracks(function.name):
-            return [header(function)]
-        for name in function.flow.conditions.get(id(term.call), ()):
-            if _tracks(name):
-                tests = [part.test for part in walk_all(function.body) if isinstance(part, (cst.If, cst.IfExp))]
-                parts = [part for test in tests for part in walk_all(test)]
-                named = [part for part in parts if isinstance(part, cst.Name) and part.value in name]
-                return [(function, part) for part in [*named, term.call]][:1]
-        owner = term.analysis.program.owner_of(function)
-        return [(owner.parent, owner.node.name)] if owner is not None and _tracks(owner.name) else []
+        named = [decider for name, decider in term.names_around if _tracks(name)]
+        return (named or [(term.function, part) for part in _condition(term)])[:1]
 
     def of_call(self, call: CallOfTerm) -> List[Decider]:
         return self.evidence(call)
@@ -68,6 +59,19 @@ class PoseStep(ByPurpose, _Tracking):
     """
 
     id = "pose-step"
+
+
+def _condition(term: Asked) -> List[cst.CSTNode]:
+    """Return the names for tracking in the conditions around a call; the call where they cannot be found."""
+    said = [name for name in term.function.flow.conditions.get(id(term.call), ()) if _tracks(name)]
+    if not said:
+        return []
+    branches = [part for part in walk_all(term.function.body) if isinstance(part, (cst.If, cst.IfExp))]
+    inside = [[id(part) for part in walk_all(branch)] for branch in branches]
+    around = sorted((len(ids), at) for at, ids in enumerate(inside) if id(term.call) in ids)
+    tests = [branches[at].test for _, at in around]  # the innermost first
+    parts = [part for test in tests for part in walk_all(test) if isinstance(part, cst.Name) and part.value in said[0]]
+    return [*parts, term.call]
 
 
 def _tracks(name: str) -> bool:

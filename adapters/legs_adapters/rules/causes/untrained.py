@@ -108,7 +108,9 @@ class Untrained(_Untrained):
     id = "untrained"
 
     def evidence(self, term: Term) -> List[Decider]:
-        return [header(term.function)] if _is_untrained(term) else []
+        if not _is_untrained(term):
+            return []
+        return term.here if term.analysis.training.touches(term.function) else [header(term.function)]
 
 
 class Leaf(_Untrained):
@@ -156,21 +158,18 @@ def _is_asked_without_grad(term: Term) -> bool:
 
 def _said(term: Term, spoken: AbstractSet[str]) -> List[Decider]:
     """Return the first of the term's function, its class and its callers whose name is one of some words."""
-    for function, name in _names(term):
-        if spoken & set(words(name)):
-            return [header(function)]
-    return []
+    return [decider for name, decider in _names(term) if spoken & set(words(name))][:1]
 
 
-def _names(term: Term) -> Iterator[Tuple[Function, str]]:
-    yield term.function, term.class_name
+def _names(term: Term) -> Iterator[Tuple[str, Decider]]:
+    yield from term.names_around
     above = queue = [term.function]
     for _ in range(2):
         queue = [caller for callee in queue for caller in _callers(term, callee)]
         above = above + queue
     for function in above:
-        yield function, function.name
-        yield function, function.module.path.rsplit("/", 1)[-1]
+        yield function.name, header(function)
+        yield function.module.path.rsplit("/", 1)[-1], header(function)
 
 
 def _callers(term: Term, function: Function) -> List[Function]:

@@ -138,7 +138,7 @@ class TestSymmetries:
     def test_normalised_response_ignores_brightness_scale(self, image, scale, operator):
         first = normalise_response(response(image, operator))
         second = normalise_response(response(image * scale, operator))
-        torch.testing.assert_close(first, second, rtol=0, atol=1e-6)
+        torch.testing.assert_close(first, second, rtol=0, atol=2e-6)  # eps by a small range
 
     @settings(max_examples=40, deadline=None)
     @given(images(), st.sampled_from(operator_names()))

@@ -41,7 +41,7 @@ def training(cameras, gaussians, initial_scaling):
 def planned(folder, example):
     """Return the plan of a codebase whose train.py is an example, and the example's first and last line in it."""
     text = example if re.match("(import|from) ", example) else IMPORTS + example
-    if not re.search("^(def|class) ", example, re.M):
+    if not re.search("^(import|from|def|class) ", example, re.M):
         text = IMPORTS + STEP.format(indent(example, 8 * " "))
     text += "\n"
     first = text[: text.index(example.splitlines()[0])].count("\n") + 1
@@ -109,6 +109,32 @@ def test_the_condition_that_decides_is_the_one_around_the_term(tmp_path):
     [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
     assert left.evidence.rule == "tracking"
     assert [(line.line - first, line.text) for line in left.because] == [(6, "elif tracking:")]
+
+
+def test_the_def_that_decides_is_found_below_its_decorators_and_namesakes(tmp_path):
+    example = (
+        "def evaluate(gaussians, camera):\n"
+        "    return None\n\n\n"
+        "@torch.jit.ignore\n"
+        "async  def evaluate(\n"
+        "    gaussians,  # def evaluate(\n"
+        "    camera,\n"
+        "):\n"
+        "    image = render(camera, gaussians, None, None)['render']\n"
+        "    return l1_loss(image, camera.original_image)\n"
+    )
+    found, first, _ = planned(tmp_path, example)
+    [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert left.evidence.rule == "evaluation"
+    assert [(line.line - first, line.text) for line in left.because] == [(5, "async  def evaluate(")]
+
+
+def test_a_term_outside_of_functions_is_decided_by_its_own_line(tmp_path):
+    example = "import torch\nfrom utils.loss_utils import l1_loss\n\nprint(l1_loss(image, gt_image))\n"
+    found, _, _ = planned(tmp_path, example)
+    [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert left.evidence.rule == "untrained"
+    assert [line.line for line in left.because] == [4]
 
 
 def test_explain_prints_a_rule_or_all_of_a_reason_or_the_list():

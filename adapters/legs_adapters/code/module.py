@@ -94,6 +94,15 @@ class Function:
         return (scope._part or self.module.outline).place(node, brackets)
 
     @property
+    def line(self) -> int:
+        """The line of its ``def``, found in the text where it can be: the positions of a whole outline cost more."""
+        if self._cut is None or self.parent is None:
+            return (self.parent or self).place(self.node).line
+        pattern = rf"^[ \t]*(async[ \t]+)?def[ \t]+{re.escape(self.name)}\b".encode()
+        starts = [found.start() for found in re.finditer(pattern, self.module.lines.data[: self._cut.start], re.M)]
+        return self.module.lines.place(starts[-1], starts[-1]).line if starts else self.parent.place(self.node).line
+
+    @property
     def flow(self) -> Flow:
         """Its reaching definitions, computed once."""
         if self._flow is None:

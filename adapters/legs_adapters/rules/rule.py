@@ -155,8 +155,7 @@ class ByPurpose(Rule):
 
 def header(function: Function) -> Decider:
     """Return the ``def`` of a function as what decided."""
-    name = function.node.name if isinstance(function.node, cst.FunctionDef) else function.node
-    return function.parent or function, name
+    return function, function.node
 
 
 def source_of(

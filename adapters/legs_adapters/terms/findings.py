@@ -105,8 +105,10 @@ class Evidence(NamedTuple):
 
 
 def _lines(function: Function, node: cst.CSTNode) -> Iterator[Line]:
+    if isinstance(node, cst.Module):
+        return  # all of a file decides nothing that a line could show
     try:
-        line = function.place(node).line
+        line = function.line if node is function.node else function.place(node).line
     except ValueError:
         return
     yield Line(function.module.path, line, function.module.lines.text(line))

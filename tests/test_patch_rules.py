@@ -137,6 +137,19 @@ def test_a_term_outside_of_functions_is_decided_by_its_own_line(tmp_path):
     assert [line.line for line in left.because] == [4]
 
 
+def test_a_default_that_decides_is_shown_by_the_def_it_stands_in(tmp_path):
+    example = (
+        "def step(gaussians, camera, predicted, key='rendered_mask'):\n"
+        "    predicted = predicted(camera)\n"
+        "    torch.abs(predicted[key] - camera.targets[key]).mean().backward()\n"
+        "    gaussians.optimizer.step()\n"
+    )
+    found, first, _ = planned(tmp_path, example)
+    [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert left.evidence.rule == "mask"
+    assert [line.line for line in left.because] == [first]
+
+
 def test_explain_prints_a_rule_or_all_of_a_reason_or_the_list():
     done = legs_patch("--explain", "huber")
     assert done.returncode == 0

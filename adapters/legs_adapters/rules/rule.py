@@ -178,5 +178,5 @@ def source_of(
             if made.value is not None:
                 found = source_of(function, made.value, says, depth + 1) if says else (function, made.value)
                 if found is not None:
-                    return found
+                    return header(function) if made.kind == "parameter" else found  # a default stands in the header
     return None

@@ -109,7 +109,7 @@ def _lines(function: Function, node: cst.CSTNode) -> Iterator[Line]:
         return  # all of a file decides nothing that a line could show
     try:
         line = function.line if node is function.node else function.place(node).line
-    except ValueError:
+    except (KeyError, ValueError):  # a node that the analysis made, or a file that LibCST writes differently
         return
     yield Line(function.module.path, line, function.module.lines.text(line))
 

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 import legs_loss
-from legs_loss import LegsError, runtime, weight_map
+from legs_loss import LegsError, weight_map
+from legs_loss.runtime import state
 from tests.test_patch_nerfstudio import FAKE as NERFSTUDIO
 
 GSPLAT = {
@@ -31,7 +32,7 @@ def library(tmp_path, monkeypatch):
     """Write a package to a folder on sys.path; everything is forgotten afterwards."""
     for name in [name for name in os.environ if name.startswith("LEGS_")]:
         monkeypatch.delenv(name)
-    monkeypatch.setattr(runtime, "_run", None)
+    state.reset()
     monkeypatch.setattr(sys, "argv", ["train.py"])
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -224,11 +224,11 @@ def test_tables_sort_both_ways(page: Any) -> None:
     table = page.locator("table.sortable").first
     head = table.get_by_role("columnheader", name="Gaussians")
 
+    column = int(head.evaluate("e => e.cellIndex")) + 1
+
     def values() -> List[float]:
-        return [
-            float(one)
-            for one in table.locator("tbody td:nth-child(8)").evaluate_all("e => e.map(x => x.dataset.value)")
-        ]
+        cells = table.locator(f"tbody td:nth-child({column})")
+        return [float(one) for one in cells.evaluate_all("e => e.map(x => x.dataset.value)")]
 
     start = values()
     head.get_by_role("button").press("Enter")

@@ -13,7 +13,7 @@ from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.usage import draws, is_box
 from legs_adapters.lexicon.words import RENDERERS
-from legs_adapters.tensors.operations import JOINS, KEEPS_PICTURE, PASSES_ON
+from legs_adapters.tensors.operations import JOINS, PICTURE_FUNCTIONS, PICTURE_METHODS
 
 __all__ = ["meaning_of_call"]
 
@@ -59,9 +59,9 @@ def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, dept
         return Meaning("gradient", meanings.of(function, values[0], depth).role)
     if name in JOINS and values:
         return meanings.of(function, values[0], depth)
-    if base is not None and not module and name in KEEPS_PICTURE:
+    if base is not None and not module and name in PICTURE_METHODS:
         return meanings.of(function, base, depth)
-    if (module or base is None) and name in KEEPS_PICTURE | PASSES_ON and values:
+    if (module or base is None) and name in PICTURE_FUNCTIONS and values:
         return meanings.of(function, values[0], depth)
     if base is not None and name in ("pop", "popleft", "__getitem__", "cuda"):
         return meanings.of(function, base, depth)

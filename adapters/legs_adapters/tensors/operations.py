@@ -13,8 +13,8 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import children
 
 __all__ = [
-    "AXES", "ENDS_GRADIENT", "JOINS", "KEEPS_PICTURE", "LIMITS", "MAKES", "MOVES", "PASSES_ON", "SIZES", "TRANSFORMS",
-    "depends",
+    "AXES", "ENDS_GRADIENT", "JOINS", "LIMITS", "MAKES", "MOVES", "PICTURE_FUNCTIONS", "PICTURE_METHODS", "SIZES",
+    "TRANSFORMS", "depends",
 ]  # fmt: skip
 
 _TABLE = """
@@ -24,8 +24,10 @@ makes         array as_tensor asarray from_numpy tensor
 limits        clamp clamp_ clamp_max clamp_min clip nan_to_num round
 axes          T expand expand_as flatten flip movedim permute rearrange repeat reshape reshape_as roll rot90 squeeze
 axes          transpose unsqueeze view view_as
-picks         chunk gather index_select masked_select narrow select split unbind
-computes      abs add conv2d cumsum div div_ einsum masked_fill mean mul mul_ pow relu sigmoid sub sum
+picks         chunk index_select narrow select split unbind
+gathers       gather masked_select
+computes      add cumsum div div_ masked_fill mean mul mul_ pow sub sum
+filters       abs conv2d einsum relu sigmoid
 resamples     avg_pool2d center_crop crop gaussian_blur grid_sample interpolate max_pool2d pad resize
 passes        DataLoader checkpoint enumerate iter list next no_grad reversed tqdm tuple zip
 joins         cat concat concatenate hstack stack vstack
@@ -49,12 +51,14 @@ MAKES = _ROWS["makes"]  # a tensor or an array of the same values
 LIMITS = _ROWS["limits"]  # the same values where they are in range
 AXES = _ROWS["axes"]  # the same values in another order or shape
 JOINS = _ROWS["joins"]  # several values as one
-PASSES_ON = _ROWS["passes"]  # Python's ways to hand a value on
+_PASSES_ON = _ROWS["passes"]  # Python's ways to hand a value on
 SIZES = _ROWS["sizes"]  # what is asked of a tensor without a look at its values
 ENDS_GRADIENT = _ROWS["ends_gradient"]  # no gradient comes back
 TRANSFORMS = _ROWS["transforms"]  # an absolute value is none any more
-# What leaves a picture a picture: the same values, some of them, others computed of them, or those of another size.
-KEEPS_PICTURE = MOVES | MAKES | LIMITS | AXES | _ROWS["picks"] | _ROWS["computes"] | _ROWS["resamples"]
+# What leaves a picture a picture: its methods, which keep its values, pick some of them or mix in others...
+PICTURE_METHODS = MOVES | LIMITS | AXES | _ROWS["picks"] | _ROWS["computes"]
+# ... and functions of it, which also make a tensor of it, filter it or give it another size.
+PICTURE_FUNCTIONS = PICTURE_METHODS | MAKES | _PASSES_ON | _ROWS["gathers"] | _ROWS["filters"] | _ROWS["resamples"]
 
 
 def depends(function: Function, node: cst.CSTNode, names: Set[str]) -> bool:

@@ -122,7 +122,8 @@ def run(args: argparse.Namespace) -> int:
             raise LegsError(f"--{name} is for --upstream")
     arms = needed(parse_arms([BASELINE, *study.arms]))
     seeds = range(args.first_seed, args.first_seed + args.seeds)
-    base = TrainConfig(iterations=args.iterations or 2000, densify_grad_threshold=args.densify_grad_threshold)
+    iterations = 2000 if args.iterations is None else args.iterations
+    base = TrainConfig(iterations=iterations, densify_grad_threshold=args.densify_grad_threshold)
     root = _embedded(args.out / "scene") if args.scene is None else Path(args.scene)
     resolution = args.resolution
     if resolution is None:
@@ -136,7 +137,7 @@ def run(args: argparse.Namespace) -> int:
     missing = sum(comparison.row(arm, seed) is None for arm in arms for seed in seeds)
     print(f"{len(arms)} arms, {len(seeds)} seed(s); {missing} of {len(arms) * len(seeds)} trainings to do", flush=True)
     reached: Dict[str, int] = {}
-    bar = tqdm(total=missing * args.iterations, desc="iterations", mininterval=0.5, disable=not missing)
+    bar = tqdm(total=missing * base.iterations, desc="iterations", mininterval=0.5, disable=not missing)
     with bar, tensorboard_log(args.tensorboard) as log:
 
         def show(name: str, progress: Progress) -> None:

@@ -31,6 +31,7 @@ class Metric(NamedTuple):
             tells all.
         available: whether what it needs is installed; None for one that needs nothing. Rows lack what was not, and
             tables leave a column out that no row has.
+        least_side: the pixels that the shorter side of an image must have; rows of smaller images lack it.
     """
 
     key: str
@@ -40,6 +41,12 @@ class Metric(NamedTuple):
     compute: Callable[[Tensor, Tensor], float]
     differences: Tuple[str, ...] = ()
     available: Optional[Callable[[], bool]] = None
+    least_side: int = 1
+
+    def computes(self, image: Tensor, split: str) -> bool:
+        """Return whether the metric can be had of an image [3, H, W] of a split."""
+        large = min(image.shape[-2:]) >= self.least_side
+        return split in self.splits and large and (self.available is None or self.available())
 
     def column(self, split: str) -> str:
         """Return the head of its column: with the split in front, where it has two."""
@@ -106,7 +113,7 @@ METRICS: Mapping[str, Metric] = {
         ),
         Metric("flip", "FLIP", ".4f", ("test",), perceptual.flip, ("test",), perceptual.has_flip),
         Metric("gmsd", "GMSD", ".4f", ("test",), perceptual.gmsd, ("test",), perceptual.has_piq),
-        Metric("haarpsi", "HaarPSI", ".4f", ("test",), perceptual.haarpsi, ("test",), perceptual.has_piq),
+        Metric("haarpsi", "HaarPSI", ".4f", ("test",), perceptual.haarpsi, ("test",), perceptual.has_piq, 16),
         Metric("lpips", "LPIPS", ".4f", ("test",), perceptual.lpips, ("test",), perceptual.has_lpips),
     )
 }
@@ -116,9 +123,7 @@ def score(prediction: Tensor, target: Tensor, split: str = "test") -> Dict[str, 
     """Return by key the metrics of one rendering [3, H, W] (clipped to [0, 1]) of a photograph of a split."""
     prediction = prediction.clamp(0.0, 1.0)
     return {
-        key: metric.compute(prediction, target)
-        for key, metric in METRICS.items()
-        if split in metric.splits and (metric.available is None or metric.available())
+        key: metric.compute(prediction, target) for key, metric in METRICS.items() if metric.computes(target, split)
     }
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from pathlib import Path
-from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_adapters.checkout.git import changed_files
 from legs_adapters.checkout.replace import locked, read_file, replace_files
@@ -39,6 +40,22 @@ class Plan(NamedTuple):
     settings: Optional[str] = None
 
 
+@contextlib.contextmanager
+def _deep_recursion() -> Iterator[None]:
+    """Let expressions of some thousand parts be walked; say which error it is where one is longer still."""
+    before = sys.getrecursionlimit()
+    # Before Python 3.11 a Python call takes some of the process's stack.
+    sys.setrecursionlimit(max(before, 20_000 if sys.version_info >= (3, 11) else 6_000))
+    try:
+        yield
+    except RecursionError:
+        raise LegsError(
+            "an expression of thousands of parts is nested too deeply: leave its file out by --exclude"
+        ) from None
+    finally:
+        sys.setrecursionlimit(before)
+
+
 def plan(
     path: str | os.PathLike[str],
     exclude: Sequence[str] = (),
@@ -56,7 +73,7 @@ def plan(
         in_place: keep every line's number (for running in memory).
 
     Raises:
-        LegsError: no such folder; a site named by hand is not there.
+        LegsError: no such folder; a site named by hand is not there; an expression that is nested too deeply.
     """
     root = check_root(path)
     readable: List[Source] = []
@@ -67,7 +84,8 @@ def plan(
             readable.append(source)
         else:
             unreadable.append(source)
-    findings = find(readable, by_hand, _unread(root, exclude, unreadable))
+    with _deep_recursion():
+        findings = find(readable, by_hand, _unread(root, exclude, unreadable))
     findings.unreadable[:0] = unreadable
     for name, line in by_hand:
         if not any(site.path == name and site.named_by(line) for site in findings.sites) and not any(

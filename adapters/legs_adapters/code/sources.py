@@ -12,6 +12,9 @@ from legs_loss import LegsError
 __all__ = ["BOM", "Source", "Unreadable", "check_root", "decode", "read_source"]
 
 BOM = b"\xef\xbb\xbf"
+LARGEST = 2 << 20  # bytes; a file of literals takes some 700 times its size to plan
+DEEPEST = 150  # brackets in brackets; Python itself refuses 200, and parsers that do not may end the process
+_NO_BRACKETS = bytes(set(range(256)) - set(b"()[]{}"))
 
 _CODING = re.compile(rb"^[ \t\f]*#.*?coding[:=][ \t]*([-\w.]+)")
 _UTF8_NAMES = {"utf8", "utf-8", "utf_8", "u8", "utf8-sig", "utf-8-sig", "ascii", "us-ascii"}
@@ -64,10 +67,27 @@ def check_root(path: str | os.PathLike[str]) -> Path:
 def read_source(root: Path, path: str) -> Source | Unreadable:
     """Read one file; what cannot be read as UTF-8 is returned with its reason."""
     try:
-        data = (root / path).read_bytes()
+        size = (root / path).stat().st_size
+        data = (root / path).read_bytes() if size <= LARGEST else b""
     except OSError as error:
         return Unreadable(path, f"cannot be read: {error.strerror}")
+    if size > LARGEST:
+        return Unreadable(path, f"larger than {LARGEST >> 20} MiB")
+    if _is_deep(data):
+        return Unreadable(path, f"brackets are nested more than {DEEPEST} deep")
     return decode(path, data)
+
+
+def _is_deep(data: bytes) -> bool:
+    """Return whether brackets are nested too deeply, going by the brackets alone, those in strings counted too."""
+    brackets = data.translate(None, _NO_BRACKETS)
+    for _ in range(DEEPEST):
+        inner = brackets.replace(b"()", b"").replace(b"[]", b"").replace(b"{}", b"")
+        if len(inner) == len(brackets):
+            # Unpaired ones, in strings say, are shallow unless many open in a row.
+            return max((len(run) for run in re.findall(rb"[(\[{]+", brackets)), default=0) > DEEPEST
+        brackets = inner
+    return bool(brackets)
 
 
 def decode(path: str, data: bytes) -> Source | Unreadable:

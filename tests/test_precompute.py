@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import time
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -231,18 +230,29 @@ class TestCommand:
         assert "manifest.json is damaged: delete that file" in done.stderr
 
 
+WAITING = """
+import sys
+import time
+
+sys.addaudithook(
+    lambda event, given: time.sleep(600) if event == "open" and str(given[0]).endswith("5a.png") else None
+)
+"""
+
+
 @needs_proc
 class TestInterrupted:
     """Runs that are stopped while they work.
 
-    One photograph of the scene is a pipe that no one writes to: whoever opens it waits, so the run cannot finish first.
+    Whoever opens one photograph of the scene waits, by a hook of Python's, so the run cannot finish first.
     """
 
     @pytest.fixture
     def scene(self, tmp_path):
-        for i in range(6):
-            save(tmp_path / "scene" / f"{i}.png", photograph(64, 48, i))
-        os.mkfifo(str(tmp_path / "scene" / "5a.png"))
+        for name in ("0", "1", "2", "3", "4", "5", "5a"):
+            save(tmp_path / "scene" / f"{name}.png", photograph(64, 48, int(name[0])))
+        (tmp_path / "hooks").mkdir()
+        (tmp_path / "hooks" / "sitecustomize.py").write_text(WAITING)
         return tmp_path / "scene"
 
     @pytest.fixture
@@ -250,10 +260,13 @@ class TestInterrupted:
         return tmp_path / "out"
 
     def start(self, scene, out, workers):
+        environment = legs_environment()
+        hooks = [str(scene.parent / "hooks"), environment.get("PYTHONPATH", "")]
+        environment["PYTHONPATH"] = os.pathsep.join(hook for hook in hooks if hook)
         process = subprocess.Popen(
             legs_command("precompute", scene, "--out", out, "--workers", workers),
             cwd=str(ROOT),
-            env=legs_environment(),
+            env=environment,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             start_new_session=True,
@@ -291,7 +304,7 @@ class TestInterrupted:
         assert len(workers) >= 3
         process.kill()
         process.wait()
-        wait_until(lambda: not let_go(scene / "5a.png") and not any(alive(worker) for worker in workers))
+        wait_until(lambda: not any(alive(worker) for worker in workers))
         store = WeightStore(out)
         assert 1 <= len(store.entries) <= 6
         assert store.check().damaged == []
@@ -335,12 +348,6 @@ def wait_until(condition):
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
-
-
-def let_go(pipe):
-    """Open the pipe's other end for a moment, if someone waits for that."""
-    with suppress(OSError):
-        os.close(os.open(str(pipe), os.O_WRONLY | os.O_NONBLOCK))
 
 
 def workers_of(pid):

@@ -58,7 +58,7 @@ class WeightSource:
 
     def __init__(self, config: Config, memo_bytes: int, say_once: Callable[[str, str], None]) -> None:
         self.config = config
-        self.memo = WeightMemo(memo_bytes)
+        self.memo: WeightMemo = WeightMemo(memo_bytes)
         self._say_once = say_once
         self._asked: Set[Tuple[str, int, int]] = set()
         self._store: Optional[WeightStore] = None

@@ -6,7 +6,7 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import Optional, Set, Union
+from typing import List, Optional, Set, Union
 
 from legs_loss.config import Config, find_config
 from legs_loss.distributed import is_first_process
@@ -39,7 +39,7 @@ class Run:
 
     def __init__(self, config: Config, memo_bytes: int = DEFAULT_LIMIT) -> None:
         self.config = config
-        self.source = WeightSource(config, memo_bytes, self.say_once)
+        self.source: WeightSource = WeightSource(config, memo_bytes, self.say_once)
         self._said: Set[str] = set()
         for note in config.notes:
             self.say_once(note, note)
@@ -77,9 +77,9 @@ class _Thread(threading.local):
         self.unweighted = 0  # on the instance: torch.compile does not ask again what the class says
 
 
-counted = Counts()
-thread = _Thread()
-version = [0]  # how often the settings were replaced; what was compiled before is compiled anew
+counted: Counts = Counts()
+thread: _Thread = _Thread()
+version: List[int] = [0]  # how often the settings were replaced; what was compiled before is compiled anew
 _run: Optional[Run] = None
 _lock = threading.RLock()
 

@@ -22,7 +22,7 @@ from legs_loss.experiments.upstream.profile import Profile
 from legs_loss.experiments.upstream.training import Checkout, copy_checkout, train_and_score
 from legs_loss.reference.training.dataset import load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
-from legs_loss.scenes import read_scene
+from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
 
@@ -60,8 +60,9 @@ class UpstreamComparison:
         extra: Sequence[str] = (),
         cpu: bool = False,
     ) -> None:
-        self.out, self.profile = Path(out), profile
-        self.scene = read_scene(scene, images)
+        self.out: Path = Path(out)
+        self.profile: Profile = profile
+        self.scene: Scene = read_scene(scene, images)
         if profile.number and gaussians is None:
             raise LegsError(f"{profile.name} trains to a fixed number of Gaussians: give it with --gaussians")
         base = TrainConfig(spec=BASELINE, iterations=iterations or profile.iterations, resolution=resolution or -1)
@@ -85,7 +86,7 @@ class UpstreamComparison:
         copy = self.out / "upstream"
         if not copy.is_dir():
             copy_checkout(root, copy)
-        self.checkout = Checkout(
+        self.checkout: Checkout = Checkout(
             copy.resolve(), profile, Path(scene).resolve(), images, resolution, iterations, gaussians, extra, cpu
         )
         self._mean_weights: Dict[WeightSpec, float] = {}

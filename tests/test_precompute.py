@@ -231,12 +231,20 @@ class TestCommand:
 
 
 WAITING = """
+import os
 import sys
 import time
 
-sys.addaudithook(
-    lambda event, given: time.sleep(600) if event == "open" and str(given[0]).endswith("5a.png") else None
-)
+parent = os.getppid()
+
+
+def wait(event, given):
+    if event == "open" and str(given[0]).endswith("5a.png"):
+        while os.getppid() == parent:
+            time.sleep(0.05)
+
+
+sys.addaudithook(wait)
 """
 
 
@@ -244,7 +252,8 @@ sys.addaudithook(
 class TestInterrupted:
     """Runs that are stopped while they work.
 
-    Whoever opens one photograph of the scene waits, by a hook of Python's, so the run cannot finish first.
+    Whoever opens one photograph of the scene waits, by a hook of Python's, as long as its parent lives: the run cannot
+    finish first.
     """
 
     @pytest.fixture

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-import builtins
+import re
 import shlex
+import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+from legs_adapters.cli import main as patch
 from PIL import Image
 
 from legs_loss import LegsError, WeightSpec
@@ -14,7 +18,7 @@ from legs_loss.cli import main
 from legs_loss.errors import did_you_mean
 from legs_loss.precompute import precompute
 from legs_loss.scenes import read_scene
-from tests.support import colmap_scene, legs, photograph, save
+from tests.support import colmap_scene, photograph, save
 
 
 @pytest.fixture
@@ -22,8 +26,8 @@ def scene(tmp_path):
     return colmap_scene(tmp_path / "a scene", names=[f"{i}.png" for i in range(3)])
 
 
-def says(capsys, *arguments):
-    """Run ``legs`` in this process; return its exit code and what it wrote to stderr."""
+def says(capsys, *arguments, main=main):
+    """Run a command in this process; return its exit code and what it wrote to stderr."""
     try:
         code = main([str(argument) for argument in arguments])
     except SystemExit as left:
@@ -47,6 +51,17 @@ class TestTypos:
         assert code == 2
         assert text.endswith(f"did you mean {meant!r}?\n")
         assert text.startswith("usage: legs" + (" " + arguments[0] if len(arguments) > 2 else ""))
+
+    @pytest.mark.parametrize(
+        ("option", "meant"),
+        [("--verfy", "--verify"), ("--preset=legz", "legs"), ("--curve=c33", "C3"), ("--operator=sobl", "sobel")],
+    )
+    def test_legs_patch_proposes_it_too(self, capsys, tmp_path, option, meant):
+        pytest.importorskip("libcst")
+        code, text = says(capsys, tmp_path, option, main=patch)
+        assert code == 2
+        assert text.endswith(f"did you mean {meant!r}?\n")
+        assert "legs-patch: error: " in text
 
     def test_nothing_is_proposed_for_what_is_like_nothing(self, capsys):
         code, text = says(capsys, "zzz")
@@ -153,8 +168,6 @@ class TestWhatIsNotThere:
 class TestCommandsToCopy:
     def test_undo_with_a_space_in_the_path(self, tmp_path):
         pytest.importorskip("libcst")
-        from legs_adapters.cli import main as patch
-
         checkout = tmp_path / "my gs"
         checkout.mkdir()
         (checkout / "train.py").write_text(
@@ -184,24 +197,44 @@ class TestCommandsToCopy:
 
 
 class TestCompletion:
-    def test_shells_get_a_script(self):
+    def test_shells_get_a_script(self, capsys):
         pytest.importorskip("shtab")
-        for shell, word in (("bash", "complete"), ("zsh", "#compdef legs")):
-            done = legs("--print-completion", shell)
-            assert done.returncode == 0, done.stderr
-            assert word in done.stdout
-            assert "precompute" in done.stdout
-            assert "--white_background" in done.stdout
+        for shell, word in (("bash", "complete -o "), ("zsh", "#compdef {}"), ("tcsh", "complete {}")):
+            for name, command, option in (("legs", main, "--white_background"), ("legs-patch", patch, "--exclude")):
+                with pytest.raises(SystemExit) as left:
+                    command(["--print-completion", shell])
+                assert left.value.code == 0
+                script = capsys.readouterr().out
+                assert word.format(name) in script
+                assert option in script or (shell == "tcsh" and option[2:] in script)
 
-    def test_without_shtab_it_says_what_to_install(self, capsys, monkeypatch):
-        real = builtins.__import__
+    def test_bash_completes_options_sub_commands_and_paths(self, tmp_path):
+        pytest.importorskip("shtab")
+        if shutil.which("bash") is None:
+            pytest.skip("no bash")
+        (tmp_path / "a_checkout").mkdir()
+        (tmp_path / "a_file.py").write_text("")
+        for program, words, wanted in (
+            ("legs", ["preco"], {"precompute"}),
+            ("legs", ["precompute", "--resol"], {"--resolution"}),
+            ("legs-patch", ["--ver"], {"--version", "--verify"}),
+            ("legs-patch", ["a_"], {"a_checkout"}),
+            ("legs", ["run", "a_"], {"a_checkout", "a_file.py"}),
+        ):
+            module = {"legs": "legs_loss.cli", "legs-patch": "legs_adapters.cli"}[program]
+            call = f"from {module} import main; main(['--print-completion', 'bash'])"
+            completion = subprocess.run([sys.executable, "-c", call], capture_output=True, text=True, check=True).stdout
+            function = re.search(rf"^complete .*-F (\w+) {program}$", completion, re.MULTILINE)
+            ask = f"COMP_WORDS=({program} {' '.join(words)})\nCOMP_CWORD={len(words)}\n{function.group(1)}\n"
+            done = subprocess.run(
+                ["bash", "-c", completion + ask + 'printf "%s\\n" "${COMPREPLY[@]}"'],
+                cwd=str(tmp_path), capture_output=True, text=True,
+            )  # fmt: skip
+            assert set(done.stdout.split()) == wanted, done.stderr
 
-        def hidden(name, *arguments, **options):
-            if name == "shtab":
-                raise ImportError(name)
-            return real(name, *arguments, **options)
-
-        monkeypatch.setattr(builtins, "__import__", hidden)
-        code, text = says(capsys, "--print-completion", "bash")
+    @pytest.mark.parametrize("command", [main, patch])
+    def test_without_shtab_it_says_what_to_install(self, capsys, monkeypatch, command):
+        monkeypatch.setitem(sys.modules, "shtab", None)
+        code, text = says(capsys, "--print-completion", "bash", main=command)
         assert code == 2
         assert "pip install 'legs-loss[completion]'" in text

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Optional, Sequence, Tuple
 
 from legs_loss import OPERATORS, LegsError, __version__
+from legs_loss.cli import Parser
 from legs_loss.terminal import never_fail_to_print, say
 
 if TYPE_CHECKING:
@@ -84,9 +85,10 @@ class _Explain(argparse.Action):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="legs-patch", description=__doc__, epilog=EXIT_CODES)
+    parser = Parser(prog="legs-patch", description=__doc__, epilog=EXIT_CODES)
     parser.add_argument("folder", metavar="FOLDER", help="the checkout")
     parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
+    parser.offer_completion()
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--diff", action="store_true", help="show what would change as a unified diff; write nothing")
     what.add_argument("--check", action="store_true", help="exit with 1 if something would change; write nothing")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Dict, List, Optional
 
 from legs_loss import OPERATORS, PRESETS, LegsError
+from legs_loss.errors import did_you_mean
 
 __all__ = ["SETTINGS_FILE", "settings_text"]
 
@@ -30,7 +31,9 @@ def settings_text(
     """
     name = preset or "legs"
     if name not in PRESETS:
-        raise LegsError(f"no preset is named {name!r}: choose one of {', '.join(PRESETS)}")
+        raise LegsError(
+            f"no preset is named {name!r}: choose one of {', '.join(PRESETS)}" + did_you_mean(name, PRESETS)
+        )
     base = PRESETS[name]
     given: Dict[str, Any] = {"beta": beta, "curve": curve, "operator": operator}
     spec = replace(base, **{key: value for key, value in given.items() if value is not None})

@@ -16,7 +16,7 @@ from legs_loss.cli.parser import Parser
 from legs_loss.errors import LegsError
 from legs_loss.plugins import plugins
 
-__all__ = ["main"]
+__all__ = ["Parser", "main"]
 
 COMMANDS = ("scene", "precompute", "show", "info", "train", "demo", "compare", "report", "view", "env")
 
@@ -42,7 +42,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog="legs", description="The LEGS loss for 3D Gaussian Splatting.", epilog=EXIT_CODES)
     parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
-    _add_completion(parser)
+    parser.offer_completion()
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.required = True
     modules: Dict[str, Callable[[], Any]] = {
@@ -54,18 +54,3 @@ def _parser() -> argparse.ArgumentParser:
         command.add_arguments(sub)
         sub.set_defaults(run=command.run)
     return parser
-
-
-def _add_completion(parser: argparse.ArgumentParser) -> None:
-    name, what = "--print-completion", "print the completion script of a shell, for its start-up file"
-    try:
-        import shtab
-    except ImportError:
-        parser.add_argument(name, action=_NoCompletion, metavar="SHELL", help=f"{what}; needs shtab")
-    else:
-        shtab.add_argument_to(parser, [name], help=what)
-
-
-class _NoCompletion(argparse.Action):
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        parser.error("completion needs shtab: pip install 'legs-loss[completion]'")

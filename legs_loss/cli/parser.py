@@ -1,14 +1,18 @@
-"""The argument parser of ``legs``: argparse's, whose errors propose the name that was meant."""
+"""The argument parser of the package's commands: argparse's, with errors that propose names, and shell completion."""
 
 from __future__ import annotations
 
 import argparse
 import re
-from typing import Any, List, NoReturn, Optional, Sequence
+from typing import Any, Iterator, List, NoReturn, Optional, Sequence
 
 from legs_loss.errors import did_you_mean
 
 __all__ = ["Parser"]
+
+# The words by which the help shows a value that is a path.
+_FOLDERS = {"DIR", "FOLDER", "PHOTOS", "RUN", "SCENE", "STORE"}
+_FILES = {"FILE", "IMAGE", "PLY", "PNG", "SCRIPT"}
 
 
 class Parser(argparse.ArgumentParser):
@@ -31,6 +35,15 @@ class Parser(argparse.ArgumentParser):
             message += did_you_mean(unknown.group(1), self._options())
         super().error(message)
 
+    def offer_completion(self) -> None:
+        """Add ``--print-completion``, which prints what a shell needs to complete this command's words."""
+        self.add_argument(
+            "--print-completion",
+            action=_PrintCompletion,
+            choices=("bash", "zsh", "tcsh"),
+            help="print the completion script of a shell, for its start-up file; needs shtab",
+        )
+
     def _options(self) -> List[str]:
         return [option for action in self._actions for option in action.option_strings]
 
@@ -39,3 +52,26 @@ class Parser(argparse.ArgumentParser):
             if isinstance(action, argparse._SubParsersAction):
                 return action.choices[getattr(parsed, action.dest)]
         return self
+
+
+class _PrintCompletion(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *given: Any) -> None:
+        try:
+            import shtab
+        except ImportError:
+            parser.error("completion needs shtab: pip install 'legs-loss[completion]'")
+        for action in _actions(parser):
+            words = set(re.findall(r"[A-Z]+", action.metavar)) if isinstance(action.metavar, str) else set()
+            if words & (_FILES | _FOLDERS):
+                action.complete = shtab.FILE if words & _FILES else shtab.DIRECTORY  # type: ignore[attr-defined]
+        print(shtab.complete(parser, given[1]))
+        parser.exit()
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Return the actions of a parser and of its sub-commands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _actions(command)

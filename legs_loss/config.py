@@ -14,7 +14,7 @@ from typing import Any, Dict, List, Mapping, Optional, Tuple
 from legs_loss.errors import LegsError, did_you_mean
 from legs_loss.spec import PRESETS, WeightSpec, as_spec
 
-__all__ = ["CONFIG_FILE", "STORE_FOLDER", "Config", "find_config"]
+__all__ = ["CONFIG_FILE", "STORE_FOLDER", "Config", "find_config", "is_off"]
 
 CONFIG_FILE = "legs.toml"
 STORE_FOLDER = "legs_weights"
@@ -83,11 +83,23 @@ def find_config(
         variable = "LEGS_" + name.upper()
         if environ.get(variable):
             config = _apply(config, {name: environ[variable]}, f"environment variable {variable}", Path.cwd())
-    if _is_true(environ.get("LEGS_OFF", "")):
+    if is_off(environ):
         config = replace(config, off=True)
     if config.store is None:
         config = replace(config, store=_store_of_scene(sys.argv if argv is None else argv))
     return config
+
+
+def is_off(environ: Optional[Mapping[str, str]] = None) -> bool:
+    """Return whether LEGS_OFF asks for the codebase's own loss, to the last bit.
+
+    Args:
+        environ: in place of ``os.environ``.
+
+    Raises:
+        LegsError: it is neither 1 nor 0 nor a word for these.
+    """
+    return _is_true((os.environ if environ is None else environ).get("LEGS_OFF", ""))
 
 
 def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> Config:

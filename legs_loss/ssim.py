@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from legs_loss.config import is_off
 from legs_loss.errors import LegsError
 from legs_loss.images import channels_first, check_pair, is_compiling, shape_of
 from legs_loss.kernels.backends import fused_ssim
@@ -35,11 +36,11 @@ def ssim(
     A Gaussian window of 11x11 and sigma 1.5, each channel by itself, C1 = 0.01^2, C2 = 0.03^2 (source: Inria's
     utils/loss_utils.py; Wang et al. 2004). Where neither image is trained on (``no_grad``, evaluation) it is 3DGS's own
     value to the last bit. In a training step value and gradient come from a backend where one takes the images
-    (docs/performance.md): equal up to rounding, differentiable once.
+    (docs/performance.md): equal up to rounding, differentiable once; with LEGS_OFF=1 they are 3DGS's own there, too.
 
     Args:
         prediction: floats in [0, 1], [C, H, W] or [B, C, H, W]; channels-last on request.
-        target: the same shape.
+        target: the same shape; or one image of a batch of one and the other without its axis, as 3DGS's takes them.
         padding: "zeros" as in 3DGS's code, "reflect", "replicate", or "valid" (only windows inside the image). A
             number is taken for 3DGS's third argument, ``window_size``, and what follows it for ``size_average``.
         channels_last: where the channel stands.
@@ -63,7 +64,8 @@ def ssim(
             size_average = bool(channels_last)
         window_size, padding, channels_last = padding, "zeros", None
     last = bool(channels_last)
-    if window_size == WINDOW_SIZE and size_average and torch.is_grad_enabled():
+    prediction, target = _of_one_rank(prediction, target)
+    if window_size == WINDOW_SIZE and size_average and torch.is_grad_enabled() and not is_off():
         check_pair(prediction, target)
         trained, constant = (prediction, target) if prediction.requires_grad else (target, prediction)
         if trained.requires_grad:
@@ -72,6 +74,16 @@ def ssim(
                 return fused
     similarity = ssim_map(prediction, target, padding, last, window_size)
     return similarity.mean() if size_average else similarity.mean(-3).mean(-2).mean(-1)
+
+
+def _of_one_rank(prediction: Tensor, target: Tensor) -> Tuple[Tensor, Tensor]:
+    """Return [C, H, W] beside [1, C, H, W] as two batches of one; others as they are."""
+    if isinstance(prediction, Tensor) and isinstance(target, Tensor):
+        if target.shape == (1, *prediction.shape):
+            return prediction.unsqueeze(0), target
+        if prediction.shape == (1, *target.shape):
+            return prediction, target.unsqueeze(0)
+    return prediction, target
 
 
 def ssim_map(

@@ -166,6 +166,21 @@ class TestDropIn:
         with torch.no_grad():
             assert torch.equal(ssim(prediction.requires_grad_(), target), formula_of_3dgs(prediction, target))
 
+    def test_with_legs_off_a_training_step_is_3dgs_own_to_the_last_bit(self, monkeypatch):
+        monkeypatch.setenv("LEGS_OFF", "1")
+        prediction, target = pair(3, 40, 50)
+        value = ssim(prediction.requires_grad_(), target)
+        expected = formula_of_3dgs(prediction, target)
+        assert torch.equal(value, expected)
+        assert torch.equal(*(torch.autograd.grad(each, prediction)[0] for each in (value, expected)))
+
+    def test_a_batch_of_one_beside_a_single_image(self):
+        prediction, target = pair(3, 24, 31)
+        for images in ((prediction[None], target), (prediction, target[None])):
+            assert torch.equal(ssim(*images), formula_of_3dgs(prediction, target))
+        with pytest.raises(LegsError, match="differ in shape"):
+            ssim(torch.stack([prediction] * 2), target)
+
     def test_both_images_may_learn(self):
         images = [image.requires_grad_() for image in pair(3, 24, 31)]
         assert all(gradient.abs().sum() > 0 for gradient in torch.autograd.grad(ssim(*images), images))

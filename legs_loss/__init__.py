@@ -72,7 +72,7 @@ class _Package(ModuleType):
     def __getattr__(self, name: str) -> object:
         if name.startswith("apply_to_"):  # legs_loss.apply_to_gsplat()
             library = name[len("apply_to_") :]
-            if library in importlib.import_module("legs_loss.plugins").plugins("legs_loss.upstreams"):
+            if library in importlib.import_module("legs_loss.system").plugins("legs_loss.upstreams"):
                 return functools.partial(importlib.import_module("legs_loss.upstreams").apply_to, library)
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

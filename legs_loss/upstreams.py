@@ -6,7 +6,7 @@ import sys
 from typing import Any, Dict, List, Tuple
 
 from legs_loss.errors import LegsError
-from legs_loss.plugins import plugins
+from legs_loss.system import plugins
 
 __all__ = ["Applied", "apply_to"]
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from legs_loss import LegsError
-from legs_loss.many_scenes import find_scenes, stores_of
+from legs_loss.precompute.many_scenes import find_scenes, stores_of
 from legs_loss.store import WeightStore
 from tests.support import colmap_scene, legs, legs_command, legs_environment, photograph, save
 
@@ -233,7 +233,7 @@ class TestCluster:
         assert not (scenes[0] / "legs_weights").exists()
 
     def test_no_scheduler_and_no_worker(self, cluster, scenes, monkeypatch):
-        from legs_loss import executors
+        from legs_loss.system import executors
 
         monkeypatch.setattr(executors, "_PATIENCE", 1)
         for address, message in (

@@ -12,7 +12,7 @@ from tests.support import ROOT, legs_environment
 
 SCRIPT = """
 import multiprocessing, os, signal
-from legs_loss.ctrl_c import kept_from_children
+from legs_loss.system import kept_from_children
 
 
 def ask(answers):

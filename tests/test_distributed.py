@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from legs_loss.distributed import is_first_process
+from legs_loss.system import is_first_process
 from tests.patching_support import checkout
 from tests.support import colmap_scene, legs, legs_environment
 

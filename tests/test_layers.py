@@ -9,7 +9,7 @@ from typing import Iterator, List, Tuple
 
 import pytest
 
-from legs_loss.plugins import plugins
+from legs_loss.system import plugins
 from tests.support import ROOT
 
 CORE, ADAPTERS = ROOT / "legs_loss", ROOT / "adapters" / "legs_adapters"
@@ -64,3 +64,51 @@ def test_a_private_name_is_told_from_a_public_one() -> None:
     assert is_public("legs_loss", "l1_loss") and is_public("legs_loss.reference.rasterizer", "draw")
     assert not is_public("legs_loss.runtime", "_Run")
     assert not is_public("legs_loss.reference.rasterizer.sorting", "OWNER")
+
+
+# The core from the ground up. A module imports what stands before it, or beside it in the same line.
+FLOORS = [
+    {"_version", "errors"},
+    {"system"},
+    {"images", "operators", "curves", "upstreams"},
+    {"spec", "scenes"},
+    {"config", "response"},
+    {"weights"},
+    {"kernels", "ssim"},  # a kernel is compared with torch's SSIM before it is used, and SSIM asks for a kernel
+    {"loss", "store"},
+    {"precompute", "runtime", "reference"},
+    {"experiments"},
+    {"report", "viewer"},
+    {"cli"},
+    {"__main__"},
+]
+# Programs: each is started by its own name, and begins another command.
+PROGRAMS = {"experiments/upstream/launch.py"}
+
+
+@pytest.mark.parametrize("floor", range(len(FLOORS)), ids=lambda floor: "+".join(sorted(FLOORS[floor])))
+def test_a_module_of_the_core_imports_only_those_before_it(floor: int) -> None:
+    below = set().union(*FLOORS[:floor])
+    for name in FLOORS[floor]:
+        folder = CORE / name
+        files = sorted(folder.rglob("*.py")) if folder.is_dir() else [CORE / f"{name}.py"]
+        assert files
+        for path in files:
+            allowed = below | (FLOORS[floor] if "kernels" in FLOORS[floor] else {name})
+            used = {(f"{module}.{what}").split(".")[1] for _, module, what in imports(path) if is_own(module)}
+            assert used <= allowed or path.relative_to(CORE).as_posix() in PROGRAMS, path
+
+
+def test_every_module_of_the_core_has_its_floor() -> None:
+    names = {path.stem for path in CORE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
+    assert names - {"__init__"} == set().union(*FLOORS)
+
+
+@pytest.mark.parametrize("folder", sorted({path.parent for path in CORE.rglob("*.py")}), ids=lambda path: path.name)
+def test_a_folder_of_the_core_has_about_a_dozen_modules(folder: Path) -> None:
+    assert len([path for path in folder.glob("*.py") if not path.name.startswith("_")]) <= 13
+
+
+def is_own(module: str) -> bool:
+    """Return whether a module is one of the core."""
+    return module.split(".")[0] == "legs_loss"

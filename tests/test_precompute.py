@@ -15,7 +15,8 @@ from PIL import Image
 
 from legs_loss.errors import LegsError
 from legs_loss.operators import operator_names
-from legs_loss.precompute import _compiled_anew, normalised_map, precompute
+from legs_loss.precompute import normalised_map, precompute
+from legs_loss.precompute.photograph import compiled_anew
 from legs_loss.response import normalise_response, response
 from legs_loss.scenes import image_tensor, images, load_training_image, read_scene
 from legs_loss.spec import PRESETS, WeightSpec
@@ -338,8 +339,8 @@ class TestCompiling:
 
         never_compiled = numba.njit(lambda image: image)
         monkeypatch.setattr(numba_response, "photograph_response", lambda image, spec: never_compiled(image))
-        assert _compiled_anew(PRESETS["legs"])
-        assert not _compiled_anew(PRESETS["legs"])
+        assert compiled_anew(PRESETS["legs"])
+        assert not compiled_anew(PRESETS["legs"])
 
     @pytest.mark.slow
     def test_a_worker_that_compiled_leaves_the_photograph_to_another(self, tmp_path):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Optional, Sequence, Tuple
 
 from legs_loss import OPERATORS, LegsError, __version__
 from legs_loss.cli import Parser
-from legs_loss.terminal import never_fail_to_print, say
+from legs_loss.system import never_fail_to_print, say
 
 if TYPE_CHECKING:
     from legs_adapters.terms.findings import Problem

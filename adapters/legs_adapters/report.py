@@ -10,7 +10,7 @@ from legs_adapters.code.syntax import one_line
 from legs_adapters.patch import Plan
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.terms.findings import Left
-from legs_loss.terminal import printable
+from legs_loss.system import printable
 
 __all__ = ["as_diff", "as_json", "as_table", "changes_as_diff"]
 

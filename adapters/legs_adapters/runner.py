@@ -21,7 +21,7 @@ from legs_adapters.code.sources import check_root
 from legs_adapters.patch import plan
 from legs_adapters.rewritten import Loader, install, main_module
 from legs_loss import LegsError
-from legs_loss.distributed import is_first_process
+from legs_loss.system import is_first_process
 
 __all__ = ["checkout_of", "execute", "run_script"]
 

@@ -14,7 +14,7 @@ from typing import Any, Callable, Dict, Optional, Sequence
 from legs_loss._version import __version__
 from legs_loss.cli.parser import Parser
 from legs_loss.errors import LegsError
-from legs_loss.plugins import plugins
+from legs_loss.system import plugins
 
 __all__ = ["Parser", "main"]
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Dict, Iterable
 
 if TYPE_CHECKING:
-    from legs_loss.many_scenes import SceneDone, SceneTask
+    from legs_loss.precompute.many_scenes import SceneDone, SceneTask
 
 HELP = "compute the weight maps of scenes once, for every later training"
 
@@ -64,8 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the stores; 1 when a photograph was skipped, or one of several scenes failed."""
     from legs_loss.errors import LegsError
-    from legs_loss.executors import executor, in_the_order_they_end
-    from legs_loss.many_scenes import precompute_scene
+    from legs_loss.precompute.many_scenes import precompute_scene
+    from legs_loss.system.executors import executor, in_the_order_they_end
 
     tasks = _tasks(args)
     failed = 0
@@ -90,7 +90,7 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     from legs_loss.cli.checks import check_resolution
     from legs_loss.cli.demo import cores
     from legs_loss.errors import LegsError
-    from legs_loss.many_scenes import SceneTask, find_scenes, stores_of
+    from legs_loss.precompute.many_scenes import SceneTask, find_scenes, stores_of
     from legs_loss.scenes import read_scene
 
     workers = args.workers if args.workers is not None else cores() if args.scheduler is None else 1
@@ -133,8 +133,8 @@ def _make(folder: Path) -> None:
 
 def _say(store: Path, done: SceneDone) -> int:
     """Print what was done of a scene; return 1 if any of it failed."""
-    from legs_loss.sharpness import unsharp_views
     from legs_loss.store import MANIFEST, WeightStore
+    from legs_loss.store.sharpness import unsharp_views
 
     report = done.report
     for view, reason in report.skipped.items():

@@ -70,9 +70,9 @@ def _computed(view: View, spec: WeightSpec) -> Shown:
 
 def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
     from legs_loss.errors import LegsError
-    from legs_loss.origin import scene_of_store
     from legs_loss.report.sheet import Shown
     from legs_loss.store import WeightStore
+    from legs_loss.store.origin import scene_of_store
 
     store, scene = WeightStore(path), scene_of_store(path)
     views = {} if scene is None else {view.name: view for view in scene.views}

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Callable, Dict, Sequence
 
 from legs_loss.errors import LegsError
-from legs_loss.executors import Listener, executor, in_the_order_they_end
 from legs_loss.reference.training.side_by_side import Arm, train_arm
 from legs_loss.reference.training.trainer import CHECKPOINT, Progress
+from legs_loss.system.executors import Listener, executor, in_the_order_they_end
 
 __all__ = ["train_on_cluster"]
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from legs_loss.errors import LegsError
-from legs_loss.files import read_regular
 from legs_loss.reference.gaussians import Gaussians
+from legs_loss.system import read_regular
 
 __all__ = ["read_ply", "write_ply"]
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import List, Optional, Set, Union
 
 from legs_loss.config import Config, find_config
-from legs_loss.distributed import is_first_process
 from legs_loss.runtime.memo import DEFAULT_LIMIT
 from legs_loss.runtime.sources import Counts, WeightSource
 from legs_loss.spec import Spec, WeightSpec, as_spec
+from legs_loss.system import is_first_process
 
 __all__ = [
     "Run",

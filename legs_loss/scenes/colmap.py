@@ -10,8 +10,8 @@ from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Opt
 import numpy as np
 
 from legs_loss.errors import LegsError
-from legs_loss.files import read_regular
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
+from legs_loss.system import read_regular
 
 __all__ = ["find_model", "read_colmap", "read_points", "write_colmap"]
 

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.files import open_regular
 from legs_loss.scenes.model import View
+from legs_loss.system import open_regular
 
 __all__ = [
     "image_size",

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from legs_loss.errors import LegsError
-from legs_loss.files import read_regular
 from legs_loss.scenes.folder import SUFFIXES
 from legs_loss.scenes.images import image_size
 from legs_loss.scenes.model import Camera, Scene, View
+from legs_loss.system import read_regular
 
 __all__ = ["find_transforms", "read_transforms"]
 

@@ -13,10 +13,10 @@ import torch
 
 import legs_loss
 from legs_loss.errors import LegsError
-from legs_loss.manifest import MANIFEST, manifest_bytes, read_manifest
 from legs_loss.precompute import precompute
 from legs_loss.scenes import View, image_tensor, load_training_image, read_scene
 from legs_loss.store import StoreWriter, WeightStore
+from legs_loss.store.manifest import MANIFEST, manifest_bytes, read_manifest
 from tests.support import legs, photograph, save
 
 SIZE = 12, 9

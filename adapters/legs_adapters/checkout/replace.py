@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Dict, Iterator, List, Mapping, Optional, Tuple
 
 from legs_loss import LegsError
-from legs_loss.ctrl_c import held_back
-from legs_loss.files import read_regular
-from legs_loss.locks import FileLock, HeldError
+from legs_loss.system import FileLock, HeldError, held_back, read_regular
 
 __all__ = ["LARGEST", "Changes", "check_name", "locked", "read_file", "replace_files"]
 

@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import Optional
 
-from legs_loss.files import read_regular
+from legs_loss.system import read_regular
 
 __all__ = ["is_sealed", "seal"]
 

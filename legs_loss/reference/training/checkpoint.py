@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from legs_loss.errors import LegsError
-from legs_loss.files import open_regular
+from legs_loss.system import open_regular
 
 __all__ = ["read_checkpoint", "read_state", "write_checkpoint"]
 

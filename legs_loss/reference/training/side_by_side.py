@@ -7,10 +7,10 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence
 
-from legs_loss.ctrl_c import kept_from_children
 from legs_loss.errors import LegsError
 from legs_loss.reference.training.trainer import Loss, Progress, TrainConfig, Weighting, step_loss, train
 from legs_loss.scenes import read_scene
+from legs_loss.system import kept_from_children
 
 __all__ = ["Arm", "train_arm", "train_side_by_side"]
 

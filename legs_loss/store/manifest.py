@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Callable, Dict, Iterable, List, Optional, Tuple
 
 from legs_loss.errors import LegsError
-from legs_loss.files import read_regular
+from legs_loss.system import read_regular
 
 __all__ = ["MANIFEST", "DamagedStoreError", "Entry", "is_map_name", "manifest_bytes", "read_manifest"]
 

@@ -11,10 +11,10 @@ from typing import List, NamedTuple, Optional, Sequence
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
-from legs_loss.executors import Listener
 from legs_loss.precompute import Report, precompute
 from legs_loss.scenes import read_scene
 from legs_loss.spec import Spec
+from legs_loss.system.executors import Listener
 
 __all__ = ["SceneDone", "SceneTask", "find_scenes", "precompute_scene", "stores_of"]
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Optional
 
 from legs_loss.errors import LegsError
-from legs_loss.files import read_regular
 from legs_loss.scenes import Scene, read_scene
+from legs_loss.system import read_regular
 
 __all__ = ["NOTE", "note_scene", "scene_of_store"]
 

@@ -1,0 +1,114 @@
+"""Write the normalised response of every view of a scene to its store."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Callable, Dict, List, Optional, Union
+
+from legs_loss.config import STORE_FOLDER
+from legs_loss.errors import LegsError
+from legs_loss.precompute.one_view import Job, Task, make
+from legs_loss.precompute.workers import in_processes
+from legs_loss.scenes import Scene, training_size
+from legs_loss.spec import Spec, as_spec
+from legs_loss.store import Entry, StoreWriter
+from legs_loss.store.origin import note_scene
+from legs_loss.system import held_back
+
+__all__ = ["Report", "precompute"]
+
+_COMMIT_SECONDS = 1.0
+
+
+@dataclass
+class Report:
+    """What :func:`precompute` did, by the names of views: maps made, maps kept, and views skipped with the reason."""
+
+    store: Path
+    made: List[str] = field(default_factory=list)
+    kept: List[str] = field(default_factory=list)
+    skipped: Dict[str, str] = field(default_factory=dict)
+
+
+def precompute(
+    scene: Scene,
+    out: Union[str, Path, None] = None,
+    spec: Spec = "legs",
+    resolution: int = -1,
+    white_background: bool = False,
+    workers: int = 1,
+    progress: bool = False,
+    on_progress: Optional[Callable[[int, int], None]] = None,
+) -> Report:
+    """Write the normalised response of every view of a scene to a store.
+
+    Args:
+        scene: from :func:`~legs_loss.scenes.read_scene`.
+        out: the store's folder, ``legs_weights`` in the scene by default, where a training script finds it by itself.
+            Maps already there are kept: one store holds many sizes and operators.
+        spec: its operator, p and eps are used; every curve and beta can be made from the result.
+        resolution: 3DGS's ``-r``, as the training will have it.
+        white_background: 3DGS's ``-w``, likewise.
+        workers: processes; 1 computes in this one. With more, a script needs its ``if __name__ == "__main__"``.
+        progress: show a bar on stderr.
+        on_progress: called after each view with the number of views that are done, and of all.
+
+    Returns:
+        What was made, kept and skipped. A photograph that cannot be read is skipped, not raised.
+
+    Raises:
+        LegsError: the store cannot be written or is damaged; bad settings.
+    """
+    from tqdm import tqdm
+
+    own = scene.root / STORE_FOLDER
+    out = own if out is None else Path(out)
+    if out.is_symlink() and os.path.abspath(str(out)) == os.path.abspath(str(own)):  # the scene's, not the user's
+        raise LegsError(f"{out} is a link, which is not followed: name the folder behind it with --out")
+    spec = as_spec(spec)
+    training_size(1 << 20, 1 << 20, resolution)  # a bad resolution is one error, not one a view
+    report = Report(out)
+    with StoreWriter(out) as writer:
+        job = Job(spec, resolution, white_background, out, writer.staging)
+        known: Dict[str, List[Entry]] = {}
+        for entry in writer.entries():
+            known.setdefault(entry.view, []).append(entry)
+        views = {view.name: view for view in scene.views}
+        tasks = [Task(view, known.get(name, [])) for name, view in views.items()]
+        results = in_processes(job, tasks, workers) if workers > 1 else (make(job, task) for task in tasks)
+        staged: List[Entry] = []
+        due = time.monotonic()  # the first at once, so that there is a store
+        with closing(results):
+            try:
+                for result in tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress):
+                    if result.unwritable is not None:
+                        raise LegsError(f"cannot write to {out}: {result.unwritable}")
+                    if result.problem is not None:
+                        report.skipped[result.view] = result.problem
+                    elif result.entry is None:
+                        report.kept.append(result.view)
+                    else:
+                        report.made.append(result.view)
+                        staged.append(result.entry)
+                    if on_progress is not None:
+                        on_progress(len(report.made) + len(report.kept) + len(report.skipped), len(tasks))
+                    if staged and time.monotonic() >= due:
+                        _commit(writer, staged)
+                        due = time.monotonic() + _COMMIT_SECONDS
+            finally:
+                _commit(writer, staged)
+    if out.resolve().parent != scene.root.resolve():
+        note_scene(out, scene)
+    return report
+
+
+def _commit(writer: StoreWriter, staged: List[Entry]) -> None:
+    """Commit what is staged, and empty the list; an interrupt waits until that is done."""
+    with held_back():
+        batch, staged[:] = list(staged), []
+        if batch:
+            writer.commit(batch)

@@ -1,0 +1,75 @@
+"""One view of a scene -> its map, staged for the store; left alone where the store has it already."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Dict, NamedTuple, Optional, Sequence
+
+from legs_loss.errors import LegsError
+from legs_loss.precompute.photograph import normalised_map, resized
+from legs_loss.scenes import View, image_size, load_training_image, training_size
+from legs_loss.spec import WeightSpec
+from legs_loss.store import Entry, fingerprint, is_intact, stage
+
+__all__ = ["Job", "Result", "Task", "make"]
+
+
+class Job(NamedTuple):
+    """The settings that all views of a run share."""
+
+    spec: WeightSpec
+    resolution: int
+    white_background: bool
+    store: Path
+    staging: Path
+
+
+class Task(NamedTuple):
+    """A view to be made."""
+
+    view: View
+    known: Sequence[Entry]  # what the store has of this view
+
+
+class Result(NamedTuple):
+    """Of one view: a staged entry, or a problem, or neither where the store's map is up to date.
+
+    ``problem`` is the photograph's and costs the view; ``unwritable`` is the store's and ends the run.
+    """
+
+    view: str
+    entry: Optional[Entry] = None
+    problem: Optional[str] = None
+    unwritable: Optional[str] = None
+
+
+def make(job: Job, task: Task) -> Result:
+    """Make the map of a view; whatever goes wrong is in the result."""
+    view = task.view
+    try:
+        source = os.stat(str(view.path))
+        width, height = training_size(*image_size(view.path), job.resolution)
+        wanted: Dict[str, Any] = {
+            "view": view.name,
+            "width": width,
+            "height": height,
+            "operator": job.spec.operator,
+            "p": job.spec.p,
+            "eps": job.spec.eps,
+            "background": ("white" if job.white_background else "black") if view.composited else None,
+            "source_bytes": source.st_size,
+            "source_mtime_ns": source.st_mtime_ns,
+        }
+        if any(wanted.items() <= vars(entry).items() and is_intact(job.store, entry) for entry in task.known):
+            return Result(view.name)
+        image = load_training_image(view, job.resolution, job.white_background, resized)
+        entry, made = Entry(fingerprint=fingerprint(image), **wanted), normalised_map(image, job.spec)
+        try:
+            return Result(view.name, stage(job.staging, entry, made))
+        except OSError as error:  # a full disk, a folder that went away: no later view fares better
+            return Result(view.name, unwritable=error.strerror or str(error))
+    except LegsError as error:
+        return Result(view.name, problem=str(error))
+    except (OSError, MemoryError) as error:
+        return Result(view.name, problem=f"{view.path}: {error or 'not enough memory'}")

@@ -1,0 +1,79 @@
+"""Photograph -> normalised response, in strips of rows, by compiled code where that is worth loading."""
+
+from __future__ import annotations
+
+from typing import Any, Tuple
+
+import numpy as np
+import torch
+
+from legs_loss.kernels.backends import backend_for
+from legs_loss.operators import OPERATORS
+from legs_loss.response import response
+from legs_loss.scenes import image_tensor
+from legs_loss.scenes.images import resized_pixels, row_strips
+from legs_loss.spec import WeightSpec
+
+__all__ = ["compiled_anew", "compiles", "normalised_map", "resized"]
+
+_WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
+
+
+def normalised_map(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
+    """Return E^ of a photograph uint8 or uint16 [H, W, C] as float16 [H, W], with one strip's temporaries at a time."""
+    height, width = image.shape[:2]
+    strength = _strength(image, spec)
+    low, high = strength.amin(), strength.amax()
+    normalised = np.empty((height, width), np.float16)  # numpy asks for large pages; torch does not
+    for rows in row_strips(height, width):  # in place: what is allocated anew has to be mapped anew
+        torch.from_numpy(normalised[rows]).copy_(strength[rows].sub_(low).div_(high - low + spec.eps))
+    return normalised
+
+
+def _strength(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
+    """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
+    if compiles(image.size):
+        from legs_loss.kernels.numba_response import photograph_response, supports_response
+
+        if supports_response(spec):
+            return torch.from_numpy(photograph_response(image, spec))
+    height, width = image.shape[:2]
+    reach = OPERATORS[spec.operator].reach
+    strength = torch.from_numpy(np.empty((height, width), np.float32))
+    for rows in row_strips(height, width):
+        # Rows that the operator reaches; at the photograph's own border it reflects.
+        above, below = max(rows.start - reach, 0), min(rows.stop + reach, height)
+        strip = response(image_tensor(image[above:below]), spec.operator, spec.p)
+        strength[rows] = strip[0, rows.start - above : rows.stop - above]
+    return strength
+
+
+def resized(image: Any, size: Tuple[int, int]) -> np.ndarray:
+    """Return what :func:`resized_pixels` returns, by compiled code where that is worth it."""
+    width, height = image.size
+    shrinks = 8 <= size[0] < width and size[1] <= height
+    if image.mode == "RGB" and shrinks and compiles(3 * width * height):
+        from legs_loss.kernels.numba_resize import resized_as
+
+        return resized_as(resized_pixels, image, size)
+    return resized_pixels(image, size)
+
+
+def compiles(values: int) -> bool:
+    """Return whether numba is there, and worth loading for so many values of a photograph."""
+    return values >= _WORTH_COMPILING and backend_for(torch.device("cpu")) == "numba"
+
+
+def compiled_anew(spec: WeightSpec) -> bool:
+    """Load the compiled code by a small picture, and say whether any of it was not on disk yet."""
+    from numba.core import event
+    from PIL import Image
+
+    from legs_loss.kernels.numba_resize import resized as resize
+    from legs_loss.kernels.numba_response import photograph_response, supports_response
+
+    with event.install_recorder("numba:compile") as compiled:
+        small = resize(Image.new("RGB", (64, 64)), (32, 32))
+        if supports_response(spec):
+            photograph_response(small, spec)
+    return bool(compiled.buffer)

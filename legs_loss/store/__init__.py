@@ -1,0 +1,30 @@
+"""Weight maps on disk, or rather what every curve and beta can be made from: normalised responses.
+
+A store is a folder: ``manifest.json`` and one ``.npy`` a view, size and operator, float16 [H, W]. A map of 1 is exact;
+elsewhere float16 rounds E^ by at most 2^-12, and small values by at most 1 part in 2048.
+
+Readers open the manifest and nothing else; it is replaced as a whole, so they need no lock. Writers stage maps in a
+folder of their own and move them in, with the manifest, under a lock: whatever the manifest does not list is a leftover
+of a writer that was killed, and the next writer sweeps it.
+"""
+
+from __future__ import annotations
+
+from legs_loss.store.fingerprints import fingerprint
+from legs_loss.store.manifest import MANIFEST, DamagedStoreError, Entry
+from legs_loss.store.maps import is_intact, read_map, stage
+from legs_loss.store.reading import Damage, WeightStore
+from legs_loss.store.writing import StoreWriter
+
+__all__ = [
+    "MANIFEST",
+    "Damage",
+    "DamagedStoreError",
+    "Entry",
+    "StoreWriter",
+    "WeightStore",
+    "fingerprint",
+    "is_intact",
+    "read_map",
+    "stage",
+]

@@ -1,0 +1,52 @@
+"""Tell whether a training image is the one that a map was made from."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Union
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["fingerprint"]
+
+
+def fingerprint(image: Union[Tensor, np.ndarray]) -> str:
+    """Return a short name of an image's values: two images have the same one only where they have the same map.
+
+    Values that are whole 255ths, as those of 8-bit photographs are, count as such however they were divided; values
+    that are whole 65535ths likewise; an image with any other value has a name by its float32 values, to the last bit.
+
+    Args:
+        image: floats in [0, 1], [C, H, W], on any device; or uint8 or uint16 [H, W, C].
+
+    Example:
+        >>> pixels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+        >>> fingerprint(pixels) == fingerprint(torch.from_numpy(pixels).permute(2, 0, 1) / 255.0)
+        True
+    """
+    if isinstance(image, np.ndarray) and image.dtype in (np.uint8, np.uint16):
+        values = image
+    else:
+        tensor = torch.as_tensor(image).detach()
+        values = _whole_numbers(tensor.float().permute(1, 2, 0).cpu().numpy(), tensor.dtype == torch.float16)
+    if values.dtype == np.uint16 and not (values % 257).any():
+        values = (values // 257).astype(np.uint8)  # an 8-bit photograph in 16 bits
+    kind = "" if values.dtype == np.uint8 else values.dtype.name
+    digest = hashlib.sha256(f"{values.shape!r}{kind}".encode())
+    digest.update(np.ascontiguousarray(values).data)
+    return digest.hexdigest()[:32]
+
+
+def _whole_numbers(image: np.ndarray, halves: bool) -> np.ndarray:
+    """Return an image's values as the 8- or 16-bit numbers that they are fractions of; else as they are."""
+    # float32 rounds values up to 1 by 6e-8, float16 by 2^-12.
+    for kind, tolerance in ((np.uint8, 255 / 4096 if halves else 1e-4), (np.uint16, 2e-2)):
+        scaled = image * np.float32(np.iinfo(kind).max)
+        whole = np.rint(scaled)
+        with np.errstate(invalid="ignore"):  # of an infinity
+            near = np.abs(scaled - whole).max() <= tolerance
+        if near and whole.min() >= 0 and whole.max() <= np.iinfo(kind).max:
+            return whole.astype(kind)
+    return image

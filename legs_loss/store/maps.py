@@ -1,0 +1,99 @@
+"""One map as a file: an .npy of float16, checked when it is read."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Tuple, Union
+
+import numpy as np
+
+from legs_loss.store.manifest import DamagedStoreError, Entry
+from legs_loss.system import read_regular
+
+__all__ = ["is_intact", "read_map", "stage", "write_parts"]
+
+_PIECE = 1 << 20  # bytes; for larger ones Linux may look for larger free pages, which took six times as long
+_REPAIR = "run legs precompute again to repair it"
+
+
+def read_map(folder: Path, entry: Entry) -> np.ndarray:
+    """Return the map E^ of an entry of the store in ``folder``: :meth:`WeightStore.normalised_response`."""
+    path = folder / entry.file
+    try:
+        data = read_regular(path, entry.bytes)
+    except OSError as error:
+        raise DamagedStoreError(f"{path} cannot be read ({error.strerror}); {_REPAIR}") from None
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise DamagedStoreError(f"{path} is damaged: its checksum differs; {_REPAIR}")
+    return _checked_map(path, data, entry)
+
+
+def _checked_map(path: Path, data: bytes, entry: Entry) -> np.ndarray:
+    """The array of an .npy file, which a stranger may have written, if it can be a normalised response."""
+    file = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(file)
+        shape, by_columns, kind = np.lib.format.read_array_header_1_0(file)
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as error:
+        raise DamagedStoreError(f"{path} holds no plain array ({error}); {_REPAIR}") from None
+    body = data[file.tell() :]
+    wanted = (entry.height, entry.width)
+    if (version, by_columns, kind) != ((1, 0), False, np.float16) or len(body) != 2 * entry.height * entry.width:
+        raise DamagedStoreError(f"{path} holds no float16 array of {list(wanted)}; {_REPAIR}")
+    if tuple(shape) != wanted:
+        raise DamagedStoreError(f"{path} has the shape {list(shape)}, its entry says {list(wanted)}; {_REPAIR}")
+    values = np.frombuffer(bytearray(body), np.float16).reshape(wanted)
+    # Bits of float16 are in the order of the numbers from 0 to 1; those of all others, NaN too, are larger.
+    if values.view(np.uint16).max() > np.float16(1).view(np.uint16):
+        raise DamagedStoreError(f"{path} has values that are not in [0, 1]; {_REPAIR}")
+    return values
+
+
+def is_intact(folder: Path, entry: Entry) -> bool:
+    """Return whether an entry's map can be read and is the one that was written."""
+    try:
+        read_map(folder, entry)
+    except DamagedStoreError:
+        return False
+    return True
+
+
+def stage(staging: Path, entry: Entry, normalised: np.ndarray) -> Entry:
+    """Write a map to a writer's staging folder and return its entry with file, bytes and checksum filled in.
+
+    Args:
+        staging: ``StoreWriter.staging``.
+        entry: without ``file``, ``bytes`` and ``sha256``.
+        normalised: E^ in [0, 1], [H, W].
+    """
+    parts = _npy(np.ascontiguousarray(normalised, np.float16))
+    checksum = hashlib.sha256()
+    for part in parts:
+        checksum.update(part)
+    sha256 = checksum.hexdigest()
+    # The name is for people; the digest, of the key and the content, keeps every two maps apart.
+    readable = re.sub(r"[^0-9a-z]+", "_", os.path.splitext(entry.view)[0].lower()).strip("_")[-40:] or "view"
+    digest = hashlib.sha256(f"{sha256}{entry.key}".encode()).hexdigest()[:16]
+    file = f"{readable}-{digest}.npy"
+    write_parts(staging / file, *parts)
+    return replace(entry, file=file, bytes=sum(len(part) for part in parts), sha256=sha256)
+
+
+def _npy(array: np.ndarray) -> Tuple[bytes, memoryview]:
+    """An .npy file in two parts, its head and the array's own memory: numpy.save to a buffer would copy that."""
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
+    return head.getvalue(), array.reshape(-1).view(np.uint8).data
+
+
+def write_parts(path: Path, *parts: Union[bytes, memoryview]) -> None:
+    """Write a file in pieces."""
+    with open(str(path), "wb") as file:
+        for part in parts:
+            for start in range(0, len(part), _PIECE):
+                file.write(part[start : start + _PIECE])

@@ -1,0 +1,84 @@
+"""A store, opened for reading."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Dict, List, NamedTuple, Optional, Tuple, Union
+
+import numpy as np
+
+from legs_loss.errors import LegsError
+from legs_loss.scenes.model import view_names
+from legs_loss.spec import WeightSpec
+from legs_loss.store.leftovers import leftovers
+from legs_loss.store.manifest import MANIFEST, Entry, read_manifest
+from legs_loss.store.maps import is_intact, read_map
+
+__all__ = ["Damage", "WeightStore"]
+
+
+class Damage(NamedTuple):
+    """What is wrong with a store: entries whose map is damaged or missing, and files that belong to no entry."""
+
+    damaged: List[Entry]
+    orphans: List[str]
+
+
+class WeightStore:
+    """A store, opened for reading: only its manifest is read.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        LegsError: there is no store, or a newer version wrote it.
+        DamagedStoreError: its manifest is damaged.
+    """
+
+    def __init__(self, path: Union[str, Path]) -> None:
+        self.path: Path = Path(path)
+        if not os.path.lexists(str(self.path / MANIFEST)):
+            raise LegsError(
+                f"{self.path} is no store of weight maps: it has no {MANIFEST} (legs precompute writes one)"
+            )
+        self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in read_manifest(self.path)}
+        self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
+        self._by_image: Dict[Tuple[Any, ...], Entry] = {}
+        for entry in self.entries.values():
+            image = (entry.fingerprint, *entry.key[1:])
+            self._by_image[image] = entry
+            for name in view_names(entry.view):
+                key = (name, *entry.key[1:])
+                self._by_name[key] = None if key in self._by_name else entry
+
+    def find(self, view: str, height: int, width: int, spec: WeightSpec) -> Optional[Entry]:
+        """Return the entry of a view at a size for a spec's operator, or None.
+
+        Args:
+            view: the photograph's path in the scene or the last parts of it, with or without the extension, or up to
+                the first dot as 3DGS names views. A name that fits two stored views gets None: it is never guessed.
+            height: of the training image in pixels.
+            width: likewise.
+            spec: its operator, p and eps count.
+        """
+        name = view.replace("\\", "/")
+        return self._by_name.get((name, height, width, spec.operator, spec.p, spec.eps))
+
+    def find_image(self, fingerprint: str, height: int, width: int, spec: WeightSpec) -> Optional[Entry]:
+        """Return the entry that was made from an image with a fingerprint, whatever its view is called, or None."""
+        return self._by_image.get((fingerprint, height, width, spec.operator, spec.p, spec.eps))
+
+    def normalised_response(self, entry: Entry) -> np.ndarray:
+        """Return an entry's map E^, float16 [H, W], after checking its checksum.
+
+        Raises:
+            DamagedStoreError: the file is missing or is not the one that was written.
+        """
+        return read_map(self.path, entry)
+
+    def check(self) -> Damage:
+        """Read every map and compare checksums."""
+        entries = self.entries.values()
+        damaged = [entry for entry in entries if not is_intact(self.path, entry)]
+        return Damage(damaged, sorted(path.name for path in leftovers(self.path, entries)))

@@ -1,0 +1,102 @@
+"""Write maps to a store so that a writer may be killed at any moment, and may meet others."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Iterator, List, Sequence, Union
+
+from legs_loss.errors import LegsError
+from legs_loss.store.leftovers import LOCK, STAGING, leftovers, remove
+from legs_loss.store.manifest import MANIFEST, Entry, manifest_bytes, read_manifest
+from legs_loss.store.maps import write_parts
+from legs_loss.system import FileLock
+
+__all__ = ["StoreWriter"]
+
+
+class StoreWriter:
+    """Writes to a store, beside other writers; a context manager.
+
+    A map is staged (from any process) and takes its place with :meth:`commit`. A writer that is killed loses what it
+    had not committed and nothing else.
+
+    Args:
+        path: the folder, made if it is missing.
+
+    Raises:
+        LegsError: the folder cannot be written, or a newer version wrote it.
+        DamagedStoreError: its manifest is damaged.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from legs_loss import WeightSpec
+        >>> from legs_loss.store import WeightStore, stage
+        >>> folder = tempfile.mkdtemp()
+        >>> with StoreWriter(folder) as writer:
+        ...     made = Entry("images/1.png", 4, 3, "laplacian", 2.0, 1e-8, None, "", 0, 0)
+        ...     writer.commit([stage(writer.staging, made, np.zeros((3, 4), np.float16))])
+        >>> WeightStore(folder).find("1", 3, 4, WeightSpec()).file
+        'images_1-f5049e0ccc83ca46.npy'
+    """
+
+    def __init__(self, path: Union[str, Path]) -> None:
+        self.path: Path = Path(path)
+
+    def __enter__(self) -> StoreWriter:
+        with self._locked():
+            for leftover in leftovers(self.path, self.entries()):
+                remove(leftover)
+            self.staging: Path = Path(tempfile.mkdtemp(prefix=STAGING, dir=str(self.path)))
+            self._alive = FileLock(self.staging / LOCK)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._alive.release()
+        remove(self.staging)
+
+    def commit(self, staged: Sequence[Entry]) -> None:
+        """Move staged maps into the store and list them, in place of older ones with the same key."""
+        with self._locked():
+            entries = {entry.key: entry for entry in self.entries()}
+            before = {entry.file for entry in entries.values()}
+            for entry in staged:
+                # Here, not where it was written: nobody waits for the disk but who commits.
+                _sync(self.staging / entry.file)
+                os.replace(str(self.staging / entry.file), str(self.path / entry.file))
+                entries[entry.key] = entry
+            write_parts(self.staging / MANIFEST, manifest_bytes(entries.values()))
+            _sync(self.staging / MANIFEST)
+            os.replace(str(self.staging / MANIFEST), str(self.path / MANIFEST))
+            if os.name == "posix":  # elsewhere a folder cannot be opened
+                _sync(self.path)
+            for file in before - {entry.file for entry in entries.values()}:
+                remove(self.path / file)
+
+    def entries(self) -> List[Entry]:
+        """Return what the store lists now."""
+        return read_manifest(self.path) if os.path.lexists(str(self.path / MANIFEST)) else []
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(self.path / LOCK)
+            try:
+                yield
+            finally:
+                lock.release()
+        except OSError as error:
+            raise LegsError(f"cannot write to {self.path}: {error.strerror or error}") from None
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file, or which files a folder has, is on the disk."""
+    descriptor = os.open(str(path), os.O_RDWR if path.is_file() else os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,28 @@
+"""What is asked of the machine: files, locks, processes, signals, the terminal, installed packages.
+
+Nothing here knows of images or losses, and nothing imports torch. ``executors`` is imported by its own name.
+"""
+
+from __future__ import annotations
+
+from legs_loss.system.ctrl_c import held_back, kept_from_children
+from legs_loss.system.distributed import is_first_process
+from legs_loss.system.files import open_regular, read_regular
+from legs_loss.system.locks import FileLock, HeldError, is_held
+from legs_loss.system.plugins import plugins
+from legs_loss.system.terminal import never_fail_to_print, printable, say
+
+__all__ = [
+    "FileLock",
+    "HeldError",
+    "held_back",
+    "is_first_process",
+    "is_held",
+    "kept_from_children",
+    "never_fail_to_print",
+    "open_regular",
+    "plugins",
+    "printable",
+    "read_regular",
+    "say",
+]

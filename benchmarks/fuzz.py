@@ -26,7 +26,7 @@ from typing import Any, Callable, Dict, Iterator, List, Tuple
 
 import numpy as np
 from legs_adapters.journal import JOURNAL, Journal
-from legs_adapters.patch import plan, write
+from legs_adapters.plan import plan, write
 from legs_adapters.undo import undo
 from PIL import Image
 

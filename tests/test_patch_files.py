@@ -17,7 +17,7 @@ from legs_adapters.cli import main
 from legs_adapters.code.folders import walk
 from legs_adapters.code.sources import Source, decode
 from legs_adapters.journal import JOURNAL
-from legs_adapters.patch import plan, write
+from legs_adapters.plan import plan, write
 from legs_adapters.runner import checkout_of
 from legs_adapters.undo import undo
 

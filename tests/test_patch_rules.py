@@ -8,7 +8,7 @@ from pathlib import Path
 from textwrap import indent
 
 import pytest
-from legs_adapters.patch import plan
+from legs_adapters.plan import plan
 from legs_adapters.rules.document import describe, explain, table
 from legs_adapters.rules.order import RULES
 from legs_adapters.rules.rule import Rule

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from legs_adapters.code.sources import decode
-from legs_adapters.patch import plan
+from legs_adapters.plan import plan
 from legs_adapters.terms.functions import L1Functions
 
 from tests.patching_support import NAMES, checkout, expected, files, legs_patch

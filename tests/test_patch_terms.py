@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("libcst")
 
-from legs_adapters.patch import plan
+from legs_adapters.plan import plan
 from legs_adapters.terms import kinds
 from legs_adapters.terms.form import Form
 

@@ -143,7 +143,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.code.sources import check_root
-    from legs_adapters.patch import plan, write
+    from legs_adapters.plan import plan, write
     from legs_adapters.report import as_diff, as_json, as_table
     from legs_adapters.settings import SETTINGS_FILE, settings_text
 

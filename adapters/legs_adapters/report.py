@@ -7,7 +7,7 @@ import json
 from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 
 from legs_adapters.code.syntax import one_line
-from legs_adapters.patch import Plan
+from legs_adapters.plan import Plan
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.terms.findings import Left
 from legs_loss.system import printable

@@ -18,7 +18,7 @@ from typing import Dict, Optional, Sequence, Tuple, Type
 
 from legs_adapters.code.folders import SUBMODULE, VENDORED, foreign_folder
 from legs_adapters.code.sources import check_root
-from legs_adapters.patch import plan
+from legs_adapters.plan import plan
 from legs_adapters.rewritten import Loader, install, main_module
 from legs_loss import LegsError
 from legs_loss.system import is_first_process

@@ -23,7 +23,7 @@ from typing import Any, Dict, List, NamedTuple, Optional, Sequence
 from legs_adapters.checkout.replace import locked
 from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL
-from legs_adapters.patch import plan
+from legs_adapters.plan import plan
 from legs_adapters.undo import undo
 from legs_loss import LegsError
 

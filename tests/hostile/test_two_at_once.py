@@ -12,7 +12,7 @@ import pytest
 from legs_adapters.checkout import replace
 from legs_adapters.cli import main
 from legs_adapters.journal import JOURNAL
-from legs_adapters.patch import plan, write
+from legs_adapters.plan import plan, write
 from legs_adapters.undo import undo
 
 from tests.patching_support import checkout, legs_patch, snapshot
@@ -136,7 +136,7 @@ def test_who_holds_the_lock_is_said(tmp_path, monkeypatch, capsys):
     assert not list(root.glob(".legs-patch*"))
 
 
-OURS = ("legs_adapters/cli.py", "patch.py", "undo.py", "journal.py", "replace.py", "locks.py", "interrupts.py")
+OURS = ("legs_adapters/cli.py", "plan.py", "undo.py", "journal.py", "replace.py", "locks.py", "interrupts.py")
 
 
 def at_line(number, action):

@@ -1,7 +1,8 @@
-"""Which kind of picture a name speaks of, and whether it speaks of a rendering or of a photograph."""
+"""Read names: the kind of picture that one speaks of, a rendering or a photograph, an L1 function."""
 
 from __future__ import annotations
 
+import re
 from typing import Optional
 
 from legs_adapters.code.syntax import words
@@ -19,7 +20,12 @@ from legs_adapters.lexicon.words import (
     WHICH,
 )
 
-__all__ = ["kind_of_words", "role_of_words"]
+__all__ = ["TORCH_L1", "is_l1_name", "kind_of_words", "role_of_words"]
+
+TORCH_L1 = re.compile(r"(^|\.)(torch\.nn\.functional|nn\.functional|functional)\.l1_loss$")
+_L1_NAME = re.compile(
+    r"^(masked|mask|weighted|pixel|pixelwise|rgb|color|image|photometric)*l1(loss)?(loss|mask(ed)?|rgb|withmask|v\d+)*$"
+)
 
 
 def kind_of_words(name: str) -> Optional[str]:
@@ -54,3 +60,8 @@ def role_of_words(name: str) -> Optional[str]:
     if target and render:  # rendered_gt, gt_pred: only a closer look can tell
         return None
     return "target" if target else "render" if render else None
+
+
+def is_l1_name(name: str) -> bool:
+    """Return whether a function of this name is an L1, going by the name."""
+    return _L1_NAME.match(name.replace("_", "").lower()) is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Optional
+from typing import Iterator, NamedTuple, Optional
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
@@ -67,6 +67,13 @@ class Doubts:
         target = one_line(form.first if flipped else form.second)
         advice = f"legs_loss.weight_map({target}) times the loss, before its mean"
         return Doubt(self._verdicts.problem(function, form, place, why)._replace(advice=advice), True)
+
+    def of_uncalled(self, function: Function) -> Iterator[Doubt]:
+        """Yield L1 functions under names that no call in sight uses: ``base = F.l1_loss``, for a function made here."""
+        for name, value in self.analysis.callbacks.uncalled(function):
+            why = f"nothing shows where {name} is called"
+            advice = f"legs_loss.l1_loss(rendering, photograph, own={one_line(value)}), where it is called"
+            yield Doubt(Problem.at(function, function.place(value), why, advice))
 
     def is_noise(self, function: Function, form: Form, left: Left) -> bool:
         """Return whether it is an absolute difference that is no loss: of angles, sizes, neighbouring pixels."""

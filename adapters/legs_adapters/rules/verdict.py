@@ -9,30 +9,26 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
-from legs_adapters.code.syntax import code, one_line, same, walk_expressions
+from legs_adapters.code.syntax import arguments, code, one_line, same, walk_expressions
 from legs_adapters.lexicon.masks import is_rows, picked_from
 from legs_adapters.lexicon.meaning import swapped
+from legs_adapters.lexicon.views import View
 from legs_adapters.rules.analysis import Analysis
-from legs_adapters.rules.order import AMBIGUOUS, DEFINITION, HUBER, ORDER, UNREAD, first
-from legs_adapters.rules.rule import Term
+from legs_adapters.rules.order import AMBIGUOUS, DEFINITION, HUBER, ORDER, RULES, UNREAD, first, first_of_call
+from legs_adapters.rules.rule import CallOfTerm, Term
 from legs_adapters.rules.uses import Use, Uses
 from legs_adapters.tensors.layout import is_channels_last, lies_last
 from legs_adapters.terms.error_maps import shared_of
-from legs_adapters.terms.findings import Evidence, Kept, Left, Problem, Site
+from legs_adapters.terms.findings import Kept, Left, Problem, Site
 from legs_adapters.terms.form import Form
+from legs_adapters.terms.kinds.callback import Callback
 from legs_adapters.terms.kinds.named import Named
 from legs_adapters.terms.kinds.reread import Reread
 from legs_adapters.terms.writing import Writing
 
-__all__ = ["Verdicts", "left"]
+__all__ = ["Verdicts"]
 
 _FORWARD = ("forward", "__call__")
-
-
-def left(function: Function, place: Place, why: str | Evidence) -> Left:
-    """Return what stands at a place as left: for what a rule found, or for a reason that no rule has."""
-    reason, evidence = (why, None) if isinstance(why, str) else (why.reason, why)
-    return Left(function.module.path, place.line, function.module.lines.text(place.line), reason, evidence)
 
 
 class Verdicts:
@@ -48,7 +44,7 @@ class Verdicts:
         pair = term.pair
         evidence = None if by_hand else first(term, (*DEFINITION, *ORDER, *AMBIGUOUS))
         if evidence is not None:
-            return left(function, place, evidence)
+            return Left.at(function, place, evidence)
         target_first = swapped(pair.a, pair.b)
         if target_first is None and not by_hand:
             sides = f"{one_line(pair.first)} and {one_line(pair.second)}"
@@ -67,7 +63,7 @@ class Verdicts:
             return self.problem(function, form, place, why, flipped)
         evidence = first(term, HUBER)
         if evidence is not None:
-            return left(function, place, evidence)
+            return Left.at(function, place, evidence)
         if form.why_by_hand():
             return self.problem(function, form, place, form.why_by_hand(), flipped)
         if form.is_named and not function.flow.unchanged_at(form.call, form.first, form.second):
@@ -75,7 +71,7 @@ class Verdicts:
         uses = self.uses.of(function, prediction, target)
         others = [(use, use.other) for use in uses if use.other is not None]
         if others and len(others) == len(uses):
-            return left(function, place, others[0][1])
+            return Left.at(function, place, others[0][1])
         unsettled = self.uses.unsettled(function, uses) if others else None
         if unsettled is not None:  # its body cannot be both
             use, other = others[0]
@@ -85,7 +81,7 @@ class Verdicts:
             return problem._replace(advice=problem.advice + _in_a_copy(function, uses))
         evidence = first(Term(self.analysis, function, form), UNREAD)
         if evidence is not None:
-            return left(function, place, evidence)
+            return Left.at(function, place, evidence)
         shared = shared_of(self.analysis.training, function, form)
         aside: Tuple[cst.Name, ...] = ()
         if shared is not None and shared.loss:
@@ -101,6 +97,37 @@ class Verdicts:
         stands = (function.module.path, place.line, place.column, place.last_line)
         kept = tuple(self._kept(function, use, other.reason) for use, other in others)
         return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside, kept)
+
+    def of_any(self, function: Function, form: Form, place: Place) -> Left | Problem:
+        """Return what becomes of a call whose function settings choose: a person is asked, unless a rule applies."""
+        term = Term(self.analysis, function, form)
+        evidence = first(term)
+        if evidence is not None:
+            return Left.at(function, place, evidence)
+        assert form.callee is not None
+        why = f"{one_line(form.callee)} is settled at run time, and may be no L1"
+        return self.problem(function, form, place, why, bool(swapped(term.pair.a, term.pair.b)))
+
+    def of_callback(self, holder: Function, callback: Callback) -> Site | Left:
+        """Return what becomes of an L1 function that is passed by name, by what it is called with."""
+        term = Term(self.analysis, callback.caller, callback.form)
+        unknown = RULES["unknown"].found(term.here)
+        evidence = first(term)
+        if evidence is None and callback.outer is not None:
+            given = [self.analysis.meanings.of(holder, value) for value in arguments(callback.outer)[0][:2]]
+            evidence = first_of_call(CallOfTerm(self.analysis, holder, callback.outer, given)) if given else unknown
+        if evidence is None and swapped(term.pair.a, term.pair.b) is not False:
+            evidence = unknown
+        if evidence is not None:
+            return Left.at(holder, holder.place(callback.form.node), evidence)
+        return self.callable(holder, callback.form)
+
+    @staticmethod
+    def callable(function: Function, form: Form) -> Site:
+        """Return a function that is passed by name as a site: which view it is called for is not known."""
+        place = function.place(form.node)
+        stands = (function.module.path, place.line, place.column, place.line)
+        return Site(*stands, form, False, "", False, View(None, "a callable has no view"), function)
 
     @staticmethod
     def _kept(function: Function, use: Use, purpose: str) -> Kept:
@@ -139,11 +166,10 @@ class Verdicts:
 
     def problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
         """Return a form as a problem, with the text to write there by hand."""
-        module = function.module
         last = is_channels_last(self.analysis.training, function, form.first, form.second)
         rows = any(is_rows(self.analysis.meanings, function, side) for side in (form.first, form.second))
         text = form.advice(Writing(swapped=flipped, channels_last=last), rows)
-        return Problem(module.path, place.line, module.lines.text(place.line), reason, text)
+        return Problem.at(function, place, reason, text)
 
 
 def _index(node: cst.Subscript) -> str:

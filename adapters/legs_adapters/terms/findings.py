@@ -7,6 +7,7 @@ from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Function
+from legs_adapters.code.parsing import Place
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Unreadable
 from legs_adapters.lexicon.views import View
@@ -129,6 +130,12 @@ class Left(NamedTuple):
     reason: str
     evidence: Optional[Evidence] = None
 
+    @classmethod
+    def at(cls, function: Function, place: Place, why: str | Evidence) -> Left:
+        """Return what stands at a place as left: for what a rule found, or for a reason that no rule has."""
+        reason, evidence = (why, None) if isinstance(why, str) else (why.reason, why)
+        return cls(function.module.path, place.line, function.module.lines.text(place.line), reason, evidence)
+
     @property
     def because(self) -> List[Line]:
         """The lines that decided; its own where those cannot be placed."""
@@ -143,6 +150,11 @@ class Problem(NamedTuple):
     text: str
     reason: str
     advice: str
+
+    @classmethod
+    def at(cls, function: Function, place: Place, reason: str, advice: str) -> Problem:
+        """Return what stands at a place of a function as a problem."""
+        return cls(function.module.path, place.line, function.module.lines.text(place.line), reason, advice)
 
 
 class Findings(NamedTuple):

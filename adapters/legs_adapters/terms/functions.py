@@ -11,9 +11,9 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import known_arguments, returned
 from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, walk_expressions
+from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
 from legs_adapters.tensors.absolute import abs_argument, is_abs, mean_of
 from legs_adapters.tensors.operations import SIZES, depends
-from legs_adapters.terms.l1_names import TORCH_L1, is_l1_name
 from legs_adapters.terms.prospects import Prospects
 
 __all__ = ["L1Functions"]

@@ -14,9 +14,9 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import arguments, call_name, constant, dotted, words
+from legs_adapters.lexicon.names import is_l1_name
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import PassedByName
-from legs_adapters.terms.l1_names import is_l1_name
 
 __all__ = ["MENTIONED", "forms_of"]
 

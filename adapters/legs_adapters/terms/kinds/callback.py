@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Dict, List, NamedTuple, Optional, Set
+from typing import Dict, Iterator, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import code
+from legs_adapters.code.syntax import code, dotted
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.forms import Forms
@@ -65,6 +65,7 @@ class Callbacks:
     def __init__(self, program: Program, training: Training, forms: Forms) -> None:
         self.functions: Set[Function] = set()
         self.by_holder: Dict[Function, List[Callback]] = {}
+        self._program, self._forms = program, forms
         own = forms.functions
         for function, calls in list(training.sites.items()):
             shape = own.shape(function)
@@ -111,9 +112,28 @@ class Callbacks:
                         form = PassedByName(element.value, call, *sides, element.value)
                         self.by_holder.setdefault(caller, []).append(Callback(form, function, outer))
 
+    def uncalled(self, function: Function) -> Iterator[Tuple[str, cst.BaseExpression]]:
+        """Yield the names that a function gives to L1 functions and that no call in sight uses, each with the L1."""
+        known = {id(callback.form.node) for callback in self.by_holder.get(function, ())}
+        for form in self._forms.of(function):  # and what is called by a name of its own
+            named = function.flow.reaching(form.callee) if form.callee is not None else ()
+            known |= {id(definition.value) for definition in named}
+        for definition in [each for found in function.flow.definitions.values() for each in found]:
+            value = definition.value
+            if definition.kind != "assign" or id(value) in known or not isinstance(value, (cst.Name, cst.Attribute)):
+                continue
+            if self._forms.functions.is_l1(function, value) and not self._is_called(function, definition.place):
+                yield definition.place, value
+
+    def _is_called(self, function: Function, place: str) -> bool:
+        """Return whether ``self.loss`` is called by another method of its class."""
+        owner = self._program.owner_of(function)
+        methods = owner.methods.values() if owner is not None and place.startswith("self.") else ()
+        return any(dotted(call.func) == place for method in methods for call in method.flow.calls)
+
 
 def _is_read(holder: Function, place: str) -> bool:
-    """Whether a function, or one in it, reads a name of its own; what has other names, others may read."""
+    """Return whether a function, or one in it, reads a name of its own; what has other names, others may read."""
     if holder.parent is None or "." in place:
         return True
     return any(read.value == place for each in (holder, *holder.inner) for read in each.flow.reads)

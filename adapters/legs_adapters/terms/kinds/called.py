@@ -11,9 +11,9 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.syntax import arguments, call_name, code, constant
+from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
-from legs_adapters.terms.l1_names import TORCH_L1, is_l1_name
 from legs_adapters.terms.text import Edit, Text, residue
 from legs_adapters.terms.writing import Writing
 from legs_loss import LegsError

@@ -9,10 +9,10 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import arguments, call_name, constant, key_of, same
+from legs_adapters.lexicon.names import is_l1_name
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.called import Called
-from legs_adapters.terms.l1_names import is_l1_name
 from legs_adapters.terms.ssim import STRUCTURAL, is_given
 
 __all__ = ["chosen_at_run_time"]

@@ -1,4 +1,4 @@
-"""Patching a checkout: what is to be written is worked out first, and written at the end."""
+"""Plan a patch of a checkout, and carry it out: everything is worked out before anything is written."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from legs_adapters.code.folders import walk, why_left_out
 from legs_adapters.code.sources import Source, Unreadable, check_root, read_source
 from legs_adapters.edit import Edit, apply_edits, rewrite
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
+from legs_adapters.rules.find import find
 from legs_adapters.settings import SETTINGS_FILE
-from legs_adapters.sites import find
 from legs_adapters.terms.findings import Findings
 from legs_loss import LegsError
 
@@ -23,7 +23,7 @@ __all__ = ["Plan", "plan", "write"]
 
 
 class Plan(NamedTuple):
-    """What a patch would do.
+    """A patch that has been worked out, and not been written.
 
     Attributes:
         root: the checkout.
@@ -109,7 +109,7 @@ def plan(
 
 
 def _unread(root: Path, exclude: Sequence[str], unreadable: Sequence[Unreadable]) -> Dict[str, str]:
-    """The text, by path, of what is excluded or no Python: the names in it may be of functions that are patched."""
+    """Return the text, by path, of what is excluded or no Python: names in it may be of functions that are patched."""
     paths = {entry.path for entry in unreadable}
     if exclude:
         paths |= set(walk(root)) - set(walk(root, exclude))
@@ -158,7 +158,7 @@ def write(plan: Plan, force: bool = False) -> List[str]:
 
 
 def _is_patched(root: Path, path: str, journal: Journal) -> bool:
-    """Whether what was changed is the patch itself."""
+    """Return whether a file is as an earlier patch wrote it."""
     try:
         data = read_file(root, path)
     except LegsError:

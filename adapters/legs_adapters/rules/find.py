@@ -1,0 +1,148 @@
+"""Find the photometric L1 terms of a checkout's training steps; and every other L1, with the reason why it is left.
+
+A site is an L1 between a rendering and the ground truth whose value reaches a backward pass. Everything is decided from
+the syntax tree; what cannot be decided is a problem that a person settles, never a guess.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple, Union
+
+from legs_adapters.code.module import Function, Module
+from legs_adapters.code.parsing import Place
+from legs_adapters.code.sources import Source
+from legs_adapters.rules.analysis import Analysis
+from legs_adapters.rules.doubts import Doubt, Doubts
+from legs_adapters.rules.verdict import Verdicts
+from legs_adapters.terms.findings import Findings, Left, Problem, Site
+from legs_adapters.terms.kinds.fused import fused_losses
+from legs_adapters.terms.kinds.run_time import chosen_at_run_time
+from legs_adapters.terms.patched import patched_nodes
+from legs_adapters.terms.ssim import STRUCTURAL
+from legs_adapters.upstreams import registered
+
+__all__ = ["find"]
+
+_Entry = Tuple[Place, Union[Site, Left, Problem]]
+
+_MAY_HAVE_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(|\bunweighted\(")
+
+
+def find(
+    sources: Iterable[Source],
+    by_hand: Sequence[Tuple[str, int]] = (),
+    unread: Optional[Mapping[str, str]] = None,
+) -> Findings:
+    """Find the photometric terms of a checkout.
+
+    Args:
+        sources: its files.
+        by_hand: (path, line) of L1 terms that are sites because the user says so; nothing else is a site then.
+        unread: by path, the text of files that are not to be looked at, or cannot be.
+    """
+    return _Finder(Analysis(sources, unread), by_hand).run()
+
+
+class _Finder:
+    def __init__(self, analysis: Analysis, by_hand: Sequence[Tuple[str, int]]) -> None:
+        self.analysis = analysis
+        self.by_hand = set(by_hand)
+        self.verdicts = Verdicts(analysis)
+        self.doubts = Doubts(analysis, self.verdicts)
+        self.found = Findings([], [], [], [], [], [], analysis.program)
+        self.doubtful: List[Doubt] = []
+
+    def run(self) -> Findings:
+        for module in self.analysis.program.matching(_MAY_HAVE_L1):
+            self._module(module)
+        if not (self.found.sites or self.found.patched or self.found.problems or self.by_hand):
+            self.found.problems.extend(doubt.problem for doubt in self.doubtful)
+            quoted = {(problem.path, problem.line) for problem, _ in self.doubtful}
+            self.found.left[:] = [left for left in self.found.left if (left.path, left.line) not in quoted]
+        elif not self.by_hand:
+            self.found.doubts.extend(doubt.problem for doubt in self.doubtful if self._trains_alone(doubt))
+        unreadable = self.analysis.program.unreadable
+        self.found.unreadable.extend(unreadable[path] for path in sorted(unreadable))
+        return self.found
+
+    def _trains_alone(self, doubt: Doubt) -> bool:
+        """Return whether its file trains something, in which nothing was weighted or quoted."""
+        settled = {site.path for site in self.found.sites} | {entry.path for entry in self.found.patched}
+        settled |= {problem.path for problem in self.found.problems}
+        path = doubt.problem.path
+        trains = any(root.module.path == path for root in self.analysis.training.roots)
+        return trains and doubt.is_told_beside_sites and path not in settled
+
+    def _module(self, module: Module) -> None:
+        entries: List[_Entry] = []
+        patched: List[Left] = []
+        try:
+            for function in module.scopes(lambda text: self.analysis.prospects.of(text) or STRUCTURAL.search(text)):
+                entries += self._entries(function)
+                nodes = patched_nodes(self.analysis.program, function)
+                patched += [Left.at(function, function.place(node), "patched") for node in nodes]
+        except ValueError:
+            self.analysis.program.give_up(module.path, "cannot be written back exactly")
+            return
+        if module.failure is not None:
+            return
+        for _, entry in sorted(entries, key=lambda item: (item[0].line, item[0].column)):
+            if isinstance(entry, Site):
+                self.found.sites.append(entry)
+            elif isinstance(entry, Problem):
+                self.found.problems.append(entry)
+            else:
+                self.found.left.append(entry)
+        self.found.patched.extend(sorted(patched, key=lambda entry: entry.line))
+
+    def _entries(self, function: Function) -> Iterator[_Entry]:
+        """Yield what becomes of each L1 in a function, with its place."""
+        # Elsewhere an L1 could only be one by a name of a name, and nothing trains on it.
+        if self.analysis.prospects.near(function.text) or self.analysis.training.touches(function):
+            yield from self._of_forms(function)
+            if not self.by_hand:
+                yield from fused_losses(self.analysis.program, self.analysis.training, function)
+        if STRUCTURAL.search(function.text):
+            yield from self._of_chosen(function)
+        yield from self._of_callables(function)
+        self.doubtful.extend(self.doubts.of_uncalled(function))
+
+    def _of_forms(self, function: Function) -> Iterator[_Entry]:
+        for form in self.analysis.forms.of(function):
+            place = function.place(form.node)
+            chosen = self._is_chosen(function, place)
+            verdict = self.verdicts.of(function, form, place, chosen)
+            if isinstance(verdict, Left) and self.doubts.is_doubtful(function, form, verdict):
+                self.doubtful.append(self.doubts.of(function, form, place, verdict))
+            if self.by_hand and not chosen and not isinstance(verdict, Left):
+                verdict = Left.at(function, place, "not chosen")
+            if not (isinstance(verdict, Left) and self.doubts.is_noise(function, form, verdict)):
+                yield place, verdict
+
+    def _of_chosen(self, function: Function) -> Iterator[_Entry]:
+        program, training, known = self.analysis.program, self.analysis.training, self.analysis.forms.of(function)
+        for form in chosen_at_run_time(program, training, function, known):
+            place = function.place(form.node)
+            if self._is_chosen(function, place):
+                yield place, self.verdicts.of(function, form, place, True)
+            elif not self.by_hand:
+                yield place, self.verdicts.of_any(function, form, place)
+
+    def _of_callables(self, function: Function) -> Iterator[_Entry]:
+        verdicts = self.verdicts
+        found = [
+            (callback.form, verdicts.of_callback(function, callback))
+            for callback in self.analysis.callbacks.by_holder.get(function, ())
+        ]
+        for call in function.flow.calls if registered.MENTIONED.search(function.text) else ():
+            forms = registered.forms_of(self.analysis.program, function, call)
+            found += [(form, verdicts.callable(function, form)) for form in forms]
+        for form, verdict in found:
+            place = function.place(form.node)
+            if not self.by_hand or self._is_chosen(function, place):
+                yield place, verdict
+
+    def _is_chosen(self, function: Function, place: Place) -> bool:
+        path = function.module.path
+        return any(path == chosen and place.line <= line <= place.last_line for chosen, line in self.by_hand)

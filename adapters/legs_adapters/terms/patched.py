@@ -1,0 +1,29 @@
+"""Find what an earlier patch, or a person, has weighted already."""
+
+from __future__ import annotations
+
+from typing import List
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.program import Program
+from legs_adapters.terms.writing import PACKAGE
+
+__all__ = ["patched_nodes"]
+
+_PATCHED = (f"{PACKAGE}.l1_loss", f"{PACKAGE}.unweighted")
+
+
+def patched_nodes(program: Program, function: Function) -> List[cst.CSTNode]:
+    """Return what refers to legs_loss in a function: what is called, and what names are given."""
+    if PACKAGE not in function.module.text:
+        return []
+    nodes: List[cst.CSTNode] = [call.func for call in function.flow.calls]
+    for definitions in function.flow.definitions.values():
+        nodes.extend(d.value for d in definitions if d.kind == "assign" and isinstance(d.value, cst.Attribute))
+    return [
+        node
+        for node in nodes
+        if any(r.kind == "external" and r.target in _PATCHED for r in program.resolve(function, node))
+    ]

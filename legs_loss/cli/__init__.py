@@ -14,7 +14,7 @@ from typing import Any, Callable, Dict, Optional, Sequence
 from legs_loss._version import __version__
 from legs_loss.cli.parser import Parser
 from legs_loss.errors import LegsError
-from legs_loss.system import plugins
+from legs_loss.system import never_fail_to_print, plugins, say
 
 __all__ = ["Parser", "main"]
 
@@ -25,14 +25,15 @@ EXIT_CODES = "exit codes: 0 done; 1 done, but some items failed; 2 bad input or 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs`` with these arguments (default: the process's own) and return its exit code."""
+    never_fail_to_print()
     args = _parser().parse_args(argv)
     try:
         return args.run(args)
     except LegsError as error:
-        print(f"legs: error: {error}", file=sys.stderr)
+        say(f"legs: error: {error}", sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("legs: interrupted", file=sys.stderr)
+        say("legs: interrupted", sys.stderr)
         return 130
     except BrokenPipeError:  # `legs ... | head`: the reader left, which is no error of ours
         sys.stderr.close()

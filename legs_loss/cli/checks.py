@@ -8,6 +8,7 @@ from typing import Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes import Scene, View, image_size, training_size
+from legs_loss.system import say
 
 __all__ = ["check_resolution", "check_trainable"]
 
@@ -23,10 +24,10 @@ def check_resolution(resolution: int, views: Sequence[View]) -> None:
     size = _first_size(views)
     width, height = training_size(*(size or (1 << 20, 1 << 20)), resolution)
     if size is not None and resolution not in (-1, 1, 2, 4, 8) and width < min(_TINY, size[0]):
-        print(
+        say(
             f"legs: warning: -r {resolution} makes images of {width}x{height} pixels: as in 3DGS, 1, 2, 4 and 8 divide "
             "the size, and any other number is the width",
-            file=sys.stderr,
+            sys.stderr,
         )
 
 

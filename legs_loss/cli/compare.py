@@ -14,9 +14,10 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Dict
+from typing import TYPE_CHECKING, Dict, Sequence
 
 from legs_loss.cli.demo import cores, default_resolution
+from legs_loss.system import say
 
 if TYPE_CHECKING:
     from legs_loss.experiments.studies import Study
@@ -101,9 +102,8 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.cli.train import set_threads
     from legs_loss.errors import LegsError
     from legs_loss.experiments.arms import needed, parse_arms
-    from legs_loss.experiments.running import BASELINE, Comparison, read_rows
+    from legs_loss.experiments.running import BASELINE, Comparison
     from legs_loss.experiments.studies import STUDIES, these_arms
-    from legs_loss.experiments.tables import study_text
     from legs_loss.reference.training.trainer import Progress, TrainConfig
     from legs_loss.report.tensorboard import tensorboard_log
     from legs_loss.scenes import read_scene
@@ -130,12 +130,12 @@ def run(args: argparse.Namespace) -> int:
         resolution = default_resolution(read_scene(root, args.images))
     comparison = Comparison(root, replace(base, resolution=resolution), args.out, args.images)
     proof = comparison.proof
-    print(
+    say(
         f"The baseline is unweighted: over {proof['views']} views its loss is {proof['loss']:.6f}, 3DGS's own "
         f"{proof['loss_3dgs']:.6f}; gradients agree to {proof['gradient_error']:.0e} of the largest."
     )
     missing = sum(comparison.row(arm, seed) is None for arm in arms for seed in seeds)
-    print(f"{len(arms)} arms, {len(seeds)} seed(s); {missing} of {len(arms) * len(seeds)} trainings to do", flush=True)
+    say(f"{len(arms)} arms, {len(seeds)} seed(s); {missing} of {len(arms) * len(seeds)} trainings to do")
     reached: Dict[str, int] = {}
     bar = tqdm(total=missing * base.iterations, desc="iterations", mininterval=0.5, disable=not missing)
     with bar, tensorboard_log(args.tensorboard) as log:
@@ -147,12 +147,17 @@ def run(args: argparse.Namespace) -> int:
             log(name, progress)
 
         comparison.train(arms, seeds, args.processes, show, args.scheduler)
-    rows = [row for row in read_rows(args.out)[1] if row["seed"] in seeds]
-    print(study_text(rows, study))
-    print()
-    print(READING)
-    print(f"Rows: {args.out}; as a page: legs report {args.out}")
+    _say_scores(args.out, study, seeds)
     return 0
+
+
+def _say_scores(out: Path, study: Study, seeds: Sequence[int]) -> None:
+    from legs_loss.experiments.running import read_rows
+    from legs_loss.experiments.tables import study_text
+
+    say(study_text([row for row in read_rows(out)[1] if row["seed"] in seeds], study))
+    say(f"\n{READING}")
+    say(f"Rows: {out}; as a page: legs report {out}")
 
 
 def _upstream(args: argparse.Namespace, study: Study) -> int:
@@ -160,8 +165,7 @@ def _upstream(args: argparse.Namespace, study: Study) -> int:
 
     from legs_loss.errors import LegsError
     from legs_loss.experiments.arms import needed, parse_arms
-    from legs_loss.experiments.running import BASELINE, read_rows
-    from legs_loss.experiments.tables import study_text
+    from legs_loss.experiments.running import BASELINE
     from legs_loss.experiments.upstream.comparison import UpstreamComparison
     from legs_loss.experiments.upstream.profile import find_profile
 
@@ -186,13 +190,9 @@ def _upstream(args: argparse.Namespace, study: Study) -> int:
     )
     arms = needed(parse_arms([BASELINE, *study.arms]))
     seeds = range(args.first_seed, args.first_seed + args.seeds)
-    print(f"{profile.name}: {len(arms)} arms, {len(seeds)} seed(s), one training at a time", flush=True)
-    comparison.train(arms, seeds, lambda name: print(name, flush=True))
-    rows = [row for row in read_rows(args.out)[1] if row["seed"] in seeds]
-    print(study_text(rows, study))
-    print()
-    print(READING)
-    print(f"Rows: {args.out}; as a page: legs report {args.out}")
+    say(f"{profile.name}: {len(arms)} arms, {len(seeds)} seed(s), one training at a time")
+    comparison.train(arms, seeds, say)
+    _say_scores(args.out, study, seeds)
     return 0
 
 
@@ -201,7 +201,7 @@ def _embedded(root: Path) -> Path:
     from legs_loss.reference.embedded import write_embedded_scene
 
     if not (root / "sparse" / "0" / "points3D.bin").is_file():  # what is written last
-        print(f"making the embedded scene in {root}", flush=True)
+        say(f"making the embedded scene in {root}")
         try:
             write_embedded_scene(root, VIEWS, WIDTH, HEIGHT)
         except OSError as error:
@@ -217,7 +217,7 @@ def _again(args: argparse.Namespace) -> int:
     row = read_row(args.again)
     with progress_bar(row["config"]["iterations"], row["arm"]) as show:
         now = train_again(args.again, None if args.scene is None else Path(args.scene), show)
-    print(again_text(row, now))
+    say(again_text(row, now))
     return 0
 
 

@@ -15,6 +15,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Dict, List
 
+from legs_loss.system import say
+
 HELP = "weight maps, four trainings, a table and pictures, on the embedded scene or your own"
 
 AFFORDABLE = 70_000  # pixels a photograph: a CPU trains such scenes in minutes
@@ -62,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     out: Path = args.out
     if args.scene is None:
         root = out / "scene"
-        print(f"making the embedded scene in {root}", flush=True)
+        say(f"making the embedded scene in {root}")
         write_embedded_scene(root)
     else:
         root = Path(args.scene)
@@ -96,14 +98,14 @@ def run(args: argparse.Namespace) -> int:
     metrics = {arm.name: metrics[arm.name] for arm in arms}
     view, sheet = _save_pictures(scene, arms, metrics, out / "pictures")
     (out / "results.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    print(table(metrics))
-    print(conclusion(metrics))
-    print(
+    say(table(metrics))
+    say(conclusion(metrics))
+    say(
         f"Pictures of the held-out view {view}: {sheet.parent}{os.sep}METHOD-rendering.png, -error.png, -weight.png; "
         f"on one sheet: {sheet}"
     )
-    print(f"Scenes: {out}{os.sep}METHOD{os.sep}point_cloud{os.sep}...{os.sep}point_cloud.ply")
-    print(f"{time.perf_counter() - started:.0f} s in all")
+    say(f"Scenes: {out}{os.sep}METHOD{os.sep}point_cloud{os.sep}...{os.sep}point_cloud.ply")
+    say(f"{time.perf_counter() - started:.0f} s in all")
     return 0
 
 

@@ -9,6 +9,7 @@ import platform
 from typing import TYPE_CHECKING, Iterator, Tuple
 
 from legs_loss._version import __version__
+from legs_loss.system import say
 
 if TYPE_CHECKING:
     import torch
@@ -23,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print what was found, a line each, and return the exit code."""
     for name, value in _lines():
-        print(f"{name:<16} {value}", flush=True)
+        say(f"{name:<16} {value}")
     return 0
 
 

@@ -12,6 +12,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Iterable
 
+from legs_loss.system import say
+
 HELP = "say what a store of weight maps holds, and check it"
 
 
@@ -37,28 +39,28 @@ def run(args: argparse.Namespace) -> int:
     try:
         store = WeightStore(path)
     except DamagedStoreError as error:
-        print(f"legs: error: {error}", file=sys.stderr)
+        say(f"legs: error: {error}", sys.stderr)
         return 1
     entries = list(store.entries.values())
     damaged, orphans = store.check()
-    print(path)
-    print(f"  views      {len({entry.view for entry in entries})}")
-    print(f"  maps       {len(entries)} ({sum(entry.bytes for entry in entries) / 1e6:.3g} MB)")
-    print(f"  sizes      {_counted(f'{entry.width}x{entry.height}' for entry in entries)}")
-    print(f"  operators  {_counted(f'{entry.operator} p={entry.p:g} eps={entry.eps:g}' for entry in entries)}")
+    say(path)
+    say(f"  views      {len({entry.view for entry in entries})}")
+    say(f"  maps       {len(entries)} ({sum(entry.bytes for entry in entries) / 1e6:.3g} MB)")
+    say(f"  sizes      {_counted(f'{entry.width}x{entry.height}' for entry in entries)}")
+    say(f"  operators  {_counted(f'{entry.operator} p={entry.p:g} eps={entry.eps:g}' for entry in entries)}")
     if any(entry.background for entry in entries):
-        print(f"  background {_counted(entry.background or 'none' for entry in entries)}")
+        say(f"  background {_counted(entry.background or 'none' for entry in entries)}")
     if not damaged:
-        print(f"  unsharp    {', '.join(unsharp_views(store)) or 'none'}")
-    print(f"  damaged    {len(damaged) or 'none'}")
+        say(f"  unsharp    {', '.join(unsharp_views(store)) or 'none'}")
+    say(f"  damaged    {len(damaged) or 'none'}")
     for entry in damaged:
-        print(f"    {entry.view} {entry.width}x{entry.height} {entry.operator}: {entry.file}")
+        say(f"    {entry.view} {entry.width}x{entry.height} {entry.operator}: {entry.file}")
     if orphans:
-        print(f"  leftovers  {len(orphans)} of interrupted runs; the next legs precompute removes them")
+        say(f"  leftovers  {len(orphans)} of interrupted runs; the next legs precompute removes them")
         for orphan in orphans:
-            print(f"    {orphan}")
+            say(f"    {orphan}")
     if damaged:
-        print("legs: error: run legs precompute again to repair the store", file=sys.stderr)
+        say("legs: error: run legs precompute again to repair the store", sys.stderr)
     return 1 if damaged else 0
 
 

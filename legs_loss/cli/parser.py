@@ -7,6 +7,7 @@ import re
 from typing import Any, Iterator, List, NoReturn, Optional, Sequence
 
 from legs_loss.errors import did_you_mean
+from legs_loss.system import printable
 
 __all__ = ["Parser"]
 
@@ -33,7 +34,7 @@ class Parser(argparse.ArgumentParser):
             message += did_you_mean(choice.group(1), re.findall(r"[\w.+-]+", choice.group(2)))
         elif unknown:
             message += did_you_mean(unknown.group(1), self._options())
-        super().error(message)
+        super().error(printable(message))
 
     def offer_completion(self) -> None:
         """Add ``--print-completion``, which prints what a shell needs to complete this command's words."""

@@ -16,6 +16,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Dict, Iterable
 
+from legs_loss.system import say
+
 if TYPE_CHECKING:
     from legs_loss.precompute.many_scenes import SceneDone, SceneTask
 
@@ -75,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
                 if isinstance(done, LegsError) and len(tasks) == 1:
                     raise done
                 if isinstance(done, LegsError):
-                    print(f"legs: error: {task.scene}: {done}", file=sys.stderr)
+                    say(f"legs: error: {task.scene}: {done}", sys.stderr)
                     failed += 1
                 else:
                     failed += _say(tasks[task], done)
@@ -138,25 +140,25 @@ def _say(store: Path, done: SceneDone) -> int:
 
     report = done.report
     for view, reason in report.skipped.items():
-        print(f"legs: skipped {view}: {reason}", file=sys.stderr)
+        say(f"legs: skipped {view}: {reason}", sys.stderr)
     if done.alike:
-        print(
+        say(
             f"legs: note: {done.alike} views share a name in 3DGS, which knows no folders and no extensions; "
             "code that names views so will compute their weights instead",
-            file=sys.stderr,
+            sys.stderr,
         )
     unsharp = unsharp_views(WeightStore(report.store)) if (report.store / MANIFEST).is_file() else []
     if unsharp:
-        print(
+        say(
             f"legs: note: {', '.join(unsharp)}: out of focus, moved or noisy beside the others, as it seems; each map "
             "counts from its own weakest to its strongest response, so that such photographs are weighted more",
-            file=sys.stderr,
+            sys.stderr,
         )
-    print(f"{store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")
+    say(f"{store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")
     if report.made and not (report.store / MANIFEST).is_file():
-        print(
+        say(
             f"legs: error: a worker wrote {report.store}, which is not seen here: the file system is not shared",
-            file=sys.stderr,
+            sys.stderr,
         )
         return 1
     return 1 if report.skipped else 0
@@ -167,10 +169,10 @@ def _say_where(tasks: Iterable[SceneTask]) -> None:
 
     away = [task for task in tasks if task.store != task.scene / STORE_FOLDER]
     if away:
-        print(
+        say(
             f"legs: note: a training that is given the scene looks in {away[0].scene / STORE_FOLDER}, not there: name "
             f"the store with LEGS_STORE={shlex.quote(str(away[0].store))}, or as `store` in legs.toml",
-            file=sys.stderr,
+            sys.stderr,
         )
 
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from legs_loss.system import say
+
 HELP = "a comparison as one HTML page"
 
 
@@ -30,5 +32,5 @@ def run(args: argparse.Namespace) -> int:
     set_threads(None)  # it draws with the CPU rasterizer: without numba, say so now
     check_matplotlib()
     path = write_report(args.folder, args.output or args.folder / "report.html", args.views, args.arms, args.scene)
-    print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
+    say(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
     return 0

@@ -11,6 +11,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from legs_loss.system import say
+
 HELP = "make a COLMAP scene of photographs"
 
 
@@ -59,10 +61,10 @@ def run(args: argparse.Namespace) -> int:
     finally:
         for bar in bars.values():
             bar.close()
-    print(
+    say(
         f"{made.folder}: {len(made.placed)} of {len(made.placed) + len(made.lost)} photographs, {made.points} points, "
         f"mean reprojection error {made.error:.2f} pixels"
     )
     if made.lost:
-        print(f"legs: no camera was found for {', '.join(made.lost)}: they are left out", file=sys.stderr)
+        say(f"legs: no camera was found for {', '.join(made.lost)}: they are left out", sys.stderr)
     return 1 if made.lost else 0

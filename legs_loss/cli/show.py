@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Callable, Dict, List, Optional, Sequence
 
+from legs_loss.system import say
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -55,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     names = _choose(list(shown), args.views)
     title = f"{args.preset}: {spec.operator}, p = {spec.p:g}, {spec.curve}, beta = {spec.beta:g}"
     save_sheet(args.out, [shown[name]() for name in names], spec, f"{path.resolve().name}   ·   {title}")
-    print(args.out)
+    say(args.out)
     return 0
 
 

@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
 
+from legs_loss.system import say
+
 if TYPE_CHECKING:
     from legs_loss.reference.training.trainer import Progress, TrainConfig
 
@@ -107,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
             on_progress=on_progress,
         )
     _print(result.metrics)
-    print(point_cloud(out, config))
+    say(point_cloud(out, config))
     return 0
 
 
@@ -176,5 +178,5 @@ def _print(metrics: Dict[str, Any]) -> None:
         scores = metrics[split] or {}
         told = [f"{METRICS[key].label} {value:{METRICS[key].format}}" for key, value in scores.items()]
         if told:
-            print(f"{views}: {', '.join(told)}")
-    print(f"{metrics['gaussians']} Gaussians, {metrics['seconds']:.0f} s")
+            say(f"{views}: {', '.join(told)}")
+    say(f"{metrics['gaussians']} Gaussians, {metrics['seconds']:.0f} s")

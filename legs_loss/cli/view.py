@@ -11,6 +11,8 @@ import argparse
 import time
 from pathlib import Path
 
+from legs_loss.system import say
+
 HELP = "look at trained Gaussians in the browser"
 
 
@@ -34,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
 
     content = find_content(args.path, args.scene)
     server = serve(content, args.preset, args.host, args.port)
-    print(f"{', '.join(content.methods)}: http://{args.host}:{server.get_port()} (Ctrl-C ends)", flush=True)
+    say(f"{', '.join(content.methods)}: http://{args.host}:{server.get_port()} (Ctrl-C ends)")
     try:
         while True:
             time.sleep(1)

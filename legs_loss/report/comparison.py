@@ -11,6 +11,7 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.reference.training.metrics import strongest
+from legs_loss.report.labels import label
 from legs_loss.response import normalise_response, response
 
 __all__ = ["Compared", "check_matplotlib", "save_pictures"]
@@ -78,7 +79,7 @@ def _sheet(
     rows = len(arms) + 1
     aspect = height / width
     figure: Any = Figure(figsize=(4 * 3.2 + 1.0, rows * (3.2 * aspect + 0.28) + 1.0), constrained_layout=True)
-    figure.suptitle(title, fontsize=13, color=_INK)
+    figure.suptitle(label(title), fontsize=13, color=_INK)
     grid = figure.subplots(rows, 4)
     for axes in grid.ravel():
         axes.set(xticks=[], yticks=[], frame_on=False)

@@ -10,6 +10,7 @@ import torch
 
 from legs_loss.curves import curve, curve_names
 from legs_loss.errors import LegsError
+from legs_loss.report.labels import label
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_from_response
 
@@ -44,7 +45,7 @@ def save_sheet(path: Union[str, Path], views: Sequence[Shown], spec: WeightSpec,
     column = min(4.2, 3.6 / aspect) if many else min(4.8, 5.0 / aspect)
     width, height = (column * len(views) + 1.4, 3 * column * aspect) if many else (3 * column, column * aspect + 0.6)
     figure: Any = Figure(figsize=(max(7.0, width), height + 4.4), constrained_layout=True)
-    figure.suptitle(title, fontsize=13, color=_INK)
+    figure.suptitle(label(title), fontsize=13, color=_INK)
     maps, below = figure.subfigures(2, 1, height_ratios=[height + 0.8, 3.4])
     if many:  # a column a view
         grid = maps.subplots(3, len(views) + 1, squeeze=False, gridspec_kw={"width_ratios": [1] * len(views) + [0.06]})
@@ -78,7 +79,7 @@ def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) 
         weights = weighted.imshow(weight, cmap="viridis", vmin=1, vmax=1 + (spec.beta or 1))
         weighted.set_xlabel(f"mean weight {weight.mean():.2f}", fontsize=9, color=_INK)
         if len(views) > 1:
-            photograph.set_title(view.label, fontsize=10, color=_INK)
+            photograph.set_title(label(view.label), fontsize=10, color=_INK)
     for axes, name in zip(cells[:, 0], ("photograph", r"response  $\hat{E}$", "weight  $W$")):
         (axes.set_ylabel if len(views) > 1 else axes.set_title)(name, fontsize=11, color=_INK)
     along = "vertical" if len(views) > 1 else "horizontal"

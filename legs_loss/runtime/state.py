@@ -12,7 +12,7 @@ from legs_loss.config import Config, find_config
 from legs_loss.runtime.memo import DEFAULT_LIMIT
 from legs_loss.runtime.sources import Counts, WeightSource
 from legs_loss.spec import Spec, WeightSpec, as_spec
-from legs_loss.system import is_first_process
+from legs_loss.system import is_first_process, say
 
 __all__ = [
     "Run",
@@ -50,7 +50,7 @@ class Run:
             self._said.add(kind)
             if kind == "active" and not is_first_process():
                 return
-            print(f"legs-loss: {message}", file=sys.stderr, flush=True)
+            say(f"legs-loss: {message}", sys.stderr)
 
     def say_what_is_used(self) -> None:
         """Print, once, the settings and where the weights of the first step came from: after it, so that it is true."""

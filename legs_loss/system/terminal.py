@@ -1,4 +1,4 @@
-"""What may be printed: names and lines of a stranger's files can hold what a terminal obeys."""
+"""Print what may be printed: names and lines of a stranger's files can hold what a terminal obeys."""
 
 from __future__ import annotations
 
@@ -30,6 +30,6 @@ def never_fail_to_print() -> None:
             reconfigure(errors="backslashreplace")
 
 
-def say(text: str, stream: Optional[TextIO] = None, end: str = "\n") -> None:
-    """Print to stdout, or another stream, what a terminal may be shown (:func:`printable`)."""
-    print(printable(text), file=stream, end=end)
+def say(text: object, stream: Optional[TextIO] = None, end: str = "\n") -> None:
+    """Print to stdout, or another stream, what a terminal may be shown (:func:`printable`); at once."""
+    print(printable(str(text)), file=stream, end=end, flush=True)

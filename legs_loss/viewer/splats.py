@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, Dict, NamedTuple
 
 import numpy as np
-import torch
 
 from legs_loss.reference.conventions import SH_C0
 from legs_loss.reference.gaussians import Gaussians
+from legs_loss.reference.rasterizer import rotations
 
 __all__ = ["Splats", "left_of", "splats"]
 
@@ -28,22 +28,7 @@ class Splats(NamedTuple):
 
 def splats(gaussians: Gaussians) -> Splats:
     """Return what viser draws of Gaussians. Colours are those of degree 0: they do not change with the direction."""
-    w, x, y, z = torch.nn.functional.normalize(gaussians.quaternions, dim=1).unbind(1)
-    rotation = torch.stack(
-        [
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y),
-        ],
-        dim=1,
-    ).reshape(-1, 3, 3)
-    axes = rotation * gaussians.scales[:, None, :]
+    axes = rotations(gaussians.quaternions) * gaussians.scales[:, None, :]
     colours = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
     parts = (gaussians.means, axes @ axes.transpose(1, 2), colours, gaussians.opacities)
     return Splats(*(part.detach().float().numpy() for part in parts))

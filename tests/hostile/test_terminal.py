@@ -7,8 +7,9 @@ import sys
 
 import pytest
 
+from legs_loss.store import WeightStore
 from tests.patching_support import checkout, files
-from tests.support import legs_environment
+from tests.support import legs_command, legs_environment, photograph, save
 
 
 def legs_patch(*arguments, encoding):
@@ -31,3 +32,49 @@ def test_every_mode_prints_and_ends_well(encoding, tmp_path):
         assert b"\\x1b[2J" in done.stdout
     missing = legs_patch("nowhere\x1b[2J", encoding=encoding)
     assert (missing.returncode, missing.stderr.count(b"\x1b")) == (2, 0)
+
+
+class TestLegs:
+    """Every command of ``legs`` that reads a scene, a store or a run prints the names in it."""
+
+    EVIL = "tr\u00e4in\x1b[2J\x1b]0;owned\x07\u2192"
+
+    def legs(self, *arguments, code, encoding="ascii"):
+        environment = dict(legs_environment(), PYTHONIOENCODING=encoding)
+        done = subprocess.run(legs_command(*arguments), capture_output=True, env=environment, timeout=300)
+        assert done.returncode == code, done.stderr
+        printed = done.stdout + done.stderr
+        assert b"\x1b" not in printed and b"\x07" not in printed and b"Traceback" not in printed
+        assert b"\\x1b[2J" in printed
+        return done
+
+    @pytest.fixture
+    def scene(self, tmp_path):
+        root = tmp_path / self.EVIL
+        save(root / "images" / f"{self.EVIL}.png", photograph(24, 16))
+        (root / "images" / f"broken{self.EVIL}.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+        return root
+
+    @pytest.mark.parametrize("encoding", ["ascii", "latin-1:strict", "utf-8"])
+    def test_what_is_skipped_and_what_was_written(self, scene, encoding):
+        done = self.legs("precompute", scene, code=1, encoding=encoding)
+        assert b"legs: skipped" in done.stderr and b"1 made, 0 up to date, 1 skipped" in done.stdout
+        assert len(WeightStore(scene / "legs_weights").entries) == 1
+
+    def test_damage_and_errors(self, scene, tmp_path):
+        self.legs("precompute", scene, code=1)
+        for path in (scene / "legs_weights").glob("*.npy"):
+            path.write_bytes(b"")
+        assert b"damaged    1" in self.legs("info", scene, code=1).stdout
+        self.legs("info", tmp_path / "nowhere\x1b[2J", code=2)
+        self.legs("show", scene, "--views", "nowhere\x1b[2J", code=2)
+        self.legs("scene\x1b[2J", code=2)
+        self.legs("report", scene, code=2)
+        self.legs("view", tmp_path / "nowhere\x1b[2J", code=2)
+        self.legs("compare", scene, "--out", tmp_path / "rows", code=2)
+
+    def test_a_picture_that_is_written_is_named(self, scene, tmp_path):
+        pytest.importorskip("matplotlib")
+        picture = tmp_path / f"{self.EVIL}.png"
+        self.legs("show", scene / "images" / f"{self.EVIL}.png", "--out", picture, code=0)
+        assert picture.stat().st_size > 0

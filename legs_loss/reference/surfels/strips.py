@@ -32,14 +32,12 @@ from legs_loss.kernels.simd import (
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, NEAR
 from legs_loss.reference.rasterizer.projection import WIDE, origin
 from legs_loss.reference.rasterizer.sorting import OWNER, ROWS, SUM
-from legs_loss.reference.rasterizer.strips import cover, exp2, place, reach, unfinished
+from legs_loss.reference.rasterizer.strips import AHEAD, CHECK, cover, exp2, place, reach, unfinished
 from legs_loss.reference.surfels.oracle import FAR
 from legs_loss.reference.surfels.projection import CAREFUL, CENTRE, COLOUR, NORMAL, OPACITY, SPLAT, TALL
 from legs_loss.reference.surfels.projection_backward import GRADIENTS
 
 PIXELS = WIDE * TALL
-AHEAD = 16  # entries whose memory is asked for while another is worked on
-CHECK = 16  # discs between two looks at whether a strip is finished
 FIELDS = SPLAT  # of an entry, float32: as of a splat, with p about the strip's origin, and its centre from there
 
 # A strip's state, but for X in planes of PIXELS numbers. T: transmittance, its sign turned once the pixel is finished.

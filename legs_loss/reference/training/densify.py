@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.reference.gaussians import Gaussians
+from legs_loss.reference.rasterizer import rotations
 from legs_loss.reference.training.adam import select, stack
 
 __all__ = ["Change", "Schedule", "densify", "prunable"]
@@ -103,20 +104,9 @@ def _split(parents: Gaussians, generator: torch.Generator) -> Gaussians:
     """Each parent's children, drawn from the parent's own distribution."""
     many = select(parents, torch.arange(len(parents)).repeat(CHILDREN))
     offsets = torch.randn(len(many), 3, generator=generator) * many.scales
-    rotated = (_rotations(many.quaternions) @ offsets[:, :, None])[:, :, 0]
+    rotated = (rotations(many.quaternions) @ offsets[:, :, None])[:, :, 0]
     shrink = torch.log(torch.tensor(0.8 * CHILDREN))
     return Gaussians(many.means + rotated, many.log_scales - shrink, many.quaternions, many.opacity_logits, many.sh)
-
-
-def _rotations(quaternions: Tensor) -> Tensor:
-    """[N, 3, 3] of quaternions wxyz of any length."""
-    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=1).unbind(1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
 def prunable(gaussians: Gaussians, extent: float, large_too: bool) -> Tensor:

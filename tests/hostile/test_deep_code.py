@@ -23,10 +23,12 @@ def training(scene, gaussians):
         loss = l1_loss(image, cam.original_image.cuda())
         loss.backward()
 """
+PARTS = "an expression of more than 2000 parts"
 # What stands in another function of the checkout, and why that file is reported as unread, if it is.
 CASES = {
     "a sum of 400 parts": ("x = " + " + ".join(["l1_loss(a, b)"] * 400), ""),
-    "a sum of 2,000 parts": ("x = " + " + ".join(["l1_loss(a, b)"] * 2000), ""),
+    "a sum of 1,000 calls": ("x = " + " + ".join(["l1_loss(a, b)"] * 1000), ""),
+    "a sum of 2,000 names": ("x = " + " + ".join(["l1_loss"] * 2000), ""),
     "a string of 400 parts": ("x = " + " ".join(["'l1_loss'"] * 400), ""),
     "400 elif": ("if a == 0:\n    x = 0\n" + "".join(f"elif a == {i}:\n    x = {i}\n" for i in range(1, 400)), ""),
     "1,000 attributes": ("x = a" + ".b" * 1000, ""),
@@ -36,17 +38,32 @@ CASES = {
     "2,000 parentheses": ("x = " + "(" * 2000 + "1" + ")" * 2000, "brackets are nested more than 150 deep"),
     "100,000 open ones": ("x = " + "(" * 100_000, "brackets are nested more than 150 deep"),
     "brackets in a string": ("x = '" + ") (" * 400 + "'", ""),
-    "5 MB of literal": ("x = [" + "1.25, " * 900_000 + "]", "larger than 2 MiB"),
+    "5 MB of literal": ("x = [" + "1.25, " * 900_000 + "]", "larger than 1 MiB"),
+    "a sum of 20,000 parts": ("x = " + " + ".join(["l1_loss(a, b)"] * 20_000), PARTS),
+    "a loss of 20,000 parts": ("def f():\n    x = " + " + ".join(["l1_loss(a, b)"] * 20_000), PARTS),
+    "20,000 attributes": ("x = a" + ".b" * 20_000, PARTS),
+    "20,000 calls": ("x = a" + ".b(1, 2)" * 20_000, PARTS),
+    "20,000 indices": ("x = a" + "[0]" * 20_000, PARTS),
+    "20,000 not": ("x = " + "not " * 20_000 + "a", PARTS),
+    "20,000 signs": ("x = " + "-" * 20_000 + "a", PARTS),
+    "20,000 strings": ("x = " + " ".join(["'l1_loss'"] * 20_000), PARTS),
+    "20,000 choices": ("x = " + "1 if a else " * 20_000 + "1", PARTS),
+    "20,000 lambdas": ("x = " + "lambda a, b: " * 20_000 + "1", PARTS),
+    "20,000 lines": ("x = 1 + \\\n" * 20_000 + "1", PARTS),
+    "a field of 20,000 parts": ("x = f'{" + "+".join(["a"] * 20_000) + "}'", PARTS),
+    "a list of 20,000 parts": ("x = [" + ", ".join(["-a.b[0]"] * 20_000) + "]", ""),
+    "20,000 statements": ("x = -a.b[0]\n" * 20_000, ""),
+    "5,000 elif": ("if a == 0:\n    x = 0\n" + "".join(f"elif a == {i}:\n    x = {i}\n" for i in range(5000)), "elif"),
+    "400 blocks": ("".join(" " * i + "if a:\n" for i in range(400)) + " " * 400 + "x = 1", "blocks are nested more"),
+    "5,000 functions in one": (
+        "def f():\n" + "".join(f"    def f{i}(a, b):\n        return l1_loss(a, b)\n\n" for i in range(5000)),
+        "more than 200 functions in one function",
+    ),
     "a double byte order mark": ("\ufeff\ufeffl1_loss(a, b)", "cannot be written back exactly"),
 }
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_the_training_is_planned_beside_it(tmp_path, name):
-    text, why = CASES[name]
-    shared = {path: content for path, content in files("common").items() if path != "train.py"}
-    other = text + "\n" if name.startswith("a double") else f"from utils.loss_utils import l1_loss\n{text}\n"
-    root = checkout(tmp_path, {**shared, "train.py": TRAIN, "other.py": other})
+def check(root):
     done = subprocess.run(
         [sys.executable, "-m", "legs_adapters.cli", "--check", str(root)],
         stdout=subprocess.PIPE,
@@ -54,9 +71,56 @@ def test_the_training_is_planned_beside_it(tmp_path, name):
         env=legs_environment(),
         timeout=300,
     )
-    said = done.stdout.decode()
-    assert done.returncode == 1, said
-    assert "Traceback" not in said
+    assert b"Traceback" not in done.stdout
+    return done.returncode, done.stdout.decode()
+
+
+def beside(folder, others):
+    shared = {path: content for path, content in files("common").items() if path != "train.py"}
+    return checkout(folder, {**shared, "train.py": TRAIN, **others})
+
+
+def test_the_training_is_planned_beside_them(tmp_path):
+    """All of them in one checkout: what is wrong with one costs only that one."""
+    others = {}
+    for number, (name, (text, _)) in enumerate(CASES.items()):
+        head = "" if name.startswith("a double") else "from utils.loss_utils import l1_loss\n"
+        others[f"other{number}.py"] = f"{head}{text}\n"
+    code, said = check(beside(tmp_path, others))
+    assert code == 1, said
     assert "would change: train.py" in said
-    unread = [line for line in said.splitlines() if line.startswith("other.py ") and "not read" in line]
-    assert [why] * bool(why) == [why for line in unread if why in line], said
+    unread = {line.split()[0]: line.split(None, 3)[3] for line in said.splitlines() if " not read " in line}
+    for number, (name, (_, why)) in enumerate(CASES.items()):
+        found = unread.get(f"other{number}.py", "")
+        assert (why in found) if why else not found, (name, found)
+
+
+def test_deeper_than_the_stack(tmp_path, monkeypatch):
+    """What the limits let through and the walk cannot follow all the same is one file's matter."""
+    from legs_adapters import plan as module
+    from legs_adapters.rules import find
+
+    def entries(self, function):
+        if function.module.path == "other.py":
+            raise RecursionError
+        return self._as_before(function)
+
+    monkeypatch.setattr(find._Finder, "_as_before", find._Finder._entries, raising=False)
+    monkeypatch.setattr(find._Finder, "_entries", entries)
+    other = "from utils.loss_utils import l1_loss\nx = l1_loss(a, b)\n"
+    found = module.plan(beside(tmp_path, {"other.py": other}))
+    assert [(one.path, one.reason) for one in found.findings.unreadable] == [("other.py", "is nested too deeply")]
+    assert list(found.after) == ["train.py"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["5,000 functions", "200 copies of train.py"])
+def test_many(what, tmp_path):
+    """Their time is in benchmarks; that they end, and how, is here."""
+    if what == "5,000 functions":
+        text = "".join(f"def f{i}(a, b):\n    x = l1_loss(a, b)\n    return x\n\n" for i in range(5000))
+        others = {"other.py": f"from utils.loss_utils import l1_loss\n{text}"}
+    else:
+        others = {f"train{i}.py": TRAIN for i in range(200)}
+    code, said = check(beside(tmp_path, others))
+    assert (code, "not read" in said) == (1, False)

@@ -74,8 +74,14 @@ class Checkout:
             return name in text and pattern.search(text) is not None
 
         if (name, called) not in self._mentions:
-            modules = [self.module(path) for path, source in self.sources.items() if says(source.text)]
-            self._mentions[name, called] = [f for module in modules if module is not None for f in module.scopes(says)]
+            modules = [
+                self.module(path)
+                for path, source in self.sources.items()
+                if name in source.text and (path in self._modules or says(source.text))
+            ]
+            self._mentions[name, called] = [
+                function for module in modules if module is not None for function in module.mentioning(name, says)
+            ]
         return self._mentions[name, called]
 
     def methods_named(self, name: str) -> List[Function]:

@@ -8,6 +8,7 @@ from typing import Callable, Dict, Iterator, List, Optional, Sequence, Tuple
 import libcst as cst
 
 from legs_adapters.code.flow import Flow
+from legs_adapters.code.limits import over_the_limits
 from legs_adapters.code.parsing import Cut, Lines, Part, Place, body_part, outline_part
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
@@ -18,6 +19,7 @@ __all__ = ["Class", "Function", "Module", "parse"]
 _PRINT_STATEMENT = re.compile(
     r"^\s*(print\s+[\"'\w]|exec\s+[\"']|raise\s+\w+\s*,)|^\s*except\s+[\w.]+\s*,\s*\w+\s*:", re.M
 )
+_WORD = re.compile(r"\w+")
 _DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
@@ -98,9 +100,15 @@ class Function:
         """The line of its ``def``, found in the text where it can be: the positions of a whole outline cost more."""
         if self._cut is None or self.parent is None:
             return (self.parent or self).place(self.node).line
-        pattern = rf"^[ \t]*(async[ \t]+)?def[ \t]+{re.escape(self.name)}\b".encode()
-        starts = [found.start() for found in re.finditer(pattern, self.module.lines.data[: self._cut.start], re.M)]
-        return self.module.lines.place(starts[-1], starts[-1]).line if starts else self.parent.place(self.node).line
+        data, name, end = self.module.lines.data, self.name.encode(), self._cut.start
+        header = re.compile(rb"[ \t]*(?:async[ \t]+)?def[ \t]+(" + re.escape(name) + rb")\b")
+        while end > 0:
+            end = data.rfind(name, 0, end)
+            start = data.rfind(b"\n", 0, max(end, 0)) + 1
+            found = header.match(data, start)
+            if found is not None and found.start(1) == end:
+                return self.module.lines.place(start, start).line
+        return self.parent.place(self.node).line
 
     @property
     def flow(self) -> Flow:
@@ -206,6 +214,7 @@ class Module:
         self.classes: List[Class] = []
         self.by_node: Dict[int, Function | Class] = {}
         self.top = Function(self, self.outline.tree)
+        self._by_word: Optional[Dict[str, List[Function]]] = None
         self._cuts: Iterator[Optional[Cut]] = iter(cuts)
         self._functions = self.collect(self.outline.tree.body, self.top)
         self._cuts = iter(())
@@ -248,16 +257,31 @@ class Module:
         """Yield the top level and the functions whose text says so."""
         return _chosen([self.top, *self._functions], says)
 
+    def mentioning(self, name: str, says: Callable[[str], object]) -> Iterator[Function]:
+        """Yield those of the scopes whose text has a word, by an index: every function's name may be asked for."""
+        if self._by_word is None:
+            self._by_word = {}
+            for scope in (self.top, *self._functions):
+                for word in set(_WORD.findall(scope.text)):
+                    self._by_word.setdefault(word, []).append(scope)
+        return _chosen(self._by_word.get(name, ()), says)
 
-def _chosen(functions: Sequence[Function], says: Callable[[str], object]) -> Iterator[Function]:
+
+def _chosen(
+    functions: Sequence[Function], says: Callable[[str], object], said: Optional[str] = None
+) -> Iterator[Function]:
+    """Yield the functions whose text says so; one that is written in a text that said so already is not asked again."""
     for function in functions:
-        if says(function.text):
+        if function.text is said or says(function.text):
             yield function
-            yield from _chosen(function.inner, says)
+            yield from _chosen(function.inner, says, function.text)
 
 
 def parse(source: Source) -> Module | Unreadable:
-    """Parse one file; what is not Python, or not of this version, is returned with its reason."""
+    """Parse one file; what is not Python, not of this version, or over the limits, is returned with its reason."""
+    over = over_the_limits(source.text)
+    if over:
+        return Unreadable(source.path, over)
     try:
         return Module(source.path, source.text)
     except (cst.ParserSyntaxError, RecursionError, ValueError) as error:

@@ -7,14 +7,12 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from legs_adapters.code.limits import LARGEST, too_deep
 from legs_loss import LegsError
 
 __all__ = ["BOM", "Source", "Unreadable", "check_root", "decode", "read_source"]
 
 BOM = b"\xef\xbb\xbf"
-LARGEST = 2 << 20  # bytes; a file of literals takes some 700 times its size to plan
-DEEPEST = 150  # brackets in brackets; Python itself refuses 200, and parsers that do not may end the process
-_NO_BRACKETS = bytes(set(range(256)) - set(b"()[]{}"))
 
 _CODING = re.compile(rb"^[ \t\f]*#.*?coding[:=][ \t]*([-\w.]+)")
 _UTF8_NAMES = {"utf8", "utf-8", "utf_8", "u8", "utf8-sig", "utf-8-sig", "ascii", "us-ascii"}
@@ -73,21 +71,8 @@ def read_source(root: Path, path: str) -> Source | Unreadable:
         return Unreadable(path, f"cannot be read: {error.strerror}")
     if size > LARGEST:
         return Unreadable(path, f"larger than {LARGEST >> 20} MiB")
-    if _is_deep(data):
-        return Unreadable(path, f"brackets are nested more than {DEEPEST} deep")
-    return decode(path, data)
-
-
-def _is_deep(data: bytes) -> bool:
-    """Return whether brackets are nested too deeply, going by the brackets alone, those in strings counted too."""
-    brackets = data.translate(None, _NO_BRACKETS)
-    for _ in range(DEEPEST):
-        inner = brackets.replace(b"()", b"").replace(b"[]", b"").replace(b"{}", b"")
-        if len(inner) == len(brackets):
-            # Unpaired ones, in strings say, are shallow unless many open in a row.
-            return max((len(run) for run in re.findall(rb"[(\[{]+", brackets)), default=0) > DEEPEST
-        brackets = inner
-    return bool(brackets)
+    deep = too_deep(data)
+    return Unreadable(path, deep) if deep else decode(path, data)
 
 
 def decode(path: str, data: bytes) -> Source | Unreadable:

@@ -85,6 +85,9 @@ class _Finder:
         except ValueError:
             self.analysis.program.give_up(module.path, "cannot be written back exactly")
             return
+        except RecursionError:
+            self.analysis.program.give_up(module.path, "is nested too deeply")
+            return
         if module.failure is not None:
             return
         for _, entry in sorted(entries, key=lambda item: (item[0].line, item[0].column)):

@@ -1,0 +1,111 @@
+"""Limits of what is planned of one file: over them it is reported as not read, and the rest of the checkout is planned.
+
+They go by the text alone, before any parser sees it: parsers of deep code may end the process, and the walk of a long
+expression takes time with the square of its parts. So what is read does not depend on the machine or its load.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Dict, List
+
+__all__ = ["LARGEST", "over_the_limits", "too_deep"]
+
+LARGEST = 1 << 20  # bytes; a file of literals takes some 900 times its size to plan
+DEEPEST = 150  # brackets in brackets; Python itself refuses 200
+BLOCKS = 100  # in blocks; as Python
+PARTS = 2000  # of one expression: operators, calls, attributes, strings in a row, `elif` in a row
+INNER = 200  # functions in one function
+
+_NO_BRACKETS = bytes(set(range(256)) - set(b"()[]{}"))
+_STRING = r"""\'\'\'(?:[^\\]|\\.)*?\'\'\'|\"\"\"(?:[^\\]|\\.)*?\"\"\"|'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*\""""
+_TOKEN = re.compile(
+    rf"(?P<string>{_STRING})|\#[^\n]*|\\\r?\n|(?P<end>[\r\n]+)|(?P<open>[(\[{{])|(?P<close>[)\]}}])|(?P<comma>,)|(?P<semi>;)"
+    r"|\b(?P<lambda>lambda)\b|\b(?P<word>if|else|and|or|not|in|is|await|for|yield)\b|(?P<signs>[-+*/%@&|^~<>=!.]+)",
+    re.S,
+)
+_FIELD = re.compile(r"\{[^{}]*\}")
+_LINE = re.compile(r"^([ \t]*)(elif\b|else\b|(?:async[ \t]+)?def\b|[^\s#])", re.M)
+
+
+def too_deep(data: bytes) -> str:
+    """Return why a file's brackets are too deep for any parser, or "": by the brackets alone, in strings too."""
+    brackets = data.translate(None, _NO_BRACKETS)
+    for _ in range(DEEPEST):
+        inner = brackets.replace(b"()", b"").replace(b"[]", b"").replace(b"{}", b"")
+        if len(inner) == len(brackets):
+            # Unpaired ones, in strings say, are shallow unless many open in a row.
+            runs = re.findall(rb"[(\[{]+", brackets)
+            return _DEEP if max(map(len, runs), default=0) > DEEPEST else ""
+        brackets = inner
+    return _DEEP if brackets else ""
+
+
+_DEEP = f"brackets are nested more than {DEEPEST} deep"
+
+
+def over_the_limits(text: str) -> str:
+    """Return why the code of a file is not walked, or "" where all of it is within the limits."""
+    return _blocks(text) or (f"an expression of more than {PARTS} parts" if _longest(text) > PARTS else "")
+
+
+def _longest(text: str) -> int:
+    """Return an upper bound of the parts that are nested in one another in any expression.
+
+    What stands between commas is not nested in one another, but for the bodies of lambdas; what stands in brackets is
+    nested in what is before them.
+    """
+    longest, before, here = 0, [], [0, 0]  # of a bracket: since its last comma, its lambdas
+    outer = 0
+    for found in _TOKEN.finditer(text):
+        kind = found.lastgroup
+        if kind == "string":
+            here[0] += 1 + max((len(field) // 2 for field in _FIELD.findall(found.group())), default=0)
+        elif kind == "word":
+            here[0] += 1
+        elif kind == "signs":
+            here[0] += len(found.group())
+        elif kind == "lambda":
+            here[1] += 1
+        elif kind == "open":
+            here[0] += 1
+            before.append(here)
+            outer += sum(here)
+            here = [0, 0]
+        elif kind == "close" and before:
+            here = before.pop()
+            outer -= sum(here)
+        elif kind == "comma":
+            here[0] = 0
+        elif (kind == "end" and not before) or kind == "semi":
+            before, outer, here = [], 0, [0, 0]
+        else:
+            continue
+        longest = max(longest, outer + sum(here))
+    return longest
+
+
+def _blocks(text: str) -> str:
+    """Return what of the blocks is over the limits, by the indentation of lines alone."""
+    columns: List[int] = []  # of the blocks that a line is in
+    branches: Dict[int, int] = {}  # `elif` in a row, by column
+    functions: List[int] = []  # the columns of `def` that a line is in
+    inner = 0
+    for found in _LINE.finditer(text):
+        column, word = len(found.group(1).expandtabs()), found.group(2)
+        while columns and columns[-1] >= column:
+            branches.pop(columns.pop(), None) if columns[-1] > column else columns.pop()
+        columns.append(column)
+        if len(columns) > BLOCKS:
+            return f"blocks are nested more than {BLOCKS} deep"
+        branches[column] = branches.get(column, 0) + 1 if word == "elif" else branches.get(column, 0) * (word == "else")
+        if branches[column] > PARTS:
+            return f"more than {PARTS} elif in a row"
+        while functions and functions[-1] >= column:
+            functions.pop()
+        if word.endswith("def"):
+            inner = inner + 1 if functions else 0
+            functions.append(column)
+            if inner > INNER:
+                return f"more than {INNER} functions in one function"
+    return ""

@@ -38,6 +38,10 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     except BrokenPipeError:  # `legs ... | head`: the reader left, which is no error of ours
         sys.stderr.close()
         return 0
+    except OSError as error:  # a full disk, a folder that went away
+        where = f"{error.filename}: " if error.filename is not None else ""
+        say(f"legs: error: {where}{error.strerror or error}", sys.stderr)
+        return 2
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.report.comparison import check_matplotlib
     from legs_loss.scenes import read_scene
     from legs_loss.spec import PRESETS
+    from legs_loss.system import write_whole
 
     started = time.perf_counter()
     set_threads(None)  # without numba there is no training: say so now
@@ -97,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         metrics = train_side_by_side(arms[::-1], args.processes, lambda name, progress: bars[name](progress))
     metrics = {arm.name: metrics[arm.name] for arm in arms}
     view, sheet = _save_pictures(scene, arms, metrics, out / "pictures")
-    (out / "results.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+    write_whole(out / "results.json", (json.dumps(metrics, indent=2) + "\n").encode())
     say(table(metrics))
     say(conclusion(metrics))
     say(

@@ -30,6 +30,7 @@ from legs_loss.reference.training.side_by_side import Arm, train_arm, train_side
 from legs_loss.reference.training.trainer import CHECKPOINT, Progress, TrainConfig, default_threshold, step_loss
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
+from legs_loss.system import write_whole
 from legs_loss.weights import weight_map
 
 __all__ = [
@@ -338,10 +339,4 @@ def read_json(path: Path, names: Sequence[str]) -> Dict[str, Any]:
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write values to a JSON file, all at once."""
-    part = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-        os.replace(str(part), str(path))
-    except OSError as error:
-        raise LegsError(f"cannot write {path}: {error.strerror or error}") from None
+    write_whole(path, (json.dumps(values, indent=1) + "\n").encode())

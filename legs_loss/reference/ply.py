@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import List, Tuple, Union
 
@@ -11,7 +10,7 @@ import torch
 
 from legs_loss.errors import LegsError
 from legs_loss.reference.gaussians import Gaussians
-from legs_loss.system import read_regular
+from legs_loss.system import read_regular, write_whole
 
 __all__ = ["read_ply", "write_ply"]
 
@@ -38,11 +37,7 @@ def write_ply(path: Union[str, Path], gaussians: Gaussians) -> None:
     table = torch.cat([column.detach().float().cpu() for column in columns], dim=1).numpy().astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property float {name}" for name in _properties(coefficients)] + ["end_header", ""]
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
-    os.replace(str(part), str(path))
+    write_whole(path, "\n".join(header).encode("ascii") + table.tobytes())
 
 
 def read_ply(path: Union[str, Path]) -> Gaussians:

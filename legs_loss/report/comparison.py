@@ -12,6 +12,7 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.reference.training.metrics import strongest
 from legs_loss.report.labels import label
+from legs_loss.report.saving import save_figure, save_png
 from legs_loss.response import normalise_response, response
 
 __all__ = ["Compared", "check_matplotlib", "save_pictures"]
@@ -43,13 +44,11 @@ def save_pictures(folder: Path, title: str, photograph: Tensor, arms: Sequence[C
     the arms; weight maps go from 1 to the largest weight. Returns the path of the sheet, ``comparison.png``.
     """
     from matplotlib import colormaps
-    from PIL import Image
 
-    folder.mkdir(parents=True, exist_ok=True)
     errors = [(arm.rendering.clamp(0, 1) - photograph).abs().mean(0).numpy() for arm in arms]
     most_error = float(np.quantile(np.stack(errors), 0.995)) or 1.0
     most_weight = max(2.0, *(float(arm.weight.max()) for arm in arms))
-    Image.fromarray(_bytes(photograph)).save(str(folder / "photograph.png"))
+    save_png(_bytes(photograph), folder / "photograph.png")
     for arm, error in zip(arms, errors):
         weight = (arm.weight[0].numpy() - 1) / (most_weight - 1)
         pictures = {
@@ -58,7 +57,7 @@ def save_pictures(folder: Path, title: str, photograph: Tensor, arms: Sequence[C
             "weight": colormaps["viridis"](weight, bytes=True)[..., :3],
         }
         for kind, pixels in pictures.items():
-            Image.fromarray(np.ascontiguousarray(pixels)).save(str(folder / f"{arm.name}-{kind}.png"))
+            save_png(pixels, folder / f"{arm.name}-{kind}.png")
     sheet = folder / "comparison.png"
     _sheet(sheet, title, photograph, arms, errors, most_error, most_weight)
     return sheet
@@ -104,7 +103,7 @@ def _sheet(
     for axes, shown in ((grid[-1, 2], shown_error), (grid[-1, 3], shown_weight)):
         bar = figure.colorbar(shown, ax=axes, orientation="horizontal", fraction=0.1, aspect=30)
         bar.ax.tick_params(labelsize=8)
-    figure.savefig(str(path), dpi=130, facecolor="white")
+    save_figure(figure, path, 130)
 
 
 def _detail(photograph: Tensor) -> Tuple[slice, slice]:

@@ -20,6 +20,7 @@ from legs_loss.report.html_pictures import FORMATS as IMAGE_FORMATS
 from legs_loss.report.html_pictures import Pictures, draw_row, encode
 from legs_loss.report.html_plots import by_gaussians, by_iterations
 from legs_loss.scenes import Scene, View
+from legs_loss.system import write_whole
 
 __all__ = ["LIMIT", "write_report"]
 
@@ -75,11 +76,7 @@ def write_report(
         page = _page(settings, rows, names, [encode(view, each, form) for view, each in drawn], first, run)
         data = page.encode("utf-8")
         if len(data) < LIMIT:
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(data)
-            except OSError as error:
-                raise LegsError(f"cannot write {path}: {error.strerror or error}") from None
+            write_whole(path, data)
             return path
     raise LegsError(
         f"the page would have {len(data) / 1e6:.0f} MB, above {LIMIT / 1e6:.0f}: choose fewer --views or --arms"

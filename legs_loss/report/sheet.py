@@ -11,6 +11,7 @@ import torch
 from legs_loss.curves import curve, curve_names
 from legs_loss.errors import LegsError
 from legs_loss.report.labels import label
+from legs_loss.report.saving import save_figure
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_from_response
 
@@ -55,10 +56,7 @@ def save_sheet(path: Union[str, Path], views: Sequence[Shown], spec: WeightSpec,
         cells, bars = grid[:1].T, grid[1]
     _draw_maps(cells, bars, views, spec)
     _draw_curves(below.subplots(), spec)
-    try:
-        figure.savefig(str(path), dpi=140, facecolor="white")
-    except (OSError, ValueError) as error:
-        raise LegsError(f"cannot write {path}: {error}") from None
+    save_figure(figure, path, 140)
 
 
 def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) -> None:

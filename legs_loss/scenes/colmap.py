@@ -11,7 +11,7 @@ import numpy as np
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
-from legs_loss.system import read_regular
+from legs_loss.system import read_regular, write_whole
 
 __all__ = ["find_model", "read_colmap", "read_points", "write_colmap"]
 
@@ -130,7 +130,7 @@ def write_colmap(root: Path, cameras: Mapping[str, Camera], points: PointCloud) 
         for number, (xyz, rgb) in enumerate(zip(points.xyz.tolist(), points.rgb.tolist()), start=1)
     ]
     for file, parts in (("images", posed), ("cameras", lenses), ("points3D", cloud)):
-        (folder / f"{file}.bin").write_bytes(b"".join(parts))
+        write_whole(folder / f"{file}.bin", b"".join(parts))
 
 
 def _parse(path: Path, parser: Callable[[bytes], Any]) -> Any:

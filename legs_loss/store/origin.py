@@ -12,7 +12,7 @@ from typing import Optional
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes import Scene, read_scene
-from legs_loss.system import read_regular
+from legs_loss.system import read_regular, write_whole
 
 __all__ = ["NOTE", "note_scene", "scene_of_store"]
 
@@ -30,12 +30,7 @@ def note_scene(store: Path, scene: Scene) -> None:
     if images is not None and not (scene.root / images).is_dir():
         images = os.path.abspath(images)
     text = json.dumps({"scene": os.path.abspath(str(scene.root)), "images": images}, indent=1) + "\n"
-    part = store / (NOTE + ".part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(str(part), str(store / NOTE))
-    except OSError as error:
-        raise LegsError(f"cannot write {store / NOTE}: {error.strerror or error}") from None
+    write_whole(store / NOTE, text.encode())
 
 
 def scene_of_store(store: Path) -> Optional[Scene]:

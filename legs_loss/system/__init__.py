@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from legs_loss.system.ctrl_c import held_back, kept_from_children
 from legs_loss.system.distributed import is_first_process
-from legs_loss.system.files import open_regular, read_regular
+from legs_loss.system.files import open_regular, read_regular, write_whole
 from legs_loss.system.locks import FileLock, HeldError, is_held
 from legs_loss.system.plugins import plugins
 from legs_loss.system.terminal import never_fail_to_print, printable, say
@@ -25,4 +25,5 @@ __all__ = [
     "printable",
     "read_regular",
     "say",
+    "write_whole",
 ]

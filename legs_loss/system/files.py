@@ -1,13 +1,16 @@
-"""Reading files that may be anything: a pipe, a device, or far larger than such a file can be."""
+"""Read files that may be anything (a pipe, a device, far too large), and write files as a whole or not at all."""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import stat
-from typing import BinaryIO, Union
+from typing import BinaryIO, Callable, Union
 
-__all__ = ["open_regular", "read_regular"]
+from legs_loss.errors import LegsError
+
+__all__ = ["open_regular", "read_regular", "write_whole"]
 
 PathLike = Union[str, "os.PathLike[str]"]
 
@@ -50,3 +53,39 @@ def read_regular(path: PathLike, limit: int) -> bytes:
         if size > limit:
             raise OSError(errno.EFBIG, f"{size} bytes, and no file of its kind has more than {limit}", os.fspath(path))
         return file.read(size)
+
+
+def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]]) -> None:
+    """Write a file as a whole or not at all: beside it first, on the disk, then into its place.
+
+    What was there stays until then. A link is replaced, not followed. What a killed process leaves is ``NAME.part``,
+    which the next write of the file replaces.
+
+    Args:
+        path: the file; folders above it are made.
+        data: its bytes, or what writes them.
+
+    Raises:
+        LegsError: it cannot be written; the message says why.
+    """
+    name = os.fspath(path)
+    part = name + ".part"
+    try:
+        os.makedirs(os.path.dirname(name) or ".", exist_ok=True)
+        if os.path.lexists(name) and not (os.path.isfile(name) or os.path.islink(name)):
+            raise OSError(errno.EINVAL, "a folder, a pipe, a socket or a device is there", name)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(part)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+        with os.fdopen(os.open(part, flags, 0o666), "wb") as file:
+            try:
+                data(file) if callable(data) else file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            except BaseException:
+                with contextlib.suppress(OSError):  # what does not fit is not left to take room
+                    os.unlink(part)
+                raise
+        os.replace(part, name)
+    except OSError as error:
+        raise LegsError(f"cannot write {name}: {error.strerror or error}") from None

@@ -7,6 +7,7 @@ and plaster, soft shadows, and objects that hide one another as the camera moves
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import List, Tuple, Union
 
@@ -16,6 +17,7 @@ from legs_loss.reference.embedded import textures
 from legs_loss.reference.embedded.raycast import Lamp, Quad, Sphere, Tube, bake_light, render
 from legs_loss.scenes.colmap import write_colmap
 from legs_loss.scenes.model import Camera, PointCloud
+from legs_loss.system import write_whole
 
 LAMP = Lamp(np.array([-0.5, -0.6, 2.95]), 0.55)
 TARGET = np.array([0.0, 0.25, 0.98])
@@ -254,7 +256,8 @@ def write_embedded_scene(
         picture, depth = render(surfaces, LAMP, pose, focal, width, height, samples)
         camera = Camera(width, height, focal, focal, width / 2.0, height / 2.0, pose)
         name = f"table_{index:03d}.png"
-        Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(str(root / "images" / name))
+        photograph = Image.fromarray(np.round(255 * picture).astype(np.uint8))
+        write_whole(root / "images" / name, partial(photograph.save, format="PNG"))
         cameras[name] = camera
         share = points * (index + 1) // views - points * index // views
         places, colours = _sparse_points(picture, depth, camera, share, random)

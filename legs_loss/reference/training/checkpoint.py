@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any, Dict, Mapping, Optional, Tuple
 
@@ -11,20 +10,15 @@ import numpy as np
 import torch
 
 from legs_loss.errors import LegsError
-from legs_loss.system import open_regular
+from legs_loss.system import open_regular, write_whole
 
 __all__ = ["read_checkpoint", "read_state", "write_checkpoint"]
 
 
 def write_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
     """Write arrays, and facts that JSON can hold. A checkpoint that was there is replaced as a whole, or not at all."""
-    part = path.with_name(path.name + ".part")
-    with open(str(part), "wb") as file:
-        all_arrays: Dict[str, Any] = dict(arrays, __facts__=np.frombuffer(json.dumps(dict(facts)).encode(), np.uint8))
-        np.savez(file, **all_arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(str(part), str(path))
+    all_arrays: Dict[str, Any] = dict(arrays, __facts__=np.frombuffer(json.dumps(dict(facts)).encode(), np.uint8))
+    write_whole(path, lambda file: np.savez(file, **all_arrays))
 
 
 def read_checkpoint(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:

@@ -9,7 +9,6 @@ The same seed gives the same Gaussians to the last bit, whether or not the run w
 from __future__ import annotations
 
 import json
-import os
 import signal
 import threading
 import time
@@ -35,6 +34,7 @@ from legs_loss.reference.training.metrics import mean_scores, psnr, score
 from legs_loss.response import normalise_response, response
 from legs_loss.scenes import Scene
 from legs_loss.spec import WeightSpec
+from legs_loss.system import write_whole
 from legs_loss.weights import error_weight_map
 
 __all__ = [
@@ -390,6 +390,4 @@ def _ctrl_c_between_iterations() -> Iterator[Callable[[], bool]]:
 
 
 def _write_json(path: Path, values: Mapping[str, Any]) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
-    os.replace(str(part), str(path))
+    write_whole(path, (json.dumps(values, indent=2) + "\n").encode())

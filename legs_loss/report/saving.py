@@ -1,0 +1,39 @@
+"""Write pictures as a whole or not at all: a sheet that was cut off looks like a sheet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Union
+
+import numpy as np
+
+from legs_loss.errors import LegsError
+from legs_loss.system import write_whole
+
+__all__ = ["save_figure", "save_png"]
+
+
+def save_figure(figure: Any, path: Union[str, Path], dpi: int) -> None:
+    """Write a figure of matplotlib; the name's ending says the format.
+
+    Raises:
+        LegsError: matplotlib does not know the format, or the file cannot be written.
+    """
+    form = Path(path).suffix[1:] or "png"
+    try:
+        write_whole(path, lambda file: figure.savefig(file, format=form, dpi=dpi, facecolor="white"))
+    except LegsError:
+        raise
+    except ValueError as error:
+        raise LegsError(f"cannot write {path}: {error}") from None
+
+
+def save_png(pixels: np.ndarray, path: Path) -> None:
+    """Write a picture [H, W, 3] of bytes.
+
+    Raises:
+        LegsError: the file cannot be written.
+    """
+    from PIL import Image
+
+    write_whole(path, lambda file: Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG"))

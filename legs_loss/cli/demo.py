@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Dict, List
 
-from legs_loss.system import say
+from legs_loss.system import say, write_whole
 
 HELP = "weight maps, four trainings, a table and pictures, on the embedded scene or your own"
 
@@ -55,7 +55,6 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.report.comparison import check_matplotlib
     from legs_loss.scenes import read_scene
     from legs_loss.spec import PRESETS
-    from legs_loss.system import write_whole
 
     started = time.perf_counter()
     set_threads(None)  # without numba there is no training: say so now

@@ -339,4 +339,4 @@ def read_json(path: Path, names: Sequence[str]) -> Dict[str, Any]:
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write values to a JSON file, all at once."""
-    write_whole(path, (json.dumps(values, indent=1) + "\n").encode())
+    write_whole(path, (json.dumps(values, indent=1) + "\n").encode(), folders=True)

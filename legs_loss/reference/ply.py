@@ -37,7 +37,7 @@ def write_ply(path: Union[str, Path], gaussians: Gaussians) -> None:
     table = torch.cat([column.detach().float().cpu() for column in columns], dim=1).numpy().astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property float {name}" for name in _properties(coefficients)] + ["end_header", ""]
-    write_whole(path, "\n".join(header).encode("ascii") + table.tobytes())
+    write_whole(path, "\n".join(header).encode("ascii") + table.tobytes(), folders=True)
 
 
 def read_ply(path: Union[str, Path]) -> Gaussians:

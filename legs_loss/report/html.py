@@ -76,7 +76,7 @@ def write_report(
         page = _page(settings, rows, names, [encode(view, each, form) for view, each in drawn], first, run)
         data = page.encode("utf-8")
         if len(data) < LIMIT:
-            write_whole(path, data)
+            write_whole(path, data, folders=True)
             return path
     raise LegsError(
         f"the page would have {len(data) / 1e6:.0f} MB, above {LIMIT / 1e6:.0f}: choose fewer --views or --arms"

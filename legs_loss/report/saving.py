@@ -36,4 +36,4 @@ def save_png(pixels: np.ndarray, path: Path) -> None:
     """
     from PIL import Image
 
-    write_whole(path, lambda file: Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG"))
+    write_whole(path, lambda file: Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG"), folders=True)

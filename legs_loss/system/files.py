@@ -55,15 +55,16 @@ def read_regular(path: PathLike, limit: int) -> bytes:
         return file.read(size)
 
 
-def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]]) -> None:
+def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]], folders: bool = False) -> None:
     """Write a file as a whole or not at all: beside it first, on the disk, then into its place.
 
     What was there stays until then. A link is replaced, not followed. What a killed process leaves is ``NAME.part``,
     which the next write of the file replaces.
 
     Args:
-        path: the file; folders above it are made.
+        path: the file.
         data: its bytes, or what writes them.
+        folders: make the folders above it.
 
     Raises:
         LegsError: it cannot be written; the message says why.
@@ -71,7 +72,8 @@ def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]]
     name = os.fspath(path)
     part = name + ".part"
     try:
-        os.makedirs(os.path.dirname(name) or ".", exist_ok=True)
+        if folders:
+            os.makedirs(os.path.dirname(name) or ".", exist_ok=True)
         if os.path.lexists(name) and not (os.path.isfile(name) or os.path.islink(name)):
             raise OSError(errno.EINVAL, "a folder, a pipe, a socket or a device is there", name)
         with contextlib.suppress(FileNotFoundError):

@@ -73,6 +73,22 @@ def test_plyfile_reads_it_and_its_files_are_read(tmp_path: Path) -> None:
         assert torch.equal(getattr(again, name), getattr(gaussians, name)), name
 
 
+def test_it_is_the_very_file_that_3dgs_writes(tmp_path: Path) -> None:
+    """3DGS hands its attributes, in its order, to plyfile: these columns of zeros stand for its normals."""
+    plyfile = pytest.importorskip("plyfile")
+    gaussians = some(5, 3)
+    means, sh = gaussians.means.numpy(), gaussians.sh.transpose(1, 2)
+    columns = [means, np.zeros_like(means), sh[..., :1].flatten(1), sh[..., 1:].flatten(1), gaussians.opacity_logits]
+    columns += [gaussians.log_scales, gaussians.quaternions]
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    rows = np.empty(5, [(name, "f4") for name in names])
+    rows[:] = [tuple(row) for row in np.concatenate(columns, 1)]
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "theirs.ply"))
+    write_ply(tmp_path / "ours.ply", gaussians)
+    assert (tmp_path / "theirs.ply").read_bytes() == (tmp_path / "ours.ply").read_bytes()
+
+
 def test_damage_and_foreign_files_are_refused(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", some(3, 1))
     good = (tmp_path / "a.ply").read_bytes()

@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from legs_loss import LegsError
+from legs_loss.cli import main
 from legs_loss.reference.gaussians import Gaussians
 from legs_loss.reference.ply import write_ply
 from legs_loss.scenes import read_scene
@@ -164,13 +165,20 @@ class TestBrowser:
 
 
 class TestTensorboard:
-    def test_scalars_of_a_training(self, tmp_path, tiny_scene):
+    @pytest.fixture
+    def scalars(self, tmp_path):
         pytest.importorskip("numba")
         pytest.importorskip("tensorboard")
         from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-        from legs_loss.cli import main
+        def read(run):
+            events = EventAccumulator(str(tmp_path / "board" / run))
+            events.Reload()
+            return {tag: [(one.step, one.value) for one in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
 
+        return read
+
+    def test_a_training(self, tmp_path, tiny_scene, scalars):
         arguments = [
             "train",
             tiny_scene,
@@ -182,10 +190,20 @@ class TestTensorboard:
             tmp_path / "board",
         ]
         assert main([str(argument) for argument in arguments]) == 0
-        events = EventAccumulator(str(tmp_path / "board" / "run"))
-        events.Reload()
-        assert set(events.Tags()["scalars"]) == {"loss", "psnr", "gaussians"}
-        steps = [event.step for event in events.Scalars("gaussians")]
-        assert steps == [10, 20]
+        found = scalars("run")
+        assert set(found) == {"loss", "psnr", "gaussians"}
         last = json.loads((tmp_path / "run" / "metrics.json").read_text())["gaussians"]
-        assert events.Scalars("gaussians")[-1].value == last
+        assert [step for step, _ in found["gaussians"]] == [10, 20]
+        assert found["gaussians"][-1][1] == last
+
+    def test_a_comparison_has_a_run_for_each_training(self, tmp_path, tiny_scene, scalars):
+        arguments = ["compare", tiny_scene, "--out", tmp_path / "out", "--tensorboard", tmp_path / "board"]
+        arguments += ["--arms", "3dgs", "legs", "--seeds", 1, "--iterations", 20, "-r", 2, "--processes", 1]
+        assert main([str(argument) for argument in arguments]) == 0
+        runs = {path.name: scalars(path.name) for path in (tmp_path / "board").iterdir()}
+        assert len(runs) == 2
+        for found in runs.values():
+            assert set(found) == {"loss", "psnr", "gaussians"}
+            assert [step for step, _ in found["loss"]] == [10, 20]
+        plain, legs = (next(found for name, found in runs.items() if name.startswith(arm)) for arm in ("3dgs", "legs"))
+        assert legs["loss"][0][1] > plain["loss"][0][1]  # the same rendering at first, its error weighted

@@ -1,4 +1,4 @@
-"""`compiled`: numba's njit with the settings that the reference shares; the lock that parallel calls take."""
+"""`compiled` and `inlined`: numba's njit as the package uses it; the lock that parallel calls take."""
 
 from __future__ import annotations
 
@@ -24,6 +24,11 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             return numba.njit(**options)(function)
 
     return decorate
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """Compile a function into its callers, with their settings."""
+    return numba.njit(inline="always")(function)
 
 
 # Of numba's three ways to run threads, one ends the process when two of Python's threads use it at a time.

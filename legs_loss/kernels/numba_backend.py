@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Union
+from typing import FrozenSet, Union
 
 import torch
 from torch import Tensor
@@ -19,10 +19,10 @@ __all__ = ["BACKEND"]
 
 class _NumbaBackend(Backend):
     name = "numba"
-    offers = frozenset({"loss", "l1", "ssim"})
-    operators = frozenset(STENCILS)
-    norms = frozenset(NORMS)
-    curves = frozenset(CURVES)
+    offers: FrozenSet[str] = frozenset({"loss", "l1", "ssim"})
+    operators: FrozenSet[str] = frozenset(STENCILS)
+    norms: FrozenSet[float] = frozenset(NORMS)
+    curves: FrozenSet[str] = frozenset(CURVES)
 
     def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
         return torch.from_numpy(response_range(target, spec))
@@ -51,4 +51,4 @@ def _one_source(target: Tensor, weights: Weights) -> Union[Tensor, WeightSpec, N
     return mask
 
 
-BACKEND = _NumbaBackend()
+BACKEND: Backend = _NumbaBackend()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from legs_loss.kernels.compiling import compiled
 from legs_loss.kernels.numba_weights import weights_of_row
@@ -15,7 +15,7 @@ ROWS = 16  # of a strip
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
-@njit(parallel=True, cache=True)
+@compiled(parallel=True, fastmath=False)
 def all_strips(images, source, gradient, sums):  # type: ignore[no-untyped-def]
     """Compute the weighted L1 strip by strip, and its gradient if that has a size.
 

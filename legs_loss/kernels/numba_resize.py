@@ -13,9 +13,8 @@ from functools import lru_cache
 from typing import Any, Callable, Dict, Iterator, NamedTuple, Tuple
 
 import numpy as np
-from numba import njit
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import compiled, inlined
 from legs_loss.kernels.simd import (
     LANES,
     halves_added,
@@ -168,7 +167,7 @@ def _down(image, apart, first, count, weights, out):  # type: ignore[no-untyped-
             store_bytes(out, i * breadth + j + LANES, _rounded(right))
 
 
-@njit(inline="always")
+@inlined
 def _rounded(sums):  # type: ignore[no-untyped-def]
     whole = (sums + splat(_HALF)) >> splat(_BITS)
     return minimum(maximum(whole, splat(_ZERO)), splat(_MOST))

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Dict, Optional, Tuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-from legs_loss.kernels.compiling import ONE_AT_A_TIME, compiled
+from legs_loss.kernels.compiling import ONE_AT_A_TIME, compiled, inlined
 from legs_loss.kernels.simd import (
     LANES,
     absolute,
@@ -144,7 +144,7 @@ def _reduced(image: np.ndarray, spec: WeightSpec, out: Optional[np.ndarray]) -> 
     return np.stack([found[..., 0].min(1), found[..., 1].max(1), found[..., 2].max(1), found[..., 3].sum(1)], 1)
 
 
-@njit(parallel=True, cache=True)
+@compiled(parallel=True, fastmath=False)
 def _strips(image, shape, settings, strips, out, found):  # type: ignore[no-untyped-def]
     views, channels, height, width = shape
     for task in prange(views * strips):
@@ -166,7 +166,7 @@ def _strips(image, shape, settings, strips, out, found):  # type: ignore[no-unty
         found[task, 0], found[task, 1], found[task, 2], found[task, 3] = low, high, largest, poison
 
 
-@njit(inline="always")
+@inlined
 def _folded(index, size):  # type: ignore[no-untyped-def]
     """Reflect an index that is one beyond the edge; a side of one pixel continues itself."""
     if index < 0:
@@ -198,7 +198,7 @@ def _response_row(image, view, shape, row, left, right, settings, out, at):  # t
         out[at + right - 1 - left] = _response_at(image, view, shape, row, right - 1, settings)
 
 
-@njit(inline="always")
+@inlined
 def _inner_responses(image, view, shape, row, left, right, settings, out, at):  # type: ignore[no-untyped-def]
     last = right - LANES
     for j in range(left, last, LANES):
@@ -206,7 +206,7 @@ def _inner_responses(image, view, shape, row, left, right, settings, out, at):  
     store(out, at + last, _responses(image, view, shape, row, last, settings))  # it may overlap the one before
 
 
-@njit(inline="always")
+@inlined
 def _responses(image, view, shape, row, j, settings):  # type: ignore[no-untyped-def]
     # Differences are taken in torch's order, which is exactly zero on a constant image.
     channels, height, width = shape[1], shape[2], shape[3]
@@ -255,7 +255,7 @@ def _responses(image, view, shape, row, j, settings):  # type: ignore[no-untyped
     return square_root(strength) if norm == 2 else strength
 
 
-@njit(inline="always")
+@inlined
 def _accumulated(sum, value, norm):  # type: ignore[no-untyped-def]
     if norm == 1:
         sum = sum + absolute(value)

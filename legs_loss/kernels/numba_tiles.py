@@ -15,7 +15,7 @@ for all of its channels.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from legs_loss.kernels.compiling import compiled
 from legs_loss.kernels.numba_weights import weights_of_row
@@ -50,7 +50,7 @@ _SLOPES = _MOMENTS + _KEPT * _RING_ROW
 _STATE = _SLOPES + _KEPT * _RING_ROW
 
 
-@njit(parallel=True, cache=True)
+@compiled(parallel=True, fastmath=False)
 def all_tiles(images, down, across, share, source, gradient, sums):  # type: ignore[no-untyped-def]
     """Compute the whole loss tile by tile, and its gradient if that has a size.
 

@@ -13,11 +13,13 @@ import operator
 from typing import Any, Sequence, Tuple
 
 from llvmlite import ir
-from numba import extending, njit, types
+from numba import extending, types
 from numba.core import cgutils
 from numba.core.errors import RequireLiteralValue
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import lower_builtin, models, register_model
+
+from legs_loss.kernels.compiling import inlined
 
 __all__ = [
     "LANES",
@@ -61,7 +63,9 @@ class _Vector(types.Type):
         self.lanes = lanes
 
 
-float8, integer8, mask8 = _Vector("float8", _VECTOR), _Vector("integer8", _INTEGERS), _Vector("mask8", _MASK)
+float8: _Vector = _Vector("float8", _VECTOR)
+integer8: _Vector = _Vector("integer8", _INTEGERS)
+mask8: _Vector = _Vector("mask8", _MASK)
 _KINDS = {types.float32: float8, types.int32: integer8}
 
 
@@ -392,7 +396,7 @@ def _pairs_added(typingctx, a, b, distance):  # type: ignore[no-untyped-def]
     return float8(float8, float8, types.IntegerLiteral(distance)), generate
 
 
-@njit(inline="always")
+@inlined
 def totals(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     """Return the sums of eight vectors, each always added in the same order."""
     ab, cd, ef, gh = _pairs_added(a, b, 1), _pairs_added(c, d, 1), _pairs_added(e, f, 1), _pairs_added(g, h, 1)
@@ -409,7 +413,7 @@ def lane(typingctx, a, index):  # type: ignore[no-untyped-def]
     return types.float32(float8, types.intp), generate
 
 
-@njit(inline="always")
+@inlined
 def total(a):  # type: ignore[no-untyped-def]
     """Return the sum of the eight values, always added in the same order."""
     pairs = _pairs_added(a, a, 1)

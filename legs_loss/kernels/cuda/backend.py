@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Callable, Dict
+from typing import Callable, Dict, FrozenSet
 
 import torch
 from torch import Tensor
@@ -28,11 +28,11 @@ class CudaBackend(Backend):
     """
 
     name = "cuda"
-    offers = frozenset({"loss", "l1", "ssim"})
+    offers: FrozenSet[str] = frozenset({"loss", "l1", "ssim"})
     most_channels = 1 << 16
-    operators = frozenset(STENCILS)
-    norms = frozenset(NORMS)
-    curves = frozenset(CURVES)
+    operators: FrozenSet[str] = frozenset(STENCILS)
+    norms: FrozenSet[float] = frozenset(NORMS)
+    curves: FrozenSet[str] = frozenset(CURVES)
 
     def __init__(self, open_device: Callable[[torch.device], Modules]) -> None:
         self._open = open_device
@@ -68,4 +68,4 @@ def _open(device: torch.device) -> Modules:
     return Modules(CudaDriver(device), find_compiler(), BinaryCache(cache_folder()))
 
 
-BACKEND = CudaBackend(_open)
+BACKEND: Backend = CudaBackend(_open)

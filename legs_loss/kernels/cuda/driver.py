@@ -44,8 +44,8 @@ class CudaDriver:
         index = torch.cuda.current_device() if device.index is None else device.index
         self._device = torch.device("cuda", index)
         properties = torch.cuda.get_device_properties(index)
-        self.architecture = 10 * properties.major + properties.minor
-        self.multiprocessors = properties.multi_processor_count
+        self.architecture: int = 10 * properties.major + properties.minor
+        self.multiprocessors: int = properties.multi_processor_count
         self._context = ctypes.c_void_p()
         # torch numbers the devices that CUDA_VISIBLE_DEVICES leaves, and so does the driver.
         self._call("cuDevicePrimaryCtxRetain", ctypes.byref(self._context), ctypes.c_int(index))

@@ -67,6 +67,16 @@ class Task(ctypes.Structure):
         *((name, ctypes.c_float) for name in ("l1_share", "ssim_share", "constant")),
     ]
 
+    views: int
+    channels: int
+    height: int
+    width: int
+    curve: int
+    side: float
+    middle: float
+    beta: float
+    eps: float
+
     def show(self, name: str, images: Tensor) -> None:
         """Set an image's pointer and its layout."""
         view, channel, row, column = images.stride()

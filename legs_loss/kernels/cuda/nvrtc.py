@@ -107,7 +107,7 @@ class Compiler:
         self._library = library
         major, minor = ctypes.c_int(), ctypes.c_int()
         self._check(library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)), "nvrtcVersion")
-        self.version = f"{major.value}.{minor.value}"
+        self.version: str = f"{major.value}.{minor.value}"
 
     def target(self, architecture: int) -> str:
         """Return what to compile for on a GPU, as "sm_86"; "compute_86" (PTX) where the GPU is newer than NVRTC."""

@@ -12,9 +12,11 @@ coordinate. Source: FastGS (Ren et al. 2025), after Speedy-Splat (Hanson et al. 
 from __future__ import annotations
 
 import math
+from typing import Tuple
 
 import numpy as np
 from numba import prange
+from torch import Tensor
 
 from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import TILE
@@ -33,10 +35,20 @@ class CompactBox:
         mult: the share of the squared distance at alpha 1/255.
     """
 
-    def __init__(self, opacities, mult):
-        self.opacities, self.mult = opacities.detach().contiguous().numpy(), float(mult)
+    def __init__(self, opacities: Tensor, mult: float) -> None:
+        self.opacities: np.ndarray = opacities.detach().contiguous().numpy()
+        self.mult: float = float(mult)
 
-    def __call__(self, tiles, splats, boxes, slots, firsts, reached, radii):
+    def __call__(
+        self,
+        tiles: Tuple[int, int],
+        splats: np.ndarray,
+        boxes: np.ndarray,
+        slots: np.ndarray,
+        firsts: np.ndarray,
+        reached: np.ndarray,
+        radii: np.ndarray,
+    ) -> None:
         """Take the rows outside the boxes from the slots, and the radii of Gaussians that enter no tile."""
         _clip(splats, self.opacities, self.mult, tiles, boxes, slots, firsts, reached, radii)
         # A Gaussian that reaches no pixel's centre is visible, to FastGS, if it enters a tile all the same.

@@ -54,6 +54,8 @@ class Drawn:
 
     def __init__(self, drawing: compiled.Drawing, tensors: Tensors, view: View) -> None:
         self._drawing, self._tensors, self._view = drawing, tensors, view
+        self.image: Tensor
+        self.radii: Tensor
         self.image, self.radii = compiled.attach(drawing, tensors)
         self._extras: Optional[Tensor] = None
 

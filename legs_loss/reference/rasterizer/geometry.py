@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from legs_loss.kernels.compiling import inlined
 
 
-@njit(inline="always")
+@inlined
 def numbers(intrinsics, pose):
     """A camera's arrays as numbers, which no loop has to read again: intrinsics [6]; the first three rows of a pose."""
     fx, fy, cx, cy, limit_x, limit_y = intrinsics
@@ -27,7 +27,7 @@ def numbers(intrinsics, pose):
     return (fx, fy, cx, cy, limit_x, limit_y), rows
 
 
-@njit(inline="always")
+@inlined
 def to_camera(a, b, c, pose):
     """A point in the camera's axes."""
     x = pose[0][0] * a + pose[0][1] * b + pose[0][2] * c + pose[0][3]
@@ -36,7 +36,7 @@ def to_camera(a, b, c, pose):
     return x, y, z
 
 
-@njit(inline="always")
+@inlined
 def rotation(w, x, y, z):
     """Rotation matrix, the normalised quaternion, and the length it had."""
     length = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
@@ -56,14 +56,14 @@ def rotation(w, x, y, z):
     return matrix, (w, x, y, z), length
 
 
-@njit(inline="always")
+@inlined
 def held(value, z, limit):
     """`value` (x or y), held where value / z leaves the guard, and whether it moves freely."""
     most = limit * z
     return max(min(value, most), -most), abs(value) <= most
 
 
-@njit(inline="always")
+@inlined
 def linearised(x, y, z, intrinsics, pose):
     """The 2x3 map from world directions to pixels at a point in the camera's axes."""
     fx, fy, _, _, limit_x, limit_y = intrinsics
@@ -82,7 +82,7 @@ def linearised(x, y, z, intrinsics, pose):
     )
 
 
-@njit(inline="always")
+@inlined
 def times_rotation(t, r):
     """A 2x3 matrix times a 3x3 one."""
     return (
@@ -95,7 +95,7 @@ def times_rotation(t, r):
     )
 
 
-@njit(inline="always")
+@inlined
 def times_covariance(t, v):
     """A 2x3 matrix times a covariance, given by its upper triangle's rows."""
     xx, xy, xz, yy, yz, zz = v
@@ -109,7 +109,7 @@ def times_covariance(t, v):
     )
 
 
-@njit(inline="always")
+@inlined
 def quaternion_partials(g, q):
     """From the gradient to the rotation matrix (row-major) to that of the four numbers in its formula."""
     w, x, y, z = q
@@ -120,7 +120,7 @@ def quaternion_partials(g, q):
     return gw, gx, gy, gz
 
 
-@njit(inline="always")
+@inlined
 def quaternion_gradient(g, q, length):
     """As `quaternion_partials`, to the quaternion before its normalisation."""
     gw, gx, gy, gz = quaternion_partials(g, q)
@@ -130,7 +130,7 @@ def quaternion_gradient(g, q, length):
     return (gw - w * along) * scale, (gx - x * along) * scale, (gy - y * along) * scale, (gz - z * along) * scale
 
 
-@njit(inline="always")
+@inlined
 def own_axes(a, b, determinant):
     """A splat's own coordinates p x + q y and r x, x and y from its centre, in which its spread is 1 in all directions.
 
@@ -140,20 +140,20 @@ def own_axes(a, b, determinant):
     return -b * inverse, a * inverse, 1 / math.sqrt(a)
 
 
-@njit(inline="always")
+@inlined
 def conic(p, q, r):
     """The conic's xx, xy and yy."""
     return p * p + r * r, p * q, q * q
 
 
-@njit(inline="always")
+@inlined
 def centre_gradient(axes, m1, m2):
     """From the first moments, by a splat's own coordinates, of dL/dpower to the gradient of its centre."""
     p, q, r = axes
     return p * m1 + r * m2, q * m1
 
 
-@njit(inline="always")
+@inlined
 def covariance_gradient(axes, m11, m12, m22):
     """From the second moments, a matrix M, to the gradient of the covariance's three numbers: L^t M L / 2."""
     p, q, r = axes
@@ -161,7 +161,7 @@ def covariance_gradient(axes, m11, m12, m22):
     return 0.5 * (p * p1 + r * (p * m12 + r * m22)), 0.5 * q * p1, 0.5 * q * q1
 
 
-@njit(inline="always")
+@inlined
 def mean_gradient(x, y, z, gu, gv, t, intrinsics, pose):
     """From the gradient to a splat's centre (gu, gv) and to its linearised map `t` to that of the mean in the world."""
     fx, fy, _, _, limit_x, limit_y = intrinsics

@@ -15,9 +15,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import compiled, inlined
 from legs_loss.reference.conventions import FARTHEST, MIN_ALPHA, NEAR, SQUARE, TILE
 from legs_loss.reference.rasterizer.geometry import (
     conic,
@@ -83,7 +83,7 @@ def lay_out(means, scales, quaternions, covariances, i, state, j):
             state[SHAPE + k, j] = covariances[i, k]
 
 
-@njit(inline="always")
+@inlined
 def _drawn(x, y, z, a, b, c, determinant, intrinsics, dilation):
     """What is kept of a splat: rows CENTRE to LARGEST of the state."""
     fx, fy, cx, cy, _, _ = intrinsics

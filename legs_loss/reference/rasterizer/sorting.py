@@ -10,11 +10,12 @@ cache, and the gradients of its entries there are added up in a row of sums of t
 
 from __future__ import annotations
 
+from typing import Tuple
+
 import numpy as np
-from numba import njit
 
 from legs_loss.errors import LegsError
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import compiled, inlined
 from legs_loss.kernels.simd import prefetch
 
 BAND = 16  # strips
@@ -26,8 +27,8 @@ STRIP, ROWS = 0, 1  # of a slot: its strip, or -1 where the splat does not reach
 OWNER, SUM = 0, 2  # of an entry: its splat, and, after its ROWS, the row of sums that its gradient is added to
 
 
-def make_slots(boxes, slots, tall):
-    """Where each splat's slots and rows of sums begin [N + 1, 2], and the slots [S, 2], not yet filled.
+def make_slots(boxes: np.ndarray, slots: np.ndarray, tall: int) -> Tuple[np.ndarray, np.ndarray]:
+    """Return where each splat's slots and rows of sums begin [N + 1, 2], and the slots [S, 2], not yet filled.
 
     There is a row of sums for each band that a splat's box touches.
 
@@ -41,8 +42,10 @@ def make_slots(boxes, slots, tall):
     return firsts, np.empty((int(firsts[-1, FIRST_SLOT]), 2), np.int32)
 
 
-def sort_entries(depths, slots, firsts, reached, across, down):
-    """Where each strip's entries begin [strips + 1]; the entries [E, 3], by strip, and in a strip by depth; the bands.
+def sort_entries(
+    depths: np.ndarray, slots: np.ndarray, firsts: np.ndarray, reached: np.ndarray, across: int, down: int
+) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where each strip's entries begin [strips + 1], the entries [E, 3] by strip and then depth, and the bands.
 
     Of the bands [B, 2], the fullest first, to be dealt out to the workers in turn: the first strip, and the one past
     the last.
@@ -60,8 +63,8 @@ def sort_entries(depths, slots, firsts, reached, across, down):
     return ranges, draws, np.stack([begins, ends], 1)[np.argsort(ranges[begins] - ranges[ends], kind="stable")]
 
 
-def make_sums(firsts, fields):
-    """The rows of sums, all 0: np.zeros would have their memory mapped anew at every call."""
+def make_sums(firsts: np.ndarray, fields: int) -> np.ndarray:
+    """Return the rows of sums, all 0: np.zeros would have their memory mapped anew at every call."""
     sums = np.empty((int(firsts[-1, FIRST_SUM]), fields), np.float32)
     sums[:] = 0
     return sums
@@ -79,25 +82,25 @@ def _number(boxes, slots, tall, firsts):
     firsts[len(slots), FIRST_SLOT], firsts[len(slots), FIRST_SUM] = slot, row
 
 
-@njit(inline="always")
+@inlined
 def band_at(strip_x):
     """How many bands are left of a strip's."""
     return np.int32(np.uint32(strip_x) // np.uint32(BAND))
 
 
-@njit(inline="always")
+@inlined
 def bands_across(first, end):
     """How many bands the strips from ``first`` to ``end`` in a row touch."""
     return band_at(end - 1) + 1 - band_at(first)
 
 
-@njit(inline="always")
+@inlined
 def packed(first, end, band):
     """A slot's ROWS: the first row of the strip that the splat reaches, the one past its last, and the box's band."""
     return np.int32(first) | np.int32(end) << 8 | np.int32(band) << 16
 
 
-@njit(inline="always")
+@inlined
 def unpacked(rows):
     """What was `packed`."""
     return rows & 255, rows >> 8 & 255, rows >> 16

@@ -23,9 +23,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import compiled, inlined
 from legs_loss.kernels.simd import (
     absolute,
     as_floats,
@@ -82,7 +82,7 @@ _MANTISSA = np.int32(23)
 _ROUNDING = np.float32(3 << 22)  # added to a number, it leaves the nearest integer in the last bits
 
 
-@njit(inline="always")
+@inlined
 def exp2(x):
     """2^x for x <= 0 in each lane, to 2e-7 relative."""
     x = maximum(x, splat(_UNDERFLOW))
@@ -124,7 +124,7 @@ def place(xs, transmittance, across, down):
         transmittance[pixel] = _ONE if pixel % WIDE < across and pixel // WIDE < down else -_ONE
 
 
-@njit(inline="always")
+@inlined
 def _write(pixels, at, wide, values, state):
     """Set a strip's row in an image, by way of WORK where the strip is cut off by the image's edge."""
     if wide == WIDE:
@@ -135,7 +135,7 @@ def _write(pixels, at, wide, values, state):
             pixels[at + x] = state[WORK + x]
 
 
-@njit(inline="always")
+@inlined
 def _read(pixels, at, wide, state):
     """Return a strip's row in an image; what is beyond the image's edge is 0."""
     if wide < WIDE:
@@ -157,14 +157,14 @@ def unfinished(transmittance):
     return False
 
 
-@njit(inline="always")
+@inlined
 def reach(draws, k):
     """An entry's first row, the one past its last, and the first row's y, counted from the middle of them."""
     first, last = np.uint32(draws[k, ROWS]) & 63, np.uint32(draws[k, ROWS] >> 8) & 63
     return first, last, splat((np.float32(first) - np.float32(last) + _ONE) * _HALF)
 
 
-@njit(inline="always")
+@inlined
 def coordinates(state, entries, k):
     """A splat's own coordinates along a row: the first at y = 0, what it gains with y, and the second."""
     xs = load(state, X)
@@ -172,7 +172,7 @@ def coordinates(state, entries, k):
     return first, splat(entries[k, 3]), multiply_add(splat(entries[k, 5]), xs, splat(entries[k, 4]))
 
 
-@njit(inline="always")
+@inlined
 def respond(state, first, last, ys, entries, k):
     """Leave an entry's alpha, not yet held at its most, in WORK; `ys`: the first row's."""
     along, down, across = coordinates(state, entries, k)
@@ -183,7 +183,7 @@ def respond(state, first, last, ys, entries, k):
         ys = ys + splat(_ONE)
 
 
-@njit(inline="always")
+@inlined
 def cover(alpha, before):
     """What a row's alpha takes from its transmittance `before`: the weight of the colour, and T after."""
     none, weight = splat(_ZERO), alpha * before
@@ -192,7 +192,7 @@ def cover(alpha, before):
     return where(drawn, weight, none), where(drawn, after, none - absolute(before))
 
 
-@njit(inline="always")
+@inlined
 def _cover(state, i):
     """Take a row's alpha in WORK from its transmittance: the weight of the colour, alpha as it counts, and T before."""
     alpha, before = minimum(load(state, WORK + i), splat(_MAX)), load(state, T + i)

@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import compiled, inlined
 from legs_loss.kernels.simd import (
     above,
     at_least,
@@ -79,14 +79,14 @@ def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
         entries[e, CENTRE], entries[e, CENTRE + 1] = -x, -y
 
 
-@njit(inline="always")
+@inlined
 def _linear(entries, k, number, xs):
     """One of p's three numbers: at the pixels of the middle row, and what it gains with each row."""
     across, down = splat(entries[k, 3 + number]), splat(entries[k, 6 + number])
     return multiply_add(across, xs, splat(entries[k, number])), down
 
 
-@njit(inline="always")
+@inlined
 def _meet(state, first, last, ys, entries, k, others, backward):
     """Leave an entry's response, not yet held at its most, and where it is met; nothing where it is not."""
     xs, none = load(state, X), splat(_ZERO)
@@ -113,13 +113,13 @@ def _meet(state, first, last, ys, entries, k, others, backward):
         ys = ys + splat(_ONE)
 
 
-@njit(inline="always")
+@inlined
 def _add(state, i, weight, value):
     """Add to a row of a sum."""
     store(state, i, multiply_add(weight, value, load(state, i)))
 
 
-@njit(inline="always")
+@inlined
 def _add_sums(sums, at, values):
     """Add to eight sums side by side."""
     store(sums, at, load(sums, at) + values)

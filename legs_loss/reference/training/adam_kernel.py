@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import compiled, inlined
 from legs_loss.kernels.simd import LANES, load, splat, square_root, store
 
 __all__ = ["BETA1", "BETA2", "LANES", "update"]
@@ -14,7 +13,7 @@ BETA1, BETA2 = 0.9, 0.999
 _NEW1, _NEW2, _EPS = np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(1e-15)
 
 
-@njit(inline="always")
+@inlined
 def _eight(parameter, gradient, moment1, moment2, i, rates, j, correction):  # type: ignore[no-untyped-def]
     """Update eight numbers from `i` on, with the rates from `j` on."""
     g, m1, m2 = load(gradient, i), load(moment1, i), load(moment2, i)

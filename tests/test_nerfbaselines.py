@@ -41,6 +41,9 @@ FAKE = {
                 return self.dataset["cameras"], self.given
 
         class NerfStudio:
+            def __init__(self, *, checkpoint, train_dataset, config_overrides):
+                self.given = config_overrides
+
             @classmethod
             def get_method_info(cls):
                 features = ("points3D_xyz",) if cls._require_points3D else ()
@@ -61,6 +64,7 @@ FAKE = {
 @pytest.fixture
 def method(tmp_path, monkeypatch):
     """The method's class, its base a stand-in."""
+    pytest.importorskip("yaml")  # nerfstudio brings it
     for path, text in FAKE.items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(textwrap.dedent(text))
@@ -149,6 +153,14 @@ def test_it_asks_for_points_and_pinholes(method):
     config = SimpleNamespace(pipeline=SimpleNamespace(datamanager=SimpleNamespace()))
     assert method()._patch_config(config, train_dataset=None).pipeline.datamanager.train_num_rays_per_batch == 1
     assert method._default_nerfstudio_name == "splatfacto-legs"
+
+
+def test_settings_of_the_command_line_have_types(method):
+    text = {"max_num_iterations": "30", "pipeline.model.background_color": "white", "method": "splatfacto"}
+    model = method(config_overrides=text)
+    assert model.given == {"max_num_iterations": 30, "pipeline.model.background_color": "white"}
+    assert model._default_nerfstudio_name == "splatfacto"
+    assert method()._default_nerfstudio_name == "splatfacto-legs"
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from typing import Any, Dict
 
 import numpy as np
 import torch
+import yaml
 from nerfbaselines.methods.nerfstudio import NerfStudio, _CustomDataParser
 from nerfbaselines.utils import convert_image_dtype
 
@@ -21,6 +22,15 @@ class SplatfactoLegs(NerfStudio):
 
     _default_nerfstudio_name = "splatfacto-legs"
     _require_points3D = True
+
+    def __init__(self, *, checkpoint: Any = None, train_dataset: Any = None, config_overrides: Any = None) -> None:
+        # ``--set`` hands over text, where nerfstudio's settings have types; ``method`` is no setting of nerfstudio.
+        settings = {
+            name: yaml.safe_load(value) if isinstance(value, str) else value
+            for name, value in (config_overrides or {}).items()
+        }
+        self._default_nerfstudio_name = settings.pop("method", self._default_nerfstudio_name)
+        super().__init__(checkpoint=checkpoint, train_dataset=train_dataset, config_overrides=settings)
 
     @classmethod
     def get_method_info(cls) -> Any:

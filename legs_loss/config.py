@@ -22,7 +22,7 @@ _DEFAULTS = "defaults"
 
 # The keys of legs.toml, and in capitals the variables LEGS_*. The preset is the first: the others change it.
 _SETTINGS = ("preset", "store", *(field.name for field in fields(WeightSpec)))
-_TEXT_FIELDS = ("operator", "curve", "normalise")
+_TEXT_FIELDS = ("operator", "curve", "normalise", "over")
 _OTHER_VARIABLES = ("off", "backend")
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("", "0", "false", "no", "off")
 
@@ -65,7 +65,8 @@ def find_config(
             root of its git checkout, the user's home folder, or the first legs.toml of another owner, which is not
             read. None looks nowhere.
         environ: in place of ``os.environ``: LEGS_PRESET, LEGS_BETA, LEGS_CURVE, LEGS_OPERATOR, LEGS_P,
-            LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_SCALE, LEGS_EPS, LEGS_ERROR, LEGS_ERROR_BLUR, LEGS_STORE, LEGS_OFF.
+            LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_SCALE, LEGS_EPS, LEGS_ERROR, LEGS_ERROR_BLUR, LEGS_OVER,
+            LEGS_NOISE_FLOOR, LEGS_SMOOTH, LEGS_STORE, LEGS_OFF.
         argv: in place of ``sys.argv``: the scene after ``-s`` / ``--source_path`` is where the store is looked for.
 
     Raises:
@@ -79,10 +80,10 @@ def find_config(
             config = replace(config, notes=(*config.notes, note))
         if path is not None:
             config = _apply(config, _read_toml(path), str(path), path.parent)
-    for name in _SETTINGS:
-        variable = "LEGS_" + name.upper()
-        if environ.get(variable):
-            config = _apply(config, {name: environ[variable]}, f"environment variable {variable}", Path.cwd())
+    given = {name: "LEGS_" + name.upper() for name in _SETTINGS if environ.get("LEGS_" + name.upper())}
+    if given:  # all at once: some settings go only together
+        what = f"environment variable{'s' if len(given) > 1 else ''} {', '.join(given.values())}"
+        config = _apply(config, {name: environ[variable] for name, variable in given.items()}, what, Path.cwd())
     if is_off(environ):
         config = replace(config, off=True)
     if config.store is None:

@@ -11,6 +11,8 @@ from legs_loss.errors import LegsError
 from legs_loss.images import as_map, check_pair
 from legs_loss.kernels.backends import fused_loss
 from legs_loss.kernels.contract import Weights
+from legs_loss.levels import RunningLevels, response_levels
+from legs_loss.response import response
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.ssim import d_ssim
 from legs_loss.weights import error_weight_map, weight_map
@@ -84,7 +86,8 @@ def legs_loss(
     Args:
         prediction: the rendering, floats in [0, 1], [C, H, W] or [B, C, H, W]; channels-last on request.
         target: the photograph of the same view, the same shape.
-        spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own to the last bit.
+        spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own to the last bit. One that is normalised over
+            the scene takes the images of this call for it; :class:`LEGSLoss` and ``l1_loss`` remember the others.
         weight: the target's weight map, where you have it already; the spec is not used then.
         mask: zeroes the L1 weight where it is 0. SSIM is not masked, as in 3DGS's code.
         lambda_dssim: in [0, 1], the share of D-SSIM; 3DGS's name and value.
@@ -129,6 +132,9 @@ def legs_loss(
 class LEGSLoss(nn.Module):
     """:func:`legs_loss` as a Module: the settings once, then the images of each step.
 
+    For a spec that is normalised over the scene the targets of all calls so far are the scene. A target that is seen
+    again counts again, which moves a median little.
+
     Args:
         spec: as for :func:`legs_loss`, like the others.
         lambda_dssim: the share of D-SSIM.
@@ -160,6 +166,7 @@ class LEGSLoss(nn.Module):
         self.padding = padding
         self.renormalise = renormalise
         self.channels_last = channels_last
+        self._seen = RunningLevels()
 
     def forward(
         self,
@@ -169,6 +176,8 @@ class LEGSLoss(nn.Module):
         mask: Optional[Tensor] = None,
     ) -> Tensor:
         """Return the loss; see :func:`legs_loss`."""
+        if weight is None and self.spec.over == "scene" and not self.spec.unweighted:
+            weight = self._over_scene(target)
         return legs_loss(
             prediction,
             target,
@@ -180,6 +189,12 @@ class LEGSLoss(nn.Module):
             self.renormalise,
             self.channels_last,
         )
+
+    def _over_scene(self, target: Tensor) -> Tensor:
+        strength = response(target, self.spec.operator, self.spec.p, self.channels_last, self.spec.smooth)
+        for levels in response_levels(strength, self.spec).reshape(-1, 2):
+            self._seen.add(levels)
+        return weight_map(target, self.spec, self.channels_last, self._seen.scene())
 
     def extra_repr(self) -> str:
         """Return the settings, for ``print(module)``."""

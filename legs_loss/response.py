@@ -21,7 +21,9 @@ from legs_loss.operators import OPERATORS, Operator, Stencil, check_operator
 __all__ = ["gaussian_blur", "normalise_response", "response"]
 
 
-def response(image: Tensor, operator: str = "laplacian", p: float = 2.0, channels_last: bool = False) -> Tensor:
+def response(
+    image: Tensor, operator: str = "laplacian", p: float = 2.0, channels_last: bool = False, smooth: float = 0.0
+) -> Tensor:
     """Return the response E = || op F ||_p of an image, one value a pixel.
 
     Args:
@@ -30,6 +32,7 @@ def response(image: Tensor, operator: str = "laplacian", p: float = 2.0, channel
         operator: a name of :data:`legs_loss.OPERATORS`, which has its stencils: a Laplacian or a gradient.
         p: 1, 2 or inf: the norm over channels, and for a gradient over its two directions too.
         channels_last: where the channel stands.
+        smooth: the standard deviation in pixels of a Gaussian that the image is averaged with first.
 
     Returns:
         The image's shape with one channel, values >= 0, float32 (float64 for float64). The border is reflected
@@ -50,6 +53,9 @@ def response(image: Tensor, operator: str = "laplacian", p: float = 2.0, channel
     check_operator(operator, p)
     flat = channels_first(image.detach(), channels_last)
     flat = flat.to(torch.promote_types(flat.dtype, torch.float32))
+    if smooth > 0.0:
+        # No operator sees a constant: without it, what rounding leaves of a flat image is exactly 0.
+        flat = gaussian_blur(flat - flat[..., :1, :1], smooth)
     single = flat.dim() == 3
     strength = _norm(_components(flat.unsqueeze(0) if single else flat, OPERATORS[operator]), p)
     strength = strength[0] if single else strength

@@ -43,6 +43,13 @@ class WeightSpec:
             E^ ** (1 - error) * e ** error, normalised to [0, 1], where e is the mean absolute error around a pixel. 0
             is the paper's weight, 1 looks at the error alone. Such weights change at every step; none are stored.
         error_blur: >= 0, the standard deviation in pixels of the Gaussian that the error is averaged with.
+        over: what the response is normalised over: "image", as in the paper, or "scene": the response that counts as 1
+            is the median over views of each one's percentile, so that a photograph out of focus gets small weights
+            beside sharp ones. ``legs precompute`` knows all views; without its maps the views seen so far stand for
+            the scene (:mod:`legs_loss.levels`).
+        noise_floor: >= 0, only over "scene": so many times the median response, the view's or the scene's, whichever is
+            larger, is taken off the response. 3 leaves little of noise.
+        smooth: in [0, 100], the standard deviation in pixels of a Gaussian before the operator.
 
     Raises:
         LegsError: a setting is unknown or out of range.
@@ -63,6 +70,9 @@ class WeightSpec:
     eps: float = 1e-8
     error: float = 0.0
     error_blur: float = 1.5
+    over: str = "image"
+    noise_floor: float = 0.0
+    smooth: float = 0.0
 
     def __post_init__(self) -> None:
         check_operator(self.operator, self.p)
@@ -73,8 +83,18 @@ class WeightSpec:
         _check_number("eps", self.eps, _LEAST_EPS <= self.eps < float("inf"), f"at least {_LEAST_EPS:g}")
         _check_number("error", self.error, 0.0 <= self.error <= 1.0, "in [0, 1]")
         _check_number("error_blur", self.error_blur, 0.0 <= self.error_blur < float("inf"), "at least 0")
+        _check_number(
+            "noise_floor", self.noise_floor, 0.0 <= self.noise_floor <= _LARGEST_FACTOR, "at least 0 and at most 1e6"
+        )
+        _check_number("smooth", self.smooth, 0.0 <= self.smooth <= 100.0, "in [0, 100]")
         if self.normalise not in ("none", "mean"):
             raise LegsError(f'normalise must be "none" or "mean", got {self.normalise!r}')
+        if self.over not in ("image", "scene"):
+            raise LegsError(f'over must be "image" or "scene", got {self.over!r}')
+        if self.over == "image" and self.noise_floor > 0.0:
+            raise LegsError('noise_floor goes with over="scene": an image by itself does not tell noise from texture')
+        if self.over == "scene" and self.error > 0.0:
+            raise LegsError('weights that follow the error (error > 0) are normalised over="image" only')
 
     @property
     def unweighted(self) -> bool:
@@ -90,6 +110,7 @@ PRESETS: Mapping[str, WeightSpec] = MappingProxyType(
         "eggs": WeightSpec(operator="sobel", curve="C1"),
         "legs-l": WeightSpec(curve="C1"),
         "legs": WeightSpec(curve="C3"),
+        "legs-robust": WeightSpec(curve="C3", percentile=99.0, over="scene", noise_floor=3.0, smooth=0.7),
     }
 )
 

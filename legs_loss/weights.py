@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from typing import Optional, Tuple
+from typing import Iterable, List, Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -11,13 +10,16 @@ from torch import Tensor
 from legs_loss.curves import curve
 from legs_loss.errors import LegsError
 from legs_loss.images import channels_first, check_image, check_values, is_compiling
+from legs_loss.levels import levels_of, over_scene, percentile
 from legs_loss.response import gaussian_blur, normalise_response, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
-__all__ = ["error_weight_map", "weight_from_response", "weight_map"]
+__all__ = ["curved", "error_weight_map", "weight_from_response", "weight_map", "weight_maps", "weight_over_scene"]
 
 
-def weight_map(image: Tensor, spec: Spec = "legs", channels_last: bool = False) -> Tensor:
+def weight_map(
+    image: Tensor, spec: Spec = "legs", channels_last: bool = False, scene: Optional[Tensor] = None
+) -> Tensor:
     """Return the weight map of a training image.
 
     Args:
@@ -25,6 +27,8 @@ def weight_map(image: Tensor, spec: Spec = "legs", channels_last: bool = False) 
             [B, H, W, C] with ``channels_last``.
         spec: a preset's name or a :class:`~legs_loss.WeightSpec`.
         channels_last: where the channel stands.
+        scene: for a spec that is normalised over the scene its levels, [2], as :func:`legs_loss.levels.scene_levels`
+            returns them; without them the images of this call are the scene.
 
     Returns:
         The image's shape with one channel, in [1, 1 + beta] (with ``normalise="mean"``: of mean 1), float32
@@ -51,8 +55,42 @@ def weight_map(image: Tensor, spec: Spec = "legs", channels_last: bool = False) 
     check_image(image)
     if image.device.type == "cpu" and not is_compiling():
         check_values(image, "image")
-    strength = response(image, spec.operator, spec.p, channels_last)
+    strength = response(image, spec.operator, spec.p, channels_last, spec.smooth)
+    if spec.over == "scene":
+        return weight_over_scene(strength, spec, scene)
     return weight_from_response(normalise_response(strength, spec.eps), spec)
+
+
+def weight_maps(images: Iterable[Tensor], spec: Spec = "legs") -> List[Tensor]:
+    """Return the weight maps [1, H, W] of a scene's images [C, H, W], whose sizes may differ.
+
+    Raises:
+        LegsError: as :func:`weight_map`.
+
+    Example:
+        >>> sharp = (torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) > 0.9).float()
+        >>> blurred = gaussian_blur(sharp, 2.0)
+        >>> [round(float(weight.mean()), 1) for weight in weight_maps([sharp, sharp, blurred], "legs-robust")]
+        [1.3, 1.3, 1.0]
+    """
+    spec, images = as_spec(spec), list(images)
+    scene = levels_of(images, spec)
+    return [weight_map(image, spec, scene=scene) for image in images]
+
+
+def weight_over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor] = None) -> Tensor:
+    """Return the weight map of a response E that is to be normalised over its scene (``over="scene"``).
+
+    Args:
+        strength: E, not normalised, [1, H, W] or [B, 1, H, W] (or channels-last), any float type.
+        spec: its operator, p and smooth are those that E was made with.
+        scene: the scene's levels, [2]; without them these images are the scene.
+
+    Returns:
+        The same shape, float32 (float64 for float64).
+    """
+    strength = strength.to(torch.promote_types(strength.dtype, torch.float32))
+    return curved(over_scene(strength, spec, scene), spec)
 
 
 def weight_from_response(normalised: Tensor, spec: Spec = "legs") -> Tensor:
@@ -60,23 +98,26 @@ def weight_from_response(normalised: Tensor, spec: Spec = "legs") -> Tensor:
 
     Args:
         normalised: E^ in [0, 1], [1, H, W] or [B, 1, H, W] (or channels-last), any float type.
-        spec: a preset's name or a spec; its operator and p are those that E^ was made with.
+        spec: a preset's name or a spec; its operator, p and smooth are those that E^ was made with.
 
     Returns:
         The same shape, float32 (float64 for float64).
+
+    Raises:
+        LegsError: the spec normalises over the scene, and E^ is normalised by itself.
 
     Example:
         >>> weight_from_response(torch.tensor([[[0.0, 0.25, 1.0]]]), "legs")
         tensor([[[ 1.,  6., 11.]]])
     """
     spec = as_spec(spec)
+    if spec.over == "scene":
+        raise LegsError('E^ is normalised by itself: a spec with over="scene" needs weight_over_scene')
     normalised = normalised.to(torch.promote_types(normalised.dtype, torch.float32))
     if spec.percentile < 100.0:
-        normalised = (normalised / (_percentile(normalised, spec) + spec.eps)).clamp(max=1.0)
-    weight = 1.0 + spec.beta * curve(spec.curve)(normalised)
-    if spec.normalise == "mean":
-        weight = weight / weight.mean(_pixels(weight), keepdim=True)
-    return weight if spec.scale == 1.0 else spec.scale * weight
+        strong = percentile(normalised, spec.percentile)
+        normalised = (normalised / (strong.reshape(*strong.shape, 1, 1, 1) + spec.eps)).clamp(max=1.0)
+    return curved(normalised, spec)
 
 
 def error_weight_map(
@@ -109,7 +150,7 @@ def error_weight_map(
         tensor([[[ 1.0000,  3.5000,  6.0000, 11.0000]]])
     """
     if normalised is None:
-        normalised = normalise_response(response(target, spec.operator, spec.p, channels_last), spec.eps)
+        normalised = normalise_response(response(target, spec.operator, spec.p, channels_last, spec.smooth), spec.eps)
     wrong = (channels_first(prediction, channels_last) - channels_first(target, channels_last)).detach().abs()
     wrong = gaussian_blur(wrong.mean(-3, keepdim=True).to(normalised.dtype), spec.error_blur)
     mixed = channels_first(normalised, channels_last) ** (1.0 - spec.error) * wrong**spec.error
@@ -117,13 +158,13 @@ def error_weight_map(
     return weight.movedim(-3, -1) if channels_last else weight
 
 
+def curved(normalised: Tensor, spec: WeightSpec) -> Tensor:
+    """Return the weight map of a response that is normalised and clamped already, as the spec says."""
+    weight = 1.0 + spec.beta * curve(spec.curve)(normalised)
+    if spec.normalise == "mean":
+        weight = weight / weight.mean(_pixels(weight), keepdim=True)
+    return weight if spec.scale == 1.0 else spec.scale * weight
+
+
 def _pixels(maps: Tensor) -> Tuple[int, ...]:
     return tuple(range(maps.dim() - 3, maps.dim()))
-
-
-def _percentile(normalised: Tensor, spec: WeightSpec) -> Tensor:
-    # The nearest rank, not torch.quantile: that refuses images of more than 16 million pixels.
-    values = normalised.flatten(-3)
-    rank = max(1, math.ceil(spec.percentile / 100.0 * values.shape[-1]))
-    threshold = values.kthvalue(rank, dim=-1).values
-    return threshold.reshape(threshold.shape + (1, 1, 1))

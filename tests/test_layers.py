@@ -73,6 +73,7 @@ FLOORS = [
     {"images", "operators", "curves", "upstreams"},
     {"spec", "scenes"},
     {"config", "response"},
+    {"levels"},
     {"weights"},
     {"kernels", "ssim"},  # a kernel is compared with torch's SSIM before it is used, and SSIM asks for a kernel
     {"loss", "store"},

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageFilter
 
 from legs_loss.cli import main
+from legs_loss.reference.training.degrade import moved
 from legs_loss.store.sharpness import outliers
 
 
@@ -30,21 +32,28 @@ def photograph(seed: int) -> Image.Image:
     return image
 
 
-@pytest.mark.parametrize("harm", ["blur", "noise"])
-def test_a_harmed_photograph_is_named(tmp_path: Path, capsys: pytest.CaptureFixture, harm: str) -> None:
+@pytest.mark.parametrize(
+    ("harm", "preset"),
+    [("blur", "legs"), ("noise", "legs"), *((h, "legs-robust") for h in ("blur", "noise", "motion"))],
+)
+def test_a_harmed_photograph_is_named(tmp_path: Path, capsys: pytest.CaptureFixture, harm: str, preset: str) -> None:
     photographs = [tmp_path / "images" / f"{seed}.png" for seed in range(8)]
     photographs[0].parent.mkdir()
     for seed, path in enumerate(photographs):
         photograph(seed).save(path)
     scene = tmp_path
-    assert main(["precompute", str(scene), "--workers", "1"]) == 0
+    command = ["precompute", str(scene), "--workers", "1", "--preset", preset]
+    assert main(command) == 0
     assert "out of focus" not in capsys.readouterr().err
     harmed = photograph(3).filter(ImageFilter.GaussianBlur(3))
     if harm == "noise":
         pixels = np.asarray(harmed, float) + np.random.default_rng(0).normal(0, 20, (*harmed.size[::-1], 3))
         harmed = Image.fromarray(pixels.clip(0, 255).astype(np.uint8))
+    if harm == "motion":
+        image = torch.from_numpy(np.array(photograph(3))).permute(2, 0, 1) / 255
+        harmed = Image.fromarray((moved(moved(image, 0), 1).permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
     harmed.save(photographs[3])
-    assert main(["precompute", str(scene), "--workers", "1"]) == 0
+    assert main(command) == 0
     said = capsys.readouterr().err
     assert "out of focus, moved or noisy" in said and photographs[3].name in said and photographs[4].name not in said
     assert main(["info", str(scene)]) == 0

@@ -30,7 +30,7 @@ from legs_loss.store import (
     read_map,
     stage,
 )
-from legs_loss.store.manifest import manifest_bytes
+from legs_loss.store.manifest import VERSION, manifest_bytes
 
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 
@@ -202,7 +202,7 @@ class TestDamage:
     def test_a_newer_version_is_said_to_be_newer(self, tmp_path):
         put(tmp_path, BLANK)
         document = json.loads((tmp_path / MANIFEST).read_text())
-        (tmp_path / MANIFEST).write_text(json.dumps(dict(document, version=2, entries={"other": "layout"})))
+        (tmp_path / MANIFEST).write_text(json.dumps(dict(document, version=VERSION + 1, entries={"other": "layout"})))
         for opened in (WeightStore, lambda path: StoreWriter(path).__enter__()):
             with pytest.raises(LegsError, match="newer legs-loss"):
                 opened(tmp_path)

@@ -133,7 +133,7 @@ def _parser() -> argparse.ArgumentParser:
         "Inria's train.py that it knows",
     )
     settings = parser.add_argument_group("settings, written to legs.toml")
-    settings.add_argument("--preset", metavar="NAME", help="3dgs, eggs, legs-l or legs; default: legs")
+    settings.add_argument("--preset", metavar="NAME", help="3dgs, eggs, legs-l, legs or legs-robust; default: legs")
     settings.add_argument("--beta", type=float, metavar="X", help="how far the strongest response lifts the weight")
     settings.add_argument("--curve", metavar="NAME", help="C1 to C5")
     settings.add_argument("--operator", metavar="NAME", help=f"one of {', '.join(OPERATORS)}")

@@ -115,6 +115,8 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, name) < least:
             raise LegsError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     study = STUDIES[args.study] if args.arms is None else these_arms(args.arms)
+    if args.upstream is not None and study.degraded:
+        raise LegsError(f"--study {args.study} is for the package's own trainer, which degrades the views itself")
     if args.upstream is not None:
         return _upstream(args, study)
     for name in ("profile", "cpu", "gaussians", "extra"):
@@ -123,7 +125,9 @@ def run(args: argparse.Namespace) -> int:
     arms = needed(parse_arms([BASELINE, *study.arms]))
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     iterations = 2000 if args.iterations is None else args.iterations
-    base = TrainConfig(iterations=iterations, densify_grad_threshold=args.densify_grad_threshold)
+    base = TrainConfig(
+        iterations=iterations, densify_grad_threshold=args.densify_grad_threshold, degraded=study.degraded
+    )
     root = _embedded(args.out / "scene") if args.scene is None else Path(args.scene)
     resolution = args.resolution
     if resolution is None:

@@ -15,6 +15,7 @@ from legs_loss.system import say
 
 if TYPE_CHECKING:
     import numpy as np
+    from torch import Tensor
 
     from legs_loss.report.sheet import Shown
     from legs_loss.scenes import View
@@ -49,11 +50,13 @@ def run(args: argparse.Namespace) -> int:
         raise LegsError(f"there is no file or folder {path}: give a scene, a store or a photograph")
     shown: Dict[str, Callable[[], Shown]] = {}  # by the view's name
     if path.is_file() and path.name != MANIFEST:
-        shown[path.name] = partial(_computed, View(path.name, path), spec)
+        shown[path.name] = partial(_computed, View(path.name, path), spec, None)
     elif (path / MANIFEST).is_file():
         shown = _stored(path, spec)
     else:
-        shown = {view.name: partial(_computed, view, spec) for view in read_scene(path).views}
+        views = read_scene(path).views
+        scene = _levels(views, spec)
+        shown = {view.name: partial(_computed, view, spec, scene) for view in views}
     names = _choose(list(shown), args.views)
     title = f"{args.preset}: {spec.operator}, p = {spec.p:g}, {spec.curve}, beta = {spec.beta:g}"
     save_sheet(args.out, [shown[name]() for name in names], spec, f"{path.resolve().name}   ·   {title}")
@@ -61,13 +64,38 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _computed(view: View, spec: WeightSpec) -> Shown:
-    from legs_loss.precompute import normalised_map
+def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor]) -> Shown:
+    from legs_loss.precompute import normalised_map, response_map
     from legs_loss.report.sheet import Shown
     from legs_loss.scenes import load_training_image
 
     photograph = load_training_image(view)
-    return Shown(view.name, photograph, normalised_map(photograph, spec))
+    if spec.over == "image":
+        return Shown(view.name, photograph, normalised_map(photograph, spec))
+    return Shown(view.name, photograph, _over_scene(response_map(photograph, spec), spec, scene))
+
+
+def _over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor]) -> np.ndarray:
+    """Normalise a response [H, W] over its scene, or by itself where that is one photograph."""
+    from legs_loss.levels import over_scene
+
+    return over_scene(strength[None], spec, scene)[0].numpy()
+
+
+def _levels(views: Sequence[View], spec: WeightSpec) -> Optional[Tensor]:
+    """Read all photographs for the levels of the scene, where the spec is normalised over it."""
+    from tqdm import tqdm
+
+    from legs_loss.levels import response_levels, scene_levels
+    from legs_loss.precompute import response_map
+    from legs_loss.scenes import load_training_image
+
+    if spec.over == "image":
+        return None
+    return scene_levels(
+        response_levels(response_map(load_training_image(view), spec)[None], spec)
+        for view in tqdm(views, "levels of the scene", unit="view")
+    )
 
 
 def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
@@ -82,13 +110,20 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
     def draw(entry: Entry) -> Shown:
         view = views.get(entry.view)
         photograph = None if view is None else _photograph(view, entry)
-        return Shown(f"{entry.view}\n{entry.width}x{entry.height}", photograph, store.normalised_response(entry))
+        normalised = store.normalised_response(entry) if spec.over == "image" else over_scene(entry)
+        return Shown(f"{entry.view}\n{entry.width}x{entry.height}", photograph, normalised)
+
+    def over_scene(entry: Entry) -> np.ndarray:
+        import torch
+
+        scene = store.scene_levels(spec, entry.width * entry.height)
+        return _over_scene(torch.from_numpy(store.response(entry)), spec, scene)
 
     # Of a view with several sizes, the largest comes last and stays.
     entries = sorted(store.entries.values(), key=lambda entry: (entry.view, entry.width))
-    fits = [entry for entry in entries if (entry.operator, entry.p, entry.eps) == (spec.operator, spec.p, spec.eps)]
+    fits = [entry for entry in entries if store.fits(entry, spec)]
     if not fits:
-        raise LegsError(f"{path} has no maps of operator {spec.operator}: show another preset, or precompute this one")
+        raise LegsError(f"{path} has no maps for this preset: show another, or run legs precompute with --preset")
     return {entry.view: partial(draw, entry) for entry in fits}
 
 

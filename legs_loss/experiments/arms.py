@@ -119,6 +119,8 @@ def parse_arm(name: str) -> ArmSpec:
     spec = _loss(name, loss)
     if spec.unweighted and any(change != "half" and not change.startswith("lambda=") for change in changes):
         raise LegsError(f"{name}: {loss} has no weights to change")
+    if spec.over == "scene" and "multiscale" in changes:
+        raise LegsError(f"{name}: multiscale normalises image by image, this loss over the scene")
     leader = parse_arm(at).name if at_sign else None
     preset = next((preset for preset, known in PRESETS.items() if known == spec), loss)
     own_name = ":".join([preset, *changes])

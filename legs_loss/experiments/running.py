@@ -31,7 +31,7 @@ from legs_loss.reference.training.trainer import CHECKPOINT, Progress, TrainConf
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
 from legs_loss.system import write_whole
-from legs_loss.weights import weight_map
+from legs_loss.weights import weight_maps
 
 __all__ = [
     "BASELINE",
@@ -87,13 +87,18 @@ class Comparison:
     def data(self) -> Dataset:
         """The baseline's views."""
         if self._data is None:
-            self._data = load_dataset(self.scene, self.base.weights, self.base.resolution, self.base.white_background)
+            base = self.base
+            self._data = load_dataset(
+                self.scene, base.weights, base.resolution, base.white_background, worse=base.degraded
+            )
         return self._data
 
     def mean_weight(self, spec: WeightSpec) -> float:
         """The mean weight of a spec's maps over the training views."""
         if spec not in self._mean_weights:
-            means = [float(weight_map(view.image, spec).double().mean()) for view in self.data.train]
+            means = [
+                float(weight.double().mean()) for weight in weight_maps((view.image for view in self.data.train), spec)
+            ]
             self._mean_weights[spec] = sum(means) / len(means)
         return self._mean_weights[spec]
 

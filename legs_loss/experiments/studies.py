@@ -20,6 +20,7 @@ class Study(NamedTuple):
     against: which arm each arm is measured against, where that is not the baseline.
     paper: the paper's training PSNR of an arm, where it gives one.
     paper_says: in words, with its source.
+    degraded: whether a third of the training views is out of focus, moved or noisy.
     alike: whether its arms should not differ: each is then compared with each, to see how far they do all the same.
     """
 
@@ -29,6 +30,7 @@ class Study(NamedTuple):
     against: Mapping[str, str] = MappingProxyType({})
     paper: Mapping[str, float] = MappingProxyType({})
     alike: bool = False
+    degraded: bool = False
 
     def reference(self, arm: str) -> Optional[str]:
         """The arm that this one is measured against, None for the baseline itself."""
@@ -110,6 +112,12 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
             ),
             "The paper reports LEGS 1.2 to 1.7 dB above the codebase it is added to, on training views.",
             {"3dgs@legs": "legs"},
+        ),
+        "degraded": Study(
+            "A third of the training views out of focus, moved or noisy",
+            ("3dgs", "legs", "legs-robust", "legs@3dgs", "legs-robust@3dgs"),
+            "The paper trains on photographs as they are.",
+            degraded=True,
         ),
         # Weights of at most 1.00001: what differs is rounding, and what it grows to.
         "noise": Study(

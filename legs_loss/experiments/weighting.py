@@ -90,7 +90,7 @@ def _faded(weight: Optional[Tensor], share: float) -> Optional[Tensor]:
 def _response_at(image: Tensor, scale: int, spec: WeightSpec) -> Tensor:
     height, width = image.shape[1:]
     smaller = avg_pool2d(image, scale, ceil_mode=True, count_include_pad=False) if scale > 1 else image
-    normalised = normalise_response(response(smaller, spec.operator, spec.p), spec.eps)
+    normalised = normalise_response(response(smaller, spec.operator, spec.p, smooth=spec.smooth), spec.eps)
     if scale == 1:
         return normalised
     return interpolate(normalised[None], size=(height, width), mode="bilinear", align_corners=False)[0]

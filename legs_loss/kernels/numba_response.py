@@ -58,7 +58,7 @@ _FOUR, _EIGHT = np.float32(4.0), np.float32(8.0)
 
 def supports_response(spec: WeightSpec) -> bool:
     """Return whether the response of a spec can be computed here; the functions below take no other."""
-    return spec.operator in STENCILS and spec.p in NORMS
+    return spec.operator in STENCILS and spec.p in NORMS and spec.smooth == 0.0
 
 
 def settings_of(spec: WeightSpec) -> Tuple[int, np.float32, np.float32, int]:

@@ -50,7 +50,8 @@ def precompute(
         scene: from :func:`~legs_loss.scenes.read_scene`.
         out: the store's folder, ``legs_weights`` in the scene by default, where a training script finds it by itself.
             Maps already there are kept: one store holds many sizes and operators.
-        spec: its operator, p and eps are used; every curve and beta can be made from the result.
+        spec: its operator, p, eps and smooth are used, and where it normalises over the scene its percentile; every
+            curve, beta and noise floor can be made from the result.
         resolution: 3DGS's ``-r``, as the training will have it.
         white_background: 3DGS's ``-w``, likewise.
         workers: processes; 1 computes in this one. With more, a script needs its ``if __name__ == "__main__"``.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Dict, NamedTuple, Optional, Sequence
 
 from legs_loss.errors import LegsError
-from legs_loss.precompute.photograph import normalised_map, resized
+from legs_loss.precompute.photograph import normalised_map_and_levels, resized
 from legs_loss.scenes import View, image_size, load_training_image, training_size
 from legs_loss.spec import WeightSpec
 from legs_loss.store import Entry, fingerprint, is_intact, stage
@@ -57,6 +57,8 @@ def make(job: Job, task: Task) -> Result:
             "operator": job.spec.operator,
             "p": job.spec.p,
             "eps": job.spec.eps,
+            "smooth": float(job.spec.smooth),
+            **({"percentile": float(job.spec.percentile)} if job.spec.over == "scene" else {}),
             "background": ("white" if job.white_background else "black") if view.composited else None,
             "source_bytes": source.st_size,
             "source_mtime_ns": source.st_mtime_ns,
@@ -64,7 +66,8 @@ def make(job: Job, task: Task) -> Result:
         if any(wanted.items() <= vars(entry).items() and is_intact(job.store, entry) for entry in task.known):
             return Result(view.name)
         image = load_training_image(view, job.resolution, job.white_background, resized)
-        entry, made = Entry(fingerprint=fingerprint(image), **wanted), normalised_map(image, job.spec)
+        made, levels = normalised_map_and_levels(image, job.spec)
+        entry = Entry(fingerprint=fingerprint(image), **wanted, **levels)
         try:
             return Result(view.name, stage(job.staging, entry, made))
         except OSError as error:  # a full disk, a folder that went away: no later view fares better

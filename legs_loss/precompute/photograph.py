@@ -2,35 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Any, Tuple
+import math
+from typing import Any, Dict, Tuple
 
 import numpy as np
 import torch
 
 from legs_loss.kernels.backends import backend_for
+from legs_loss.levels import response_levels
 from legs_loss.operators import OPERATORS
 from legs_loss.response import response
 from legs_loss.scenes import image_tensor
 from legs_loss.scenes.images import resized_pixels, row_strips
 from legs_loss.spec import WeightSpec
 
-__all__ = ["compiled_anew", "compiles", "normalised_map", "resized"]
+__all__ = ["compiled_anew", "compiles", "normalised_map", "normalised_map_and_levels", "resized", "response_map"]
 
 _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 
 
 def normalised_map(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
     """Return E^ of a photograph uint8 or uint16 [H, W, C] as float16 [H, W], with one strip's temporaries at a time."""
-    height, width = image.shape[:2]
-    strength = _strength(image, spec)
-    low, high = strength.amin(), strength.amax()
-    normalised = np.empty((height, width), np.float16)  # numpy asks for large pages; torch does not
-    for rows in row_strips(height, width):  # in place: what is allocated anew has to be mapped anew
-        torch.from_numpy(normalised[rows]).copy_(strength[rows].sub_(low).div_(high - low + spec.eps))
-    return normalised
+    return _normalised(response_map(image, spec), spec)[0]
 
 
-def _strength(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
+def normalised_map_and_levels(image: np.ndarray, spec: WeightSpec) -> Tuple[np.ndarray, Dict[str, Any]]:
+    """Return E^ of a photograph, and what its entry says besides where it is to be normalised over its scene."""
+    strength = response_map(image, spec)
+    if spec.over == "image":
+        return _normalised(strength, spec)[0], {}
+    median, strong = response_levels(strength[None], spec).tolist()
+    normalised, low, span = _normalised(strength, spec)
+    return normalised, {"low": low, "span": span, "median": median, "strong": strong}
+
+
+def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
     if compiles(image.size):
         from legs_loss.kernels.numba_response import photograph_response, supports_response
@@ -38,14 +44,25 @@ def _strength(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
         if supports_response(spec):
             return torch.from_numpy(photograph_response(image, spec))
     height, width = image.shape[:2]
-    reach = OPERATORS[spec.operator].reach
+    reach = OPERATORS[spec.operator].reach + math.ceil(3.0 * spec.smooth)
     strength = torch.from_numpy(np.empty((height, width), np.float32))
     for rows in row_strips(height, width):
         # Rows that the operator reaches; at the photograph's own border it reflects.
         above, below = max(rows.start - reach, 0), min(rows.stop + reach, height)
-        strip = response(image_tensor(image[above:below]), spec.operator, spec.p)
+        strip = response(image_tensor(image[above:below]), spec.operator, spec.p, smooth=spec.smooth)
         strength[rows] = strip[0, rows.start - above : rows.stop - above]
     return strength
+
+
+def _normalised(strength: torch.Tensor, spec: WeightSpec) -> Tuple[np.ndarray, float, float]:
+    """Return E^ of a response [H, W], which is overwritten, as float16; it was low + span * E^."""
+    low, high = strength.amin(), strength.amax()
+    span = high - low + spec.eps
+    height, width = strength.shape
+    normalised = np.empty((height, width), np.float16)  # numpy asks for large pages; torch does not
+    for rows in row_strips(height, width):  # in place: what is allocated anew has to be mapped anew
+        torch.from_numpy(normalised[rows]).copy_(strength[rows].sub_(low).div_(span))
+    return normalised, float(low), float(span)
 
 
 def resized(image: Any, size: Tuple[int, int]) -> np.ndarray:

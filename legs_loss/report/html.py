@@ -6,15 +6,19 @@ import base64
 import hashlib
 import math
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
+
+from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE, read_rows, scene_of
 from legs_loss.experiments.statistics import COLUMNS, difference, summarise_all, times_gaussians
 from legs_loss.experiments.tables import LABELS, MISSING, difference_cell, score_cells, times_cell, with_values
-from legs_loss.reference.training.dataset import load_view, split_views
+from legs_loss.levels import levels_of
+from legs_loss.reference.training.dataset import load_dataset, load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
 from legs_loss.report.html_pictures import FORMATS as IMAGE_FORMATS
 from legs_loss.report.html_pictures import Pictures, draw_row, encode
@@ -60,14 +64,18 @@ def write_report(
     first: Dict[str, Row] = {}
     for row in sorted(rows, key=lambda row: row["seed"]):
         first.setdefault(row["arm"], row)
+    base = TrainConfig.from_dict(settings["base"])
+    levels = _scene_levels(read, base, first)
     drawn = []
     for view in shown:
-        loaded = load_view(read, view, TrainConfig.from_dict(settings["base"]).resolution)
+        loaded = load_view(read, view, base.resolution)
         drawn.append(
             (
                 loaded,
                 {
-                    arm: draw_row(first[arm], run / parse_arm(arm).folder / f"seed-{first[arm]['seed']}", loaded)
+                    arm: draw_row(
+                        first[arm], run / parse_arm(arm).folder / f"seed-{first[arm]['seed']}", loaded, levels.get(arm)
+                    )
                     for arm in names
                 },
             )
@@ -265,6 +273,16 @@ def _arms(rows: Sequence[Row], asked: Optional[Sequence[str]]) -> List[str]:
         if name not in there:
             raise LegsError(f"no row of the arm {name} is trained: there are {', '.join(there)}")
     return names
+
+
+def _scene_levels(scene: Scene, base: TrainConfig, rows: Mapping[str, Row]) -> Dict[str, Optional[Tensor]]:
+    """Return the levels of the training views, for each arm whose weights are normalised over the scene."""
+    specs = {arm: TrainConfig.from_dict(row["config"]).weights for arm, row in rows.items()}
+    if all(spec.over != "scene" for spec in specs.values()):
+        return {}
+    unweighted = replace(base, spec="3dgs").weights
+    views = load_dataset(scene, unweighted, base.resolution, base.white_background, worse=base.degraded).train
+    return {arm: levels_of((view.image for view in views), spec) for arm, spec in specs.items()}
 
 
 def _views(scene: Scene, asked: Optional[Sequence[str]]) -> List[View]:

@@ -58,14 +58,17 @@ class Pictures(NamedTuple):
     crops: Dict[str, List[List[int]]]
 
 
-def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Drawn:
-    """Draw a view with a row's Gaussians, and make the weight map that its run would have ended with there."""
+def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView, scene: Optional[Tensor] = None) -> Drawn:
+    """Draw a view with a row's Gaussians, and make the weight map that its run would have ended with there.
+
+    ``scene`` are the levels of the training views, for weights that are normalised over the scene.
+    """
     config = TrainConfig.from_dict(row["config"])
     if "upstream" in row:
         rendering = _upstreams_own(row, folder, view)
     else:
         rendering = draw(read_ply(point_cloud(folder, config)), view, config)
-    weight = _weight(config.weights, view.image, rendering)
+    weight = _weight(config.weights, view.image, rendering, scene)
     if row["weighting"] is not None:
         weight = WEIGHTINGS[row["weighting"]]([replace(view, weight=weight)], config)(0, 1.0, rendering)
     weight = step_weight(weight, view, config)
@@ -80,11 +83,13 @@ def _upstreams_own(row: Mapping[str, Any], folder: Path, view: TrainingView) -> 
     return read_picture(folder / path)
 
 
-def _weight(spec: WeightSpec, photograph: Tensor, rendering: Tensor) -> Optional[Tensor]:
+def _weight(spec: WeightSpec, photograph: Tensor, rendering: Tensor, scene: Optional[Tensor]) -> Optional[Tensor]:
     """The weight map at the end of the run; None where nothing is weighted."""
     if spec.unweighted:
         return None
-    return error_weight_map(rendering, photograph, spec) if spec.error > 0.0 else weight_map(photograph, spec)
+    if spec.error > 0.0:
+        return error_weight_map(rendering, photograph, spec)
+    return weight_map(photograph, spec, scene=scene)
 
 
 def encode(view: TrainingView, drawn: Mapping[str, Drawn], form: Mapping[str, Any]) -> Pictures:

@@ -13,7 +13,7 @@ from legs_loss.errors import LegsError
 from legs_loss.report.labels import label
 from legs_loss.report.saving import save_figure
 from legs_loss.spec import WeightSpec
-from legs_loss.weights import weight_from_response
+from legs_loss.weights import curved, weight_from_response
 
 __all__ = ["Shown", "save_sheet"]
 
@@ -21,7 +21,10 @@ _INK, _FAINT = "#222222", "#9a9a9a"
 
 
 class Shown(NamedTuple):
-    """One view of a sheet: its label, its photograph uint8 or uint16 [H, W, C] if there is one, its E^ [H, W]."""
+    """One view of a sheet: its label, its photograph uint8 or uint16 [H, W, C] if there is one, its E^ [H, W].
+
+    For a spec that is normalised over the scene, E^ is its response normalised so.
+    """
 
     label: str
     photograph: Optional[np.ndarray]
@@ -67,7 +70,8 @@ def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) 
         photograph, response, weighted = cells[:, column]
         for axes in cells[:, column]:
             axes.set(xticks=[], yticks=[], frame_on=False)
-        weight = weight_from_response(torch.from_numpy(np.array(view.normalised))[None], spec)[0].numpy()
+        weighted_by = curved if spec.over == "scene" else weight_from_response
+        weight = weighted_by(torch.from_numpy(view.normalised.astype(np.float32))[None], spec)[0].numpy()
         if view.photograph is None:
             photograph.text(0.5, 0.5, "not found,\nor changed since", ha="center", va="center", color=_FAINT)
         else:

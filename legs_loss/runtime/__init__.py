@@ -12,6 +12,7 @@ from typing import Any, Callable, Optional, TypeVar
 import torch
 from torch import Tensor
 
+from legs_loss.errors import LegsError
 from legs_loss.images import is_compiling
 from legs_loss.kernels.contract import Weights
 from legs_loss.runtime.call import Call, Own, View
@@ -86,6 +87,11 @@ def _compiled(call: Call) -> Tensor:
     spec = None if thread.unweighted or not call.trains() else spec_to_compile(version[0])
     if spec is None:
         return call.plain()
+    if spec.over == "scene":
+        raise LegsError(
+            "weights that are normalised over the scene are kept from step to step, which a compiled graph cannot do: "
+            "leave the loss out of torch.compile, or set LEGS_PRESET=legs"
+        )
     call = call.aligned()
     if spec.error > 0.0:
         weight = error_weight_map(call.prediction, call.target, spec, call.channels_last)

@@ -8,19 +8,21 @@ numbers of it, the least response and the span; torch wants the map.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Callable, Optional, Set, Tuple
+from typing import TYPE_CHECKING, Callable, Dict, Optional, Set, Tuple
 
 import torch
 from torch import Tensor
 
 from legs_loss.config import Config
 from legs_loss.errors import LegsError
+from legs_loss.images import check_values
 from legs_loss.kernels.backends import fused_range, is_capturing
 from legs_loss.kernels.contract import Weights
+from legs_loss.levels import RunningLevels, response_levels
 from legs_loss.response import normalise_response, response
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.memo import WeightMemo
-from legs_loss.weights import error_weight_map, weight_from_response, weight_map
+from legs_loss.weights import error_weight_map, weight_from_response, weight_map, weight_over_scene
 
 if TYPE_CHECKING:
     from legs_loss.store import Entry, WeightStore
@@ -61,6 +63,8 @@ class WeightSource:
         self.memo: WeightMemo = WeightMemo(memo_bytes)
         self._say_once = say_once
         self._asked: Set[Tuple[str, int, int]] = set()
+        self._seen: RunningLevels = RunningLevels()
+        self._of_store: Dict[int, Optional[Tensor]] = {}
         self._store: Optional[WeightStore] = None
         self._store_opened = False
 
@@ -73,6 +77,9 @@ class WeightSource:
         if spec.error > 0.0:
             normalised = found[0] if call.target.dim() == 3 else torch.stack(found)
             return Weights(map=error_weight_map(call.prediction, call.target, spec, call.channels_last, normalised))
+        if spec.over == "scene":
+            strength = found[0] if call.target.dim() == 3 else torch.stack(found)
+            return Weights(map=weight_over_scene(strength, spec, self._scene_levels(found[0].numel())))
         if all(map(_is_range, found)):
             return Weights(spec=spec, range=torch.cat(found))
         maps = [
@@ -84,12 +91,13 @@ class WeightSource:
     def _weight(self, image: Tensor, view: Optional[str], call: Call, counts: Counts) -> Tensor:
         """Return an image's weight map [1, H, W] (channels-last [H, W, 1]), or the range that makes it, [1, 2].
 
-        Where weights follow the rendering's error it is E^, all that is known of them before.
+        Where weights follow the rendering's error it is E^, all that is known of them before; where they are normalised
+        over the scene it is E, since the scene's levels change with each view that is seen.
         """
         if is_capturing(image.device):
             # A CUDA graph is replayed with other pixels in the target's memory: their weight is part of the graph.
             counts.computed += 1
-            return self._computed(image, call)
+            return self._computed(image, call, again=True)
         if call.is_mean() and image.device.type == "cpu" and self.config.store is None:
             # Here to know an image again, by a SHA-256 of its bytes, takes longer than to compute its range.
             found = fused_range(image, self.config.spec, call.channels_last)
@@ -109,10 +117,18 @@ class WeightSource:
         counts.computed += 1
         return self._computed(image, call)
 
-    def _computed(self, image: Tensor, call: Call) -> Tensor:
+    def _computed(self, image: Tensor, call: Call, again: bool = False) -> Tensor:
+        """Return what :meth:`_weight` returns of an image; ``again`` where it will be computed at each step."""
         spec = self.config.spec
-        if spec.error > 0.0:
-            return normalise_response(response(image, spec.operator, spec.p, call.channels_last), spec.eps)
+        if spec.error > 0.0 or spec.over == "scene":
+            if image.device.type == "cpu":
+                check_values(image, "target")
+            strength = response(image, spec.operator, spec.p, call.channels_last, spec.smooth)
+            if spec.error > 0.0:
+                return normalise_response(strength, spec.eps)
+            if not again:
+                self._seen.add(response_levels(strength, spec))
+            return strength
         found = fused_range(image, spec, call.channels_last) if call.is_mean() else None
         return weight_map(image, spec, call.channels_last) if found is None else found
 
@@ -124,14 +140,27 @@ class WeightSource:
             entry = self._entry(store, image.movedim(-1, 0) if channels_last else image, view)
             if entry is None:
                 return None
-            normalised = torch.from_numpy(store.normalised_response(entry)).to(image.device).unsqueeze(0)
+            over_scene = self.config.spec.over == "scene"
+            values = store.response(entry) if over_scene else store.normalised_response(entry)
         except LegsError as error:
             self._say_once("damaged", f"{error}; the weights of such views are computed")
             return None
-        weight = normalised.float()
-        if self.config.spec.error == 0.0:
-            weight = weight_from_response(normalised, self.config.spec)
+        known = torch.from_numpy(values).to(image.device).unsqueeze(0)
+        weight = known.float()
+        if self.config.spec.error == 0.0 and not over_scene:
+            weight = weight_from_response(known, self.config.spec)
         return weight.movedim(0, -1) if channels_last else weight
+
+    def _scene_levels(self, pixels: int) -> Optional[Tensor]:
+        """Return the levels of the scene: of all the store's views of this size, else of those seen so far."""
+        store = self._open_store()
+        if store is not None and pixels not in self._of_store:
+            self._of_store[pixels] = store.scene_levels(self.config.spec, pixels)
+        levels = self._of_store.get(pixels)
+        if levels is not None:
+            return levels
+        self._say_once("running", _RUNNING)
+        return self._seen.scene()
 
     def _entry(self, store: WeightStore, image: Tensor, view: Optional[str]) -> Optional[Entry]:
         """Return the store's entry that was made from an image [C, H, W]."""
@@ -178,6 +207,10 @@ class WeightSource:
         return self._store
 
 
+_RUNNING = (
+    "weights are normalised over the views seen so far, a running estimate; legs precompute --preset legs-robust knows "
+    "all views from the first step"
+)
 _CHANGED = (
     "view {view!r}: the training image is not the one that the stored map was made from, so its weight is computed "
     "(said once; see docs/precompute.md)"

@@ -20,7 +20,7 @@ from legs_loss.system import read_regular
 __all__ = ["MANIFEST", "DamagedStoreError", "Entry", "is_map_name", "manifest_bytes", "read_manifest"]
 
 MANIFEST = "manifest.json"
-VERSION = 1
+VERSION = 2  # 1 is written where no entry has what came with 2, so that older versions read it
 _LARGEST = 256 << 20  # bytes: some 500,000 entries
 _SIDE = 1 << 20  # pixels
 _FILE_NAME = re.compile(r"[0-9a-z_]+-[0-9a-f]{16}\.npy")
@@ -44,6 +44,11 @@ class Entry:
         source_bytes, source_mtime_ns: size and time of the photograph's file.
         file: the map's file in the store.
         bytes, sha256: size and checksum of that file.
+        smooth: of its response too: the Gaussian before the operator.
+        low, span: the response that E^ was made from is low + span * E^; None, as the next ones, where the map was not
+            made to be normalised over its scene.
+        percentile: of the level ``strong``.
+        median, strong: the view's levels (:mod:`legs_loss.levels`).
     """
 
     view: str
@@ -59,11 +64,25 @@ class Entry:
     file: str = ""
     bytes: int = 0
     sha256: str = ""
+    smooth: float = 0.0
+    low: Optional[float] = None
+    span: Optional[float] = None
+    percentile: Optional[float] = None
+    median: Optional[float] = None
+    strong: Optional[float] = None
 
     @property
     def key(self) -> Tuple[Any, ...]:
         """What there is one map of: a view at a size with an operator."""
-        return self.view, self.height, self.width, self.operator, self.p, self.eps
+        return self.view, self.height, self.width, self.operator, self.p, self.eps, self.smooth
+
+
+_LEVELS = ("low", "span", "percentile", "median", "strong")
+_ADDED = {"smooth": 0.0, **dict.fromkeys(_LEVELS)}  # by version 2, and what they are where they are not written
+
+
+def _is_level(value: Any) -> bool:
+    return value is None or (type(value) is float and 0 <= value < math.inf)
 
 
 # What a field may be. Type by type: JSON's true is an int, and 1.0 == 1.
@@ -81,6 +100,8 @@ _FIELDS: Dict[str, Callable[[Any], bool]] = {
     "file": lambda value: type(value) is str and is_map_name(value),
     "bytes": lambda value: type(value) is int and value > 0,
     "sha256": lambda value: type(value) is str and _CHECKSUM.fullmatch(value) is not None,
+    "smooth": lambda value: type(value) is float and 0 <= value <= 100,
+    **dict.fromkeys(_LEVELS, _is_level),
 }
 
 
@@ -91,11 +112,16 @@ def is_map_name(name: str) -> bool:
 
 def manifest_bytes(entries: Iterable[Entry]) -> bytes:
     """Return the manifest's one spelling for these entries."""
-    rows = []
+    rows, version = [], 1
     for entry in sorted(entries, key=lambda entry: entry.key):
         values = dict(vars(entry), p=entry.p if math.isfinite(entry.p) else "inf")
+        for name, absent in _ADDED.items():
+            if values[name] == absent:
+                del values[name]
+            else:
+                version = VERSION
         rows.append(json.dumps(values, sort_keys=True, allow_nan=False))
-    body = '"entries": [\n' + ",\n".join(rows) + f'\n],\n"version": {VERSION}'
+    body = '"entries": [\n' + ",\n".join(rows) + f'\n],\n"version": {version}'
     return f'{{"checksum": "{hashlib.sha256(body.encode()).hexdigest()}",\n{body}}}\n'.encode()
 
 
@@ -120,6 +146,7 @@ def read_manifest(folder: Path) -> List[Entry]:
             )
         entries = [Entry(**dict(row, p=float(row["p"]))) for row in document["entries"]]
         wrong = [name for entry in entries for name, fits in _FIELDS.items() if not fits(getattr(entry, name))]
+        wrong += [entry.view for entry in entries if len({getattr(entry, name) is None for name in _LEVELS}) > 1]
         intact = not wrong and manifest_bytes(entries) == data
     except LegsError:
         raise

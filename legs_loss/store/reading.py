@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Tuple, Union
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from legs_loss.errors import LegsError
+from legs_loss.levels import scene_levels
 from legs_loss.scenes.model import view_names
 from legs_loss.spec import WeightSpec
 from legs_loss.store.leftovers import leftovers
@@ -60,14 +63,43 @@ class WeightStore:
                 the first dot as 3DGS names views. A name that fits two stored views gets None: it is never guessed.
             height: of the training image in pixels.
             width: likewise.
-            spec: its operator, p and eps count.
+            spec: what its response is made with counts; for one that is normalised over the scene, the entry must
+                have what that needs.
         """
-        name = view.replace("\\", "/")
-        return self._by_name.get((name, height, width, spec.operator, spec.p, spec.eps))
+        entry = self._by_name.get((view.replace("\\", "/"), height, width, *_made_with(spec)))
+        return entry if entry is not None and self.fits(entry, spec) else None
 
     def find_image(self, fingerprint: str, height: int, width: int, spec: WeightSpec) -> Optional[Entry]:
         """Return the entry that was made from an image with a fingerprint, whatever its view is called, or None."""
-        return self._by_image.get((fingerprint, height, width, spec.operator, spec.p, spec.eps))
+        entry = self._by_image.get((fingerprint, height, width, *_made_with(spec)))
+        return entry if entry is not None and self.fits(entry, spec) else None
+
+    @staticmethod
+    def fits(entry: Entry, spec: WeightSpec) -> bool:
+        """Return whether the weights of a spec can be made from an entry's map."""
+        return entry.key[3:] == _made_with(spec) and (spec.over == "image" or entry.percentile == spec.percentile)
+
+    def scene_levels(self, spec: WeightSpec, pixels: int) -> Optional[Tensor]:
+        """Return the levels of the scene (:mod:`legs_loss.levels`) over all views of a number of pixels, [2].
+
+        None where the store holds none for this spec: ``legs precompute`` was run for another preset.
+        """
+        views = [
+            torch.tensor([entry.median, entry.strong])
+            for entry in self.entries.values()
+            if self.fits(entry, spec) and entry.width * entry.height == pixels
+        ]
+        return scene_levels(views) if views else None
+
+    def response(self, entry: Entry) -> np.ndarray:
+        """Return an entry's response before it was normalised, float32 [H, W]; the entry must have ``span``.
+
+        Raises:
+            DamagedStoreError: the file is missing or is not the one that was written.
+        """
+        assert entry.low is not None
+        assert entry.span is not None
+        return np.float32(entry.low) + np.float32(entry.span) * read_map(self.path, entry).astype(np.float32)
 
     def normalised_response(self, entry: Entry) -> np.ndarray:
         """Return an entry's map E^, float16 [H, W], after checking its checksum.
@@ -82,3 +114,8 @@ class WeightStore:
         entries = self.entries.values()
         damaged = [entry for entry in entries if not is_intact(self.path, entry)]
         return Damage(damaged, sorted(path.name for path in leftovers(self.path, entries)))
+
+
+def _made_with(spec: WeightSpec) -> Tuple[Any, ...]:
+    """Return the last part of the keys of the maps that a spec can use."""
+    return spec.operator, spec.p, spec.eps, spec.smooth

@@ -3,6 +3,10 @@
 A normalised response E^ counts from an image's weakest to its strongest response. In a sharp photograph few pixels come
 near the strongest; blur weakens the strongest, noise lifts all others, and the mean of E^ rises with either. So the
 views that LEGS weights most as a whole are named here.
+
+Of maps that are to be normalised over their scene (``legs precompute --preset legs-robust``) more is known: a
+photograph that moved or is out of focus has weak contours beside the others, a noisy one a strong median. That finds
+motion too, which weakens all of a photograph alike.
 """
 
 from __future__ import annotations
@@ -43,11 +47,7 @@ def mean_responses(store: WeightStore) -> Dict[str, float]:
     Raises:
         LegsError: a map cannot be read.
     """
-    groups: Dict[object, List[Entry]] = {}
-    for entry in store.entries.values():
-        groups.setdefault((entry.operator, entry.p, entry.width * entry.height), []).append(entry)
-    largest = max(groups.values(), key=len, default=[])
-    return {entry.view: float(store.normalised_response(entry).mean(dtype=np.float64)) for entry in largest}
+    return {entry.view: float(store.normalised_response(entry).mean(dtype=np.float64)) for entry in _alike(store)}
 
 
 def unsharp_views(store: WeightStore) -> List[str]:
@@ -56,4 +56,18 @@ def unsharp_views(store: WeightStore) -> List[str]:
     Raises:
         LegsError: a map cannot be read.
     """
-    return outliers(mean_responses(store))
+    entries = _alike(store)
+    if any(entry.strong is None or entry.median is None for entry in entries):
+        return outliers(mean_responses(store))
+    weak = outliers({entry.view: 1.0 / max(entry.strong or 0.0, 1e-6) for entry in entries})
+    noisy = outliers({entry.view: entry.median or 0.0 for entry in entries})
+    return list(dict.fromkeys(weak + noisy))
+
+
+def _alike(store: WeightStore) -> List[Entry]:
+    """Return the entries of the response and size that most views have; of several, of those with levels."""
+    groups: Dict[object, List[Entry]] = {}
+    for entry in store.entries.values():
+        key = entry.operator, entry.p, entry.smooth, entry.percentile, entry.width * entry.height
+        groups.setdefault(key, []).append(entry)
+    return max(groups.values(), key=lambda entries: (len(entries), entries[0].strong is not None), default=[])

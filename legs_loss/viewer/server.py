@@ -10,6 +10,7 @@ import numpy as np
 from legs_loss.errors import LegsError
 from legs_loss.reference.ply import read_ply
 from legs_loss.scenes import View, image_tensor, load_training_image
+from legs_loss.spec import as_spec
 from legs_loss.viewer.content import Content
 from legs_loss.viewer.splats import Splats, left_of, splats
 
@@ -110,7 +111,8 @@ class _Cameras:
         assert content.scene is not None
         with_camera = [view for view in content.scene.views if view.camera is not None]
         step = max(1, -(-len(with_camera) // _CAMERAS))
-        self.content, self.preset, self.views = content, preset, with_camera[::step]
+        self.content, self.spec, self.views = content, as_spec(preset), with_camera[::step]
+        self.levels: Any = None
         poses = [_pose(view) for view in self.views]
         size = 0.08 * float(np.ptp([position for _, position in poses], axis=0).max()) if len(poses) > 1 else 0.2
         self.handles = [self._add(server, view, *pose, size or 0.2) for view, pose in zip(self.views, poses)]
@@ -149,24 +151,29 @@ class _Cameras:
         key = self.what.value, view.name
         if key not in self.pictures:
             try:
-                self.pictures[key] = _picture(view, self.preset if key[0] == "weight map" else None)
+                self.pictures[key] = self._weight(view) if key[0] == "weight map" else _photograph(view)
             except LegsError:
                 return None  # the photograph is missing: the outline stays
         return self.pictures[key]
 
+    def _weight(self, view: View) -> np.ndarray:
+        """A weight map from black (1) to white (1 + beta), uint8 [H, W, 3]."""
+        from legs_loss.levels import levels_of
+        from legs_loss.weights import weight_map
 
-def _picture(view: View, preset: Any) -> np.ndarray:
-    """A photograph, or its weight map from black (1) to white (1 + beta), uint8 [H, W, 3]."""
-    from legs_loss.spec import as_spec
-    from legs_loss.weights import weight_map
+        if self.levels is None:  # of the views that are shown; None again where the preset needs none
+            self.levels = levels_of(map(_image, self.views), self.spec)
+        gray = (weight_map(_image(view), self.spec, scene=self.levels)[0].numpy() - 1) / max(self.spec.beta, 1e-6)
+        return np.repeat((gray.clip(0, 1) * 255).round().astype(np.uint8)[..., None], 3, axis=2)
 
-    photograph = load_training_image(view, _PICTURE)
-    image = image_tensor(photograph)
-    if preset is None:
-        return (image.expand(3, -1, -1).permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-    weight = weight_map(image, preset)[0].numpy()
-    gray = (weight - 1) / max(as_spec(preset).beta, 1e-6)
-    return np.repeat((gray.clip(0, 1) * 255).round().astype(np.uint8)[..., None], 3, axis=2)
+
+def _photograph(view: View) -> np.ndarray:
+    """A photograph, uint8 [H, W, 3]."""
+    return (_image(view).expand(3, -1, -1).permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
+
+
+def _image(view: View) -> Any:
+    return image_tensor(load_training_image(view, _PICTURE))
 
 
 def _pose(view: View) -> Tuple[np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ from legs_loss.reference.training.dataset import load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
-from legs_loss.weights import weight_map
+from legs_loss.weights import weight_maps
 
 __all__ = ["UpstreamComparison", "next_factor"]
 
@@ -140,7 +140,7 @@ class UpstreamComparison:
             return spec.scale if spec.normalise == "mean" else math.nan
         if spec not in self._mean_weights:
             images = (load_view(self.scene, view, self.base.resolution).image for view in split_views(self.scene)[0])
-            means = [float(weight_map(image, spec).double().mean()) for image in images]
+            means = [float(weight.double().mean()) for weight in weight_maps(images, spec)]
             self._mean_weights[spec] = sum(means) / len(means)
         return self._mean_weights[spec]
 

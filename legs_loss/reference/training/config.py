@@ -11,9 +11,12 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.reference.training.dataset import TrainingView
-from legs_loss.spec import Spec, WeightSpec, as_spec
+from legs_loss.spec import PRESETS, Spec, WeightSpec, as_spec
 
 __all__ = ["Loss", "TrainConfig", "Weigh", "Weighting", "default_threshold"]
+
+# What a spec had not when the first comparisons were written: absent where it is the default, so that they go on.
+ADDED_SETTINGS = ("over", "noise_floor", "smooth")
 
 # Weights that change during a run: of a training view's index, the share of the run that is done, and the view's
 # rendering [3, H, W], detached, the weight map [1, H, W] of this one iteration. It must depend on nothing else.
@@ -37,6 +40,7 @@ class TrainConfig:
             it by the size of the photographs, see :func:`default_threshold`.
         max_gaussians: a cap on their number, None for none.
         white_background: white in place of black.
+        degraded: a third of the training views are out of focus, moved or noisy (:mod:`.degrade`): for experiments.
         seed: of the order of the views and of the places of split Gaussians.
     """
 
@@ -50,6 +54,7 @@ class TrainConfig:
     densify_grad_threshold: Optional[float] = None
     max_gaussians: Optional[int] = None
     white_background: bool = False
+    degraded: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -78,6 +83,11 @@ class TrainConfig:
         """The settings as JSON holds them."""
         values = asdict(self)
         values["spec"]["p"] = str(self.weights.p)  # JSON has no infinity
+        for name in ADDED_SETTINGS:
+            if values["spec"][name] == getattr(PRESETS["legs"], name):
+                del values["spec"][name]
+        if not self.degraded:
+            del values["degraded"]
         return values
 
     @classmethod

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
+from legs_loss.reference.training.degrade import degraded
 from legs_loss.scenes import Camera, Scene, View, image_tensor, load_training_image
 from legs_loss.spec import WeightSpec
-from legs_loss.store import WeightStore, fingerprint
-from legs_loss.weights import weight_from_response, weight_map
+from legs_loss.store import Entry, WeightStore, fingerprint
+from legs_loss.weights import weight_from_response, weight_map, weight_maps, weight_over_scene
 
 __all__ = ["Dataset", "TrainingView", "extent", "load_dataset", "load_view", "pinhole_camera", "split_views"]
 
@@ -66,6 +67,7 @@ def load_dataset(
     white_background: bool = False,
     store: Optional[Path] = None,
     weights: Optional[Mapping[str, Tensor]] = None,
+    worse: bool = False,
 ) -> Dataset:
     """Load every view of a scene.
 
@@ -77,23 +79,23 @@ def load_dataset(
         store: a store of weight maps; default: ``legs_weights`` in the scene folder, if it is there. A map is taken
             from it only for the very image it was made from, else it is computed.
         weights: explicit maps [1, H, W] by view name, in place of the spec's: for experiments.
+        worse: a third of the training views is degraded (:mod:`.degrade`): for experiments.
 
     Raises:
         LegsError: a view has no pinhole camera, a photograph cannot be read, or an explicit map is missing or does
             not fit.
     """
-    train, test = split_views(scene)
-    opened = _open_store(scene, store) if not spec.unweighted and weights is None else None
-
-    def weighted(view: View) -> TrainingView:
-        loaded = load_view(scene, view, resolution, white_background)
-        if weights is not None:
-            return replace(loaded, weight=_explicit(weights, loaded))
-        return replace(loaded, weight=_weight(opened, loaded, spec)) if not spec.unweighted else loaded
-
-    return Dataset(
-        [weighted(view) for view in train], [load_view(scene, view, resolution, white_background) for view in test]
+    train, test = (
+        [load_view(scene, view, resolution, white_background) for view in views] for views in split_views(scene)
     )
+    if worse:
+        train = [replace(view, image=image) for view, image in zip(train, degraded([view.image for view in train]))]
+    if weights is not None:
+        train = [replace(view, weight=_explicit(weights, view)) for view in train]
+    elif not spec.unweighted:
+        maps = _weights(_open_store(scene, store), train, spec)
+        train = [replace(view, weight=weight) for view, weight in zip(train, maps)]
+    return Dataset(train, test)
 
 
 def load_view(scene: Scene, view: View, resolution: int = -1, white_background: bool = False) -> TrainingView:
@@ -139,13 +141,37 @@ def _open_store(scene: Scene, store: Optional[Path]) -> Optional[WeightStore]:
     return WeightStore(default) if (default / "manifest.json").is_file() else None
 
 
-def _weight(store: Optional[WeightStore], view: TrainingView, spec: WeightSpec) -> Tensor:
-    if store is not None:
-        height, width = view.image.shape[1:]
-        entry = store.find(view.name, height, width, spec)
-        if entry is not None and entry.fingerprint in (fingerprint(view.image), fingerprint(view.image[:1])):
-            return weight_from_response(torch.from_numpy(store.normalised_response(entry))[None], spec)
-    return weight_map(view.image, spec)
+def _weights(store: Optional[WeightStore], views: List[TrainingView], spec: WeightSpec) -> List[Tensor]:
+    """Return the views' weight maps, of stored responses where a store has those of these very images."""
+    if store is None:
+        return weight_maps([view.image for view in views], spec)
+    found = [_entry(store, view, spec) for view in views]
+    if spec.over == "scene":
+        entries = [entry for entry in found if entry is not None]
+        if len(entries) < len(views):  # of a part of the scene the levels are not known
+            return weight_maps([view.image for view in views], spec)
+        return [
+            weight_over_scene(
+                torch.from_numpy(store.response(entry))[None],
+                spec,
+                store.scene_levels(spec, entry.width * entry.height),
+            )
+            for entry in entries
+        ]
+    return [
+        weight_map(view.image, spec)
+        if entry is None
+        else weight_from_response(torch.from_numpy(store.normalised_response(entry))[None], spec)
+        for view, entry in zip(views, found)
+    ]
+
+
+def _entry(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional[Entry]:
+    height, width = view.image.shape[1:]
+    entry = store.find(view.name, height, width, spec)
+    if entry is None or entry.fingerprint not in (fingerprint(view.image), fingerprint(view.image[:1])):
+        return None
+    return entry
 
 
 def _explicit(weights: Mapping[str, Tensor], view: TrainingView) -> Tensor:

@@ -83,7 +83,8 @@ def step_loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lamb
 def by_error(views: List[TrainingView], config: TrainConfig) -> Weigh:
     """Make the weights of a spec that follows the rendering's error (``spec.error``)."""
     spec = config.weights
-    responses = [normalise_response(response(view.image, spec.operator, spec.p), spec.eps) for view in views]
+    strengths = [response(view.image, spec.operator, spec.p, smooth=spec.smooth) for view in views]
+    responses = [normalise_response(strength, spec.eps) for strength in strengths]
 
     def weigh(index: int, done: float, rendering: Tensor) -> Tensor:
         return error_weight_map(rendering, views[index].image, spec, normalised=responses[index])
@@ -142,7 +143,7 @@ def train(
         KeyboardInterrupt: Ctrl-C, after the checkpoint.
     """
     maps = config.weights if config.weights.error == 0.0 else WeightSpec(beta=0.0)
-    data = load_dataset(scene, maps, config.resolution, config.white_background, store, weights)
+    data = load_dataset(scene, maps, config.resolution, config.white_background, store, weights, config.degraded)
     if weighting is None and config.weights.error > 0.0:
         weighting = by_error
     folder = None if out is None else Path(out)

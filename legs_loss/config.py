@@ -29,7 +29,7 @@ _TRUE, _FALSE = ("1", "true", "yes", "on"), ("", "0", "false", "no", "off")
 
 @dataclass(frozen=True)
 class Config:
-    """What a run uses.
+    """The settings of a run.
 
     Attributes:
         spec: the weight map's settings.
@@ -49,7 +49,7 @@ class Config:
 
     @property
     def active(self) -> bool:
-        """Whether any weight is applied."""
+        """Return whether any weight is applied."""
         return not self.off and not self.spec.unweighted
 
 

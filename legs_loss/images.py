@@ -1,4 +1,4 @@
-"""What counts as an image here: its layouts, and the checks that every public function shares."""
+"""Check images and their layouts, as every public function does."""
 
 from __future__ import annotations
 

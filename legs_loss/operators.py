@@ -32,7 +32,7 @@ class Operator(NamedTuple):
 
     @property
     def reach(self) -> int:
-        """How many pixels beyond its own a response depends on."""
+        """Return how many pixels beyond its own a response depends on."""
         return len(self.stencils[0]) // 2
 
 

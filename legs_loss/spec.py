@@ -98,7 +98,7 @@ class WeightSpec:
 
     @property
     def unweighted(self) -> bool:
-        """Whether the weight is 1 everywhere: 3DGS's own loss."""
+        """Return whether the weight is 1 everywhere: 3DGS's own loss."""
         return self.beta == 0.0 and self.scale == 1.0
 
 

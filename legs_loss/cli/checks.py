@@ -1,4 +1,4 @@
-"""What is checked of a command's arguments before anything is computed."""
+"""Check a command's arguments before anything is computed."""
 
 from __future__ import annotations
 

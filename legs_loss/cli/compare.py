@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Dict, Sequence
 
-from legs_loss.cli.demo import cores, default_resolution
+from legs_loss.cli.affordable import add_scene_arguments, default_resolution
 from legs_loss.system import say
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     changes = ", ".join(f"{name} ({what})" for name, what in CHANGES.items())
     parser.description = (__doc__ or "").format(changes=changes)
-    parser.add_argument("scene", metavar="SCENE", nargs="?", help="a COLMAP scene; default: the embedded scene")
+    add_scene_arguments(parser)
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--arms", nargs="+", metavar="ARM", help="default: those of --study")
     what.add_argument(
@@ -59,14 +59,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-m", "--out", type=Path, default=Path("legs_compare"), metavar="DIR", help="default: legs_compare"
     )
-    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
-    parser.add_argument(
-        "-r",
-        "--resolution",
-        type=int,
-        metavar="1|2|4|8|WIDTH",
-        help="as in 3DGS; default: about 70,000 pixels, which a CPU trains in minutes",
-    )
     parser.add_argument(
         "--iterations",
         type=int,
@@ -75,9 +67,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--densify_grad_threshold", type=float, metavar="X", help="of all arms; default: as for legs train"
-    )
-    parser.add_argument(
-        "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one a core"
     )
     parser.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
     parser.add_argument(

@@ -8,40 +8,28 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Dict, List
 
+from legs_loss.cli.affordable import add_scene_arguments, default_resolution
 from legs_loss.system import say, write_whole
 
 HELP = "weight maps, four trainings, a table and pictures, on the embedded scene or your own"
 
-AFFORDABLE = 70_000  # pixels a photograph: a CPU trains such scenes in minutes
 METHODS = ("3dgs", "eggs", "legs-l", "legs")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", metavar="SCENE", nargs="?", help="a COLMAP scene; default: the embedded scene")
-    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
+    add_scene_arguments(parser)
     parser.add_argument(
         "-m", "--out", type=Path, default=Path("legs_demo"), metavar="DIR", help="default: legs_demo; replaced"
     )
-    parser.add_argument(
-        "-r",
-        "--resolution",
-        type=int,
-        metavar="1|2|4|8|WIDTH",
-        help="as in 3DGS; default: about 70,000 pixels, which a CPU trains in minutes",
-    )
     parser.add_argument("--iterations", type=int, default=1200, metavar="N", help="of each training; default: 1200")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: 0")
-    parser.add_argument(
-        "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one a core"
-    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -110,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def table(metrics: Dict[str, Dict[str, Any]]) -> str:
-    """The results as text, a line a method."""
+    """Return the results as text, a line a method."""
     from legs_loss.experiments.statistics import summarise
     from legs_loss.experiments.tables import LABELS, markdown, score_cells
 
@@ -122,7 +110,7 @@ def table(metrics: Dict[str, Dict[str, Any]]) -> str:
 
 
 def conclusion(metrics: Dict[str, Dict[str, Any]]) -> str:
-    """What the table does and does not say."""
+    """Return what the table does and does not say."""
     plain, legs = metrics["3dgs"], metrics["legs"]
     return (
         f"legs has {legs['gaussians'] / plain['gaussians']:.1f} times as many Gaussians as 3dgs: a larger L1 term "
@@ -152,17 +140,3 @@ def _save_pictures(scene: Any, arms: List[Any], metrics: Dict[str, Dict[str, Any
     ]
     sheet = save_pictures(folder, f"{scene.root.resolve().name}: {chosen.name}, held out", view.image, compared)
     return chosen.name, sheet
-
-
-def default_resolution(scene: Any) -> int:
-    """The width that leaves AFFORDABLE pixels, or the photographs' own size (1) where that is less."""
-    sizes = [(view.camera.width, view.camera.height) for view in scene.views if view.camera is not None]
-    width, height = max(sizes, default=(1, 1))
-    return 1 if width * height <= AFFORDABLE else round(width * math.sqrt(AFFORDABLE / (width * height)))
-
-
-def cores() -> int:
-    """The cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

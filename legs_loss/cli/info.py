@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _without_store(path: Path) -> str:
-    """What is said of a folder that is no store."""
+    """Return the message for a folder that is no store."""
     from legs_loss.errors import LegsError
     from legs_loss.scenes import read_scene
     from legs_loss.store import MANIFEST

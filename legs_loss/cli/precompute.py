@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Dict, Iterable
 
-from legs_loss.system import say
+from legs_loss.system import cores, say
 
 if TYPE_CHECKING:
     from legs_loss.precompute.many_scenes import SceneDone, SceneTask
@@ -26,7 +26,6 @@ HELP = "compute the weight maps of scenes once, for every later training"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    from legs_loss.cli.demo import cores
     from legs_loss.spec import PRESETS
 
     parser.add_argument(
@@ -90,7 +89,6 @@ def run(args: argparse.Namespace) -> int:
 def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     """Check what can be checked before anything is computed; return the tasks, and their stores as they were named."""
     from legs_loss.cli.checks import check_resolution
-    from legs_loss.cli.demo import cores
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import SceneTask, find_scenes, stores_of
     from legs_loss.scenes import read_scene

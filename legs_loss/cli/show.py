@@ -128,7 +128,7 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
 
 
 def _photograph(view: View, entry: Entry) -> Optional[np.ndarray]:
-    """The very image that a map was made from, None if it is missing or has changed."""
+    """Return the very image that a map was made from, None if it is missing or has changed."""
     from legs_loss.errors import LegsError
     from legs_loss.scenes import image_size, load_training_image, training_size
     from legs_loss.store import fingerprint

@@ -155,7 +155,7 @@ def progress_bar(iterations: int, name: str, position: int = 0) -> Iterator[Call
 
 
 def _resumed(checkpoint: Path, given: Dict[str, Any]) -> TrainConfig:
-    """The settings of the run in the output folder; the flags that were given must be the same."""
+    """Return the settings of the run in the output folder; the flags that were given must be the same."""
     from legs_loss.errors import LegsError
     from legs_loss.reference.training.checkpoint import read_state
     from legs_loss.reference.training.trainer import TrainConfig

@@ -54,22 +54,22 @@ class ArmSpec:
 
     @property
     def folder(self) -> str:
-        """The name as a folder's, on any system."""
+        """Return the name as a folder's, on any system."""
         return self.name.replace(":", "-").replace("@", "-at-").replace("=", "-").replace(",", "-")
 
     @property
     def weighting(self) -> Optional[str]:
-        """The name of what makes its weights during the run, None where its spec does."""
+        """Return the name of what makes its weights during the run, None where its spec does."""
         return next((change for change in self.changes if change in _WEIGHTINGS), None)
 
     @property
     def loss(self) -> Optional[str]:
-        """The name of its iterations' loss, None for 3DGS's with weights."""
+        """Return the name of its iterations' loss, None for 3DGS's with weights."""
         return "ssim" if "ssim" in self.changes else None
 
     @property
     def needs_mean_weight(self) -> bool:
-        """Whether :meth:`config` needs the mean weight of the spec's maps."""
+        """Return whether :meth:`config` needs the mean weight of the spec's maps."""
         return "scale" in self.changes or "threshold" in self.changes
 
     def config(self, base: TrainConfig, threshold: float, mean_weight: float) -> TrainConfig:

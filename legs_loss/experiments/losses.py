@@ -14,7 +14,7 @@ __all__ = ["LOSSES"]
 
 
 def weighted_ssim(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lambda_dssim: float) -> Tensor:
-    """The weights multiply both terms pixel by pixel: the error, and 1 - SSIM before its mean is taken."""
+    """Return the loss whose weights multiply both terms pixel by pixel: the error, and 1 - SSIM before its mean."""
     if weight is None:
         return step_loss(prediction, target, weight, lambda_dssim)
     structural = (weight * (1.0 - ssim_map(prediction, target))).mean()

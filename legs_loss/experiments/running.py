@@ -85,7 +85,7 @@ class Comparison:
 
     @property
     def data(self) -> Dataset:
-        """The baseline's views."""
+        """Return the baseline's views."""
         if self._data is None:
             base = self.base
             self._data = load_dataset(
@@ -94,7 +94,7 @@ class Comparison:
         return self._data
 
     def mean_weight(self, spec: WeightSpec) -> float:
-        """The mean weight of a spec's maps over the training views."""
+        """Return the mean weight of a spec's maps over the training views."""
         if spec not in self._mean_weights:
             means = [
                 float(weight.double().mean()) for weight in weight_maps((view.image for view in self.data.train), spec)
@@ -103,11 +103,11 @@ class Comparison:
         return self._mean_weights[spec]
 
     def folder(self, arm: ArmSpec, seed: int) -> Path:
-        """Where a row lies."""
+        """Return the folder of a row."""
         return self.out / arm.folder / f"seed-{seed}"
 
     def row(self, arm: ArmSpec, seed: int) -> Optional[Row]:
-        """The row of an arm and seed, None if it is not trained yet."""
+        """Return the row of an arm and seed, None if it is not trained yet."""
         path = self.folder(arm, seed) / "row.json"
         return read_json(path, _ROW) if path.is_file() else None
 
@@ -256,7 +256,7 @@ def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progre
 
 
 def versions() -> Dict[str, str]:
-    """What a result may depend on."""
+    """Return the versions that a result may depend on."""
     import numba
     import torch
 
@@ -272,7 +272,7 @@ def versions() -> Dict[str, str]:
 
 
 def _code() -> str:
-    """A checksum of this package's sources: they change more often than its version, and rounding with them."""
+    """Return a checksum of this package's sources: they change more often than its version, and rounding with them."""
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parents[1]
     for path in sorted(package.rglob("*.py")):
@@ -281,7 +281,7 @@ def _code() -> str:
 
 
 def _planned(name: str, plan: Mapping[str, Any], root: Path, images: Optional[str], folder: Optional[Path]) -> Arm:
-    """The training that a plan describes; a folder that has its checkpoint is gone on with."""
+    """Return the training that a plan describes; a folder that has its checkpoint is gone on with."""
     config = TrainConfig.from_dict(plan["config"])
     return Arm(
         name,

@@ -1,4 +1,4 @@
-"""What rows say: means and spreads over seeds, and differences paired view by view with an interval."""
+"""Means and spreads of rows over seeds, and differences paired view by view with an interval."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Difference(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        """Whether the interval excludes 0 and every seed has the same sign."""
+        """Return whether the interval excludes 0 and every seed has the same sign."""
         return bool(self.low * self.high > 0 and all(seed * self.mean > 0 for seed in self.seeds))
 
 
@@ -197,7 +197,7 @@ def times_gaussians(rows: Rows, arm: str, reference: str) -> Optional[float]:
 
 
 def _table(rows: Rows, arm: str, reference: str, split: str, score: str) -> Optional[np.ndarray]:
-    """The differences by seed and view, [seeds, views]; None if the arms share no seed or a row lacks the metric."""
+    """Return the differences [seeds, views]; None if the arms share no seed or a row lacks the metric."""
     ours, theirs = _scores(rows, arm, split, score), _scores(rows, reference, split, score)
     seeds = sorted(set(ours) & set(theirs))
     if not seeds or not ours[seeds[0]]:

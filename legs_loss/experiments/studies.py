@@ -33,7 +33,7 @@ class Study(NamedTuple):
     degraded: bool = False
 
     def reference(self, arm: str) -> Optional[str]:
-        """The arm that this one is measured against, None for the baseline itself."""
+        """Return the arm that this one is measured against, None for the baseline itself."""
         return self.against.get(arm, None if arm == "3dgs" else "3dgs")
 
 

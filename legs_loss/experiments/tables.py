@@ -169,7 +169,7 @@ def again_text(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 
 
 def _scores_agree(then: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether every view has the same scores, of the metrics that both rows have."""
+    """Return whether every view has the same scores, of the metrics that both rows have."""
     for split, views in then["metrics"]["views"].items():
         for view, scores in views.items():
             again = now["metrics"]["views"][split].get(view, {})

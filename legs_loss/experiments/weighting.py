@@ -24,7 +24,7 @@ SCALES = (1, 2, 4)  # the photograph's own size, a half and a quarter of it
 
 
 def shuffled(views: List[TrainingView], config: TrainConfig) -> Weigh:
-    """Each map's pixels in random order, another one a view and a seed: the same weights without their places."""
+    """Return each map's pixels in random order, another a view and a seed: the same weights without their places."""
     generator = torch.Generator().manual_seed(1_000_003 + config.seed)
     maps = [_shuffle(view.weight, generator) for view in views]
     return lambda index, done, rendering: maps[index]
@@ -41,7 +41,7 @@ def fading(views: List[TrainingView], config: TrainConfig) -> Weigh:
 
 
 def multiscale(views: List[TrainingView], config: TrainConfig) -> Weigh:
-    """The mean of the normalised responses at three sizes of the photograph, in place of the one at its own size."""
+    """Return the mean of the normalised responses at three sizes of the photograph, not the one at its own."""
     spec = config.weights
     means = [torch.stack([_response_at(view.image, scale, spec) for scale in SCALES]).mean(0) for view in views]
     maps = [weight_from_response(mean, spec) for mean in means]
@@ -49,12 +49,12 @@ def multiscale(views: List[TrainingView], config: TrainConfig) -> Weigh:
 
 
 def late(views: List[TrainingView], config: TrainConfig) -> Weigh:
-    """The spec's weights from a third of the run on; 3DGS's own loss before."""
+    """Return the spec's weights from a third of the run on; 3DGS's own loss before."""
     return _from(1.0 / 3.0, views, config)
 
 
 def latest(views: List[TrainingView], config: TrainConfig) -> Weigh:
-    """The spec's weights from two thirds of the run on; 3DGS's own loss before."""
+    """Return the spec's weights from two thirds of the run on; 3DGS's own loss before."""
     return _from(2.0 / 3.0, views, config)
 
 

@@ -1,4 +1,4 @@
-"""Which code computes the loss: torch, or a backend where one is installed and works.
+"""Choose the code that computes the loss: torch, or a backend where one is installed and works.
 
 A backend is tried once before it is used, on a small image against torch. One that is not installed is passed over in
 silence; one that fails, then or later, is named once on stderr; torch does the work then.
@@ -46,7 +46,7 @@ _OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 
 
 class Finding(NamedTuple):
-    """What trying a backend on a device gave: the backend, or why it is not used.
+    """The result of trying a backend on a device: the backend, or why it is not used.
 
     Attributes:
         backend: None where it is not used.
@@ -237,13 +237,13 @@ def _map(values: Optional[Tensor], target: Tensor, channels_last: bool, name: st
 
 
 def _plain_tensors(prediction: Tensor, *constants: Optional[Tensor]) -> bool:
-    """Whether the values are plainly in memory, and a gradient flows to the prediction only."""
+    """Return whether the values are plainly in memory, and a gradient flows to the prediction only."""
     given = [tensor for tensor in constants if isinstance(tensor, Tensor)]
     return not any(tensor.requires_grad for tensor in given) and not any(map(_is_special, (prediction, *given)))
 
 
 def _is_special(tensor: Tensor) -> bool:
-    """Whether this is a subclass, or what torch.func wraps."""
+    """Return whether this is a subclass, or what torch.func wraps."""
     if type(tensor) not in (Tensor, torch.nn.Parameter):
         return True
     functorch = getattr(torch._C, "_functorch", None)

@@ -1,4 +1,4 @@
-"""What a backend is: what it declares, and the operations that it offers. torch is the reference for each of them.
+"""The contract of a backend: what it declares, and the operations that it offers. torch is the reference.
 
 A backend never meets what it did not declare: backends.py hands that to torch. So no kernel needs a branch for "any
 other curve", which would compute something else without a word.
@@ -21,7 +21,7 @@ class NotNow(Exception):
 
 
 class Weights(NamedTuple):
-    """Where the weight of a pixel comes from. With none of it given the weight is 1.
+    """The weight of a pixel, in one of three forms. With none of them given it is 1.
 
     Attributes:
         spec: the weight is made from the target by this spec; never beside ``map``.

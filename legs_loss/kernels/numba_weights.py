@@ -31,7 +31,7 @@ class Images(NamedTuple):
 
 
 class WeightSource(NamedTuple):
-    """Where weights come from: nowhere (kind 0), a map (1), or the target (2).
+    """The source of weights: none (kind 0), a map (1), or the target (2).
 
     stored: kind 1: float32 [height * width] for all views, or [views * height * width].
     ranges: kind 2: float32 [views, 2]: the least response, and the greatest less the least plus eps.

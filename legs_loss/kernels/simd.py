@@ -121,7 +121,7 @@ def _is_row(array: Any, dtype: Any) -> bool:
 
 
 def _vector_of(array: Any) -> Any:
-    """The kind of vector that a row holds, or None where it is no row of either."""
+    """Return the kind of vector that a row holds, or None where it is no row of either."""
     return next((kind for dtype, kind in _KINDS.items() if _is_row(array, dtype)), None)
 
 

@@ -34,7 +34,7 @@ class SceneTask(NamedTuple):
 
 
 class SceneDone(NamedTuple):
-    """What was done of a scene; ``alike`` is the number of its views that share a name in 3DGS with another."""
+    """The report of a scene; ``alike`` is the number of its views that share a name in 3DGS with another."""
 
     report: Report
     alike: int

@@ -26,7 +26,7 @@ _COMMIT_SECONDS = 1.0
 
 @dataclass
 class Report:
-    """What :func:`precompute` did, by the names of views: maps made, maps kept, and views skipped with the reason."""
+    """The result of :func:`precompute`, by names of views: maps made, maps kept, views skipped with the reason."""
 
     store: Path
     made: List[str] = field(default_factory=list)

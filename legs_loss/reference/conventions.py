@@ -34,7 +34,7 @@ SH_C3 = (
 
 
 class View(NamedTuple):
-    """What the rasterizer needs of a camera, as plain numbers."""
+    """A camera as the rasterizer needs it, in plain numbers."""
 
     width: int
     height: int
@@ -47,17 +47,17 @@ class View(NamedTuple):
 
     @property
     def tiles(self) -> Tuple[int, int]:
-        """Tiles across and down."""
+        """Return tiles across and down."""
         return -(-self.width // TILE), -(-self.height // TILE)
 
     @property
     def limits(self) -> Tuple[float, float]:
-        """Where |x/z| and |y/z| are held in the linearised projection."""
+        """Return the limits at which |x/z| and |y/z| are held in the linearised projection."""
         return GUARD * self.width / (2 * self.fx), GUARD * self.height / (2 * self.fy)
 
     @classmethod
     def of(cls, camera: Any) -> View:
-        """From anything with a pinhole camera's attributes (`legs_loss.scenes.Camera`)."""
+        """Make one of anything with a pinhole camera's attributes (`legs_loss.scenes.Camera`)."""
         world_to_camera = np.ascontiguousarray(camera.world_to_camera, dtype=np.float64)
         rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
         position = -np.linalg.solve(rotation, translation)

@@ -32,17 +32,17 @@ class Gaussians:
 
     @property
     def scales(self) -> Tensor:
-        """Standard deviations along the Gaussians' axes, [N, 3], world units."""
+        """Return standard deviations along the Gaussians' axes, [N, 3], world units."""
         return torch.exp(self.log_scales)
 
     @property
     def opacities(self) -> Tensor:
-        """[N, 1] in (0, 1)."""
+        """Return [N, 1] in (0, 1)."""
         return torch.sigmoid(self.opacity_logits)
 
     @classmethod
     def from_points(cls, xyz: Any, rgb: Any, sh_degree: int = 3, opacity: float = 0.1) -> Gaussians:
-        """3DGS's start from a point cloud: round, opacity 0.1, as wide as the three nearest points are far.
+        """Start as 3DGS from a point cloud: round, opacity 0.1, as wide as the three nearest points are far.
 
         xyz [N, 3]; rgb [N, 3] uint8 (arrays or tensors). The scale is the root mean square of the three distances.
         """
@@ -59,7 +59,7 @@ class Gaussians:
 
 
 def _mean_square_distance(points: Tensor, neighbours: int = 3, block: int = 1024) -> Tensor:
-    """[N]: to each point's nearest neighbours, itself left out; block by block, so that memory stays bounded."""
+    """Return [N]: to each point's nearest neighbours, itself left out; block by block, so that memory stays bounded."""
     neighbours = min(neighbours, len(points) - 1)
     if neighbours < 1:
         return torch.ones(len(points))

@@ -107,7 +107,7 @@ def _sheet(
 
 
 def _detail(photograph: Tensor) -> Tuple[slice, slice]:
-    """The window of a third of the size with the most contours, for a closer look."""
+    """Return the window of a third of the size with the most contours, for a closer look."""
     height, width = photograph.shape[1:]
     size = max(1, height // 3), max(1, width // 3)
     strength = torch.nn.functional.avg_pool2d(response(photograph)[None], size, stride=1)[0, 0]

@@ -201,7 +201,7 @@ def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> str:
 
 
 def _table(caption: str, heads: Sequence[str], body: Sequence[Sequence[Tuple[str, str]]], sortable: bool = True) -> str:
-    """A table; each cell is its text and the value that it sorts by."""
+    """Return a table; each cell is its text and the value that it sorts by."""
     from markupsafe import Markup
 
     nothing = Markup("")

@@ -76,7 +76,7 @@ def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView, scene: Op
 
 
 def _upstreams_own(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Tensor:
-    """The codebase's own rendering of a held-out view."""
+    """Return the codebase's own rendering of a held-out view."""
     path = row["upstream"]["pictures"].get(view.name)
     if path is None or not (folder / path).is_file():
         raise LegsError(f"{row['arm']} left no rendering of {view.name}: choose held-out views (--views)")
@@ -84,7 +84,7 @@ def _upstreams_own(row: Mapping[str, Any], folder: Path, view: TrainingView) -> 
 
 
 def _weight(spec: WeightSpec, photograph: Tensor, rendering: Tensor, scene: Optional[Tensor]) -> Optional[Tensor]:
-    """The weight map at the end of the run; None where nothing is weighted."""
+    """Return the weight map at the end of the run; None where nothing is weighted."""
     if spec.unweighted:
         return None
     if spec.error > 0.0:

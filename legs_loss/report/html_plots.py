@@ -41,7 +41,7 @@ def colours(arms: Sequence[str]) -> Dict[str, Tuple[str, str]]:
 
 
 def by_iterations(rows: Rows, arms: Sequence[str]) -> str:
-    """Held-out PSNR during the runs, the mean over seeds, the band from the lowest to the highest."""
+    """Plot held-out PSNR during the runs: the mean over seeds, a band from the lowest to the highest."""
     figure, axes = _figure(1)
     style = colours(arms)
     for arm in arms:
@@ -57,7 +57,7 @@ def by_iterations(rows: Rows, arms: Sequence[str]) -> str:
 
 
 def by_gaussians(rows: Rows, arms: Sequence[str]) -> str:
-    """Training and held-out PSNR against the number of Gaussians at the end: each seed, and their mean, larger."""
+    """Plot training and held-out PSNR by the number of Gaussians at the end: each seed, their mean larger."""
     figure, axes = _figure(2)
     style = colours(arms)
     for panel, split, title in ((axes[0], "train", "training views"), (axes[1], "test", "held-out views")):

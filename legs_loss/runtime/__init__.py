@@ -1,4 +1,4 @@
-"""What a training script talks to: ``l1_loss``, in place of the codebase's own.
+"""The drop-in ``l1_loss`` that a training script calls in place of the codebase's own.
 
 It weights only a prediction that is being trained on; under ``no_grad`` it is the plain mean, so that reported metrics
 do not change. call.py is the call and the loss, sources.py where its weights come from, memo.py what is remembered of

@@ -124,7 +124,7 @@ def _size(weight: Tensor) -> int:
 
 
 class _Entry:
-    """What is remembered of a target; of a large map of the CPU the bytes, in pages of their own.
+    """An entry of the memo; of a large map of the CPU it has the bytes, in pages of their own.
 
     A tensor that is kept on the heap lies among the temporaries that it was made from, and what they leave does not fit
     the next ones: a memo of such tensors took twice what it counted.

@@ -1,4 +1,4 @@
-"""Where the weight of a target comes from: the memo, the store, or the target itself, in this order.
+"""Find the weight of a target: in the memo, in the store, or from the target itself, in this order.
 
 The memo knows a target that it can prove to be the same as before. The store is used for the very image that its map
 was made from, which the target's fingerprint tells. For all others the target itself is asked: a backend wants two
@@ -32,7 +32,7 @@ __all__ = ["Counts", "WeightSource"]
 
 @dataclass
 class Counts:
-    """How often ``l1_loss`` was called in this process, and where its weights came from.
+    """Counts of this process's calls of ``l1_loss``, and of where its weights came from.
 
     Attributes:
         weighted: calls that trained with a weight.

@@ -71,7 +71,7 @@ class Run:
 
 
 class _Thread(threading.local):
-    """How many calls of `unweighted` functions a thread is in."""
+    """The number of calls of `unweighted` functions that a thread is in."""
 
     def __init__(self) -> None:
         self.unweighted = 0  # on the instance: torch.compile does not ask again what the class says

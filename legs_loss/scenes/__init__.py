@@ -58,7 +58,7 @@ def _read_scene(root: Path, images: Optional[str]) -> Scene:
 
 
 def _images_folder(root: Path, images: str) -> Tuple[Path, str]:
-    """The folder of the photographs and what goes before their names."""
+    """Return the folder of the photographs and what goes before their names."""
     folder = root / images  # pathlib keeps an absolute ``images`` as it is
     if not folder.is_dir():
         if not os.path.isdir(images):

@@ -52,7 +52,7 @@ class _Image(NamedTuple):
 
 
 def find_model(root: Path) -> Optional[Path]:
-    """The folder of a scene's sparse model, ``sparse/0`` or else ``sparse``; None without one."""
+    """Return the folder of a scene's sparse model, ``sparse/0`` or else ``sparse``; None without one."""
     for folder in (root / "sparse" / "0", root / "sparse"):
         if (folder / "images.bin").is_file() or (folder / "images.txt").is_file():
             return folder
@@ -157,7 +157,7 @@ def _pinhole(lens: _Intrinsics, image: _Image) -> Optional[Camera]:
 
 
 def _rotation(quaternion: Tuple[float, ...]) -> np.ndarray:
-    """[3, 3] of a quaternion w, x, y, z of any length: v -> 2 u (u.v) + (w^2 - u.u) v + 2w u x v."""
+    """Return [3, 3] of a quaternion w, x, y, z of any length: v -> 2 u (u.v) + (w^2 - u.u) v + 2w u x v."""
     w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
     u = np.array([x, y, z])
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -165,7 +165,7 @@ def _rotation(quaternion: Tuple[float, ...]) -> np.ndarray:
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """The quaternion w, x, y, z with w >= 0 of a rotation [3, 3]."""
+    """Return the quaternion w, x, y, z with w >= 0 of a rotation [3, 3]."""
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
     # Row k is 4 q_k q: the one with the largest diagonal is the safest to divide by.
     products = np.array(

@@ -155,7 +155,7 @@ def open_image(path: Path) -> Iterator[Any]:
 
 @lru_cache(maxsize=None)
 def _formats() -> Tuple[str, ...]:
-    """Those of :data:`FORMATS` that this Pillow was built with."""
+    """Return those of :data:`FORMATS` that this Pillow was built with."""
     from PIL import Image
 
     Image.init()
@@ -169,7 +169,7 @@ def row_strips(height: int, width: int) -> Iterator[slice]:
 
 
 def _pixels(image: Any) -> np.ndarray:
-    """The values of an image without its alpha, [H, W, C]; in strips, since Pillow copies what it hands over thrice."""
+    """Return an image's values without its alpha, [H, W, C]; in strips: Pillow copies what it hands over thrice."""
     width, height = image.size
     pixels = np.empty((height, width, 1 if image.mode == "L" else 3), np.uint8)
     for rows in row_strips(height, width):
@@ -179,7 +179,7 @@ def _pixels(image: Any) -> np.ndarray:
 
 
 def _colour_mode(image: Any) -> str:
-    """The one of L, RGB and RGBA that keeps what the image shows."""
+    """Return the one of L, RGB and RGBA that keeps what the image shows."""
     if image.mode == "F":
         raise LegsError("an image of floats: save it with 8 or 16 bits")
     if image.mode in ("L", "1"):

@@ -1,4 +1,4 @@
-"""What a scene is: views with cameras, and the points to start from."""
+"""A scene: views with cameras, and the points to start from."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Camera:
     world_to_camera: np.ndarray
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera for the image resized to ``width`` x ``height``.
+        """Return the same camera for the image resized to ``width`` x ``height``.
 
         >>> camera = Camera(400, 300, 500.0, 500.0, 200.0, 150.0, np.eye(4))
         >>> half = camera.resized(200, 150)
@@ -89,7 +89,7 @@ class Scene:
 
     @property
     def points(self) -> Optional[PointCloud]:
-        """COLMAP's points, or None; read from disk at every call, since most users of a scene need none.
+        """Return COLMAP's points, or None; read from disk at every call, since most users of a scene need none.
 
         Raises :class:`LegsError` when the file is damaged.
         """

@@ -114,7 +114,7 @@ def _photographs(folder: Path) -> List[str]:
 
 
 def _one_camera(folder: Path, names: Sequence[str]) -> bool:
-    """Whether all photographs have one size, and one focal length as far as they tell it."""
+    """Return whether all photographs have one size, and one focal length as far as they tell it."""
     from PIL import Image
 
     kinds = set()

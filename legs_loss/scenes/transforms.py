@@ -30,7 +30,7 @@ _WRONG = (ArithmeticError, ValueError, TypeError, LookupError, AttributeError, R
 
 
 def find_transforms(root: Path) -> List[Path]:
-    """NeRF's ``transforms_{train,test,val}.json``, else ``transforms.json``; [] without any."""
+    """Return NeRF's ``transforms_{train,test,val}.json``, else ``transforms.json``; [] without any."""
     if (root / "transforms_train.json").is_file():
         files = [root / f"transforms_{split}.json" for split in ("train", "test", "val")]
         return [file for file in files if file.is_file()]
@@ -86,7 +86,7 @@ def _read_file(root: Path, file: Path) -> List[View]:
 
 
 def _image_name(root: Path, file_path: str) -> str:
-    """The image's path relative to the scene, with the extension that the file on disk has."""
+    """Return the image's path relative to the scene, with the extension that the file on disk has."""
     if "\0" in file_path or not file_path:
         raise ValueError(f"a frame has the file_path {file_path!r}, which no file can have")
     name = posixpath.normpath(file_path.replace("\\", "/"))
@@ -99,14 +99,14 @@ def _image_name(root: Path, file_path: str) -> str:
 
 
 def _model(intrinsics: Dict[str, Any]) -> str:
-    """The name of the camera's model; OPENCV without any distortion is a PINHOLE."""
+    """Return the name of the camera's model; OPENCV without any distortion is a PINHOLE."""
     distorted = any(intrinsics.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = intrinsics.get("camera_model", "OPENCV")
     return "PINHOLE" if model == "OPENCV" and not distorted else str(model)
 
 
 def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
-    """A frame's camera; None where its size is not written and the image cannot be opened."""
+    """Return a frame's camera; None where its size is not written and the image cannot be opened."""
     if "w" in intrinsics:
         width, height = int(intrinsics["w"]), int(intrinsics["h"])
     else:

@@ -28,7 +28,7 @@ _CHECKSUM = re.compile(r"[0-9a-f]{64}")
 
 
 class DamagedStoreError(LegsError):
-    """What a store holds is not what was written to it."""
+    """A store's files are not those that were written to it."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Entry:
 
     @property
     def key(self) -> Tuple[Any, ...]:
-        """What there is one map of: a view at a size with an operator."""
+        """Return what tells a map from all others: a view at a size with an operator."""
         return self.view, self.height, self.width, self.operator, self.p, self.eps, self.smooth
 
 

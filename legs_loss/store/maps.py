@@ -34,7 +34,7 @@ def read_map(folder: Path, entry: Entry) -> np.ndarray:
 
 
 def _checked_map(path: Path, data: bytes, entry: Entry) -> np.ndarray:
-    """The array of an .npy file, which a stranger may have written, if it can be a normalised response."""
+    """Return the array of an .npy file, which a stranger may have written, if it can be a normalised response."""
     file = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(file)
@@ -85,7 +85,7 @@ def stage(staging: Path, entry: Entry, normalised: np.ndarray) -> Entry:
 
 
 def _npy(array: np.ndarray) -> Tuple[bytes, memoryview]:
-    """An .npy file in two parts, its head and the array's own memory: numpy.save to a buffer would copy that."""
+    """Return an .npy file in two parts, its head and the array's own memory: numpy.save to a buffer would copy that."""
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
     return head.getvalue(), array.reshape(-1).view(np.uint8).data

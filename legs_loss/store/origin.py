@@ -1,4 +1,4 @@
-"""Where a store's photographs lie: a note beside the maps, for a store that is not in its scene's folder.
+"""Find a store's photographs: by a note beside the maps, where a store is not in its scene's folder.
 
 The note only says where to look. Whoever reads it compares fingerprints before a photograph is taken for a map's own.
 """

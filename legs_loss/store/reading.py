@@ -22,7 +22,7 @@ __all__ = ["Damage", "WeightStore"]
 
 
 class Damage(NamedTuple):
-    """What is wrong with a store: entries whose map is damaged or missing, and files that belong to no entry."""
+    """The damage of a store: entries whose map is damaged or missing, and files that belong to no entry."""
 
     damaged: List[Entry]
     orphans: List[str]

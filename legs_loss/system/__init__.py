@@ -1,25 +1,28 @@
-"""What is asked of the machine: files, locks, processes, signals, the terminal, installed packages.
+"""Files, locks, processes, signals, the terminal, installed packages: all that is asked of the machine.
 
 Nothing here knows of images or losses, and nothing imports torch. ``executors`` is imported by its own name.
 """
 
 from __future__ import annotations
 
-from legs_loss.system.ctrl_c import held_back, kept_from_children
+from legs_loss.system.ctrl_c import held_back, kept_from_children, noted
 from legs_loss.system.distributed import is_first_process
 from legs_loss.system.files import open_regular, read_regular, write_whole
 from legs_loss.system.locks import FileLock, HeldError, is_held
 from legs_loss.system.plugins import plugins
+from legs_loss.system.processors import cores
 from legs_loss.system.terminal import never_fail_to_print, printable, say
 
 __all__ = [
     "FileLock",
     "HeldError",
+    "cores",
     "held_back",
     "is_first_process",
     "is_held",
     "kept_from_children",
     "never_fail_to_print",
+    "noted",
     "open_regular",
     "plugins",
     "printable",

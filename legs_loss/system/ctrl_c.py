@@ -6,14 +6,16 @@ import os
 import signal
 import threading
 from contextlib import contextmanager
-from typing import Iterator, List
+from typing import Callable, Iterator, List
 
 try:
     from multiprocessing.resource_tracker import ensure_running
 except ImportError:  # Python 3.7's name
     from multiprocessing.semaphore_tracker import ensure_running  # type: ignore[no-redef]
 
-__all__ = ["held_back", "kept_from_children"]
+__all__ = ["held_back", "kept_from_children", "noted"]
+
+_RAISES = hasattr(signal, "raise_signal")  # from Python 3.8 on
 
 
 @contextmanager
@@ -38,19 +40,30 @@ def kept_from_children() -> Iterator[None]:
 
 
 @contextmanager
-def held_back() -> Iterator[None]:
-    """Hold Ctrl-C back over a few steps that belong together; it strikes right after them.
+def noted() -> Iterator[Callable[[], bool]]:
+    """Only note Ctrl-C meanwhile: yield what says whether it was struck.
 
-    Elsewhere than in the main thread, which alone gets Ctrl-C, nothing is done.
+    Elsewhere than in the main thread, which alone gets Ctrl-C, or where it is ignored, nothing is done.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
+    struck: List[int] = []  # no Event: its lock would wait for itself where Ctrl-C is struck twice
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+        yield lambda: False
         return
-    struck: List[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: struck.append(number))
+    signal.signal(signal.SIGINT, lambda number, _: struck.append(number))
     try:
-        yield
+        yield lambda: bool(struck)
     finally:
         signal.signal(signal.SIGINT, before if before is not None else signal.SIG_DFL)
-        if struck:
-            signal.raise_signal(signal.SIGINT) if hasattr(signal, "raise_signal") else os.kill(os.getpid(), struck[0])
+
+
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Hold Ctrl-C back over a few steps that belong together; it strikes right after them."""
+    struck: Callable[[], bool] = bool
+    try:
+        with noted() as struck:
+            yield
+    finally:
+        if struck():
+            signal.raise_signal(signal.SIGINT) if _RAISES else os.kill(os.getpid(), signal.SIGINT)

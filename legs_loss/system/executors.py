@@ -1,4 +1,4 @@
-"""Where tasks run: in this process, or on the workers of a dask scheduler. Both are concurrent.futures' Executor.
+"""Run tasks in this process, or on the workers of a dask scheduler. Both are concurrent.futures' Executor.
 
 A task is a function of a module with its arguments. One that has news takes ``tell``, which hands a message (numbers,
 strings, lists, dicts) to whoever waits. Workers must see the files that a task names: the file system is shared.
@@ -109,7 +109,7 @@ class _Cluster(Executor):
 
 
 class _Topic(NamedTuple):
-    """What a worker's messages are sent under; the scheduler passes them on."""
+    """The topic of a worker's messages; the scheduler passes them on."""
 
     name: str
 

@@ -1,4 +1,4 @@
-"""What there is to see in a folder or a .ply: the Gaussians of each method, and the scene that they were trained on."""
+"""Read what a folder or a .ply shows: the Gaussians of each method, and the scene that they were trained on."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def find_content(path: Path, scene: Optional[Path] = None) -> Content:
 
 
 def _runs(path: Path) -> Iterator[Tuple[str, Path]]:
-    """The folder's own last .ply, or those of the folders in it."""
+    """Return the folder's own last .ply, or those of the folders in it."""
     own = _last(path)
     if own is not None:
         yield path.resolve().name, own

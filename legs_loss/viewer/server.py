@@ -157,7 +157,7 @@ class _Cameras:
         return self.pictures[key]
 
     def _weight(self, view: View) -> np.ndarray:
-        """A weight map from black (1) to white (1 + beta), uint8 [H, W, 3]."""
+        """Return a weight map from black (1) to white (1 + beta), uint8 [H, W, 3]."""
         from legs_loss.levels import levels_of
         from legs_loss.weights import weight_map
 
@@ -168,7 +168,7 @@ class _Cameras:
 
 
 def _photograph(view: View) -> np.ndarray:
-    """A photograph, uint8 [H, W, 3]."""
+    """Return a photograph, uint8 [H, W, 3]."""
     return (_image(view).expand(3, -1, -1).permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
 
 
@@ -177,7 +177,7 @@ def _image(view: View) -> Any:
 
 
 def _pose(view: View) -> Tuple[np.ndarray, np.ndarray]:
-    """A camera's axes in the world [3, 3], and its position [3]."""
+    """Return a camera's axes in the world [3, 3], and its position [3]."""
     assert view.camera is not None
     rotation = view.camera.world_to_camera[:3, :3].T
     return rotation, -rotation @ view.camera.world_to_camera[:3, 3]
@@ -198,7 +198,7 @@ def _look_through(client: Any, wxyz: np.ndarray, position: np.ndarray) -> None:
 
 
 def _look_at_all(server: Any, loaded: Dict[str, Splats]) -> None:
-    """Without cameras: from outside, towards the middle of what is opaque."""
+    """Look from outside towards the middle of what is opaque, where there are no cameras."""
     points = np.concatenate([one.centers[one.opacities[:, 0] > 0.1] for one in loaded.values()])
     if not len(points):
         return

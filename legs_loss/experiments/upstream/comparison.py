@@ -105,7 +105,7 @@ class UpstreamComparison:
                 raise LegsError(f"{arm.name}: the profile {self.profile.name} names no threshold to change")
 
     def row(self, arm: ArmSpec, seed: int) -> Optional[Row]:
-        """The row of an arm and seed, None if it is not trained yet."""
+        """Return the row of an arm and seed, None if it is not trained yet."""
         path = self._folder(arm, seed) / "row.json"
         return read_json(path, ("arm", "seed", "metrics")) if path.is_file() else None
 
@@ -129,13 +129,13 @@ class UpstreamComparison:
         return rows
 
     def spec_of(self, arm: ArmSpec) -> WeightSpec:
-        """The settings that the drop-in is given for an arm."""
+        """Return the settings that the drop-in is given for an arm."""
         if "scale" not in arm.changes:
             return arm.spec
         return WeightSpec(beta=0.0, scale=self.mean_weight(arm.spec))
 
     def mean_weight(self, spec: WeightSpec) -> float:
-        """The mean weight of a spec's maps over the training views; NaN where they follow the rendering's error."""
+        """Return the mean weight of a spec's maps over the training views; NaN where they follow the error."""
         if spec.error > 0.0:
             return spec.scale if spec.normalise == "mean" else math.nan
         if spec not in self._mean_weights:
@@ -178,7 +178,7 @@ class UpstreamComparison:
         return self._row(arm, seed, spec, best[0], best[1])
 
     def _plain(self, arm: ArmSpec, seed: int) -> Optional[Row]:
-        """The row of the same loss at its own number, where it is there: a first point for the search."""
+        """Return the row of the same loss at its own number, where it is there: a first point for the search."""
         return self.row(replace(arm, name=arm.name.partition("@")[0], at=None), seed)
 
     def _row(self, arm: ArmSpec, seed: int, spec: WeightSpec, factor: float, metrics: Dict[str, Any]) -> Row:

@@ -1,4 +1,4 @@
-"""How a codebase is trained and rendered, as a TOML file says it: one a codebase in profiles/, and a user's own."""
+"""Read how a codebase is trained and rendered from a TOML file: one a codebase in profiles/, or a user's own."""
 
 from __future__ import annotations
 

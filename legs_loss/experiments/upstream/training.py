@@ -155,7 +155,7 @@ def gaussians_in(cloud: Path) -> int:
 
 
 def _run_name(output: Path) -> str:
-    """A name for a run whose codebase has a folder of its own for all runs: ARM-seed-N."""
+    """Return a name for a run whose codebase has a folder of its own for all runs: ARM-seed-N."""
     return "-".join(output.parts[-3:-1])
 
 
@@ -192,7 +192,7 @@ def _once(
 
 
 def _environment(spec: WeightSpec, seed: int) -> Dict[str, str]:
-    """The environment of a script whose loss has this spec, wherever a legs.toml may lie."""
+    """Return the environment of a script whose loss has this spec, wherever a legs.toml may lie."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
     environment.update({f"LEGS_{field.name.upper()}": str(getattr(spec, field.name)) for field in fields(spec)})
     environment.update(LEGS_OFF="1" if spec.unweighted else "0", PYTHONHASHSEED=str(seed))

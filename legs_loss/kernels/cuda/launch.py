@@ -1,4 +1,4 @@
-"""What a kernel is given, as legs.cu reads it (``struct Task``), and how many blocks it is given to."""
+"""Prepare launches: a kernel's arguments as legs.cu reads them (``struct Task``), and the number of blocks."""
 
 from __future__ import annotations
 

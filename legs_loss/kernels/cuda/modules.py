@@ -14,7 +14,7 @@ __all__ = ["PLAIN", "Modules", "Variant", "options", "source"]
 
 
 class Variant(NamedTuple):
-    """What legs.cu is compiled with; one module has all kernels of a variant.
+    """The settings that legs.cu is compiled with; one module has all kernels of a variant.
 
     Attributes:
         value: the images' type: 0 float32, 1 float16, 2 bfloat16.

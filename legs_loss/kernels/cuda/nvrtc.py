@@ -25,7 +25,7 @@ class CompilerError(Exception):
 
 
 class Compiled(NamedTuple):
-    """What a compilation gave.
+    """The result of a compilation.
 
     Attributes:
         binary: for ``cuModuleLoadData``: machine code, or PTX where the compiler is older than the GPU.

@@ -18,7 +18,7 @@ NEAR = 0.05
 
 
 class Hits(NamedTuple):
-    """Where N rays meet a surface: distance along the ray (inf: missed) and texture coordinates in [0, 1]."""
+    """The hits of N rays on a surface: distance along the ray (inf: missed), texture coordinates in [0, 1]."""
 
     distance: np.ndarray
     u: np.ndarray
@@ -32,7 +32,7 @@ class Lamp(NamedTuple):
     radius: float
 
     def points(self, count: int) -> np.ndarray:
-        """``count`` points spread evenly over the lamp, [count, 3]."""
+        """Return ``count`` points spread evenly over the lamp, [count, 3]."""
         k = np.arange(count)
         radius = self.radius * np.sqrt((k + 0.5) / count)
         angle = k * 2.399963  # the golden angle
@@ -87,12 +87,12 @@ class Quad:
         self.light: Optional[np.ndarray] = None
 
     def hull(self) -> np.ndarray:
-        """Points whose convex hull holds the surface."""
+        """Return points whose convex hull holds the surface."""
         a, b = self.across, self.down
         return self.corner + np.stack([0 * a, a, b, a + b])
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
-        """Rays from ``origin`` ([3] or [N, 3]) along ``direction`` [N, 3]."""
+        """Intersect rays from ``origin`` ([3] or [N, 3]) along ``direction`` [N, 3]."""
         dual = self._dual.astype(direction.dtype)
         start = ((origin - self.corner) @ self._dual.T).astype(direction.dtype)
         u, v, height = dual @ direction.T
@@ -108,7 +108,7 @@ class Quad:
         return Hits(np.where(inside, distance, np.inf), u, v)
 
     def shade(self, hits: Hits, origin: np.ndarray, direction: np.ndarray, lamp: Lamp) -> np.ndarray:
-        """Colours [N, 3] of the hit points of rays."""
+        """Return colours [N, 3] of the hit points of rays."""
         colour = _look_up(self.texture, hits.u, hits.v)
         if self.light is None:
             return colour
@@ -116,7 +116,7 @@ class Quad:
 
 
 class _Curved:
-    """What spheres and tubes share: Lambert shading without shadows, a contact shade below, a soft highlight."""
+    """The shading of spheres and tubes: Lambert without shadows, a contact shade below, a soft highlight."""
 
     texture: np.ndarray
     gloss: float
@@ -147,12 +147,12 @@ class Sphere(_Curved):
         self.casts_shadow: bool = True
 
     def hull(self) -> np.ndarray:
-        """Points whose convex hull holds the surface."""
+        """Return points whose convex hull holds the surface."""
         corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T
         return self.centre + self.radius * corners
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
-        """Rays from ``origin`` ([3] or [N, 3]) along ``direction`` [N, 3]."""
+        """Intersect rays from ``origin`` ([3] or [N, 3]) along ``direction`` [N, 3]."""
         offset = origin - self.centre
         a = (direction * direction).sum(1)
         b = (direction * offset).sum(1)
@@ -167,7 +167,7 @@ class Sphere(_Curved):
         return Hits(distance, u, v)
 
     def shade(self, hits: Hits, origin: np.ndarray, direction: np.ndarray, lamp: Lamp) -> np.ndarray:
-        """Colours [N, 3] of the hit points of rays."""
+        """Return colours [N, 3] of the hit points of rays."""
         point = origin + hits.distance[:, None] * direction
         return self._shade(hits, (point - self.centre) / self.radius, point, direction, lamp)
 
@@ -196,13 +196,13 @@ class Tube(_Curved):
         self.frame: np.ndarray = np.stack([side, np.cross(axis, side), axis])  # rows
 
     def hull(self) -> np.ndarray:
-        """Points whose convex hull holds the surface."""
+        """Return points whose convex hull holds the surface."""
         square = self.radius * np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]])
         local = np.concatenate([square, square + [0, 0, self.length]])
         return self.start + local @ self.frame
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
-        """Rays from ``origin`` ([3] or [N, 3]) along ``direction`` [N, 3]."""
+        """Intersect rays from ``origin`` ([3] or [N, 3]) along ``direction`` [N, 3]."""
         o = (origin - self.start) @ self.frame.T
         d = direction.astype(float) @ self.frame.T
         a = d[:, 0] ** 2 + d[:, 1] ** 2
@@ -217,7 +217,7 @@ class Tube(_Curved):
         return Hits(np.where(hit, distance, np.inf), u, np.clip(along / self.length, 0, 1))
 
     def shade(self, hits: Hits, origin: np.ndarray, direction: np.ndarray, lamp: Lamp) -> np.ndarray:
-        """Colours [N, 3] of the hit points of rays."""
+        """Return colours [N, 3] of the hit points of rays."""
         angle = (hits.u - 0.5) * 2 * np.pi
         normal = np.cos(angle)[:, None] * self.frame[0] + np.sin(angle)[:, None] * self.frame[1]
         point = origin + hits.distance[:, None] * direction
@@ -267,7 +267,7 @@ def render(
     height: int,
     samples: int = 3,
 ) -> Tuple[np.ndarray, np.ndarray]:
-    """One picture with ``samples`` x ``samples`` rays a pixel, and its depth.
+    """Render one picture with ``samples`` x ``samples`` rays a pixel, and its depth.
 
     Returns the picture float32 [height, width, 3] in [0, 1], and the depth along the optical axis at one ray next to
     the centre of each pixel, float32 [height, width]. The principal point is the middle of the picture.
@@ -294,7 +294,7 @@ def render(
 def _screen_rectangle(
     hull: np.ndarray, xs: np.ndarray, ys: np.ndarray, focal: float, samples: int
 ) -> Tuple[int, int, int, int]:
-    """Rows and columns of rays that may meet a surface whose hull, in camera axes, is given."""
+    """Return rows and columns of rays that may meet a surface whose hull, in camera axes, is given."""
     if hull[:, 2].max() < NEAR:
         return 0, 0, 0, 0
     if hull[:, 2].min() < NEAR:

@@ -48,7 +48,7 @@ def _room(random: np.random.RandomState) -> List[Quad]:
 
 
 def _pictures(random: np.random.RandomState) -> List[Quad]:
-    """What hangs on the walls and stands upright: a poster, a star chart, a board of text, a rug below."""
+    """Return the surfaces on the walls: a poster, a star chart, a board of text, and a rug below."""
     dark, red, paper = (0.10, 0.11, 0.15), (0.72, 0.14, 0.12), (0.93, 0.91, 0.84)
     poster = textures.plain((260, 420, 3)[:2], (0.13, 0.24, 0.42))
     textures.write(poster, "LEGS", 34, 66, 12, (0.96, 0.86, 0.42))
@@ -97,7 +97,7 @@ def _box(
     turn: float,
     faces: List[np.ndarray],
 ) -> List[Quad]:
-    """A box turned about the vertical: four sides (front, right, back, left) and the top."""
+    """Return a box turned about the vertical: four sides (front, right, back, left) and the top."""
     c, s = np.cos(turn), np.sin(turn)
     x, y = np.array([c, s, 0]) * size[0] / 2, np.array([-s, c, 0]) * size[1] / 2
     z = np.array([0, 0, size[2] / 2])
@@ -124,7 +124,7 @@ def _furniture(random: np.random.RandomState) -> List:
 
 
 def _still_life(random: np.random.RandomState) -> List:
-    """What stands on the table (its top is at 0.75 m) and hangs over it."""
+    """Return the surfaces of what stands on the table (its top is at 0.75 m) and hangs over it."""
     top = 0.75
     letters = textures.plain((96, 96), (0.90, 0.78, 0.30))
     textures.write(letters, "LEGS", 14, 3, 4, (0.12, 0.12, 0.30))
@@ -192,7 +192,7 @@ def _surfaces(seed: int) -> List:
 
 
 def _pose(index: int, count: int) -> np.ndarray:
-    """World to camera, [4, 4]: a hand-held sweep in front of the table, up and down as it goes."""
+    """Return world to camera, [4, 4]: a hand-held sweep in front of the table, up and down as it goes."""
     phase = 2 * np.pi * index / count + 0.4
     azimuth = np.radians(58) * np.sin(phase)
     distance = 2.75 + 0.25 * np.cos(2 * phase + 0.7)
@@ -215,7 +215,7 @@ def _sparse_points(
     count: int,
     random: np.random.RandomState,
 ) -> Tuple[np.ndarray, np.ndarray]:
-    """Points as structure from motion finds them: on texture and edges, a little off; float [N, 3] and uint8 [N, 3]."""
+    """Return points as structure from motion finds them, on texture and edges: float [N, 3] and uint8 [N, 3]."""
     gray = picture.mean(axis=2)
     detail = np.hypot(*np.gradient(gray)) + 0.02
     chosen = random.choice(gray.size, count, replace=False, p=(detail / detail.sum()).ravel())

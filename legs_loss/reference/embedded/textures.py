@@ -60,7 +60,7 @@ _GLYPHS = {
 
 
 def text_mask(text: str) -> np.ndarray:
-    """The pixels of one line of capitals, digits and ``.-+=()``: bool [7, 6 * len(text) - 1].
+    """Return the pixels of one line of capitals, digits and ``.-+=()``: bool [7, 6 * len(text) - 1].
 
     >>> print("\\n".join("".join(".#"[int(p)] for p in row) for row in text_mask("LE")))
     #.....#####
@@ -79,12 +79,12 @@ def text_mask(text: str) -> np.ndarray:
 
 
 def plain(size: Tuple[int, int], colour: Colour) -> np.ndarray:
-    """One colour; ``size`` is (height, width)."""
+    """Return one colour; ``size`` is (height, width)."""
     return np.broadcast_to(np.asarray(colour, np.float32), tuple(size) + (3,)).copy()
 
 
 def smooth_noise(size: Tuple[int, int], cells: int, random: np.random.RandomState) -> np.ndarray:
-    """Value noise in [0, 1], [height, width]: about ``cells`` bumps along the shorter side."""
+    """Return value noise in [0, 1], [height, width]: about ``cells`` bumps along the shorter side."""
     height, width = size
     step = min(height, width) / float(cells)
     rows, columns = np.arange(height) / step, np.arange(width) / step
@@ -98,7 +98,7 @@ def smooth_noise(size: Tuple[int, int], cells: int, random: np.random.RandomStat
 
 
 def fractal_noise(size: Tuple[int, int], cells: int, octaves: int, random: np.random.RandomState) -> np.ndarray:
-    """Octaves of ``smooth_noise``, each twice as fine and 0.6 as strong, in [0, 1]."""
+    """Sum octaves of ``smooth_noise``, each twice as fine and 0.6 as strong, in [0, 1]."""
     total = np.zeros(size, np.float32)
     for octave in range(octaves):
         total += 0.6**octave * smooth_noise(size, cells * 2**octave, random)
@@ -106,13 +106,13 @@ def fractal_noise(size: Tuple[int, int], cells: int, octaves: int, random: np.ra
 
 
 def tint(noise: np.ndarray, dark: Colour, light: Colour) -> np.ndarray:
-    """A ramp from ``dark`` to ``light`` along values in [0, 1]."""
+    """Return a ramp from ``dark`` to ``light`` along values in [0, 1]."""
     low, high = np.asarray(dark, np.float32), np.asarray(light, np.float32)
     return low + noise[..., None] * (high - low)
 
 
 def checker(size: Tuple[int, int], cell: int, dark: Colour, light: Colour, random: np.random.RandomState) -> np.ndarray:
-    """A checkerboard with ``cell``-texel fields, each field a slightly different shade."""
+    """Return a checkerboard with ``cell``-texel fields, each field a slightly different shade."""
     rows, columns = np.arange(size[0]) // cell, np.arange(size[1]) // cell
     odd = (rows[:, None] + columns[None, :]) % 2
     shade = 1 - 0.16 * random.rand(rows[-1] + 1, columns[-1] + 1)[rows][:, columns]
@@ -121,7 +121,7 @@ def checker(size: Tuple[int, int], cell: int, dark: Colour, light: Colour, rando
 
 
 def brick(size: Tuple[int, int], length: int, course: int, random: np.random.RandomState) -> np.ndarray:
-    """A running bond of bricks, ``length`` x ``course`` texels each, with light mortar."""
+    """Return a running bond of bricks, ``length`` x ``course`` texels each, with light mortar."""
     rows, columns = np.arange(size[0])[:, None], np.arange(size[1])[None, :]
     layer = rows // course
     shifted = columns + (layer % 2) * (length // 2)
@@ -135,7 +135,7 @@ def brick(size: Tuple[int, int], length: int, course: int, random: np.random.Ran
 
 
 def planks(size: Tuple[int, int], plank: int, random: np.random.RandomState) -> np.ndarray:
-    """Wooden planks ``plank`` texels wide, with a grain along the rows."""
+    """Return wooden planks ``plank`` texels wide, with a grain along the rows."""
     height, width = size
     grain = fractal_noise((height, max(width // 12, 8)), 24, 4, random)
     grain = np.repeat(grain, 13, axis=1)[:, :width]
@@ -147,7 +147,7 @@ def planks(size: Tuple[int, int], plank: int, random: np.random.RandomState) -> 
 
 
 def stripes(size: Tuple[int, int], widths: Sequence[int], colours: Sequence[Colour]) -> np.ndarray:
-    """Vertical stripes whose widths and colours repeat in turn."""
+    """Return vertical stripes whose widths and colours repeat in turn."""
     edges = np.cumsum(widths)
     index = np.searchsorted(edges, np.arange(size[1]) % edges[-1], side="right")
     pattern = np.arange(size[1]) // edges[-1] * len(widths) + index
@@ -156,7 +156,7 @@ def stripes(size: Tuple[int, int], widths: Sequence[int], colours: Sequence[Colo
 
 
 def star(size: int, spokes: int) -> np.ndarray:
-    """A Siemens star on white, black and white spokes that meet in the middle, inside rings."""
+    """Return a Siemens star on white, black and white spokes that meet in the middle, inside rings."""
     y, x = np.mgrid[:size, :size] - (size - 1) / 2.0
     radius, angle = np.hypot(x, y) / (size / 2.0), np.arctan2(y, x)
     black = (np.sin(angle * spokes) > 0) & (radius < 0.78)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, Dict, NamedTuple, Optional, Tuple
+from typing import Any, Callable, Dict, List, NamedTuple, Optional, Tuple
 
 import numba
 import numpy as np
@@ -10,14 +10,15 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from legs_loss.reference.conventions import DILATION, SH_C0, SQUARE, View
+from legs_loss.reference.conventions import SH_C0, View
 from legs_loss.reference.rasterizer import projection, projection_backward, sorting, strips
+from legs_loss.reference.rasterizer.groups import Camera, Footprint, Parameters, Splats
 
 Clip = Callable[..., None]
 
 
 class Tensors(NamedTuple):
-    """What a drawing is differentiable in.
+    """The tensors that a drawing is differentiable in.
 
     ``colours`` [N, 3] in place of ``sh``; ``covariances`` [N, 6] (xx, xy, xz, yy, yz, zz), world units^2, in place of
     ``scales`` and ``quaternions``.
@@ -33,22 +34,14 @@ class Tensors(NamedTuple):
     covariances: Optional[Tensor] = None
 
 
-class Footprint(NamedTuple):
-    """How far a splat reaches; the defaults are 3DGS's. In pixels^2, and in standard deviations (conventions.py)."""
-
-    dilation: float = DILATION
-    square: float = SQUARE
-
-
 class Drawing(NamedTuple):
     """All that drawing leaves behind: for the way back, and for who wants to know more of it.
 
     A slot is a strip in a Gaussian's box of strips; an entry, one that it reaches, sorted by strip and depth.
     """
 
-    parameters: Tuple[Optional[np.ndarray], ...]  # means, scales, quaternions, opacities, sh, covariances
-    degree: int
-    camera: Tuple[np.ndarray, np.ndarray, np.ndarray]  # intrinsics, world to camera, the camera's centre
+    parameters: Parameters
+    camera: Camera
     splats: np.ndarray
     radii: np.ndarray
     clamped: np.ndarray
@@ -62,12 +55,12 @@ class Drawing(NamedTuple):
     image: np.ndarray
 
     def recoloured(self, colours: Tensor, background: np.ndarray) -> Drawing:
-        """The same splats in other colours [N, 3], as they are: neither harmonics nor held at 0."""
+        """Return the same splats in other colours [N, 3], as they are: neither harmonics nor held at 0."""
         splats = self.splats.copy()
         splats[:, 6:9] = _array(colours)
         return self._replace(
-            parameters=(*self.parameters[:4], np.zeros((len(splats), 1, 3), np.float32), self.parameters[5]),
-            degree=0,
+            parameters=self.parameters._replace(sh=np.zeros((len(splats), 1, 3), np.float32)),
+            camera=self.camera._replace(degree=0),
             splats=splats,
             clamped=np.zeros_like(self.clamped),
             entries=np.empty_like(self.entries),
@@ -102,25 +95,24 @@ def draw(
     splats, boxes, slots, firsts, reached and radii.
     """
     count = len(tensors.means)
-    degree = degree if tensors.sh is not None else 0
-    sh = torch.zeros(count, 1, 3) if tensors.sh is None else tensors.sh
-    parameters = tuple(
-        None if tensor is None else _array(tensor)
-        for tensor in (tensors.means, tensors.scales, tensors.quaternions, tensors.opacities, sh, tensors.covariances)
+    parameters = Parameters(
+        means=_array(tensors.means),
+        scales=None if tensors.scales is None else _array(tensors.scales),
+        quaternions=None if tensors.quaternions is None else _array(tensors.quaternions),
+        opacities=_array(tensors.opacities),
+        sh=np.zeros((count, 1, 3), np.float32) if tensors.sh is None else _array(tensors.sh),
+        covariances=None if tensors.covariances is None else _array(tensors.covariances),
     )
-    size = np.array([view.width, view.height], np.int64)
-    camera = (
-        np.array([view.fx, view.fy, view.cx, view.cy, *view.limits]),
-        view.world_to_camera,
-        view.position,
+    camera = Camera(
+        degree=0 if tensors.sh is None else degree,
+        intrinsics=np.array([view.fx, view.fy, view.cx, view.cy, *view.limits]),
+        pose=view.world_to_camera,
+        position=view.position,
+        size=np.array([view.width, view.height], np.int64),
     )
-    splats = np.empty((count, 9))
-    depths = np.empty(count, np.float32)
-    radii = np.empty(count, np.int32)
-    clamped = np.empty((count, 3), np.bool_)
-    boxes = np.empty((count, 4), np.int32)
-    slots = np.empty(count, np.int64)
-    projection.project(*parameters, degree, *camera, size, *footprint, splats, depths, radii, clamped, boxes, slots)
+    found = Splats.empty(count)
+    projection.project(parameters, camera, footprint, found)
+    splats, depths, radii, clamped, boxes, slots = found
     if tensors.colours is not None:
         splats[:, 6:9] = _array(tensors.colours)
         clamped[:] = False
@@ -133,7 +125,6 @@ def draw(
     ranges, draws, bands = sorting.sort_entries(depths, slots, firsts, reached, across, down)
     return Drawing(
         parameters=parameters,
-        degree=degree,
         camera=camera,
         splats=splats,
         radii=radii,
@@ -150,7 +141,7 @@ def draw(
 
 
 def attach(drawing: Drawing, tensors: Tensors) -> Tuple[Tensor, Tensor]:
-    """A drawing as image [3, H, W] and radii int32 [N], with the gradient to the tensors it was drawn from."""
+    """Return a drawing as image [3, H, W] and radii int32 [N], with the gradient to the tensors it was drawn from."""
     # A colour is 1 / C0 of its constant harmonic, as the way back sees it.
     sh = tensors.sh if tensors.colours is None else tensors.colours[:, None] / SH_C0
     return _Attach.apply(*tensors[:4], sh, tensors.covariances, tensors.viewspace, drawing)
@@ -186,7 +177,6 @@ class _Attach(torch.autograd.Function):
     def backward(ctx: Any, g_image: Tensor, _: Any) -> Tuple[Optional[Tensor], ...]:
         arrays = (tensor.numpy() for tensor in ctx.saved_tensors[-len(ctx.large) :])
         it: Drawing = ctx.drawing._replace(**dict(zip(ctx.large, arrays)))
-        height, width = it.image.shape[1:]
         moments = strips.ABSOLUTE_MOMENTS if ctx.columns == 4 else strips.MOMENTS
         sums = sorting.make_sums(it.firsts, moments)
         strips.render_backward(
@@ -195,11 +185,10 @@ class _Attach(torch.autograd.Function):
         )  # fmt: skip
         shapes = [None if array is None else array.shape for array in it.parameters] + [(len(it.radii), ctx.columns)]
         gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
+        filled: List[Any] = [None if gradient is None else gradient.numpy() for gradient in gradients]
         projection_backward.project_backward(
-            *it.parameters, it.degree, *it.camera, it.splats, it.clamped, it.firsts, sums,
-            np.array([width / 2, height / 2]),
-            *[None if gradient is None else gradient.numpy() for gradient in gradients],
-        )  # fmt: skip
+            it.parameters, it.camera, it.splats, it.clamped, it.firsts, sums, Parameters(*filled[:-1]), filled[-1]
+        )
         found = [gradient if wanted else None for gradient, wanted in zip(gradients, ctx.needs_input_grad)]
         return (*found, None)
 
@@ -215,6 +204,6 @@ def render(
     sh_degree: int,
     viewspace: Optional[Tensor],
 ) -> Tuple[Tensor, Tensor]:
-    """Image [3, H, W] and radii int32 [N]; arguments as `rasterize` has checked them."""
+    """Return image [3, H, W] and radii int32 [N]; arguments as `rasterize` has checked them."""
     tensors = Tensors(means, scales, quaternions, opacities, sh, None, viewspace)
     return attach(draw(tensors, view, background, sh_degree), tensors)

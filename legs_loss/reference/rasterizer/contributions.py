@@ -79,7 +79,7 @@ def contribute(across, ranges, ends, splats, draws, entries, values, sums):
 
 @compiled()
 def _sensitive_strip(left, top, wide, tall, begin, end, draws, entries, image, g_image, squares):
-    """For each entry of a strip, the sum over its pixels of the squared derivative by its alpha."""
+    """Sum the squared derivative by its alpha over the pixels of each entry of a strip."""
     before, rest, g = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.float32), np.zeros((PIXELS, 3), np.float32)
     state = np.empty(STATE, np.float32)
     place(state[X:], state[T : T + PIXELS], wide, tall)

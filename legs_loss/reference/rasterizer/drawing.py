@@ -11,6 +11,7 @@ from torch import Tensor
 from legs_loss.reference.conventions import DILATION, NEAR, SQUARE, View
 from legs_loss.reference.rasterizer import compiled, contributions, sorting
 from legs_loss.reference.rasterizer.compiled import Clip, Tensors
+from legs_loss.reference.rasterizer.groups import Footprint
 from legs_loss.reference.rasterizer.oracle import rotations
 
 __all__ = ["Contributions", "Drawn", "Lens", "compensation", "covariance", "draw", "full"]
@@ -19,7 +20,7 @@ LEAST_RATIO = 0.000025  # of determinants, as in Inria's antialiasing
 
 
 class Lens(NamedTuple):
-    """How a fork's footprints differ from 3DGS's.
+    """The ways in which a fork's footprints differ from 3DGS's.
 
     Attributes:
         dilation: pixels^2, added to the diagonal of the splat's covariance.
@@ -195,5 +196,5 @@ def draw(
     if tensors.viewspace is not None and tensors.viewspace.requires_grad and lens.fade > 0:
         scale = (depths(tensors.means, view).detach() / lens.fade).square().clamp_max(1)[:, None]
         tensors.viewspace.register_hook(lambda gradient: gradient * scale)
-    footprint = compiled.Footprint(lens.dilation, lens.square)
+    footprint = Footprint(lens.dilation, lens.square)
     return Drawn(compiled.draw(tensors, view, background.detach(), sh_degree, footprint, clip), tensors, view)

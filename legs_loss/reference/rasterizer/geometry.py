@@ -17,7 +17,7 @@ from legs_loss.kernels.compiling import inlined
 
 @inlined
 def numbers(intrinsics, pose):
-    """A camera's arrays as numbers, which no loop has to read again: intrinsics [6]; the first three rows of a pose."""
+    """Return a camera's arrays as numbers: intrinsics [6], the first three rows of a pose. No loop reads them again."""
     fx, fy, cx, cy, limit_x, limit_y = intrinsics
     rows = (
         (pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]),
@@ -29,7 +29,7 @@ def numbers(intrinsics, pose):
 
 @inlined
 def to_camera(a, b, c, pose):
-    """A point in the camera's axes."""
+    """Return a point in the camera's axes."""
     x = pose[0][0] * a + pose[0][1] * b + pose[0][2] * c + pose[0][3]
     y = pose[1][0] * a + pose[1][1] * b + pose[1][2] * c + pose[1][3]
     z = pose[2][0] * a + pose[2][1] * b + pose[2][2] * c + pose[2][3]
@@ -38,7 +38,7 @@ def to_camera(a, b, c, pose):
 
 @inlined
 def rotation(w, x, y, z):
-    """Rotation matrix, the normalised quaternion, and the length it had."""
+    """Return rotation matrix, the normalised quaternion, and the length it had."""
     length = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     shorter = 1 / length
     w, x, y, z = w * shorter, x * shorter, y * shorter, z * shorter
@@ -58,14 +58,14 @@ def rotation(w, x, y, z):
 
 @inlined
 def held(value, z, limit):
-    """`value` (x or y), held where value / z leaves the guard, and whether it moves freely."""
+    """Return `value` (x or y), held where value / z leaves the guard, and whether it moves freely."""
     most = limit * z
     return max(min(value, most), -most), abs(value) <= most
 
 
 @inlined
 def linearised(x, y, z, intrinsics, pose):
-    """The 2x3 map from world directions to pixels at a point in the camera's axes."""
+    """Return the 2x3 map from world directions to pixels at a point in the camera's axes."""
     fx, fy, _, _, limit_x, limit_y = intrinsics
     held_x, _ = held(x, z, limit_x)
     held_y, _ = held(y, z, limit_y)
@@ -84,7 +84,7 @@ def linearised(x, y, z, intrinsics, pose):
 
 @inlined
 def times_rotation(t, r):
-    """A 2x3 matrix times a 3x3 one."""
+    """Return a 2x3 matrix times a 3x3 one."""
     return (
         t[0] * r[0] + t[1] * r[3] + t[2] * r[6],
         t[0] * r[1] + t[1] * r[4] + t[2] * r[7],
@@ -97,7 +97,7 @@ def times_rotation(t, r):
 
 @inlined
 def times_covariance(t, v):
-    """A 2x3 matrix times a covariance, given by its upper triangle's rows."""
+    """Return a 2x3 matrix times a covariance, given by its upper triangle's rows."""
     xx, xy, xz, yy, yz, zz = v
     return (
         t[0] * xx + t[1] * xy + t[2] * xz,
@@ -111,7 +111,7 @@ def times_covariance(t, v):
 
 @inlined
 def quaternion_partials(g, q):
-    """From the gradient to the rotation matrix (row-major) to that of the four numbers in its formula."""
+    """Return the gradient of the four numbers in a rotation matrix's formula, from the matrix's (row-major)."""
     w, x, y, z = q
     gw = 2 * (z * (g[3] - g[1]) + y * (g[2] - g[6]) + x * (g[7] - g[5]))
     gx = 2 * (y * (g[1] + g[3]) + z * (g[2] + g[6]) - 2 * x * (g[4] + g[8]) + w * (g[7] - g[5]))
@@ -122,7 +122,7 @@ def quaternion_partials(g, q):
 
 @inlined
 def quaternion_gradient(g, q, length):
-    """As `quaternion_partials`, to the quaternion before its normalisation."""
+    """Return the gradient as `quaternion_partials`, of the quaternion before its normalisation."""
     gw, gx, gy, gz = quaternion_partials(g, q)
     w, x, y, z = q
     along = w * gw + x * gx + y * gy + z * gz
@@ -132,7 +132,7 @@ def quaternion_gradient(g, q, length):
 
 @inlined
 def own_axes(a, b, determinant):
-    """A splat's own coordinates p x + q y and r x, x and y from its centre, in which its spread is 1 in all directions.
+    """Return a splat's own coordinates p x + q y and r x (x, y from its centre), in which its spread is 1 everywhere.
 
     Their squares add up to -2 times its power: conic = L^t L, L = [[p, q], [r, 0]]. From the covariance's xx and xy.
     """
@@ -142,20 +142,20 @@ def own_axes(a, b, determinant):
 
 @inlined
 def conic(p, q, r):
-    """The conic's xx, xy and yy."""
+    """Return the conic's xx, xy and yy."""
     return p * p + r * r, p * q, q * q
 
 
 @inlined
 def centre_gradient(axes, m1, m2):
-    """From the first moments, by a splat's own coordinates, of dL/dpower to the gradient of its centre."""
+    """Return the gradient of a splat's centre from the first moments of dL/dpower, by its own coordinates."""
     p, q, r = axes
     return p * m1 + r * m2, q * m1
 
 
 @inlined
 def covariance_gradient(axes, m11, m12, m22):
-    """From the second moments, a matrix M, to the gradient of the covariance's three numbers: L^t M L / 2."""
+    """Return the gradient of the covariance's three numbers, L^t M L / 2, from the second moments, a matrix M."""
     p, q, r = axes
     p1, q1 = p * m11 + r * m12, q * m11
     return 0.5 * (p * p1 + r * (p * m12 + r * m22)), 0.5 * q * p1, 0.5 * q * q1
@@ -163,7 +163,7 @@ def covariance_gradient(axes, m11, m12, m22):
 
 @inlined
 def mean_gradient(x, y, z, gu, gv, t, intrinsics, pose):
-    """From the gradient to a splat's centre (gu, gv) and to its linearised map `t` to that of the mean in the world."""
+    """Return the gradient of the mean in the world from those of a splat's centre (gu, gv) and linearised map `t`."""
     fx, fy, _, _, limit_x, limit_y = intrinsics
     held_x, free_x = held(x, z, limit_x)
     held_y, free_y = held(y, z, limit_y)

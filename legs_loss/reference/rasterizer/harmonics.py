@@ -19,7 +19,7 @@ _E0, _E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(c) for c in SH_C3)
 
 @compiled()
 def direction(means, i, position):
-    """From the camera's centre to the Gaussian's, of length 1, and the length it had."""
+    """Return the direction from the camera's centre to the Gaussian's, of length 1, and the length it had."""
     x, y, z = means[i, 0] - position[0], means[i, 1] - position[1], means[i, 2] - position[2]
     length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
     shorter = 1 / length
@@ -49,7 +49,7 @@ def harmonics(degree, x, y, z, basis):
 
 @compiled()
 def harmonics_gradient(degree, x, y, z, g):
-    """Gradient to the direction, from the gradient `g` to each of its harmonics."""
+    """Return gradient to the direction, from the gradient `g` to each of its harmonics."""
     two, three, four, six, eight = np.float32(2), np.float32(3), np.float32(4), np.float32(6), np.float32(8)
     gx = gy = gz = np.float32(0)
     if degree > 0:

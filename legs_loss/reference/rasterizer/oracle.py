@@ -54,7 +54,7 @@ def unit_rotations(quaternions: Tensor) -> Tensor:
 
 
 def project(points: Tensor, scales: Tensor, quaternions: Tensor, view: View) -> Splats:
-    """EWA projection of Gaussians; their centres `points` [N, 3] are in the camera's axes, beyond the near plane."""
+    """Project Gaussians by EWA; their centres `points` [N, 3] are in the camera's axes, beyond the near plane."""
     x, y, z = points.unbind(1)
     centres = torch.stack([view.fx * x / z + view.cx - 0.5, view.fy * y / z + view.cy - 0.5], 1)
 
@@ -85,7 +85,7 @@ def project(points: Tensor, scales: Tensor, quaternions: Tensor, view: View) -> 
 
 
 def tile_bounds(centres: Tensor, radii: Tensor, tiles: Tuple[int, int]) -> Tensor:
-    """[N, 4] int64: first tile in x and y, then the one past the last, of those that the splat's square touches."""
+    """Return [N, 4] int64: of the tiles that a splat's square touches, the first in x and y, then past the last."""
     grid = torch.tensor(tiles)
     reach = radii[:, None].to(centres.dtype)
     first = ((centres - reach) / TILE).floor().clamp(-1, 1 << 24).to(torch.int64)
@@ -94,7 +94,7 @@ def tile_bounds(centres: Tensor, radii: Tensor, tiles: Tuple[int, int]) -> Tenso
 
 
 def colours(directions: Tensor, sh: Tensor, degree: int) -> Tensor:
-    """Spherical harmonics [N, K, 3] seen along unit `directions` [N, 3] -> RGB [N, 3], 0.5 added, not below 0."""
+    """Return RGB [N, 3] of harmonics [N, K, 3] along unit `directions` [N, 3], 0.5 added, not below 0."""
     x, y, z = directions[:, :, None].unbind(1)
     result = SH_C0 * sh[:, 0]
     if degree > 0:
@@ -124,7 +124,7 @@ def colours(directions: Tensor, sh: Tensor, degree: int) -> Tensor:
 
 
 def blend(offsets: Tensor, conics: Tensor, opacities: Tensor, rgb: Tensor, background: Tensor) -> Tensor:
-    """Colours [P, 3] of P pixels from n splats in depth order; `offsets` [P, n, 2] run from pixel to splat."""
+    """Return colours [P, 3] of P pixels from n splats in depth order; `offsets` [P, n, 2] run from pixel to splat."""
     dx, dy = offsets.unbind(2)
     a, b, c = conics.unbind(1)
     alpha, before, left = cover(opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy))
@@ -172,7 +172,7 @@ def render(
     sh_degree: int,
     viewspace: Optional[Tensor],
 ) -> Tuple[Tensor, Tensor]:
-    """Image [3, H, W] and radii int32 [N]; arguments as `rasterize` has checked them."""
+    """Return image [3, H, W] and radii int32 [N]; arguments as `rasterize` has checked them."""
     dtype = means.dtype
     to_camera = torch.as_tensor(view.world_to_camera, dtype=dtype)
     points = means @ to_camera[:3, :3].T + to_camera[:3, 3]

@@ -44,19 +44,19 @@ STATE = 10, BLOCK + 8  # a row ends 64 bytes past a power of two: else all rows 
 
 @compiled()
 def floor(value):
-    """As an integer, within 1e8 of 0."""
+    """Return the greatest integer below, within 1e8 of 0."""
     return np.int64(math.floor(max(min(value, 1e8), -1e8)))
 
 
 @compiled()
 def ceil(value):
-    """As an integer, within 1e8 of 0."""
+    """Return the greatest integer below, within 1e8 of 0."""
     return -floor(-value)
 
 
 @compiled()
 def tile_range(centre, radius, tiles):
-    """First tile of the square around a splat, and the one past the last, by 3DGS's rounding."""
+    """Return first tile of the square around a splat, and the one past the last, by 3DGS's rounding."""
     first, end = floor((centre - radius) / TILE), floor((centre + radius + (TILE - 1)) / TILE)
     return min(max(first, 0), tiles), min(max(end, 0), tiles)
 
@@ -85,7 +85,7 @@ def lay_out(means, scales, quaternions, covariances, i, state, j):
 
 @inlined
 def _drawn(x, y, z, a, b, c, determinant, intrinsics, dilation):
-    """What is kept of a splat: rows CENTRE to LARGEST of the state."""
+    """Return a splat's rows CENTRE to LARGEST of the state."""
     fx, fy, cx, cy, _, _ = intrinsics
     nearness = 1 / z
     middle = 0.5 * (a + c) + dilation
@@ -96,7 +96,7 @@ def _drawn(x, y, z, a, b, c, determinant, intrinsics, dilation):
 
 @compiled()
 def _shapes(count, intrinsics, pose, dilation, state):
-    """From means, scales and quaternions to centres and covariances in the image."""
+    """Project means, scales and quaternions to centres and covariances in the image."""
     intrinsics, pose = numbers(intrinsics, pose)
     for j in range(np.uint64(count)):
         x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
@@ -117,7 +117,7 @@ def _shapes(count, intrinsics, pose, dilation, state):
 
 @compiled()
 def _covariances(count, intrinsics, pose, dilation, state):
-    """From means and covariances in the world to those in the image. What was handed in need be no covariance."""
+    """Project means and covariances to those in the image. What was handed in need be no covariance."""
     intrinsics, pose = numbers(intrinsics, pose)
     for j in range(np.uint64(count)):
         x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
@@ -140,10 +140,11 @@ def _covariances(count, intrinsics, pose, dilation, state):
 
 
 @compiled()
-def _project_block(
-    first, end, means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position, size,
-    dilation, square, splats, depths, radii, clamped, boxes, slots,
-):  # fmt: skip
+def _project_block(first, end, parameters, camera, footprint, found):
+    means, scales, quaternions, opacities, sh, covariances = parameters
+    degree, intrinsics, pose, position, size = camera
+    dilation, square = footprint
+    splats, depths, radii, clamped, boxes, slots = found
     basis = np.empty(16, np.float32)
     state, before_camera, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
     for i in range(np.uint64(first), np.uint64(end)):
@@ -199,21 +200,12 @@ def _project_block(
 
 
 @compiled(parallel=True)
-def project(
-    means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position, size,
-    dilation, square, splats, depths, radii, clamped, boxes, slots,
-):  # fmt: skip
-    """Fill, for each Gaussian: splat, depth, radius, which channels are clamped, box of strips, how many they are.
-
-    Shapes are `scales` and `quaternions`, or `covariances` [N, 6] (xx, xy, xz, yy, yz, zz); the others are None.
-    """
-    count = len(means)
+def project(parameters, camera, footprint, found):
+    """Fill the `Splats` that `Parameters` become to a `Camera`, with a `Footprint` (groups.py)."""
+    count = len(parameters.means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
-        _project_block(
-            first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, covariances, degree,
-            intrinsics, pose, position, size, dilation, square, splats, depths, radii, clamped, boxes, slots,
-        )  # fmt: skip
+        _project_block(first, min(first + BLOCK, count), parameters, camera, footprint, found)
 
 
 @compiled()

@@ -132,23 +132,42 @@ def _covariances_backward(count, intrinsics, pose, state):
 
 
 @compiled()
-def _project_backward_block(
-    first, end, means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position,
-    splats, clamped, firsts, sums, half,
-    g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
-):  # fmt: skip
+def _no_gradient(i, g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances):
+    """Set the gradients of a Gaussian that was not drawn."""
+    g_means[i] = 0
+    if g_scales is not None:
+        g_scales[i] = 0
+        g_quaternions[i] = 0
+    if g_covariances is not None:
+        g_covariances[i] = 0
+    g_opacities[i] = 0
+    g_sh[i] = 0
+
+
+@compiled()
+def _take_out(g_scales, g_quaternions, g_covariances, i, state, j):
+    """Read the gradients of a Gaussian's shape from column `j` of a block's state."""
+    if g_scales is not None:
+        for k in range(3):
+            g_scales[i, k] = state[SHAPE + k, j]
+        for k in range(4):
+            g_quaternions[i, k] = state[SHAPE + 3 + k, j]
+    if g_covariances is not None:
+        for k in range(6):
+            g_covariances[i, k] = state[SHAPE + k, j]
+
+
+@compiled()
+def _project_backward_block(first, end, parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
+    means, scales, quaternions, opacities, sh, covariances = parameters
+    degree, intrinsics, pose, position, size = camera
+    g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances = gradients
+    half = size[0] / 2, size[1] / 2
     basis, g_basis = np.empty(16, np.float32), np.empty(16, np.float32)
     state, drawn, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
     for i in range(first, end):
         if firsts[i, FIRST_SUM] == firsts[i + 1, FIRST_SUM]:
-            g_means[i] = 0
-            if scales is not None:
-                g_scales[i] = 0
-                g_quaternions[i] = 0
-            if covariances is not None:
-                g_covariances[i] = 0
-            g_opacities[i] = 0
-            g_sh[i] = 0
+            _no_gradient(i, g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances)
             g_view[i] = 0
             continue
         _collect(firsts[i, FIRST_SUM], firsts[i + 1, FIRST_SUM], sums, state, count)
@@ -163,14 +182,7 @@ def _project_backward_block(
         _covariances_backward(count, intrinsics, pose, state)
     for j in range(np.uint64(count)):
         i = np.uint64(drawn[j])
-        if scales is not None:
-            for k in range(3):
-                g_scales[i, k] = state[SHAPE + k, j]
-            for k in range(4):
-                g_quaternions[i, k] = state[SHAPE + 3 + k, j]
-        if covariances is not None:
-            for k in range(6):
-                g_covariances[i, k] = state[SHAPE + k, j]
+        _take_out(g_scales, g_quaternions, g_covariances, i, state, j)
         g_opacities[i, 0] = state[POWER, j] / opacities[i, 0]
         axes = state[AXES, j], state[AXES + 1, j], state[AXES + 2, j]
         gu, gv = centre_gradient(axes, state[FIRST, j], state[FIRST + 1, j])
@@ -188,17 +200,20 @@ def _project_backward_block(
 
 
 @compiled(parallel=True)
-def project_backward(
-    means, scales, quaternions, opacities, sh, covariances, degree, intrinsics, pose, position,
-    splats, clamped, firsts, sums, half,
-    g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
-):  # fmt: skip
-    """Fill the gradients `g_...` of each Gaussian from those of its entries; of what is None, there is none."""
-    count = len(means)
+def project_backward(parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
+    """Fill the gradients of each Gaussian from the sums of its entries'; of what is None, there is none.
+
+    Args:
+        parameters, gradients: `Parameters`, with None in the same places.
+        camera: `Camera`.
+        splats: [N, 9], as projected.
+        clamped: [N, 3].
+        firsts: [N + 1, 2], from the sorting.
+        sums: [bands, MOMENTS or ABSOLUTE_MOMENTS].
+        g_view: [N, 2 or 4], the view-space gradient, and that of absolute values.
+    """
+    count = len(parameters.means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
-        _project_backward_block(
-            first, min(first + BLOCK, count), means, scales, quaternions, opacities, sh, covariances, degree,
-            intrinsics, pose, position, splats, clamped, firsts, sums,
-            half, g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances, g_view,
-        )  # fmt: skip
+        end = min(first + BLOCK, count)
+        _project_backward_block(first, end, parameters, camera, splats, clamped, firsts, sums, gradients, g_view)

@@ -18,7 +18,7 @@ BACKENDS = ("numba", "torch")
 
 
 class Rendering(NamedTuple):
-    """What `rasterize` returns."""
+    """The result of `rasterize`."""
 
     image: Tensor  # [3, H, W]
     radii: Tensor  # [N] int32, pixels; 0: the Gaussian touches no tile of this image

@@ -1,4 +1,4 @@
-"""Which splats reach which strip of the image, and in which order: slots, entries and bands.
+"""Find the strips that each splat reaches, and sort a strip's splats by depth: slots, entries and bands.
 
 A slot is a strip in a splat's box of strips. Those that the splat reaches are sorted by strip and depth: the entries.
 A band is a row of strips that one thread draws, in their order: a splat that reaches several of them is still in the
@@ -84,31 +84,31 @@ def _number(boxes, slots, tall, firsts):
 
 @inlined
 def band_at(strip_x):
-    """How many bands are left of a strip's."""
+    """Return how many bands are left of a strip's."""
     return np.int32(np.uint32(strip_x) // np.uint32(BAND))
 
 
 @inlined
 def bands_across(first, end):
-    """How many bands the strips from ``first`` to ``end`` in a row touch."""
+    """Return how many bands the strips from ``first`` to ``end`` in a row touch."""
     return band_at(end - 1) + 1 - band_at(first)
 
 
 @inlined
 def packed(first, end, band):
-    """A slot's ROWS: the first row of the strip that the splat reaches, the one past its last, and the box's band."""
+    """Return a slot's ROWS: the first row that the splat reaches, the one past its last, and the box's band."""
     return np.int32(first) | np.int32(end) << 8 | np.int32(band) << 16
 
 
 @inlined
 def unpacked(rows):
-    """What was `packed`."""
+    """Return the three numbers of a `packed` one."""
     return rows & 255, rows >> 8 & 255, rows >> 16
 
 
 @compiled()
 def order_by_depth(depths, slots):
-    """Indices of the splats that are drawn, front to back; equal depths keep their order. A radix sort."""
+    """Return indices of the splats that are drawn, front to back; equal depths keep their order. A radix sort."""
     bits, count = depths.view(np.uint32), 0
     order, starts = np.empty(len(slots), np.int32), np.zeros((3, 2049), np.int64)
     for i in range(len(slots)):

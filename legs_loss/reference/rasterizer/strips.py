@@ -84,7 +84,7 @@ _ROUNDING = np.float32(3 << 22)  # added to a number, it leaves the nearest inte
 
 @inlined
 def exp2(x):
-    """2^x for x <= 0 in each lane, to 2e-7 relative."""
+    """Return 2^x for x <= 0 in each lane, to 2e-7 relative."""
     x = maximum(x, splat(_UNDERFLOW))
     rounded = x + splat(_ROUNDING)
     f = x - (rounded - splat(_ROUNDING))
@@ -159,14 +159,14 @@ def unfinished(transmittance):
 
 @inlined
 def reach(draws, k):
-    """An entry's first row, the one past its last, and the first row's y, counted from the middle of them."""
+    """Return an entry's first row, the one past its last, and the first row's y, counted from the middle of them."""
     first, last = np.uint32(draws[k, ROWS]) & 63, np.uint32(draws[k, ROWS] >> 8) & 63
     return first, last, splat((np.float32(first) - np.float32(last) + _ONE) * _HALF)
 
 
 @inlined
 def coordinates(state, entries, k):
-    """A splat's own coordinates along a row: the first at y = 0, what it gains with y, and the second."""
+    """Return a splat's own coordinates along a row: the first at y = 0, what it gains with y, and the second."""
     xs = load(state, X)
     first = multiply_add(splat(entries[k, 2]), xs, splat(entries[k, 1]))
     return first, splat(entries[k, 3]), multiply_add(splat(entries[k, 5]), xs, splat(entries[k, 4]))
@@ -185,7 +185,7 @@ def respond(state, first, last, ys, entries, k):
 
 @inlined
 def cover(alpha, before):
-    """What a row's alpha takes from its transmittance `before`: the weight of the colour, and T after."""
+    """Return the weight of a row's colour, given its transmittance `before`, and T after it."""
     none, weight = splat(_ZERO), alpha * before
     after = before - weight
     drawn = at_least(after, splat(_LAST))  # false for a finished pixel too, whose transmittance is negative
@@ -249,7 +249,7 @@ def render(workers, bands, across, ranges, splats, draws, entries, ends, backgro
 
 @compiled()
 def _blend_backward(state, begin, end, draws, entries, moments, sums):
-    """As `_blend`, front to back, adding to the owners' sums: moments of h = dL/dpower, and the colour's gradient.
+    """Go front to back as `_blend`, adding to the owners' sums: moments of h = dL/dpower, and the colour's gradient.
 
     dL/dalpha = T (g . colour) - rest / (1 - alpha), where rest = g . (all the colour behind this splat): what is left
     of g . (the pixel's colour) after what came before. Nothing is carried from back to front.

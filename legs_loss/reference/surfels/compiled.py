@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from legs_loss.reference.rasterizer import sorting
 from legs_loss.reference.surfels import projection, projection_backward, strips
+from legs_loss.reference.surfels.groups import Camera, Discs, Pictures, Splats, Work
 from legs_loss.reference.surfels.model import Surfels, SurfelView
 from legs_loss.reference.surfels.oracle import CHANNELS, to_pixels
 
@@ -30,38 +31,44 @@ class _Render(torch.autograd.Function):
     ) -> Tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         tensors = tuple(torch.empty(shape) if tensor is None else tensor for tensor, shape in zip(given, EMPTY))
-        means, scales, quaternions, homographies, opacities, sh, colours = (_array(tensor) for tensor in tensors)
-        width, height, count = view.width, view.height, len(means)
-        parameters = (means, scales, quaternions, homographies, opacities, sh, colours)
-        camera = (
-            view.sh_degree,
-            _array(view.world_to_camera.double()),
-            _array(to_pixels(view.projection.detach().double(), width, height)),
-            _array(view.position.double()),
+        discs = Discs(*(_array(tensor) for tensor in tensors))
+        width, height, count = view.width, view.height, len(discs.means)
+        camera = Camera(
+            degree=view.sh_degree,
+            pose=_array(view.world_to_camera.double()),
+            pixels=_array(to_pixels(view.projection.detach().double(), width, height)),
+            position=_array(view.position.double()),
+            width=width,
+            height=height,
         )
-        splats, extents = (np.empty((count, fields)) for fields in (projection.SPLAT, projection.EXTENT))
-        depths, radii, clamped = np.empty(count, np.float32), np.empty(count, np.int32), np.empty((count, 3), np.bool_)
-        boxes, slots = np.empty((count, 4), np.int32), np.empty(count, np.int64)
-        projection.project(*parameters, *camera, width, height, splats, extents, depths, radii, clamped, boxes, slots)
+        found = Splats(
+            rows=np.empty((count, projection.SPLAT)),
+            extents=np.empty((count, projection.EXTENT)),
+            depths=np.empty(count, np.float32),
+            radii=np.empty(count, np.int32),
+            clamped=np.empty((count, 3), np.bool_),
+            boxes=np.empty((count, 4), np.int32),
+            slots=np.empty(count, np.int64),
+        )
+        projection.project(discs, camera, found)
 
         across, down = -(-width // projection.WIDE), -(-height // projection.TALL)
-        firsts, reached = sorting.make_slots(boxes, slots, projection.TALL)
-        projection.find_rows(extents, boxes, slots, firsts, across, reached)
-        ranges, draws, bands = sorting.sort_entries(depths, slots, firsts, reached, across, down)
+        firsts, reached = sorting.make_slots(found.boxes, found.slots, projection.TALL)
+        projection.find_rows(found.extents, found.boxes, found.slots, firsts, across, reached)
+        ranges, draws, bands = sorting.sort_entries(found.depths, found.slots, firsts, reached, across, down)
 
         image, others = torch.empty(3, height, width), torch.empty(CHANNELS, height, width)
-        kept, ends = np.empty((3, height, width), np.float32), np.empty(across * down, np.int64)
-        entries, background = np.empty((int(ranges[-1]), strips.FIELDS), np.float32), _array(view.background)
-        strips.render(
-            numba.get_num_threads(), bands, across, ranges, splats, draws, entries, ends, background, image.numpy(),
-            others.numpy(), kept,
-        )  # fmt: skip
+        entries = np.empty((int(ranges[-1]), strips.FIELDS), np.float32)
+        work = Work(bands, across, ranges, draws, entries, np.empty(across * down, np.int64))
+        kept, background = np.empty((3, height, width), np.float32), _array(view.background)
+        pictures = Pictures(image.numpy(), others.numpy(), kept)
+        strips.render(numba.get_num_threads(), work, found.rows, background, pictures)
 
-        radii_tensor = torch.from_numpy(radii)
+        radii_tensor = torch.from_numpy(found.radii)
         ctx.mark_non_differentiable(radii_tensor)
         ctx.save_for_backward(image, others, *[tensor for tensor in given if tensor is not None])
-        ctx.discs = parameters, camera, (splats, clamped, firsts)
-        ctx.strips = (bands, across, ranges, draws, entries, ends, background), kept
+        ctx.discs = discs, camera, (found.rows, found.clamped, firsts)
+        ctx.strips = work, background, kept
         return image, others, radii_tensor
 
     @staticmethod
@@ -70,22 +77,20 @@ class _Render(torch.autograd.Function):
         ctx: Any, g_image: Optional[Tensor], g_others: Optional[Tensor], _: Any
     ) -> Tuple[Optional[Tensor], ...]:
         image, others = (_array(tensor) for tensor in ctx.saved_tensors[:2])
-        parameters, camera, discs = ctx.discs
-        work, kept = ctx.strips
-        sums = sorting.make_sums(discs[-1], projection_backward.GRADIENTS)
+        discs, camera, drawn = ctx.discs
+        work, background, kept = ctx.strips
+        sums = sorting.make_sums(drawn[-1], projection_backward.GRADIENTS)
         of_image = _array(torch.zeros(image.shape) if g_image is None else g_image)
         of_others = None if g_others is None else _array(g_others)
         if of_others is not None and not strips.matters(of_others, others):
             of_others = None
-        strips.render_backward(
-            numba.get_num_threads(), *work, image, others, kept, of_image, of_others, sums.reshape(-1)
-        )
-        results = [torch.empty(array.shape) for array in parameters]
-        viewspace = torch.empty(len(parameters[0]), 3)
-        half = np.array([image.shape[2] / 2, image.shape[1] / 2])
-        projection_backward.project_backward(
-            *parameters, *camera, half, *discs, sums, *[result.numpy() for result in (*results, viewspace)]
-        )
+        pictures = Pictures(image, others, kept)
+        threads = numba.get_num_threads()
+        strips.render_backward(threads, work, background, pictures, of_image, of_others, sums.reshape(-1))
+        results = [torch.empty(array.shape) for array in discs]
+        viewspace = torch.empty(len(discs.means), 3)
+        gradients = Discs(*(result.numpy() for result in results))
+        projection_backward.project_backward(discs, camera, *drawn, sums, gradients, viewspace.numpy())
         wanted = ctx.needs_input_grad
         found = [result if wanted[2 + k] else None for k, result in enumerate(results)]
         return (viewspace if wanted[0] else None, None, *found)

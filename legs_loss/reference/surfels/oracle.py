@@ -27,7 +27,7 @@ CHANNELS = 7  # of the second image: depth, alpha, normal x y z, median depth, d
 
 
 class Bounds(NamedTuple):
-    """Where surfels lie in the image."""
+    """The boxes of surfels in the image."""
 
     centres: Tensor  # [N, 2] pixels; a pixel's centre has integer coordinates
     radii: Tensor  # [N] int32, pixels; 0: not drawn
@@ -87,7 +87,7 @@ def bounds(homography: Tensor, visible: Tensor, width: int, height: int) -> Boun
 
 
 class Hit(NamedTuple):
-    """Where the rays of P pixels meet n discs, each [P, n]."""
+    """The points where the rays of P pixels meet n discs, each [P, n]."""
 
     depth: Tensor
     falloff: Tensor  # squared distance in standard deviations: of the disc, or on the screen where that is less

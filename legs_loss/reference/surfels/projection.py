@@ -30,10 +30,10 @@ ELLIPSE, CIRCLE, REACH, EXTENT = 0, 5, 7, 8
 
 
 @compiled(fastmath=CAREFUL)
-def _project_block(
-    begin, end, means, scales, quaternions, homographies, opacities, sh, colours, degree, pose, pixels,
-    position, width, height, splats, extents, depths, radii, clamped, boxes, slots,
-):  # fmt: skip
+def _project_block(begin, end, discs, camera, found):
+    means, scales, quaternions, homographies, opacities, sh, colours = discs
+    degree, pose, pixels, position, width, height = camera
+    splats, extents, depths, radii, clamped, boxes, slots = found
     basis = np.empty(16, np.float32)
     for i in range(np.uint64(begin), np.uint64(end)):
         radii[i] = slots[i] = 0
@@ -95,30 +95,12 @@ def _project_block(
 
 
 @compiled(parallel=True)
-def project(
-    means, scales, quaternions, homographies, opacities, sh, colours, degree, pose, pixels, position,
-    width, height, splats, extents, depths, radii, clamped, boxes, slots,
-):  # fmt: skip
-    """Fill, for each disc: splat, extent, depth, radius, which channels are clamped, box of strips, how many they are.
-
-    Args:
-        means, scales, quaternions, opacities: [N, ...].
-        homographies: [N, 9], in place of scales and quaternions, or [0, 9].
-        sh, degree: [N, K, 3], harmonics.
-        colours: [N, 3] in their place, or [0, 3].
-        pose: [4, 4], world to camera, for points that are rows.
-        pixels: [4, 3], world to homogeneous pixels, likewise.
-        position: [3], of the camera.
-        width, height: of the image.
-        splats, extents, depths, radii, clamped, boxes, slots: what is filled.
-    """
-    count = len(means)
+def project(discs, camera, found):
+    """Fill the `Splats` that `Discs` become to a `Camera` (groups.py)."""
+    count = len(discs.means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         begin = block * BLOCK
-        _project_block(
-            begin, min(begin + BLOCK, count), means, scales, quaternions, homographies, opacities, sh, colours, degree,
-            pose, pixels, position, width, height, splats, extents, depths, radii, clamped, boxes, slots,
-        )  # fmt: skip
+        _project_block(begin, min(begin + BLOCK, count), discs, camera, found)
 
 
 @compiled()

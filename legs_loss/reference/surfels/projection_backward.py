@@ -63,11 +63,10 @@ def _across(gx, gy, gw, pixels, a, k):
 
 
 @compiled()
-def _project_backward_block(
-    begin, end, means, scales, quaternions, homographies, opacities, sh, colours, degree, pose, pixels,
-    position, half, splats, clamped, firsts, gradients,
-    g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours, g_view,
-):  # fmt: skip
+def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, sums_of_bands, gradients, g_view):
+    means, scales, quaternions, homographies, opacities, sh, colours = discs
+    degree, pose, pixels, position, width, height = camera
+    g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours = gradients
     given = len(homographies) > 0
     basis, g_basis = np.empty(16, np.float32), np.empty(16, np.float32)
     sums = np.empty(GRADIENTS, np.float64)
@@ -89,7 +88,7 @@ def _project_backward_block(
         sums[:] = 0
         for row in range(firsts[i, FIRST_SUM], firsts[i + 1, FIRST_SUM]):
             for k in range(GRADIENTS):
-                sums[k] += gradients[row, k]
+                sums[k] += sums_of_bands[row, k]
         g_opacities[i, 0] = sums[G_OPACITY] / opacities[i, 0]
         x, y, w, _, turn = shape(means, scales, quaternions, homographies, i, pose, pixels)
         gx, gy, gw = _rows_gradient(x, y, w, splats[i, CENTRE], splats[i, CENTRE + 1], sums)
@@ -100,7 +99,7 @@ def _project_backward_block(
         # for homographies that were given.
         if given:
             tap_x, tap_y = gx[2], gy[2]
-        g_view[i, 0], g_view[i, 1], g_view[i, 2] = tap_x * w[2] * half[0], tap_y * w[2] * half[1], 0
+        g_view[i, 0], g_view[i, 1], g_view[i, 2] = tap_x * w[2] * (width / 2), tap_y * w[2] * (height / 2), 0
 
         mx = my = mz = 0.0
         if len(colours) > 0:
@@ -146,17 +145,20 @@ def _project_backward_block(
 
 
 @compiled(parallel=True)
-def project_backward(
-    means, scales, quaternions, homographies, opacities, sh, colours, degree, pose, pixels, position, half,
-    splats, clamped, firsts, gradients,
-    g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours, g_view,
-):  # fmt: skip
-    """Fill the gradients `g_...` of each disc from its sums in the bands; those of what was not given stay empty."""
-    count = len(means)
+def project_backward(discs, camera, splats, clamped, firsts, sums, gradients, g_view):
+    """Fill the gradients of each disc from its sums in the bands; those of what was not given stay empty.
+
+    Args:
+        discs, gradients: `Discs`.
+        camera: `Camera`.
+        splats: [N, SPLAT], as projected.
+        clamped: [N, 3].
+        firsts: [N + 1, 2], from the sorting.
+        sums: [bands, GRADIENTS].
+        g_view: [N, 3], the view-space gradient.
+    """
+    count = len(discs.means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         begin = block * BLOCK
-        _project_backward_block(
-            begin, min(begin + BLOCK, count), means, scales, quaternions, homographies, opacities, sh, colours, degree,
-            pose, pixels, position, half, splats, clamped, firsts, gradients,
-            g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours, g_view,
-        )  # fmt: skip
+        end = min(begin + BLOCK, count)
+        _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, sums, gradients, g_view)

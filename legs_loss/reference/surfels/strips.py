@@ -81,7 +81,7 @@ def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
 
 @inlined
 def _linear(entries, k, number, xs):
-    """One of p's three numbers: at the pixels of the middle row, and what it gains with each row."""
+    """Return one of p's three numbers: at the pixels of the middle row, and what it gains with each row."""
     across, down = splat(entries[k, 3 + number]), splat(entries[k, 6 + number])
     return multiply_add(across, xs, splat(entries[k, number])), down
 
@@ -158,7 +158,9 @@ def _blend(state, start, begin, end, draws, entries):
 
 
 @compiled(fastmath=CAREFUL)
-def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image, others, kept):
+def _render_strip(strip, state, work, splats, background, pictures):
+    _, across, ranges, draws, entries, ends = work
+    image, others, kept = pictures
     height, width = image.shape[1], image.shape[2]
     left, top = strip % across * WIDE, strip // across * TALL
     wide, tall = min(WIDE, width - left), min(TALL, height - top)
@@ -183,20 +185,18 @@ def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, ba
 
 
 @compiled(parallel=True, fastmath=CAREFUL)
-def render(workers, bands, across, ranges, splats, draws, entries, ends, background, image, others, kept):
-    """Fill the images; what the gradient needs of them; the entries, and in each strip the end of those that matter."""
+def render(workers, work, splats, background, pictures):
+    """Fill the `Pictures` of splats [N, SPLAT], and of the `Work` the entries and the ends."""
     for worker in prange(workers):
         state = np.empty(STATE, np.float32)
-        for turn in range(worker, len(bands), workers):
-            for strip in range(bands[turn, 0], bands[turn, 1]):
-                _render_strip(
-                    strip, across, state, ranges, splats, draws, entries, ends, background, image, others, kept
-                )
+        for turn in range(worker, len(work.bands), workers):
+            for strip in range(work.bands[turn, 0], work.bands[turn, 1]):
+                _render_strip(strip, state, work, splats, background, pictures)
 
 
 @compiled(fastmath=CAREFUL)
 def _blend_backward(state, begin, end, draws, entries, g_others, sums):
-    """As `_blend`, front to back again, adding to the discs' sums; `g_others` is None where there is none.
+    """Go front to back as `_blend`, adding to the discs' sums; `g_others` is None where there is none.
 
     dL/dalpha = T own - rest / (1 - alpha): `own` is the gradient of this disc's weight, `rest` the sum of weight times
     own over those behind it: what is left of the whole pixel's sum after those before.
@@ -276,9 +276,9 @@ def _blend_backward(state, begin, end, draws, entries, g_others, sums):
 
 
 @compiled(fastmath=CAREFUL)
-def _render_backward_strip(
-    strip, across, state, ranges, draws, entries, ends, background, image, others, kept, g_image, g_others, sums
-):
+def _render_backward_strip(strip, state, work, background, pictures, g_image, g_others, sums):
+    _, across, ranges, draws, entries, ends = work
+    image, others, kept = pictures
     height, width = image.shape[1], image.shape[2]
     left, top = strip % across * WIDE, strip // across * TALL
     wide, tall = min(WIDE, width - left), min(TALL, height - top)
@@ -311,23 +311,18 @@ def _render_backward_strip(
 
 
 @compiled(parallel=True, fastmath=CAREFUL)
-def render_backward(
-    workers, bands, across, ranges, draws, entries, ends, background, image, others, kept, g_image, g_others, sums
-):
+def render_backward(workers, work, background, pictures, g_image, g_others, sums):
     """Add the gradient of every entry to its disc's sums, one array; `g_others` may be None."""
     for worker in prange(workers):
         state = np.empty(BACKWARD_STATE, np.float32)
-        for turn in range(worker, len(bands), workers):
-            for strip in range(bands[turn, 0], bands[turn, 1]):
-                _render_backward_strip(
-                    strip, across, state, ranges, draws, entries, ends, background, image, others, kept, g_image,
-                    g_others, sums,
-                )  # fmt: skip
+        for turn in range(worker, len(work.bands), workers):
+            for strip in range(work.bands[turn, 0], work.bands[turn, 1]):
+                _render_backward_strip(strip, state, work, background, pictures, g_image, g_others, sums)
 
 
 @compiled(fastmath=CAREFUL)
 def matters(g_others, others):
-    """Whether a gradient to the other channels says anything where a disc is drawn."""
+    """Return whether a gradient to the other channels says anything where a disc is drawn."""
     for v in range(g_others.shape[1]):
         for u in range(g_others.shape[2]):
             if others[1, v, u] != _ZERO:

@@ -23,7 +23,7 @@ COLOUR_RATE = 2.5e-3  # of the constant harmonic; a twentieth of it for the othe
 
 
 def position_rate(progress: float, extent: float) -> float:
-    """The learning rate of positions when ``progress``, from 0 to 1, of its way to the last is done.
+    """Return the learning rate of positions when ``progress``, from 0 to 1, of its way to the last is done.
 
     >>> position_rate(0.0, 2.0), round(position_rate(0.5, 2.0), 9)
     (0.00032, 3.2e-05)
@@ -33,12 +33,12 @@ def position_rate(progress: float, extent: float) -> float:
 
 
 def select(gaussians: Gaussians, index: Tensor) -> Gaussians:
-    """The Gaussians of an index or a mask, detached copies."""
+    """Return the Gaussians of an index or a mask, detached copies."""
     return Gaussians(*(getattr(gaussians, name).detach()[index] for name in FIELDS))
 
 
 def stack(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Two sets as one, detached."""
+    """Return two sets as one, detached."""
     return Gaussians(*(torch.cat([getattr(first, name).detach(), getattr(second, name).detach()]) for name in FIELDS))
 
 
@@ -96,7 +96,7 @@ class Adam:
         self.moment2.opacity_logits.zero_()
 
     def state(self) -> Dict[str, Any]:
-        """Arrays from which :meth:`restore` makes an equal optimiser."""
+        """Return arrays from which :meth:`restore` makes an equal optimiser."""
         sets = (("gaussians", self.gaussians), ("moment1", self.moment1), ("moment2", self.moment2))
         arrays = {
             f"{label}.{name}": getattr(values, name).detach().numpy() for label, values in sets for name in FIELDS
@@ -106,7 +106,7 @@ class Adam:
 
     @classmethod
     def restore(cls, arrays: Any) -> Adam:
-        """The optimiser whose :meth:`state` this is."""
+        """Return the optimiser whose :meth:`state` this is."""
         sets = [
             Gaussians(*(torch.from_numpy(np.array(arrays[f"{label}.{name}"])) for name in FIELDS))
             for label in ("gaussians", "moment1", "moment2")
@@ -122,7 +122,7 @@ def _flat(tensor: Tensor) -> np.ndarray:
 
 @lru_cache(maxsize=None)
 def _rates(name: str, columns: int) -> np.ndarray:
-    """The learning rate of every column, repeated to a block of whole vectors that is long enough to loop over."""
+    """Return every column's learning rate, repeated to a block of whole vectors that is long enough to loop over."""
     rates = np.full(columns, RATES.get(name, 1.0), np.float32)
     if name == "sh":
         rates[:3], rates[3:] = COLOUR_RATE, COLOUR_RATE / 20

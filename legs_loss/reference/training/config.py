@@ -80,7 +80,7 @@ class TrainConfig:
                 raise LegsError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
 
     def as_dict(self) -> Dict[str, Any]:
-        """The settings as JSON holds them."""
+        """Return the settings as JSON holds them."""
         values = asdict(self)
         values["spec"]["p"] = str(self.weights.p)  # JSON has no infinity
         for name in ADDED_SETTINGS:
@@ -92,7 +92,7 @@ class TrainConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
-        """The settings that :meth:`as_dict` gave; ``spec`` may also be a preset's name.
+        """Return the settings that :meth:`as_dict` gave; ``spec`` may also be a preset's name.
 
         Raises:
             LegsError: they are none.
@@ -109,12 +109,12 @@ class TrainConfig:
 
     @property
     def weights(self) -> WeightSpec:
-        """``spec``, resolved."""
+        """Return ``spec``, resolved."""
         return as_spec(self.spec)
 
     @property
     def background(self) -> Tensor:
-        """The colour behind all Gaussians, [3]."""
+        """Return the colour behind all Gaussians, [3]."""
         return torch.full((3,), 1.0 if self.white_background else 0.0)
 
 

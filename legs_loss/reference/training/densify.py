@@ -21,7 +21,7 @@ RESET_OPACITY = 0.01
 
 
 class Schedule(NamedTuple):
-    """When things happen, in iterations."""
+    """The schedule of a training, in iterations."""
 
     densify_from: int
     densify_until: int
@@ -31,7 +31,7 @@ class Schedule(NamedTuple):
 
     @classmethod
     def of(cls, iterations: int) -> Schedule:
-        """3DGS's schedule, for runs of any length.
+        """Return 3DGS's schedule, for runs of any length.
 
         Densification begins after a tenth of the run, at iteration 500 at the latest, ends after three fifths of it,
         at iteration 15000 at the latest, and is due every 100 iterations or every twentieth of a shorter run.
@@ -52,16 +52,16 @@ class Schedule(NamedTuple):
         )
 
     def densifies(self, iteration: int) -> bool:
-        """Whether this iteration, counted from 1, ends with a densification."""
+        """Return whether this iteration, counted from 1, ends with a densification."""
         return self.densify_from < iteration < self.densify_until and iteration % self.densify_every == 0
 
     def resets(self, iteration: int) -> bool:
-        """Whether this iteration ends with an opacity reset."""
+        """Return whether this iteration ends with an opacity reset."""
         return iteration < self.densify_until and iteration % self.reset_every == 0
 
 
 class Change(NamedTuple):
-    """What a densification does to a set: which of its Gaussians stay (indices), and which are appended."""
+    """The change of a set by a densification: which Gaussians stay (indices), and which are appended."""
 
     kept: Tensor
     new: Gaussians
@@ -101,7 +101,7 @@ def densify(
 
 
 def _split(parents: Gaussians, generator: torch.Generator) -> Gaussians:
-    """Each parent's children, drawn from the parent's own distribution."""
+    """Return each parent's children, drawn from the parent's own distribution."""
     many = select(parents, torch.arange(len(parents)).repeat(CHILDREN))
     offsets = torch.randn(len(many), 3, generator=generator) * many.scales
     rotated = (rotations(many.quaternions) @ offsets[:, :, None])[:, :, 0]

@@ -84,7 +84,7 @@ def _network() -> Any:
 
 @lru_cache(maxsize=None)
 def _piq(name: str) -> ModuleType:
-    """One module of piq, without what the package itself imports at its start: torchvision, for networks unused here.
+    """Import one module of piq without the package's own imports: torchvision, for networks unused here.
 
     torchvision exists for few builds of torch, and raises RuntimeError with any other.
     """

@@ -9,13 +9,10 @@ The same seed gives the same Gaussians to the last bit, whether or not the run w
 from __future__ import annotations
 
 import json
-import signal
-import threading
 import time
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Union
+from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Union
 
 import numpy as np
 import torch
@@ -34,7 +31,7 @@ from legs_loss.reference.training.metrics import mean_scores, psnr, score
 from legs_loss.response import normalise_response, response
 from legs_loss.scenes import Scene
 from legs_loss.spec import WeightSpec
-from legs_loss.system import write_whole
+from legs_loss.system import noted, write_whole
 from legs_loss.weights import error_weight_map
 
 __all__ = [
@@ -57,7 +54,7 @@ CHECKPOINT = "checkpoint.npz"
 
 
 class Progress(NamedTuple):
-    """What a running training tells: smoothed loss and PSNR of the training views, and the number of Gaussians."""
+    """The progress of a training: smoothed loss and PSNR of the training views, and the number of Gaussians."""
 
     iteration: int
     loss: float
@@ -99,7 +96,7 @@ def draw(gaussians: Gaussians, view: TrainingView, config: TrainConfig) -> Tenso
 
 
 def point_cloud(out: Path, config: TrainConfig) -> Path:
-    """Where a run's .ply lies in its output folder: 3DGS's own place."""
+    """Return the path of a run's .ply in its output folder: 3DGS's own place."""
     return out / "point_cloud" / f"iteration_{config.iterations}" / "point_cloud.ply"
 
 
@@ -243,7 +240,7 @@ class _Run:
     ) -> None:
         """Run to the last iteration."""
         started = _clocks() - self.clocks
-        with _ctrl_c_between_iterations() as interrupted:
+        with noted() as interrupted:  # not between two updates that belong together
             while self.iteration < self.config.iterations:
                 self.step()
                 self.clocks = _clocks() - started
@@ -260,7 +257,7 @@ class _Run:
                     raise KeyboardInterrupt
 
     def step(self) -> None:
-        """One iteration: draw, loss, gradient, Adam; and what the schedule asks for."""
+        """Run one iteration: draw, loss, gradient, Adam; and what the schedule asks for."""
         self.iteration += 1
         gaussians = self.adam.gaussians
         index = self._next_view()
@@ -285,7 +282,7 @@ class _Run:
                 self.adam.reset_opacity(RESET_OPACITY)
 
     def metrics(self) -> Dict[str, Any]:
-        """Scores over training and held-out views, and what they cost."""
+        """Return scores over training and held-out views, and what they cost."""
         train, test = self._scores("train"), self._scores("test")
         return {
             "train": mean_scores(list(train.values())),
@@ -373,21 +370,6 @@ def step_weight(weight: Optional[Tensor], view: TrainingView, config: TrainConfi
 
 def _clocks() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
-
-
-@contextmanager
-def _ctrl_c_between_iterations() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C only sets a flag, so that it cannot fall between two updates that belong together."""
-    flag = threading.Event()
-    elsewhere = threading.current_thread() is not threading.main_thread()  # only the main thread handles signals
-    if elsewhere or signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
-        yield flag.is_set
-        return
-    before = signal.signal(signal.SIGINT, lambda *_: flag.set())
-    try:
-        yield flag.is_set
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _write_json(path: Path, values: Mapping[str, Any]) -> None:

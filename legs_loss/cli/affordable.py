@@ -1,0 +1,39 @@
+"""The scene of trainings that a CPU does in minutes, as demo and compare take it."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import TYPE_CHECKING
+
+from legs_loss.system import cores
+
+if TYPE_CHECKING:
+    from legs_loss.scenes import Scene
+
+__all__ = ["add_scene_arguments", "default_resolution"]
+
+AFFORDABLE = 70_000  # pixels a photograph
+
+
+def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the scene, its photographs and their size, and how many trainings run at a time."""
+    parser.add_argument("scene", metavar="SCENE", nargs="?", help="a COLMAP scene; default: the embedded scene")
+    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
+    parser.add_argument(
+        "-r",
+        "--resolution",
+        type=int,
+        metavar="1|2|4|8|WIDTH",
+        help=f"as in 3DGS; default: about {AFFORDABLE:,} pixels, which a CPU trains in minutes",
+    )
+    parser.add_argument(
+        "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one a core"
+    )
+
+
+def default_resolution(scene: Scene) -> int:
+    """Return the width that leaves AFFORDABLE pixels, or the photographs' own size (1) where that is less."""
+    sizes = [(view.camera.width, view.camera.height) for view in scene.views if view.camera is not None]
+    width, height = max(sizes, default=(1, 1))
+    return 1 if width * height <= AFFORDABLE else round(width * math.sqrt(AFFORDABLE / (width * height)))

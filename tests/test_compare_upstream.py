@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import shutil
 from pathlib import Path
@@ -31,6 +32,14 @@ def test_built_in_profiles_are_whole(path: Path) -> None:
     assert any("1000" in word for word in command)
     for threshold in profile.threshold:
         assert f"{0.5 * threshold.value:.6g}" in " ".join(command)
+
+
+def test_what_a_framework_reads_as_python_is_quoted() -> None:
+    checkout = Checkout(Path("copy"), read_profile(PROFILES / "fastergs.toml"), Path("my scene"), iterations=1000)
+    values = dict(word.split("=", 1) for word in checkout.commands(Path("3dgs/seed-0/output"), 1.0)[-1] if "=" in word)
+    assert ast.literal_eval(values["DATASET.PATH"]) == "my scene"
+    assert ast.literal_eval(values["TRAINING.MODEL_NAME"]) == "3dgs-seed-0"
+    assert {type(ast.literal_eval(value)) for value in values.values()} == {str, int, bool, type(None)}
 
 
 def test_a_profile_is_found_by_what_a_checkout_has(tmp_path: Path) -> None:
@@ -153,6 +162,7 @@ def test_what_cannot_be_compared_is_refused(compared, tmp_path: Path, capsys: py
         (["--arms", "legs:shuffled"], "needs the package's own trainer"),
         (["--gaussians", "100"], "has no words for gaussians"),
         (["--profile", "3dgs-mcmc"], "give it with --gaussians"),
+        (["--profile", "3dgs-mcmc", "--gaussians", "1"], "give more with --gaussians, not 1"),
         (["--densify_grad_threshold", "1"], "by --extra"),
         (["--upstream", str(tmp_path / "nowhere")], "there is no folder"),
     ):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from legs_loss.experiments.tables import MISSING, with_values
-from legs_loss.reference.training.metrics import METRICS, score
+from legs_loss.reference.training.metrics import METRICS, left_out, score
 
 pytest.importorskip("numba")
 
@@ -57,6 +57,17 @@ def test_piq_itself_is_left_as_it_was() -> None:
     need("gmsd")
     METRICS["gmsd"].compute(torch.rand(3, 32, 32), torch.rand(3, 32, 32))
     assert "piq" not in sys.modules or importlib.util.find_spec("torchvision") is not None
+
+
+def test_what_is_left_out_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    for key in ("flip", "gmsd", "haarpsi", "lpips"):
+        monkeypatch.setitem(METRICS, key, METRICS[key]._replace(available=lambda key=key: key == "flip"))  # type: ignore[misc]
+    said = left_out()
+    assert said.startswith("Left out: GMSD, HaarPSI (pip install 'legs-loss[metrics]'); LPIPS (pip install lpips")
+    assert "nothing is downloaded" in said and "\n" not in said
+    for key in ("gmsd", "haarpsi", "lpips"):
+        monkeypatch.setitem(METRICS, key, METRICS[key]._replace(available=lambda: True))
+    assert left_out() == ""
 
 
 def test_a_column_that_no_row_has_is_left_out() -> None:

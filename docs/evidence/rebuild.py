@@ -2,6 +2,7 @@
 
     python docs/evidence/rebuild.py                           # tables and plots, from the .json files beside it
     python docs/evidence/rebuild.py --take OUT docs/evidence/NAME.json    # first: the rows of a `legs compare` folder
+    python docs/evidence/mean_weights.py SCENE docs/evidence/NAME_weights.json
 
 A table stands in the text between `<!-- NAME STUDY -->` and `<!-- end -->`.
 """
@@ -53,6 +54,8 @@ def tables(text: str) -> str:
     """Return the text with every table made anew."""
 
     def table(match: re.Match[str]) -> str:
+        if match.group(2) == "weights":
+            return f"<!-- {match.group(1)} weights -->\n\n{_weights(match.group(1))}\n\n<!-- end -->"
         scene, study = match.group(1), STUDIES[match.group(2)]
         if "+" in scene:
             return f"<!-- {scene} {match.group(2)} -->\n\n{_pooled(scene.split('+'), study)}\n\n<!-- end -->"
@@ -105,6 +108,17 @@ def _pooled(scenes: List[str], study: Study) -> str:
             cells = [difference_cell(each, key) for each, (_, key) in zip(found, DIFFERENCES.values())]
             lines.append([f"{name} − {reference}", *cells])
     return markdown(*with_values([f"over {len(scenes)} captures", *DIFFERENCES], lines))
+
+
+def _weights(scene: str) -> str:
+    """Mean weights of degraded photographs, measured by mean_weights.py."""
+    measured = json.loads((HERE / f"{scene}_weights.json").read_text(encoding="utf-8"))
+    arms = list(measured["rows"][0]["mean"])
+    lines = [
+        [row["photograph"], *(f"{row['mean'][arm]:.2f} ({row['rises'][arm]} of {measured['views']})" for arm in arms)]
+        for row in measured["rows"]
+    ]
+    return markdown(["one photograph of the scene", *(f"{arm}: mean weight (of which it rose)" for arm in arms)], lines)
 
 
 def _rows(scene: str) -> List[Any]:

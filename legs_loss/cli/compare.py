@@ -147,9 +147,12 @@ def run(args: argparse.Namespace) -> int:
 def _say_scores(out: Path, study: Study, seeds: Sequence[int]) -> None:
     from legs_loss.experiments.running import read_rows
     from legs_loss.experiments.tables import study_text
+    from legs_loss.reference.training.metrics import left_out
 
     say(study_text([row for row in read_rows(out)[1] if row["seed"] in seeds], study))
     say(f"\n{READING}")
+    if left_out():
+        say(left_out())
     say(f"Rows: {out}; as a page: legs report {out}")
 
 

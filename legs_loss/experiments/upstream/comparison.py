@@ -65,6 +65,12 @@ class UpstreamComparison:
         self.scene: Scene = read_scene(scene, images)
         if profile.number and gaussians is None:
             raise LegsError(f"{profile.name} trains to a fixed number of Gaussians: give it with --gaussians")
+        points = 0 if self.scene.points is None else len(self.scene.points.xyz)
+        if profile.number and gaussians is not None and gaussians <= points:
+            raise LegsError(
+                f"{profile.name} starts with the scene's {points:,} points and grows: give more with --gaussians, "
+                f"not {gaussians:,}"
+            )
         base = TrainConfig(spec=BASELINE, iterations=iterations or profile.iterations, resolution=resolution or -1)
         settings = {
             "scene": identity(self.scene),

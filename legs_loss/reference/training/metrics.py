@@ -6,7 +6,7 @@ To add a metric, add a record. A row that was trained before has none of it, and
 from __future__ import annotations
 
 import math
-from typing import Callable, Dict, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from legs_loss.errors import LegsError
 from legs_loss.reference.training import perceptual
 from legs_loss.response import response
 
-__all__ = ["METRICS", "Metric", "mean_scores", "psnr", "score", "strongest"]
+__all__ = ["METRICS", "Metric", "left_out", "mean_scores", "psnr", "score", "strongest"]
 
 
 class Metric(NamedTuple):
@@ -31,6 +31,7 @@ class Metric(NamedTuple):
             tells all.
         available: whether what it needs is installed; None for one that needs nothing. Rows lack what was not, and
             tables leave a column out that no row has.
+        needs: what makes it available, in words.
         least_side: the pixels that the shorter side of an image must have; rows of smaller images lack it.
     """
 
@@ -41,6 +42,7 @@ class Metric(NamedTuple):
     compute: Callable[[Tensor, Tensor], float]
     differences: Tuple[str, ...] = ()
     available: Optional[Callable[[], bool]] = None
+    needs: str = ""
     least_side: int = 1
 
     def computes(self, image: Tensor, split: str) -> bool:
@@ -91,6 +93,8 @@ def _ssim(prediction: Tensor, target: Tensor) -> float:
     return 1.0 - float(fused_loss(prediction, target, None, 1.0))  # many times as fast as torch's
 
 
+_EXTRA = "pip install 'legs-loss[metrics]'"
+
 METRICS: Mapping[str, Metric] = {
     metric.key: metric
     for metric in (
@@ -111,12 +115,31 @@ METRICS: Mapping[str, Metric] = {
             ("test",),
             lambda prediction, target: psnr(prediction, target, ~strongest(target)),
         ),
-        Metric("flip", "FLIP", ".4f", ("test",), perceptual.flip, ("test",), perceptual.has_flip),
-        Metric("gmsd", "GMSD", ".4f", ("test",), perceptual.gmsd, ("test",), perceptual.has_piq),
-        Metric("haarpsi", "HaarPSI", ".4f", ("test",), perceptual.haarpsi, ("test",), perceptual.has_piq, 16),
-        Metric("lpips", "LPIPS", ".4f", ("test",), perceptual.lpips, ("test",), perceptual.has_lpips),
+        Metric("flip", "FLIP", ".4f", ("test",), perceptual.flip, ("test",), perceptual.has_flip, _EXTRA),
+        Metric("gmsd", "GMSD", ".4f", ("test",), perceptual.gmsd, ("test",), perceptual.has_piq, _EXTRA),
+        Metric("haarpsi", "HaarPSI", ".4f", ("test",), perceptual.haarpsi, ("test",), perceptual.has_piq, _EXTRA, 16),
+        Metric(
+            "lpips",
+            "LPIPS",
+            ".4f",
+            ("test",),
+            perceptual.lpips,
+            ("test",),
+            perceptual.has_lpips,
+            perceptual.NEEDS_LPIPS,
+        ),
     )
 }
+
+
+def left_out() -> str:
+    """Return one line on the metrics that are not computed here and what they need, "" where all are."""
+    missing: Dict[str, List[str]] = {}
+    for metric in METRICS.values():
+        if metric.available is not None and not metric.available():
+            missing.setdefault(metric.needs, []).append(metric.label)
+    parts = [f"{', '.join(labels)} ({needs})" for needs, labels in missing.items()]
+    return f"Left out: {'; '.join(parts)}." if parts else ""
 
 
 def score(prediction: Tensor, target: Tensor, split: str = "test") -> Dict[str, float]:

@@ -16,9 +16,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["flip", "gmsd", "haarpsi", "has_flip", "has_lpips", "has_piq", "lpips"]
+__all__ = ["NEEDS_LPIPS", "flip", "gmsd", "haarpsi", "has_flip", "has_lpips", "has_piq", "lpips"]
 
 VGG = "vgg16-397923af.pth"  # as torchvision names its file
+NEEDS_LPIPS = f"pip install lpips torchvision, and {VGG} in torch's cache of checkpoints: nothing is downloaded here"
 
 
 @lru_cache(maxsize=None)

@@ -11,11 +11,11 @@ from legs_adapters.code.module import Class, Function, Module
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import attribute_chain, call_name, children, constant, path_of
 
-__all__ = ["Calls", "calls_of", "likely_calls", "sure_calls"]
+__all__ = ["BY_NAME", "Calls", "calls_of", "likely_calls", "sure_calls"]
 
 _CALLED = ("forward", "__call__")  # by calling the instance
 _METHODS = {"staticmethod", "classmethod"}  # decorators that hand a function to nobody
-_BY_NAME = {"getattr", "attrgetter", "methodcaller", "eval"}
+BY_NAME = {"getattr", "attrgetter", "methodcaller", "eval"}  # what looks a name up at run time
 _NAMESPACES = {"globals", "locals", "vars"}
 
 
@@ -155,7 +155,7 @@ def _looks_up(node: cst.CSTNode) -> bool:
     """``getattr(losses, "photometric")``, ``globals()["photometric"]``."""
     if isinstance(node, cst.Subscript):
         return isinstance(node.value, cst.Call) and call_name(node.value) in _NAMESPACES
-    return isinstance(node, cst.Call) and call_name(node) in _BY_NAME
+    return isinstance(node, cst.Call) and call_name(node) in BY_NAME
 
 
 def _is_label(node: cst.CSTNode, child: cst.CSTNode) -> bool:

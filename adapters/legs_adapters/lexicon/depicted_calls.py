@@ -12,21 +12,14 @@ from legs_adapters.code.syntax import arguments, call_name, constant, words
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.usage import draws, is_box
-from legs_adapters.lexicon.words import RENDERERS
-from legs_adapters.tensors.operations import JOINS, PICTURE_FUNCTIONS, PICTURE_METHODS
+from legs_adapters.lexicon.words import LOADING, MATCHED, OF_DIFFUSION, RENDERERS, STATISTICS
+from legs_adapters.tensors.operations import EXTREMES, JOINS, MODULES, NUMBERS, PICTURE_FUNCTIONS, PICTURE_METHODS
 
 __all__ = ["meaning_of_call"]
 
 
 if TYPE_CHECKING:
     from legs_adapters.lexicon.depiction import Meanings
-
-_MODULES = {"torch", "F", "np", "nn", "einops", "functional", "TF"}
-_NUMBERS = {"int", "float", "len", "bool"}
-_STATISTICS = {"histc", "histogram", "bincount", "entropy", "gram", "moments"}  # of a picture, no picture
-_MATCHED = {"match", "matching", "matched", "equalize", "equalized"}  # histogram_matching(image, photo) is one
-_EXTREMES = {"max", "min", "amax", "amin"}
-_OF_DIFFUSION = {"guidance_scale", "negative_prompt", "num_inference_steps", "strength"}  # of a picture that it paints
 
 
 def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, depth: int) -> Meaning:
@@ -35,16 +28,16 @@ def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, dept
     positional, keywords, _ = arguments(node)
     values = [*positional, *keywords.values()]
     base = node.func.value if isinstance(node.func, cst.Attribute) else None
-    module = isinstance(base, cst.Name) and (base.value in _MODULES or _is_module(meanings.program, function, base))
+    module = isinstance(base, cst.Name) and (base.value in MODULES or _is_module(meanings.program, function, base))
     if name == "get" and positional and isinstance(constant(positional[0]), str) and base is not None:
         key = constant(positional[0])
         role = role_of_words(key) or meanings.role_of_holder(function, base, depth)
         return Meaning(kind_of_words(key), role)
-    if "prompt" in keywords and _OF_DIFFUSION & set(keywords):
+    if "prompt" in keywords and OF_DIFFUSION & set(keywords):
         return Meaning("warp", None)
-    if (base is None and name in _NUMBERS) or (base is not None and name == "item"):
+    if (base is None and name in NUMBERS) or (base is not None and name == "item"):
         return UNKNOWN
-    if name in _EXTREMES and (base is not None or positional):
+    if name in EXTREMES and (base is not None or positional):
         of, axes = (positional[0], positional[1:]) if module or base is None else (base, positional)
         meaning = meanings.of(function, of, depth)
         if meaning.kind == "image" and ("dim" in keywords or isinstance(constant(axes[0] if axes else None), int)):
@@ -52,7 +45,7 @@ def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, dept
         return meaning
     if name == "where" and len(values) == 3:
         return mix([meanings.of(function, value, depth) for value in values[1:]])
-    if set(words(name)) & _STATISTICS and not set(words(name)) & _MATCHED and values:
+    if set(words(name)) & STATISTICS and not set(words(name)) & MATCHED and values:
         return Meaning("feature", meanings.of(function, values[0], depth).role)
     filters = name in ("conv2d", "filter2d", "spatial_gradient") and values and "stride" not in keywords
     if filters and not (len(positional) > 1 and is_box(function, positional[1])):
@@ -74,7 +67,7 @@ def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, dept
         return Meaning("image" if of_points else kind, "render")
     if kind is not None and kind not in ("image", "mask", "parameter"):
         return Meaning(kind, role_of_words(name))
-    if kind == "image" and (role_of_words(name) == "target" or spoken & {"load", "read", "get", "open", "fetch"}):
+    if kind == "image" and (role_of_words(name) == "target" or spoken & LOADING):
         holder = meanings.role_of_holder(function, base, depth) if base is not None else None
         return Meaning("image", role_of_words(name) or holder or "target")
     # A function of an image is an image, unless its name says otherwise: exposure, appearance, a background.
@@ -104,7 +97,7 @@ def _made_by(meanings: Meanings, function: Function, node: cst.CSTNode, depth: i
     for reference in meanings.program.resolve(function, node):
         if reference.kind in ("instance", "class", "made by", "external", "function"):
             name = getattr(reference.target, "name", str(reference.target))
-            if set(words(name)) & {"renderer", "rasterizer", "rasterization", "render", "rasterize"}:
+            if set(words(name)) & RENDERERS:
                 return Meaning("image", "render")
         if reference.kind == "function" and isinstance(reference.target, Function) and not reference.guess:
             found = [meanings.of(reference.target, value, depth) for value in reference.target.flow.returns]

@@ -37,16 +37,20 @@ from legs_adapters.lexicon.usage import (
     is_masked,
     is_taken_from_one,
 )
-from legs_adapters.lexicon.words import DATA, KINDS, RENDERERS
+from legs_adapters.lexicon.words import (
+    BACKGROUND,
+    COMPARED,
+    DATA,
+    KINDS,
+    LOSS_CLASS,
+    PARAMETERS,
+    RENDERERS,
+    STEPS_OR_DYNAMIC,
+)
 from legs_adapters.tensors.backward import Training
 
 __all__ = ["Meanings"]
 
-_PARAMETERS = {"params", "param", "parameters", "variables", "splats", "gauss_params"}
-_BACKGROUND = {"bg", "bkgd", "background", "backgrounds"}  # a colour to lay things over, whoever keeps it
-_LOSSES = {"loss", "losses", "criterion"}
-_COMPARED = {"image", "depth", "normal", "flow"}
-_STEPS_OR_DYNAMIC = {"dx", "dy"}
 _DEPTH = 40
 _BUDGET = 20000  # steps to answer one question: some code is one large knot
 
@@ -140,7 +144,7 @@ class Meanings:
     @staticmethod
     def _named(name: str, flow: Meaning) -> Meaning:
         kind = kind_of_words(name)
-        if kind == "gradient" and flow.kind == "image" and set(words(name)) & _STEPS_OR_DYNAMIC:
+        if kind == "gradient" and flow.kind == "image" and set(words(name)) & STEPS_OR_DYNAMIC:
             return Meaning("image", role_of_words(name) or flow.role)  # dy_tensor = package["render_dy"]
         if kind == "image" and flow.kind == "feature":
             return Meaning("image", role_of_words(name) or flow.role)  # `rgb = outputs["features"]`: colours, there
@@ -239,12 +243,12 @@ class Meanings:
     def _said_by_class(self, function: Function) -> Optional[str]:
         """What a loss class's name says that its method is given, where one call in a base class serves several."""
         owner = function.owner
-        if owner is None or not set(words(owner.name)) & _LOSSES:
+        if owner is None or not set(words(owner.name)) & LOSS_CLASS:
             return None
         if not any(self.program.member(base, function.name) for base in self.program.bases(owner)):
             return None
         kind = kind_of_words(owner.name)
-        return kind if kind in _COMPARED else None
+        return kind if kind in COMPARED else None
 
     def _calls_of(self, function: Function) -> List[Tuple[Function, cst.Call]]:
         """The calls of a function that training does not go through."""
@@ -254,7 +258,7 @@ class Meanings:
 
     def _attribute(self, function: Function, node: cst.Attribute, depth: int) -> Meaning:
         name = node.attr.value
-        if isinstance(node.value, cst.Name) and node.value.value in _PARAMETERS:
+        if isinstance(node.value, cst.Name) and node.value.value in PARAMETERS:
             return Meaning("parameter", None)
         local = self._flow(function, node, depth) if function.flow.reaching(node) else UNKNOWN
         if local == UNKNOWN and isinstance(node.value, cst.Name) and node.value.value == "self":
@@ -271,7 +275,7 @@ class Meanings:
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> Meaning:
         key = key_of(node) or formatted_key(node) or default_key(function, node)
-        if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in _PARAMETERS:
+        if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in PARAMETERS:
             return Meaning("parameter", None)
         if isinstance(key, str):
             here = bool(function.flow.reaching(node))
@@ -279,7 +283,7 @@ class Meanings:
             role = role_of_words(key) or local.role
             if role == "render" and not here and is_asked_for(key) and is_loaded(function, node.value, key):
                 role = "target"
-            if role is None and not _BACKGROUND & set(words(key)):
+            if role is None and not BACKGROUND & set(words(key)):
                 role = self.role_of_holder(function, node.value, depth)
             return Meaning(more_special(kind_of_words(key), local.kind), role)
         computed = computed_key(function, node)

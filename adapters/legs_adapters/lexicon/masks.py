@@ -8,13 +8,13 @@ import libcst as cst
 
 from legs_adapters.code.entries import called_makers, written
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import arguments, call_name, constant, key_of, word_set, words
+from legs_adapters.code.syntax import arguments, call_name, constant, key_of, words
 from legs_adapters.lexicon.depiction import Meanings
-from legs_adapters.tensors.operations import JOINS, LIMITS, MOVES
+from legs_adapters.lexicon.words import PICKING
+from legs_adapters.tensors.operations import JOINS, KEEPS_AXES, MAKES
 
 __all__ = ["is_mask", "is_rows", "makes_mask", "picked_from", "without_rows"]
 
-_MASK_WORDS = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
 _DEPTH = 4
 
 
@@ -32,7 +32,7 @@ def is_mask(meanings: Meanings, function: Function, element: cst.SubscriptElemen
     name = node.value if isinstance(node, cst.Name) else node.attr.value if isinstance(node, cst.Attribute) else ""
     if _is_list_of_views(function, node):
         return False
-    return bool(set(words(name)) & _MASK_WORDS) or meanings.of(function, node).kind == "mask"
+    return bool(set(words(name)) & PICKING) or meanings.of(function, node).kind == "mask"
 
 
 def _is_list_of_views(function: Function, node: cst.CSTNode) -> bool:
@@ -41,7 +41,7 @@ def _is_list_of_views(function: Function, node: cst.CSTNode) -> bool:
     made = [value.body if isinstance(value, cst.IfExp) else value for value in made]
     return bool(made) and all(
         isinstance(value, cst.Call)
-        and call_name(value) in ("tensor", "as_tensor", "BoolTensor")
+        and call_name(value) in MAKES
         and any(_is_list(function, part) for part in arguments(value)[0][:1])
         for value in made
     )
@@ -57,7 +57,7 @@ def _is_list(function: Function, node: cst.CSTNode) -> bool:
 
 def makes_mask(call: cst.Call) -> bool:
     """Whether a function makes a mask of an error map, going by its name."""
-    return bool(set(words(call_name(call))) & _MASK_WORDS) or call_name(call) == "quantile"
+    return bool(set(words(call_name(call))) & PICKING) or call_name(call) == "quantile"
 
 
 def _is_picked(meanings: Meanings, function: Function, node: Optional[cst.CSTNode]) -> bool:
@@ -100,7 +100,7 @@ def is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: in
             return True
         if call_name(node) in JOINS:
             return are((function, arg.value) for arg in node.args[:1])
-        return call_name(node) in MOVES | LIMITS and are([(function, node.func.value)])
+        return call_name(node) in KEEPS_AXES and are([(function, node.func.value)])
     return False
 
 

@@ -16,26 +16,16 @@ from legs_adapters.code.syntax import (
     constant,
     dotted,
     same,
-    word_set,
     words,
     words_in,
     words_under,
 )
-from legs_adapters.tensors.steps import MAKES_OPTIMISERS
+from legs_adapters.lexicon.words import GAUSSIANS, PLUMBING, POSES
+from legs_adapters.tensors.operations import OPTIMISERS
 
-__all__ = ["EMBEDDINGS", "GAUSSIANS", "MODELS", "POSES", "Optimised"]
+__all__ = ["Optimised"]
 
-POSES = word_set("pose poses cam cams camera cameras c2w w2c extrinsic extrinsics camtoworld camtoworlds tracking se3")
-EMBEDDINGS = word_set("embedding embeddings embed emb appearance exposure")
-MODELS = word_set(
-    """
-    gaussian gaussians gs splat splats xyz means opacity opacities scaling scalings scales features sh0 shn model models
-    net network mlp scene deform anchor anchors primitives points parameters params variables
-    """
-)
-_PLUMBING = word_set("torch optim adam params lr name eps self")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
-GAUSSIANS = word_set("gaussian gaussians gs splat splats")
 _NOTHING = object()
 _DEPTH = 3
 
@@ -50,7 +40,7 @@ class Optimised:
         """The words in an optimiser's name, and in what it was made of."""
         assert isinstance(step.func, cst.Attribute)
         parts: List[cst.CSTNode] = [step.func.value, *(arg.value for arg in step.args)]
-        return {word for part in parts for word in self._words_of(function, part, 0)} - _PLUMBING
+        return {word for part in parts for word in self._words_of(function, part, 0)} - PLUMBING
 
     def _words_of(self, function: Function, node: cst.CSTNode, depth: int) -> Set[str]:
         name = set(words(node.attr.value)) if isinstance(node, cst.Attribute) else set()
@@ -67,7 +57,7 @@ class Optimised:
                         found |= self._words_of(caller, given, depth + 1) if given is not None else set()
             if definition.kind != "assign" or not isinstance(made, cst.Call):
                 continue
-            if set(words(call_name(made))) & MAKES_OPTIMISERS:
+            if set(words(call_name(made))) & OPTIMISERS:
                 found |= _handed_to(made)
             if not _OPTIMISER.search(call_name(made)):
                 continue

@@ -9,15 +9,12 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, word_set, words
+from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, words
 from legs_adapters.lexicon.names import role_of_words
-from legs_adapters.tensors.operations import AXES, JOINS, LIMITS, MAKES, MOVES
+from legs_adapters.lexicon.words import MESH_RASTERIZERS
+from legs_adapters.tensors.operations import KEEPS_VALUES, MODULES
 
 __all__ = ["is_of_mesh", "is_rendering"]
-
-_KEEPS = MOVES | MAKES | LIMITS | AXES | JOINS
-_MODULES = word_set("torch np numpy")
-_MESH_RASTERIZERS = ("nvdiffrast.", "kaolin.render.", "pytorch3d.renderer")
 
 
 def is_rendering(function: Function, node: cst.CSTNode) -> bool:
@@ -38,7 +35,7 @@ def is_of_mesh(program: Program, function: Function, node: cst.CSTNode) -> bool:
 def _rasterizes_mesh(program: Program, function: Function, call: cst.Call, depth: int) -> bool:
     """Whether a call is of a rasterizer of triangles, or of a method that calls one."""
     for reference in program.resolve(function, call.func):
-        if reference.kind in ("external", "made by") and str(reference.target).startswith(_MESH_RASTERIZERS):
+        if reference.kind in ("external", "made by") and str(reference.target).startswith(MESH_RASTERIZERS):
             return True
         callee = reference.target
         if depth == 0 and isinstance(callee, Function) and not reference.guess:
@@ -97,9 +94,9 @@ def _makers(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> 
         return _makers(function, node.left, seen)
     if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Multiply):  # image * mask
         return [*_makers(function, node.left, seen), *_makers(function, node.right, seen)]
-    if isinstance(node, cst.Call) and call_name(node) in _KEEPS:
+    if isinstance(node, cst.Call) and call_name(node) in KEEPS_VALUES:
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
-        if base is None or (isinstance(base, cst.Name) and base.value in _MODULES):
+        if base is None or (isinstance(base, cst.Name) and base.value in MODULES):
             return _makers(function, arguments(node)[0][0] if arguments(node)[0] else None, seen)
         return _makers(function, base, seen)
     return [node if isinstance(node, cst.Call) else None]

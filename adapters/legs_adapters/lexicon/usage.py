@@ -9,6 +9,7 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import call_name, constant, root_of, same, walk_expressions, words
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
+from legs_adapters.lexicon.words import CAMERAS, GAUSSIANS, LOADERS, RESULT
 
 __all__ = [
     "are_neighbours",
@@ -21,16 +22,12 @@ __all__ = [
     "is_taken_from_one",
 ]
 
-_GAUSSIANS = {"gaussians", "gaussian", "splats"}
-_LOADERS = {"loader", "dataloader"}
-_CAMERAS = {"cam", "camera", "view", "viewpoint"}
-
 
 def draws(values: List[cst.BaseExpression]) -> bool:
     """Whether a function is given the Gaussians and a camera, ``imlsplat(gaussians, viewpoint_cam, background)``."""
     names = [root_of(value) for value in values if isinstance(value, (cst.Name, cst.Attribute))]
     spoken = [set(words(name)) for name in names]
-    return any(each & _GAUSSIANS for each in spoken) and any(each & _CAMERAS for each in spoken)
+    return any(each & GAUSSIANS for each in spoken) and any(each & CAMERAS for each in spoken)
 
 
 def is_box(function: Function, node: cst.CSTNode) -> bool:
@@ -77,10 +74,10 @@ def is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
     """Whether a dictionary is what a data loader hands out, and the entry its own: nothing has rendered it."""
     made = [d for d in function.flow.reaching(node) if d.kind != "store" or d.key in (None, key)]
     sources = [part for d in made if d.kind == "element" and d.value is not None for part in walk_expressions(d.value)]
-    loaders = [part for part in sources if isinstance(part, cst.Name) and set(words(part.value)) & _LOADERS]
+    loaders = [part for part in sources if isinstance(part, cst.Name) and set(words(part.value)) & LOADERS]
     return bool(loaders) and all(d.kind == "element" for d in made)
 
 
 def is_asked_for(key: str) -> bool:
     """``images_output``: nothing but that it is what comes out says that it is a rendering."""
-    return all(role_of_words(word) != "render" or word in ("output", "outputs") for word in words(key))
+    return all(role_of_words(word) != "render" or word in RESULT for word in words(key))

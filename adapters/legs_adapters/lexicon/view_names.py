@@ -24,9 +24,9 @@ from legs_adapters.code.syntax import (
     dotted,
     loops_around,
     walk_expressions,
-    word_set,
     words,
 )
+from legs_adapters.lexicon.words import NO_PHOTOGRAPHS
 from legs_adapters.tensors.operations import depends
 
 __all__ = ["NAME", "Names"]
@@ -38,7 +38,6 @@ _NAMING = re.compile(rf"\b{NAME}\s*=(?!=)")
 _OF_LISTS = {"copy", "pop", "popleft"}
 _OTHER_CAMERAS = re.compile(r"get(?!Train|Test)\w+Cam(era)?s$")
 _POSES = re.compile(r"\bcam_extrinsics\s*=")
-_NO_PHOTOGRAPHS = word_set("virtual pseudo fake warped")
 _PLACED = re.compile(r"\.source_path\s*=[^=]")  # in the settings that Inria's Scene reads
 
 
@@ -177,7 +176,7 @@ def _calls(caller: Function, function: Function) -> bool:
 def _of_no_photograph(function: Function, site: cst.CSTNode) -> Optional[str]:
     """Why the cameras have none here: ``if camera.is_virtual:``."""
     for name in function.flow.conditions.get(id(site), ()):
-        if _NO_PHOTOGRAPHS & set(words(name)):
+        if NO_PHOTOGRAPHS & set(words(name)):
             return f"only where {name}"
     return None
 

@@ -15,11 +15,10 @@ from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import arguments, brief, call_name, code, constant, dotted, words
 from legs_adapters.lexicon.view_names import NAME, Names
-from legs_adapters.tensors.operations import MOVES
+from legs_adapters.lexicon.words import RESIZING, SHIFTING, STORED_IMAGES
+from legs_adapters.tensors.operations import JOINS, MOVES
 
 __all__ = ["View", "Views"]
-
-_IMAGES = {"original_image", "image", "gt_image", "rgb", "original_rgb", "img", "image_tensor"}
 
 
 class View(NamedTuple):
@@ -63,7 +62,11 @@ class Views:
         self, function: Function, node: cst.CSTNode, images: List[Tuple[cst.Attribute, Function]], seen: Set[int]
     ) -> Optional[str]:
         """Follow the target to where it is stored; return why that fails, if it does."""
-        if isinstance(node, cst.Attribute) and node.attr.value in _IMAGES and dotted(node.value) not in (None, "self"):
+        if (
+            isinstance(node, cst.Attribute)
+            and node.attr.value in STORED_IMAGES
+            and dotted(node.value) not in (None, "self")
+        ):
             images.append((node, function))
             return None
         if isinstance(node, cst.Name):
@@ -83,7 +86,7 @@ class Views:
                 return self._trace(function, node.func.value, images, seen)
             if dotted(node.func) in ("torch.clamp", "torch.clip") and node.args and _unit_range(node, 1):
                 return self._trace(function, node.args[0].value, images, seen)
-            if name in ("cat", "stack", "concat"):
+            if name in JOINS:
                 return "batched"
         if isinstance(node, cst.Subscript):
             if _first_channels(node):
@@ -94,9 +97,9 @@ class Views:
         if isinstance(node, cst.Call):
             name = call_name(node)
             spoken = set(words(name))
-            if spoken & {"interpolate", "resize", "downsample", "avg"}:
+            if spoken & RESIZING:
                 return f"resized by {name}"
-            if spoken & {"offset", "shift", "shifted", "warp", "translate", "roll"}:
+            if spoken & SHIFTING:
                 return f"shifted by {name}"
             return f"changed by {name or 'a call'}"
         if isinstance(node, cst.BinaryOperation):

@@ -1,28 +1,23 @@
-"""The field's words: those that name a kind of picture, a rendering, a photograph, what holds them."""
+"""The field's words, each list once: kinds of pictures, renderings and photographs, cameras, models, purposes.
+
+A comment says where words were met, where that is not every codebase. Words are compared with those of an identifier
+(``gtImage_2`` is gt, image, 2), patterns with text. What torch's operations are called stands in
+``tensors/operations.py``.
+"""
 
 from __future__ import annotations
 
+import re
+
 from legs_adapters.code.syntax import word_set
 
-__all__ = [
-    "DATA",
-    "HELD_IN",
-    "KINDS",
-    "KIND_OF",
-    "LAID_OVER",
-    "LIT_BY",
-    "OF_ONE",
-    "OF_PICTURES",
-    "PICTURES",
-    "RENDER",
-    "RENDERERS",
-    "TARGET",
-    "WHICH",
-    "WORDS",
-]
+# -- pictures
 
+# Pictures of a view that were warped from another one (SE-GS, GaVS), which are no photographs.
+WARPED = word_set("warp warped warping reproj reproject reprojected reprojection")
 # The more special kinds first: a "depth image" is a depth.
 WORDS = {
+    # 4DGS-SLAM and SC-GS call pixels that move coor
     "flow": """
         flow flows motion motions optical velocity velocities coor coords coordinate coordinates track traj trajs
         trajectory trajectories
@@ -31,14 +26,16 @@ WORDS = {
     "depth": """
         depth depths disp disparity disparities invdepth inverse idepth zbuf lidar distortion dist monodepth midas tof
     """,
+    # LangSplat, Feature 3DGS, Gaussian Grouping; polarised light, phasors of time-of-flight cameras
     "feature": """
         feature features feat feats semantic semantics sem language lang clip dino dinov2 lseg sam embedding embeddings
         latent latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors
         classes objects wavelet wavelets haar dwt fft rfft dct census
         stokes aolp dolp phasor phasors
     """,
-    "warp": """
-        warp warped warping reproj reprojected reprojection pseudo virtual unseen sds diffusion inpaint inpainted
+    # sds, inpaint, edit: GaussianDreamer, GaussianEditor; pseudo, unseen, virtual: codebases with few views
+    "warp": f"""
+        {" ".join(sorted(WARPED))} pseudo virtual unseen sds diffusion inpaint inpainted
         outpaint outpainted edit edited
     """,
     "gradient": "grad gradient gradients edge edges laplacian sobel curv curvature hessian canny dx dy",
@@ -46,6 +43,7 @@ WORDS = {
         mask masks alpha alphas opacity opacities silhouette sil acc accumulation seg segmentation visibility
         transmittance occupancy sky
     """,
+    # of Gaussians, cameras, light and materials (GS-IR, GaussianShader), bodies and faces (GaussianAvatar)
     "parameter": """
         scaling scalings scale scales xyz xyzs rotation rotations rot rots quat quats sh shs sh0 shn offset offsets grid
         grids plane planes pose poses deform deformation delta deltas residual means mean2d pts points point light
@@ -60,31 +58,100 @@ WORDS = {
 }
 KINDS = tuple(WORDS)
 KIND_OF = {word: kind for kind in reversed(KINDS) for word in WORDS[kind].split()}
-TARGET = word_set(
+COMPARED = {"image", "depth", "normal", "flow"}  # the kinds that a loss class is named for
+LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}  # the kinds that a photograph's name may speak of, too
+TARGET = word_set("gt gts target targets tgt ground truth original orig real true observed obs reference pixels")
+RENDERERS = word_set("render rendering rasterize rasterization rasterizer renderer raster splat splatting")
+RENDER = RENDERERS | word_set(
     """
-    gt gts target targets tgt ground truth original orig real true observed obs reference pixels
-    """
-)
-RENDER = word_set(
-    """
-    render renders rendered rendering renderings renderer rasterize rasterizer rasterization raster pred preds
-    predict predicted prediction predictions out output outputs rets comp synth synthesized splat splatting
-    network student recon reconstructed reconstruction est estimated
+    renders rendered renderings pred preds predict predicted prediction predictions out output outputs rets comp synth
+    synthesized network student recon reconstructed reconstruction est estimated
     """
 )
+RESULT = word_set("output outputs")  # of anything, not only of a renderer
 LAID_OVER = word_set("mask masks valid weight weights diff error errors")
 WHICH = word_set("first second third last left right front back")  # of several of a kind
 OF_PICTURES = word_set("sky sh shs prior time dx dy")  # a mask, say, where nothing says that it is a picture
-PICTURES = {"image", "images", "img", "imgs", "photo", "photos", "frame", "frames"}
-LIT_BY = {"light", "lights"}
+STEPS_OR_DYNAMIC = word_set("dx dy")  # steps from pixel to pixel, or render_dy: the dynamic part
+PICTURES = word_set("image images img imgs photo photos frame frames")
+LIT_BY = word_set("light lights")
 OF_ONE = word_set("scale scales scaling scalings offset offsets center centers mean light lights")  # scaled or shifted
 HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
-DATA = word_set(
+BACKGROUND = word_set("bg bkgd background backgrounds")  # a colour to lay things over, whoever keeps it
+# Which photograph it is, or which part of one; and what is said of anything.
+OF_PHOTOGRAPHS = (
+    WHICH
+    | HELD_IN
+    | word_set("blur blurred blurry sharp hdr ldr nir infrared raw patch crop face head hand hands lips")
+)
+STORED_IMAGES = word_set("original_image image gt_image rgb original_rgb img image_tensor")  # attributes of cameras
+PICKING = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
+MASKED = word_set("mask masked")  # of a function that takes a mask beside two pictures
+STATISTICS = word_set("histc histogram bincount entropy gram moments")  # of a picture, no picture
+MATCHED = word_set("match matching matched equalize equalized")  # histogram_matching(image, photo) is a picture
+LOADING = word_set("load read get open fetch")
+RESIZING = word_set("interpolate resize downsample avg")
+SHIFTING = word_set("offset shift shifted warp translate roll")
+NO_PHOTOGRAPHS = WARPED | word_set("virtual pseudo fake")  # what cameras without a photograph are called
+OF_DIFFUSION = word_set("guidance_scale negative_prompt num_inference_steps strength")  # arguments where it paints
+PERCEPTUAL = word_set("vgg perceptual lpips gram")
+
+# -- cameras, models and what optimisers move
+
+_CAMERA = word_set("cam cams camera cameras")
+CAMERAS = _CAMERA | word_set("view views viewpoint viewpoints")
+DATA = CAMERAS | word_set(
+    "data batch sample item items datum info infos keyframe frame dataset input inputs entry"
+)  # what holds photographs
+OF_VIEWS = DATA | word_set("frames scene")
+LOADERS = word_set("loader dataloader")
+POSES = _CAMERA | word_set("pose poses c2w w2c extrinsic extrinsics camtoworld camtoworlds tracking se3")
+EMBEDDING = word_set("embedding embeddings")
+EMBEDDINGS = EMBEDDING | word_set("embed emb appearance exposure")
+GAUSSIANS = word_set("gaussian gaussians gs splat splats")
+MODELS = GAUSSIANS | word_set(
     """
-    data batch sample item items datum cam camera cameras cams view views viewpoint viewpoints info infos
-    keyframe frame dataset input inputs entry
+    xyz means opacity opacities scaling scalings scales features sh0 shn model models net network mlp scene deform
+    anchor anchors primitives points parameters params variables
     """
 )
-RENDERERS = {
-    "render", "rendering", "rasterize", "rasterization", "rasterizer", "renderer", "raster", "splat", "splatting",
-}  # fmt: skip
+PARAMETERS = word_set("params param parameters variables splats gauss_params")  # names of what holds a model's
+GAUSSIAN_MODEL = word_set("get_xyz oneupSHdegree")  # methods of Inria's GaussianModel, in every fork
+PLUMBING = word_set("torch optim adam params lr name eps self")  # around what an optimiser is given
+POINTS = word_set("point points")
+
+# -- purposes
+
+LOSS = word_set("loss losses")
+LOSS_CLASS = LOSS | {"criterion"}
+EVALUATING = word_set("eval evaluate evaluation evaluator test")
+# A function's first word, where it does not train ...
+NOT_TRAINING = word_set("render eval evaluate test validate validation inference")
+# ... and any word of one through which nothing is trained.
+REPORTING = (
+    EVALUATING
+    | NOT_TRAINING
+    | word_set("testing report reports metric metrics valid visualize vis benchmark compare psnr quality")
+)
+FITTING = word_set("optimize optimise fit optim eval")  # an embedding, to a test view
+SCORING = word_set(
+    "score scores scoring importance densify densification prune pruning sensitivity sample sampling error"
+)
+TRACKING = word_set("tracking track tracker localize localization relocalize relocalization")  # SLAM
+MAPPING = word_set("mapping map mapper")  # a class that tracks and maps says nothing of one method
+
+# -- what a text speaks of
+
+# Files of Gaussian splatting, and of those the ones that cannot be about meshes.
+SPLATS = re.compile(r"splat|gaussians|gaussian_?(model|render|scene|raster)|diff_\w*raster|3dgs|surfel", re.I)
+DRAWS_SPLATS = re.compile(SPLATS.pattern + r"|rasteriz|render_pkg", re.I)
+# Rays of a NeRF: nerfstudio's bundles, rays_o and rays_d of others, and their colours in avatars made of both.
+RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
+RAY_BUNDLES = word_set("ray_bundle ray_samples")
+RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
+OF_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
+FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
+MESH_RASTERIZERS = ("nvdiffrast.", "kaolin.render.", "pytorch3d.renderer")
+STRUCTURAL = re.compile("ssim", re.I)
+SPEAKS_OF_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(")
+SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)

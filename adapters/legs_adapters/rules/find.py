@@ -12,6 +12,7 @@ from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple,
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.sources import Source
+from legs_adapters.lexicon.words import SPEAKS_OF_L1, STRUCTURAL
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.doubts import Doubt, Doubts
 from legs_adapters.rules.verdict import Verdicts
@@ -19,14 +20,13 @@ from legs_adapters.terms.findings import Findings, Left, Problem, Site
 from legs_adapters.terms.kinds.fused import fused_losses
 from legs_adapters.terms.kinds.run_time import chosen_at_run_time
 from legs_adapters.terms.patched import patched_nodes
-from legs_adapters.terms.ssim import STRUCTURAL
 from legs_adapters.upstreams import registered
 
 __all__ = ["find"]
 
 _Entry = Tuple[Place, Union[Site, Left, Problem]]
 
-_MAY_HAVE_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(|\bunweighted\(")
+_MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|\bunweighted\(")
 
 
 def find(

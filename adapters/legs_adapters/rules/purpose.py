@@ -14,10 +14,11 @@ from legs_adapters.code.calls import likely_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import attribute_chain, call_name, loops_around, walk_all, words
-from legs_adapters.lexicon.optimised import EMBEDDINGS, GAUSSIANS, MODELS, POSES, Optimised
+from legs_adapters.lexicon.optimised import Optimised
+from legs_adapters.lexicon.words import EMBEDDINGS, GAUSSIANS, MODELS, POSES
 from legs_adapters.tensors.backward import Training
+from legs_adapters.tensors.operations import OPTIMISERS
 from legs_adapters.tensors.steps import (
-    MAKES_OPTIMISERS,
     calls_in,
     gradients_read,
     has_step,
@@ -162,7 +163,7 @@ class Purposes:
         stepped = [step.value for step in steps if isinstance(step, cst.Attribute)]
         return any(
             isinstance(optimiser, cst.Attribute)
-            and optimiser.attr.value in MAKES_OPTIMISERS
+            and optimiser.attr.value in OPTIMISERS
             and isinstance(optimiser.value, cst.Name)
             and self._made_here(function, optimiser.value)
             for optimiser in stepped

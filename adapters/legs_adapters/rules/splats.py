@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Dict, List, Set
 
 import libcst as cst
@@ -10,17 +9,11 @@ import libcst as cst
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import code, walk_expressions, words
+from legs_adapters.lexicon.words import DRAWS_SPLATS, FIELD, RAYS, SPLATS
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 
 __all__ = ["Splats", "made_of"]
-
-_SPLATS = re.compile(
-    r"splat|rasteriz|gaussians|gaussian_?(model|render|scene)|render_gaussian|render_pkg|3dgs|surfel", re.I
-)
-_GAUSSIANS = re.compile(r"splat|gaussians|gaussian_?(model|render|scene|raster)|diff_\w*raster|3dgs|surfel", re.I)
-_RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
-_FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
 
 
 class Splats:
@@ -59,9 +52,9 @@ class Splats:
         """Return whether a name in the term or a file beside it says so, where the file is not about rays."""
         sides = made_of(function, form)
         names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
-        if _RAYS.search(module.text) or "mesh" in words(module.path.rpartition("/")[2]):
+        if RAYS.search(module.text) or "mesh" in words(module.path.rpartition("/")[2]):
             return False
-        if _FIELD.search(module.text):
+        if FIELD.search(module.text):
             return False
         rendered = any(word.startswith(("render", "raster")) for word in names)
         folder = module.path.rpartition("/")[0]
@@ -70,7 +63,7 @@ class Splats:
             top = folder.split("/")[0] + "/"
             together = self.program.together(module)
             near = [path for path in self.program.sources if path.startswith(top) or path in together]
-            near = [path for path in near if _GAUSSIANS.search(self.program.sources[path].text)]
+            near = [path for path in near if SPLATS.search(self.program.sources[path].text)]
         return any(self._speaks_of_splats(path) for path in near)
 
     def _takes_splats(self, module: Module) -> bool:
@@ -84,7 +77,7 @@ class Splats:
 
     def _speaks_of_splats(self, path: str) -> bool:
         if path not in self._splats:
-            self._splats[path] = _SPLATS.search(self.program.sources[path].text) is not None
+            self._splats[path] = DRAWS_SPLATS.search(self.program.sources[path].text) is not None
         return self._splats[path]
 
 

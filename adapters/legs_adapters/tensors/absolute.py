@@ -62,5 +62,5 @@ def is_abs(node: cst.Call) -> bool:
 
 
 def _is_module(node: cst.CSTNode) -> bool:
-    """Whether what has ``abs`` or ``mean`` can be torch, under whatever name: a tensor's own take no tensor."""
+    """Return whether what has ``abs`` or ``mean`` can be torch, under whatever name: a tensor's own take no tensor."""
     return isinstance(node, cst.Name) and node.value not in ("np", "numpy", "math", "jnp", "cp", "cupy", "tf")

@@ -7,6 +7,7 @@ from typing import Dict, List, Optional, Tuple
 import libcst as cst
 
 from legs_adapters.code.syntax import arguments, call_name, constant
+from legs_adapters.tensors.operations import MODULES
 
 __all__ = [
     "FIRST",
@@ -64,7 +65,7 @@ def reduced_axis(node: cst.Call) -> Optional[int]:
     positional, keywords, _ = arguments(node)
     values = [keywords[key] for key in ("dim", "axis") if key in keywords]
     if isinstance(node.func, cst.Attribute) and not (
-        isinstance(node.func.value, cst.Name) and node.func.value.value == "torch"
+        isinstance(node.func.value, cst.Name) and node.func.value.value in MODULES
     ):
         values += positional[:1]
     else:
@@ -78,7 +79,7 @@ def subject(node: cst.Call) -> Optional[cst.CSTNode]:
     if (
         isinstance(node.func, cst.Attribute)
         and isinstance(node.func.value, cst.Name)
-        and node.func.value.value in ("torch", "einops")
+        and node.func.value.value in MODULES
     ):
         return node.args[0].value if node.args else None
     if isinstance(node.func, cst.Attribute):

@@ -11,15 +11,15 @@ from legs_adapters.code.module import Class, Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import arguments, call_name, children, constant, key_of
+from legs_adapters.tensors.operations import BACKWARD, ENDS_GRADIENT, SIZES
+from legs_adapters.tensors.steps import is_backward
 
 __all__ = ["Training"]
 
 _BACKWARD = re.compile(r"\b(manual_)?backward\s*\(")
 # Methods whose result a framework trains on: Lightning, nerfstudio.
 _HOOKS = {"training_step", "get_loss_dict", "get_train_loss_dict"}
-_HOOK = re.compile(r"def\s+(training_step|get_loss_dict|get_train_loss_dict)\s*\(")
-_CUT = {"item", "detach", "tolist", "numpy", "backward", "manual_backward", "size", "numel", "dim"}
-_MEASURES = {"shape", "dtype", "device", "ndim"}  # of a tensor: nothing of its values
+_HOOK = re.compile(rf"def\s+({'|'.join(sorted(_HOOKS))})\s*\(")
 _ANY = object()
 
 
@@ -70,7 +70,7 @@ class Training:
 
     def _start(self, function: Function) -> None:
         for call in function.flow.calls:
-            if call_name(call) not in ("backward", "manual_backward"):
+            if not is_backward(call):
                 continue
             self._root(function)
             values = [arg.value for arg in call.args if arg.keyword is None or arg.keyword.value in ("loss", "tensors")]
@@ -126,7 +126,7 @@ class Training:
         if isinstance(node, cst.Call):
             self._call(function, node, key)
         elif isinstance(node, (cst.Name, cst.Attribute)):
-            if not (isinstance(node, cst.Attribute) and node.attr.value in _MEASURES):
+            if not (isinstance(node, cst.Attribute) and node.attr.value in SIZES):
                 self._place(function, node, key)
         elif isinstance(node, cst.Subscript):
             if not self._place(function, node, key):
@@ -156,7 +156,7 @@ class Training:
 
     def _call(self, function: Function, node: cst.Call, key: object) -> None:
         name = call_name(node)
-        if name in _CUT and isinstance(node.func, cst.Attribute):
+        if name in ENDS_GRADIENT | SIZES | BACKWARD and isinstance(node.func, cst.Attribute):
             return
         if (
             isinstance(node.func, cst.Attribute)

@@ -8,10 +8,9 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import attribute_chain, call_name, constant, walk_expressions
+from legs_adapters.tensors.operations import ENDS_GRADIENT, NO_GRAD
 
 __all__ = ["detaches", "is_detached", "is_without_grad", "no_grad_around", "under_no_grad"]
-
-_NO_GRAD = {"no_grad", "inference_mode", "set_grad_enabled"}
 
 
 def under_no_grad(function: Function, node: cst.CSTNode) -> bool:
@@ -31,14 +30,14 @@ def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Fu
             if _stops_gradients(context):
                 return function, context
     for decorator, name in zip(getattr(function.node, "decorators", ()), function.decorators):
-        if name in ("no_grad", "inference_mode"):
+        if name in NO_GRAD:
             return function.parent or function, decorator.decorator
     return no_grad_around(function.parent, function.node) if function.parent is not None else None
 
 
 def is_detached(node: cst.CSTNode) -> bool:
     """Whether no gradient goes that way."""
-    return any(isinstance(part, cst.Call) and call_name(part) in ("detach", "item") for part in attribute_chain(node))
+    return any(isinstance(part, cst.Call) and call_name(part) in ENDS_GRADIENT for part in attribute_chain(node))
 
 
 def detaches(node: cst.CSTNode) -> bool:
@@ -47,7 +46,7 @@ def detaches(node: cst.CSTNode) -> bool:
 
 
 def _stops_gradients(node: cst.CSTNode) -> bool:
-    if isinstance(node, cst.Call) and call_name(node) in _NO_GRAD:
+    if isinstance(node, cst.Call) and call_name(node) in NO_GRAD:
         if call_name(node) == "no_grad":
             return True
         value = constant(node.args[0].value) if node.args else True

@@ -34,12 +34,9 @@ from legs_adapters.tensors.axes import (
     unsqueezed_axis,
 )
 from legs_adapters.tensors.backward import Training
-from legs_adapters.tensors.operations import LIMITS, MOVES
+from legs_adapters.tensors.operations import CHANNELS_LAST, KEEPS_AXES
 
 __all__ = ["Vote", "is_channels_last", "lies_last"]
-
-_LAST_RENDERERS = {"rasterization", "rasterization_2dgs", "rasterize_gaussians", "rasterization_inria_wrapper"}
-_KEEPS = MOVES | LIMITS  # leaves the axes where they are
 
 
 class Vote(NamedTuple):
@@ -115,7 +112,7 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
         if pattern is not None:
             after = pattern.split("->")[-1].split()
             return [Vote(LAST if after[-1:] == ["c"] else FIRST, 3)]
-        if call_name(node) in _LAST_RENDERERS:
+        if call_name(node) in CHANNELS_LAST:
             return [Vote(LAST, 2)]
         if call_name(node) in ("array", "asarray") and node.args and _is_picture(function, node.args[0].value):
             return [Vote(LAST, 3)]
@@ -153,7 +150,7 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
                 continue
             if definition.kind == "element" and isinstance(definition.value, cst.Call):
                 # what a call returns says something of its first element only
-                if not definition.index and call_name(definition.value) in _LAST_RENDERERS:
+                if not definition.index and call_name(definition.value) in CHANNELS_LAST:
                     votes.append(Vote(LAST, 2))
             elif definition.kind in ("assign", "augment"):
                 votes.extend(_votes(training, function, definition.value, seen, depth + 1))
@@ -277,7 +274,7 @@ def _before(node: Optional[cst.CSTNode], order: Optional[Tuple[int, ...]]) -> Li
     Of a product, ``x * mask``, each factor.
     """
     while node is not None:
-        if isinstance(node, cst.Call) and call_name(node) in _KEEPS:
+        if isinstance(node, cst.Call) and call_name(node) in KEEPS_AXES:
             node = subject(node)
         elif isinstance(node, cst.Call) and call_name(node) == "unsqueeze" and order is not None:
             if constant(node.args[-1].value if node.args else None) != 0 or len(order) != 4:

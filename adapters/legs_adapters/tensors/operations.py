@@ -12,15 +12,10 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import children
 
-__all__ = [
-    "AXES", "ENDS_GRADIENT", "JOINS", "LIMITS", "MAKES", "MOVES", "PICTURE_FUNCTIONS", "PICTURE_METHODS", "SIZES",
-    "TRANSFORMS", "depends",
-]  # fmt: skip
-
 _TABLE = """
 moves         astype clone contiguous copy cpu cuda deepcopy detach double float half numpy requires_grad_ to type
 moves         type_as
-makes         array as_tensor asarray from_numpy tensor
+makes         BoolTensor FloatTensor Tensor array as_tensor asarray from_numpy tensor
 limits        clamp clamp_ clamp_max clamp_min clip nan_to_num round
 axes          T expand expand_as flatten flip movedim permute rearrange repeat reshape reshape_as roll rot90 squeeze
 axes          transpose unsqueeze view view_as
@@ -31,9 +26,24 @@ filters       abs conv2d einsum relu sigmoid
 resamples     avg_pool2d center_crop crop gaussian_blur grid_sample interpolate max_pool2d pad resize
 passes        DataLoader checkpoint enumerate iter list next no_grad reversed tqdm tuple zip
 joins         cat concat concatenate hstack stack vstack
+constant      eye full full_like ones ones_like zeros zeros_like
+like          expand_as reshape_as to type_as view_as
+asks          isfinite isinf isnan ones_like zeros_like
 sizes         device dim dtype is_cuda ndim numel shape size
-ends_gradient detach item numpy tolist
+reduces       mean median std sum var
+extremes      amax amin max min
+numbers       bool float int len
+leaves        item numpy tolist
+detaches      detach
+no_grad       inference_mode no_grad set_grad_enabled
+backward      backward manual_backward
 transforms    exp log log10 log1p log2 pow sigmoid sqrt square tanh
+other_losses  huber_loss mse_loss norm smooth_l1_loss
+channels_last rasterization rasterization_2dgs rasterization_inria_wrapper rasterize_gaussians
+modules       F TF einops functional nn np numpy torch
+optimisers    optimiser optimisers optimizer optimizers
+steps         adam optim optimise optimize sgd step steps update
+schedules     bar lr pbar profiler progress sched scheduler schedulers strategy tqdm
 """
 
 
@@ -51,14 +61,30 @@ MAKES = _ROWS["makes"]  # a tensor or an array of the same values
 LIMITS = _ROWS["limits"]  # the same values where they are in range
 AXES = _ROWS["axes"]  # the same values in another order or shape
 JOINS = _ROWS["joins"]  # several values as one
-_PASSES_ON = _ROWS["passes"]  # Python's ways to hand a value on
+KEEPS_AXES = MOVES | LIMITS  # what leaves every value where it is
+KEEPS_VALUES = KEEPS_AXES | MAKES | AXES | JOINS  # what leaves the values, wherever they go
+CONSTANT = _ROWS["constant"]  # made of nothing but a size
+LIKE = _ROWS["like"]  # what takes a tensor's type or shape, and none of its values
+ASKS = _ROWS["asks"]  # what is asked of values that are not compared
 SIZES = _ROWS["sizes"]  # what is asked of a tensor without a look at its values
-ENDS_GRADIENT = _ROWS["ends_gradient"]  # no gradient comes back
+REDUCES, EXTREMES = _ROWS["reduces"], _ROWS["extremes"]
+NUMBERS = _ROWS["numbers"]  # Python's, of which there is one
+LEAVES = _ROWS["leaves"]  # what makes numbers or arrays of a tensor
+ENDS_GRADIENT = _ROWS["detaches"] | LEAVES  # no gradient comes back
+NO_GRAD = _ROWS["no_grad"]  # contexts and decorators under which no gradient is kept
+BACKWARD = _ROWS["backward"]  # manual_backward is Lightning's
 TRANSFORMS = _ROWS["transforms"]  # an absolute value is none any more
+OTHER_LOSSES = _ROWS["other_losses"]  # than an L1
+CHANNELS_LAST = _ROWS["channels_last"]  # renderers that return [H, W, C]: gsplat's
+MODULES = _ROWS["modules"]  # the names under which torch and its neighbours are imported
+# Words in the names of optimisers, of what steps them, and of what has a step() of another kind.
+OPTIMISERS, STEPS, SCHEDULES = _ROWS["optimisers"], _ROWS["steps"], _ROWS["schedules"]
 # What leaves a picture a picture: its methods, which keep its values, pick some of them or mix in others...
-PICTURE_METHODS = MOVES | LIMITS | AXES | _ROWS["picks"] | _ROWS["computes"]
+PICTURE_METHODS = KEEPS_AXES | AXES | _ROWS["picks"] | _ROWS["computes"]
 # ... and functions of it, which also make a tensor of it, filter it or give it another size.
-PICTURE_FUNCTIONS = PICTURE_METHODS | MAKES | _PASSES_ON | _ROWS["gathers"] | _ROWS["filters"] | _ROWS["resamples"]
+PICTURE_FUNCTIONS = PICTURE_METHODS.union(
+    MAKES, _ROWS["passes"], _ROWS["gathers"], _ROWS["filters"], _ROWS["resamples"]
+)
 
 
 def depends(function: Function, node: cst.CSTNode, names: Set[str]) -> bool:
@@ -73,6 +99,6 @@ def depends(function: Function, node: cst.CSTNode, names: Set[str]) -> bool:
             new = [d for d in function.flow.reaching(part) if id(d) not in seen]
             seen.update(id(definition) for definition in new)
             work.extend(definition.value for definition in new if definition.value is not None)
-        elif not (isinstance(part, cst.Attribute) and part.attr.value in ("shape", "device", "dtype")):
+        elif not (isinstance(part, cst.Attribute) and part.attr.value in SIZES):
             work.extend(children(part))
     return False

@@ -7,10 +7,10 @@ from typing import Dict, Iterable, Iterator, List, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import call_name, children, constant, walk_all, word_set, words, words_under
+from legs_adapters.code.syntax import call_name, children, constant, walk_all, words, words_under
+from legs_adapters.tensors.operations import BACKWARD, OPTIMISERS, SCHEDULES, STEPS
 
 __all__ = [
-    "MAKES_OPTIMISERS",
     "calls_in",
     "gradients_read",
     "has_step",
@@ -20,34 +20,29 @@ __all__ = [
     "only_reads_gradients",
 ]
 
-_SCHEDULES = word_set("sched scheduler schedulers lr strategy profiler progress pbar tqdm bar")
-MAKES_OPTIMISERS = {"optimizer", "optimiser", "optimizers", "optimisers"}
-_STEPS = word_set("step steps update optimize optimise optim adam sgd")
 _NOTHING = object()
 
 
 def is_backward(call: cst.Call) -> bool:
     """Return whether a call runs a backward pass."""
-    return call_name(call) in ("backward", "manual_backward")
+    return call_name(call) in BACKWARD
 
 
 def is_step(call: cst.Call) -> bool:
     """``gaussians.optimizer.step()``, ``optimizers.optimizer_step_all()``."""
     said = set(words(call_name(call)))
-    if not isinstance(call.func, cst.Attribute) or not (
-        said == {"step"} or ("step" in said and said & MAKES_OPTIMISERS)
-    ):
+    if not isinstance(call.func, cst.Attribute) or not (said == {"step"} or ("step" in said and said & OPTIMISERS)):
         return False
     return not _is_of_schedule(call)
 
 
 def may_step(calls: Iterable[cst.Call]) -> bool:
     """Whether a call says that it steps, under whatever name: ``gaussians.update(opt)``; not ``pbar.update(1)``."""
-    return any(set(words(call_name(call))) & _STEPS and not _is_of_schedule(call) for call in calls)
+    return any(set(words(call_name(call))) & STEPS and not _is_of_schedule(call) for call in calls)
 
 
 def _is_of_schedule(call: cst.Call) -> bool:
-    return isinstance(call.func, cst.Attribute) and bool(words_under(call.func.value) & _SCHEDULES)
+    return isinstance(call.func, cst.Attribute) and bool(words_under(call.func.value) & SCHEDULES)
 
 
 def has_step(function: Function) -> bool:

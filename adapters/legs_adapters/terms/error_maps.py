@@ -11,7 +11,7 @@ from legs_adapters.code.syntax import arguments, attribute_chain, call_name, wal
 from legs_adapters.lexicon.masks import makes_mask
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.gradients import under_no_grad
-from legs_adapters.tensors.operations import ENDS_GRADIENT, SIZES
+from legs_adapters.tensors.operations import ENDS_GRADIENT, EXTREMES, LEAVES, SIZES
 from legs_adapters.terms.form import Form
 
 __all__ = ["Shared", "is_asked", "is_huber", "is_measured", "is_rescaled", "shared_of", "takes_no_gradient"]
@@ -47,12 +47,7 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
         read for read in reads if id(read) in callers and takes_no_gradient(training, function, callers[id(read)], read)
     ]
     loss = [read for read in reads if training.includes(read) and read not in masks]
-    logged = {
-        id(part)
-        for call in function.flow.calls
-        if call_name(call) in ("item", "tolist", "numpy")
-        for part in attribute_chain(call)
-    }
+    logged = {id(part) for call in function.flow.calls if call_name(call) in LEAVES for part in attribute_chain(call)}
     edited = _edited(function)
     aside = [
         read
@@ -102,7 +97,7 @@ def is_rescaled(function: Function, form: Form) -> bool:
     """Whether a map is only put between 0 and 1, ``(error - error.min()) / (error.max() - error.min())``: to cut at."""
     reads = [read for read in function.flow.reads if form.node in _values(function, read)]
     ranges = {id(part) for node in function.flow.expressions for part in _of_range(node)}
-    extremes = [call for call in function.flow.calls if call_name(call) in ("min", "max") and not call.args]
+    extremes = [call for call in function.flow.calls if call_name(call) in EXTREMES and not call.args]
     asked = {id(call.func.value): call_name(call) for call in extremes if isinstance(call.func, cst.Attribute)}
     used = {asked.get(id(read), "range" if id(read) in ranges else "more") for read in reads}
     return used == {"min", "max", "range"}
@@ -120,7 +115,7 @@ def _of_range(node: cst.CSTNode) -> List[cst.CSTNode]:
 def is_measured(function: Function, form: Form) -> bool:
     """Whether a term is turned into a number, ``error.mean().item()``, from which no gradient comes back."""
     return any(
-        call_name(call) in ("item", "tolist") and any(part is form.node for part in attribute_chain(call))
+        call_name(call) in LEAVES and any(part is form.node for part in attribute_chain(call))
         for call in function.flow.calls
     )
 

@@ -12,20 +12,17 @@ from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import known_arguments, returned
 from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, walk_expressions
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
+from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
 from legs_adapters.tensors.absolute import abs_argument, is_abs, mean_of
-from legs_adapters.tensors.operations import SIZES, depends
+from legs_adapters.tensors.operations import ASKS, LIKE, OTHER_LOSSES, SIZES, TRANSFORMS, depends
 from legs_adapters.terms.prospects import Prospects
 
 __all__ = ["L1Functions"]
 
 _GSPLAT_L1 = re.compile(r"^gsplat\.losses\.l1_loss$")
 _TORCH_MODULE = re.compile(r"(^|\.)L1Loss$")  # nerfstudio hands torch's on
-_SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)
-_ASKING = {"isnan", "isfinite", "isinf", "zeros_like", "ones_like"}
-_AS_THAT = {"to", "type_as", "expand_as", "view_as", "reshape_as"}  # mask.to(prediction)
 # Decorators that return what the function returns.
 _TRANSPARENT = {"staticmethod", "classmethod", "script", "compile", "jaxtyped", "typechecked", "autocast"}
-_NOT_L1 = {"pow", "square", "sqrt", "log", "exp", "mse_loss", "norm", "smooth_l1_loss", "huber_loss"}
 
 
 class L1Functions:
@@ -65,7 +62,7 @@ class L1Functions:
             shape = self._shape_of(function, value, a, b, depth)
             if shape is not None:
                 return shape
-        return "own" if _SPEAKS_OF_LOSS.search(function.name) or function.name in ("forward", "__call__") else None
+        return "own" if SPEAKS_OF_LOSS.search(function.name) or function.name in ("forward", "__call__") else None
 
     def shape_of_reference(self, reference: Reference, node: cst.Call) -> Optional[str]:
         """Say what a function makes of its first two arguments where it is called, as `shape` does: torch's, too."""
@@ -151,9 +148,9 @@ class L1Functions:
                     allowed.update(id(n) for n in walk_expressions(node))
             elif isinstance(node, cst.Call):
                 name = call_name(node)
-                if name in _NOT_L1:
+                if name in TRANSFORMS | OTHER_LOSSES:
                     return False
-                if name in _ASKING or name in _AS_THAT:
+                if name in ASKS | LIKE:
                     allowed.update(id(n) for arg in node.args for n in walk_expressions(arg))
                 absolute = absolute or is_abs(node)
                 positional = arguments(node)[0]

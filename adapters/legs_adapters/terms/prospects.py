@@ -10,9 +10,10 @@ from __future__ import annotations
 import re
 from typing import Dict, Iterable, Iterator, List, Set, Tuple
 
+from legs_adapters.lexicon.words import SPEAKS_OF_L1
+
 __all__ = ["Prospects"]
 
-_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(")
 _WORD = re.compile(r"[^\W\d]\w*")
 _DEFINITION = re.compile(r"^([ \t]*)(?:async[ \t]+)?(def|class)[ \t]+(\w+)", re.M)
 # A value goes on where its line ends in an opening bracket, a comma or a backslash.
@@ -38,7 +39,7 @@ class Prospects:
         speakers: Dict[str, List[str]] = {}
         self._names: Set[str] = set()
         for name, text in said:
-            if _L1.search(text):
+            if SPEAKS_OF_L1.search(text):
                 self._names.add(name)
             else:
                 for word in known.intersection(_WORD.findall(text)):
@@ -55,12 +56,12 @@ class Prospects:
     def of(self, text: str) -> bool:
         """Whether a text can lead to an L1."""
         if text not in self._answers:
-            self._answers[text] = bool(_L1.search(text)) or not self._names.isdisjoint(_WORD.findall(text))
+            self._answers[text] = bool(SPEAKS_OF_L1.search(text)) or not self._names.isdisjoint(_WORD.findall(text))
         return self._answers[text]
 
     def near(self, text: str) -> bool:
         """Whether a text speaks of an L1, or of something whose own text does."""
-        return bool(_L1.search(text)) or not self._near.isdisjoint(_WORD.findall(text))
+        return bool(SPEAKS_OF_L1.search(text)) or not self._near.isdisjoint(_WORD.findall(text))
 
 
 def _said(text: str) -> Iterator[Tuple[str, str]]:

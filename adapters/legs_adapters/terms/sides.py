@@ -13,11 +13,10 @@ from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.masks import is_mask
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
+from legs_adapters.lexicon.words import OF_RAYS
 from legs_adapters.terms.form import Form
 
 __all__ = ["Pair", "are_counterparts", "is_role", "of_rays", "pair_of", "same_root"]
-
-_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
 
 
 class Pair(NamedTuple):
@@ -90,7 +89,7 @@ def are_counterparts(form: Form) -> bool:
 
 def of_rays(form: Form) -> bool:
     """Whether the names speak of rays, or of a field that they go through: a list of colours, whatever it is called."""
-    return any(_RAYS.search(code(node)) for node in (form.first, form.second))
+    return any(OF_RAYS.search(code(node)) for node in (form.first, form.second))
 
 
 def is_role(node: cst.CSTNode) -> bool:

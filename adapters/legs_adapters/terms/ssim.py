@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import re
-
 import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import attribute_chain, call_name, same
+from legs_adapters.lexicon.words import STRUCTURAL
 
-__all__ = ["STRUCTURAL", "is_beside_ssim", "is_given"]
-
-STRUCTURAL = re.compile("ssim", re.I)
+__all__ = ["is_beside_ssim", "is_given"]
 
 
 def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:

@@ -13,8 +13,8 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, call_name, constant, dotted, words
-from legs_adapters.lexicon.names import is_l1_name
+from legs_adapters.code.syntax import arguments, call_name, constant, dotted
+from legs_adapters.lexicon.names import is_l1_name, kind_of_words
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import PassedByName
 
@@ -22,7 +22,6 @@ __all__ = ["MENTIONED", "forms_of"]
 
 
 MENTIONED = re.compile(r"\badd_loss_metric\s*\(")
-_COLOUR = {"color", "colour", "rgb", "image", "photometric", "l1"}
 
 
 def forms_of(program: Program, function: Function, call: cst.Call) -> List[Form]:
@@ -32,11 +31,10 @@ def forms_of(program: Program, function: Function, call: cst.Call) -> List[Form]
     positional, keywords, _ = arguments(call)
     name = constant(keywords.get("name", positional[0] if positional else None))
     metric = keywords.get("metric", positional[1] if len(positional) > 1 else None)
-    if not isinstance(name, str) or metric is None or not _is_l1(program, function, metric):
+    if not isinstance(name, str) or metric is None or kind_of_words(name) not in ("image", None):
         return []
-    if not set(words(name)) & _COLOUR or set(words(name)) & {"depth", "normal", "alpha", "mask", "flow", "feature"}:
-        return []
-    return [PassedByName(metric, call, cst.Name("input"), cst.Name("target"), metric)]
+    form = PassedByName(metric, call, cst.Name("input"), cst.Name("target"), metric)
+    return [form] if _is_l1(program, function, metric) else []
 
 
 def _is_l1(program: Program, function: Function, node: cst.BaseExpression) -> bool:

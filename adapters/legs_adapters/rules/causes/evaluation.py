@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import List
 
 from legs_adapters.code.syntax import words
+from legs_adapters.lexicon.words import EMBEDDING, EVALUATING, FITTING, LOSS, NOT_TRAINING
 from legs_adapters.rules.rule import ByPurpose, CallOfTerm, Rule, Term, header
 from legs_adapters.terms.findings import Decider
 
 __all__ = ["EmbeddingFit", "EmbeddingStep", "EvaluationName", "EvaluationRule", "is_of_evaluating_class"]
-
-_NOT_TRAINING = {"render", "eval", "evaluate", "test", "validate", "validation", "inference"}
-_EVALUATING = {"eval", "evaluate", "evaluation", "evaluator", "test"}
 
 
 class EvaluationRule(Rule):
@@ -42,16 +40,16 @@ class EvaluationName(EvaluationRule):
     def evidence(self, term: Term) -> List[Decider]:
         function, purposes = term.function, term.analysis.purposes
         said = words(function.name)
-        shows = len(said) > 1 and said[0] in _NOT_TRAINING and not {"loss", "losses"} & set(said[1:])
+        shows = len(said) > 1 and said[0] in NOT_TRAINING and not LOSS & set(said[1:])
         if shows and not _is_of_training_step(term) and not purposes.trains_its_own(function):
             return [header(function)]
         folders, _, file = function.module.path.rpartition("/")
-        evaluates = (words(file)[:1] and words(file)[0] in _EVALUATING) or set(folders.split("/")) & _EVALUATING
+        evaluates = (words(file)[:1] and words(file)[0] in EVALUATING) or set(folders.split("/")) & EVALUATING
         return term.here if evaluates and not purposes.trains_its_own(function) else []
 
     def of_call(self, call: CallOfTerm) -> List[Decider]:
         said = set(words(call.function.name))
-        return [header(call.function)] if said & _EVALUATING and "train" not in said else []
+        return [header(call.function)] if said & EVALUATING and "train" not in said else []
 
 
 class EmbeddingFit(EvaluationRule):
@@ -72,7 +70,7 @@ class EmbeddingFit(EvaluationRule):
     def evidence(self, term: Term) -> List[Decider]:
         names = (term.function.name, *term.function.flow.conditions.get(id(term.call), ()))
         spoken = {word for name in names for word in words(name)}
-        fits = {"embedding", "embeddings"} & spoken and spoken & {"optimize", "optimise", "fit", "optim", "eval"}
+        fits = EMBEDDING & spoken and spoken & FITTING
         return [header(term.function)] if fits else []
 
 
@@ -96,7 +94,7 @@ class EmbeddingStep(ByPurpose, EvaluationRule):
 
 def is_of_evaluating_class(term: Term) -> bool:
     """Return whether the term's class says that it evaluates: ``TestLoss``."""
-    return bool(set(words(term.class_name)) & _EVALUATING)
+    return bool(set(words(term.class_name)) & EVALUATING)
 
 
 def _is_of_training_step(term: Term) -> bool:

@@ -7,24 +7,16 @@ from typing import Iterator, List, Optional, Set, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import call_name, code, constant, dotted, key_of, walk_expressions, word_set, words
+from legs_adapters.code.syntax import call_name, code, constant, dotted, key_of, walk_expressions, words
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
+from legs_adapters.lexicon.words import OF_PHOTOGRAPHS, PERCEPTUAL
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.rules.splats import made_of
+from legs_adapters.tensors.operations import KEEPS_VALUES
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.forms import Forms
 
 __all__ = ["NamedMap", "Network", "Scan", "compared"]
-
-_NETWORKS = {"vgg", "vgg16", "vgg19", "perceptual", "lpips", "gram"}
-_KEEPS = word_set("clamp clip clone contiguous cuda detach float permute squeeze to unsqueeze")
-# Which photograph it is, or which part of one; and what is said of anything.
-_OF_PHOTOGRAPHS = word_set(
-    """
-    left right front back blur blurred blurry sharp hdr ldr nir infrared raw patch crop face head hand hands lips
-    map tensor
-    """
-)
 
 
 class _Feature(Rule):
@@ -82,7 +74,7 @@ class Network(_Feature):
         if all(_is_given_whole(term.function, side) for side in term.sides):
             return []
         names = [*term.names_around, (term.function.module.path.rpartition("/")[2], header(term.function))]
-        return [decider for name, decider in names if _NETWORKS & set(words(name))][:1]
+        return [decider for name, decider in names if PERCEPTUAL & set(words(name))][:1]
 
 
 class NamedMap(_Feature):
@@ -159,7 +151,7 @@ def _entry(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> O
         return _entry(function, made[0].value, seen) if len(made) == 1 and made[0].kind == "assign" else None
     if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Multiply):  # image * mask
         return _entry(function, node.left, seen)
-    if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) in _KEEPS:
+    if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) in KEEPS_VALUES:
         return _entry(function, node.func.value, seen)
     if isinstance(node, cst.Attribute):
         return code(node.value), node.attr.value
@@ -172,4 +164,4 @@ def _entry(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> O
 def _special(name: str) -> Set[str]:
     """Return the words of a name that say neither that it is a picture nor which one."""
     found = {word for word in words(name) if not word.isdigit() and role_of_words(word) is None}
-    return {word for word in found if kind_of_words(word) != "image"} - _OF_PHOTOGRAPHS
+    return {word for word in found if kind_of_words(word) != "image"} - OF_PHOTOGRAPHS

@@ -9,6 +9,7 @@ import libcst as cst
 from legs_adapters.code.syntax import call_name, key_of, walk_expressions, words
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words
+from legs_adapters.lexicon.words import LAID_OVER_PICTURES, MASKED, WARPED
 from legs_adapters.rules.rule import CallOfTerm, Rule, Term, header, source_of
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.form import Form
@@ -26,10 +27,6 @@ __all__ = [
     "Synthetic",
     "Warping",
 ]
-
-# What a picture is made with, or masked by, may stand in its name; what has a depth's name is none.
-_LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}
-_WARPED = {"reprojection", "reproject", "reprojected", "warp", "warped", "warping"}
 
 
 class _Kind(Rule):
@@ -149,7 +146,7 @@ class Warping(_Synthetic):
     id = "warping"
 
     def evidence(self, term: Term) -> List[Decider]:
-        return [header(term.function)] if set(words(term.function.name)) & _WARPED else []
+        return [header(term.function)] if set(words(term.function.name)) & WARPED else []
 
 
 class Gradients(_Kind):
@@ -194,14 +191,14 @@ _KINDS = {rule.kind for rule in (Depth, Normals, Features, Flow, Mask, Synthetic
 
 def _is_named_picture(term: Term, meaning: Meaning, side: cst.CSTNode, beside: Meaning) -> bool:
     """Return whether a side is an image, although a word of its name is of a mask, a parameter or a gradient."""
-    if meaning.kind not in _LAID_OVER_PICTURES or beside.kind != "image":
+    if meaning.kind not in LAID_OVER_PICTURES or beside.kind != "image":
         return False
     return is_beside_ssim(term.function, *term.sides) or _is_under_mask(term.form, side, meaning)
 
 
 def _is_under_mask(form: Form, side: cst.CSTNode, meaning: Meaning) -> bool:
     """``l1_loss_masked(image, data["seg_im"], mask)``: the photograph under the mask that the L1 is given beside it."""
-    masked = form.callee is not None and {"mask", "masked"} & set(words(call_name(form.call))) and form.extras
+    masked = form.callee is not None and MASKED & set(words(call_name(form.call))) and form.extras
     name = side.value if isinstance(side, cst.Name) else str(key_of(side) or "")
     return bool(masked) and meaning.kind == "mask" and any(kind_of_words(word) == "image" for word in words(name))
 

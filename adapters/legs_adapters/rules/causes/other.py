@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from typing import List
 
 import libcst as cst
 
-from legs_adapters.code.syntax import attribute_chain, code, loops_around, walk_expressions, word_set, words
+from legs_adapters.code.syntax import attribute_chain, code, loops_around, walk_expressions, words
 from legs_adapters.lexicon.masks import picked_from
 from legs_adapters.lexicon.renderings import is_of_mesh, is_rendering
+from legs_adapters.lexicon.words import OF_VIEWS, RAY_BUNDLES, RAY_COLOURS
 from legs_adapters.rules.causes.features import compared
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
@@ -17,10 +17,6 @@ from legs_adapters.terms.sides import of_rays
 from legs_adapters.terms.ssim import is_beside_ssim
 
 __all__ = ["FixedTarget", "NotSplats"]
-
-_BUNDLES = {"ray_bundle", "ray_samples"}
-_RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
-_OF_VIEWS = word_set("batch cam camera cameras cams data frame frames item scene view views viewpoint viewpoints")
 
 
 class _Other(Rule):
@@ -58,7 +54,7 @@ class FixedTarget(_Other):
             return []
         named = [part for value in values for part in walk_expressions(value) if isinstance(part, cst.Name)]
         inside = {id(part) for part in walk_expressions(loops[-1])}
-        if any(id(name) in inside or set(words(name.value)) & _OF_VIEWS for name in named):
+        if any(id(name) in inside or set(words(name.value)) & OF_VIEWS for name in named):
             return []
         beside = any(
             id(call) in inside and (is_rendering(function, one) or is_rendering(function, other))
@@ -85,7 +81,7 @@ class NotSplats(_Other):
         if ((of_rays(term.form) and not picked) or by_class) and not is_beside_ssim(function, *term.sides):
             return by_class or term.here
         mesh = any(is_of_mesh(analysis.program, function, side) for side in term.sides)
-        eikonal = "eikonal" in function.module.text and _RAY_COLOURS.search(code(term.form.node))
+        eikonal = "eikonal" in function.module.text and RAY_COLOURS.search(code(term.form.node))
         return term.here if mesh or eikonal else []
 
 
@@ -93,4 +89,4 @@ def _ray_method(term: Term) -> List[Decider]:
     """Return the method of its class that takes rays, which make no picture: ``get_outputs(self, ray_bundle)``."""
     owner = term.analysis.program.owner_of(term.function)
     methods = owner.methods.values() if owner is not None else ()
-    return [header(method) for method in methods if _BUNDLES & set(method.parameters)][:1]
+    return [header(method) for method in methods if RAY_BUNDLES & set(method.parameters)][:1]

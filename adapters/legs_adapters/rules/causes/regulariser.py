@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import List, Optional, Sequence
+from typing import AbstractSet, List, Optional, Sequence
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import arguments, attribute_chain, call_name, constant, dotted, words
 from legs_adapters.lexicon.depiction import Meanings
+from legs_adapters.lexicon.words import GAUSSIAN_MODEL, POINTS
 from legs_adapters.rules.rule import Rule, Term, source_of
+from legs_adapters.tensors.operations import CONSTANT, KEEPS_VALUES, MAKES, MODULES, REDUCES
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import same_root
 
 __all__ = ["Literal", "OfModel", "Statistic"]
 
-_MADE_UP = {f"torch.{name}{like}" for name in ("eye", "zeros", "ones", "full") for like in ("", "_like")}
-_OF_LITERALS = {"torch.tensor", "torch.as_tensor", "torch.Tensor", "torch.FloatTensor"}
-_SHAPED = {"cuda", "to", "float", "view", "reshape", "unsqueeze", "expand", "expand_as", "repeat"}
 _DEPTH = 8
 
 
@@ -80,7 +79,7 @@ class OfModel(_Regulariser):
         parts = list(attribute_chain(term.target))
         owner = term.analysis.program.owner_of(term.function)
         own = isinstance(parts[-1], cst.Name) and parts[-1].value == "self" and len(parts) > 1
-        own = own and owner is not None and bool({"get_xyz", "oneupSHdegree"} & set(owner.methods))
+        own = own and owner is not None and bool(GAUSSIAN_MODEL & set(owner.methods))
         return [(term.function, term.target)] if own else []
 
 
@@ -88,7 +87,7 @@ def _is_of_points(sides: Sequence[cst.CSTNode]) -> bool:
     """``model.rgb_colors[point_indexes]``: rows of points, no picture."""
     indexed = [node for node in sides if isinstance(node, cst.Subscript)]
     names = [element.slice.value for node in indexed for element in node.slice if isinstance(element.slice, cst.Index)]
-    return any(isinstance(name, cst.Name) and {"point", "points"} & set(words(name.value)) for name in names)
+    return any(isinstance(name, cst.Name) and POINTS & set(words(name.value)) for name in names)
 
 
 def _is_number(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int) -> bool:
@@ -96,12 +95,12 @@ def _is_number(meanings: Meanings, function: Function, node: cst.CSTNode, depth:
     if isinstance(node, cst.Call):
         positional, keywords, _ = arguments(node)
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
-        own = base is not None and not (isinstance(base, cst.Name) and base.value == "torch")
+        own = base is not None and not (isinstance(base, cst.Name) and base.value in MODULES)
         of = base if own else positional[0] if positional else None
-        if call_name(node) in ("mean", "sum", "std", "var", "median"):
+        if call_name(node) in REDUCES:
             axes = [*positional[0 if own else 1 :], *(keywords[key] for key in ("dim", "axis") if key in keywords)]
             return of is not None and all(isinstance(constant(axis), tuple) for axis in axes)
-        moved = call_name(node) in ("detach", "clamp", "clip", "cuda", "to", "float", "sqrt")
+        moved = call_name(node) in KEEPS_VALUES | {"sqrt"}
         return moved and of is not None and _is_number(meanings, function, of, depth)
     if isinstance(node, cst.BinaryOperation):
         for side, other in ((node.left, node.right), (node.right, node.left)):
@@ -111,6 +110,12 @@ def _is_number(meanings: Meanings, function: Function, node: cst.CSTNode, depth:
         made = [d.value for d in function.flow.reaching(node) if d.kind == "assign" and d.value is not None]
         return bool(made) and all(_is_number(meanings, function, value, depth + 1) for value in made)
     return False
+
+
+def _is_torchs(node: cst.Call, operations: AbstractSet[str]) -> bool:
+    """Return whether a call is ``torch.`` and one of some operations."""
+    module, _, name = (dotted(node.func) or "").rpartition(".")
+    return module == "torch" and name in operations
 
 
 def _is_constant_tensor(function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
@@ -127,12 +132,12 @@ def _is_constant_tensor(function: Function, node: cst.CSTNode, depth: int = 0) -
         parts = [node.value]
     elif not isinstance(node, cst.Call):
         return constant(node) is not None
-    elif dotted(node.func) in _OF_LITERALS:
+    elif _is_torchs(node, MAKES):
         parts = [*arguments(node)[0][:1]]
-    elif isinstance(node.func, cst.Attribute) and call_name(node) in _SHAPED:
+    elif isinstance(node.func, cst.Attribute) and call_name(node) in KEEPS_VALUES:
         parts = [node.func.value]
     else:
-        return dotted(node.func) in _MADE_UP
+        return _is_torchs(node, CONSTANT)
     return (
         depth < _DEPTH
         and bool(parts)

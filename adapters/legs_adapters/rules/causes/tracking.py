@@ -7,13 +7,11 @@ from typing import List
 import libcst as cst
 
 from legs_adapters.code.syntax import walk_all, words
+from legs_adapters.lexicon.words import MAPPING, TRACKING
 from legs_adapters.rules.rule import Asked, ByPurpose, CallOfTerm, Rule
 from legs_adapters.terms.findings import Decider
 
 __all__ = ["PoseStep", "Tracking"]
-
-_POSE = {"tracking", "track", "tracker", "localize", "localization", "relocalize", "relocalization"}
-_MAPPING = {"mapping", "map", "mapper"}  # a class that tracks and maps says nothing of one method
 
 
 class _Tracking(Rule):
@@ -77,4 +75,4 @@ def _condition(term: Asked) -> List[cst.CSTNode]:
 def _tracks(name: str) -> bool:
     """Return whether a name says that poses are moved: to track, or to align a test view."""
     said = set(words(name))
-    return {"test", "pose"} <= said or bool(said & _POSE and not said & _MAPPING)
+    return {"test", "pose"} <= said or bool(said & TRACKING and not said & MAPPING)

@@ -7,7 +7,8 @@ from typing import AbstractSet, Iterator, List, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import call_name, word_set, words
+from legs_adapters.code.syntax import call_name, words
+from legs_adapters.lexicon.words import LOSS, REPORTING, SCORING
 from legs_adapters.rules.causes.evaluation import EvaluationRule
 from legs_adapters.rules.rule import ByPurpose, Rule, Term, header
 from legs_adapters.tensors.gradients import is_without_grad, no_grad_around
@@ -15,18 +16,6 @@ from legs_adapters.tensors.operations import JOINS
 from legs_adapters.terms.findings import Decider
 
 __all__ = ["Evaluation", "Leaf", "NoStep", "Scoring", "Untrained"]
-
-_EVALUATION = word_set(
-    """
-    eval evaluate evaluation test testing report reports metric metrics valid validate validation render
-    visualize vis benchmark compare psnr quality
-    """
-)
-_SCORING = word_set(
-    """
-    score scores scoring importance densify densification prune pruning sensitivity sample sampling error
-    """
-)
 
 
 class _Scoring(Rule):
@@ -47,7 +36,7 @@ class Scoring(_Scoring):
     id = "scoring"
 
     def evidence(self, term: Term) -> List[Decider]:
-        return _said(term, _SCORING) if _is_untrained(term) else []
+        return _said(term, SCORING) if _is_untrained(term) else []
 
 
 class NoStep(ByPurpose, _Scoring):
@@ -83,7 +72,7 @@ class Evaluation(EvaluationRule):
         if not _is_untrained(term):
             return []
         around = no_grad_around(term.function, term.call, term.form.node)
-        return [around] if around is not None else _said(term, _EVALUATION)
+        return [around] if around is not None else _said(term, REPORTING)
 
 
 class _Untrained(Rule):
@@ -139,11 +128,11 @@ def _is_untrained(term: Term) -> bool:
 def _is_called_by_framework(term: Term) -> bool:
     """Return whether it makes the loss of a module's ``forward``, whose caller is settled at run time (a registry)."""
     training = term.analysis.training
-    if not {"loss", "losses"} & set(words(term.function.name)):
+    if not LOSS & set(words(term.function.name)):
         return False
     above = [term.function, *_callers(term, term.function)]
     above += [caller for callee in above[1:] for caller in _callers(term, callee)]
-    if any(set(words(f.name)) & (_EVALUATION | _SCORING) for f in above):
+    if any(set(words(f.name)) & (REPORTING | SCORING) for f in above):
         return False
     return bool(training.roots) and any(
         f.name == "forward" and f.owner is not None and f not in training.sites for f in above

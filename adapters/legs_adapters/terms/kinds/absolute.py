@@ -9,6 +9,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.tensors.absolute import absolute_value, is_difference
+from legs_adapters.tensors.operations import NUMBERS
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
@@ -83,4 +84,4 @@ class Absolute(Form):
 
 
 def _is_number(node: cst.CSTNode) -> bool:
-    return isinstance(node, cst.Call) and isinstance(node.func, cst.Name) and node.func.value in ("int", "float", "len")
+    return isinstance(node, cst.Call) and isinstance(node.func, cst.Name) and node.func.value in NUMBERS

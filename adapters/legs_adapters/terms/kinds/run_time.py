@@ -6,18 +6,18 @@ from typing import List, Optional, Sequence
 
 import libcst as cst
 
+from legs_adapters.code.calls import BY_NAME
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import arguments, call_name, constant, key_of, same
 from legs_adapters.lexicon.names import is_l1_name
+from legs_adapters.lexicon.words import STRUCTURAL
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.called import Called
-from legs_adapters.terms.ssim import STRUCTURAL, is_given
+from legs_adapters.terms.ssim import is_given
 
 __all__ = ["chosen_at_run_time"]
-
-_BY_NAME = {"eval", "getattr"}
 
 
 def chosen_at_run_time(program: Program, training: Training, function: Function, known: Sequence[Form]) -> List[Form]:
@@ -58,6 +58,6 @@ def _looks_up(value: Optional[cst.CSTNode]) -> bool:
     """``eval(name)``, ``getattr(losses, name)``, ``globals()[name]``, ``losses[name]``; not ``losses["l2"]``."""
     if isinstance(value, cst.Subscript):
         return key_of(value) is None
-    if not isinstance(value, cst.Call) or call_name(value) not in _BY_NAME:
+    if not isinstance(value, cst.Call) or call_name(value) not in BY_NAME:
         return False
     return not any(isinstance(constant(arg.value), str) for arg in value.args)

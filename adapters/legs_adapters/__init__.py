@@ -1,1 +1,1 @@
-"""What knows other people's code: finding and rewriting the loss of a 3DGS codebase. Uses legs_loss's public face."""
+"""Find and rewrite the loss of a 3DGS codebase. Uses legs_loss's public face."""

@@ -245,7 +245,7 @@ def _undo(args: argparse.Namespace) -> int:
 
 
 def _journal(folder: str) -> bytes:
-    """What tells one state of a checkout's journal from another; empty where there is none."""
+    """Return bytes that tell one state of a checkout's journal from another; empty where there is none."""
     try:
         found = os.lstat(os.path.join(folder, ".legs-patch.json"))
     except (OSError, ValueError):

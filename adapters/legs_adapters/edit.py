@@ -19,7 +19,7 @@ from typing import List, Optional, Sequence, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Module
-from legs_adapters.code.sources import Source, decode
+from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import dotted
 from legs_adapters.terms.findings import Kept, Site
 from legs_adapters.terms.text import Edit, Text, on_one_line
@@ -59,8 +59,7 @@ def rewrite(
     if (sites or kept) and not imported:
         edits.append(_Import(Text(source, module.top)).edit(name, in_place))
     edits.sort()
-    checked = decode(source.path, apply_edits(source.data, edits))
-    if not isinstance(checked, Source) or not _parses(checked.text):
+    if not _parses(apply_edits(source.data, edits).decode("utf-8-sig")):
         raise LegsError(f"{source.path}: the rewritten file would not parse; please report this")
     return edits
 
@@ -94,7 +93,7 @@ def _kept_edits(text: Text, kept: Kept, package: str) -> List[Edit]:
 
 
 class _Import:
-    """Where a file's import of the package goes."""
+    """The import of the package in one file, and its place there."""
 
     def __init__(self, text: Text) -> None:
         self.text = text
@@ -122,7 +121,7 @@ class _Import:
         return self.text.replace(at, at, self._newline() + line)  # the last line of a file that does not end in one
 
     def _anchor(self) -> Optional[cst.SimpleStatementLine]:
-        """The statement that the import goes after: the last ``import torch...`` at the top, or the last import."""
+        """Return the statement that the import goes after: the last ``import torch...`` at the top, or the last one."""
         imports: List[cst.SimpleStatementLine] = []
         torch: List[cst.SimpleStatementLine] = []
         header: Optional[cst.SimpleStatementLine] = None
@@ -167,7 +166,7 @@ class _Import:
 
 
 def _package_name(module: Module) -> Tuple[str, bool]:
-    """The name that legs_loss has, or will have, in a file; and whether the file imports it already."""
+    """Return the name that legs_loss has, or will have, in a file; and whether the file imports it already."""
     imported = False
     for function in module.scopes(lambda text: PACKAGE in text):
         for definition in function.flow.definitions.get(PACKAGE, []):

@@ -10,8 +10,8 @@ from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_adapters.checkout.git import changed_files
 from legs_adapters.checkout.replace import locked, read_file, replace_files
-from legs_adapters.code.folders import walk, why_left_out
-from legs_adapters.code.sources import Source, Unreadable, check_root, read_source
+from legs_adapters.code.folders import why_left_out
+from legs_adapters.code.sources import check_root, read_files
 from legs_adapters.edit import Edit, apply_edits, rewrite
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_adapters.rules.find import find
@@ -76,17 +76,10 @@ def plan(
         LegsError: no such folder; a site named by hand is not there; an expression that is nested too deeply.
     """
     root = check_root(path)
-    readable: List[Source] = []
-    unreadable: List[Unreadable] = []
-    for name in walk(root, exclude):
-        source = read_source(root, name)
-        if isinstance(source, Source):
-            readable.append(source)
-        else:
-            unreadable.append(source)
+    files = read_files(root, exclude)
     with _deep_recursion():
-        findings = find(readable, by_hand, _unread(root, exclude, unreadable))
-    findings.unreadable[:0] = unreadable
+        findings = find(files.readable, by_hand, files.unread)
+    findings.unreadable[:0] = files.unreadable
     for name, line in by_hand:
         if not any(site.path == name and site.named_by(line) for site in findings.sites) and not any(
             left.path == name and left.line == line for left in findings.patched
@@ -106,18 +99,6 @@ def plan(
         edits[name] = rewrite(source, module, sites, kept, in_place)
         after[name] = apply_edits(source.data, edits[name])
     return Plan(root, findings, edits, after, settings)
-
-
-def _unread(root: Path, exclude: Sequence[str], unreadable: Sequence[Unreadable]) -> Dict[str, str]:
-    """Return the text, by path, of what is excluded or no Python: names in it may be of functions that are patched."""
-    paths = {entry.path for entry in unreadable}
-    if exclude:
-        paths |= set(walk(root)) - set(walk(root, exclude))
-    texts: Dict[str, str] = {}
-    for path in sorted(paths):
-        with contextlib.suppress(OSError):
-            texts[path] = (root / path).read_text(encoding="utf-8", errors="replace")
-    return texts
 
 
 def write(plan: Plan, force: bool = False) -> List[str]:

@@ -1,4 +1,4 @@
-"""What a run found and did, as a table for people and as JSON for scripts; and the diff."""
+"""Report what a run found and did, as a table for people and as JSON for scripts; and show the diff."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ class Verdict(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether all claims hold."""
+        """Return whether all claims hold."""
         return all(self.claims.values())
 
     def text(self) -> str:

@@ -27,7 +27,7 @@ class Calls(NamedTuple):
 
 
 class _Mention(NamedTuple):
-    """Where a name is said: the expression that ends in it, and what is around that, the innermost first."""
+    """A mention of a name: the expression that ends in it, and what is around that, the innermost first."""
 
     scope: Function
     node: cst.CSTNode
@@ -100,7 +100,7 @@ def calls_of(program: Program, function: Function) -> Calls:
 
 
 def _refers(program: Program, target: Function | Class, mention: _Mention) -> Optional[bool]:
-    """Whether a mention is of the function, or of an instance or the class of its own; None where it may be."""
+    """Return whether a mention is of the function, or of an instance or the class of its own; None where it may be."""
     node = mention.node
     if isinstance(node, (cst.ImportAlias, cst.SimpleString)):
         return None
@@ -119,7 +119,7 @@ def _refers(program: Program, target: Function | Class, mention: _Mention) -> Op
 
 
 def _held(program: Program, owner: Class, mention: _Mention) -> List[str]:
-    """The names that an instance gets where it is made: ``self.image_loss = ImageLoss().cuda()``."""
+    """Return the names that an instance gets where it is made: ``self.image_loss = ImageLoss().cuda()``."""
     for outer in mention.around:
         if isinstance(outer, cst.Assign) and any(part is mention.node for part in attribute_chain(outer.value)):
             made = program.resolve(mention.scope, outer.value)
@@ -152,14 +152,14 @@ def _says(node: cst.CSTNode, around: Tuple[cst.CSTNode, ...], name: str) -> bool
 
 
 def _looks_up(node: cst.CSTNode) -> bool:
-    """``getattr(losses, "photometric")``, ``globals()["photometric"]``."""
+    """Return whether a node looks a name up: ``getattr(losses, "photometric")``, ``globals()["photometric"]``."""
     if isinstance(node, cst.Subscript):
         return isinstance(node.value, cst.Call) and call_name(node.value) in _NAMESPACES
     return isinstance(node, cst.Call) and call_name(node) in BY_NAME
 
 
 def _is_label(node: cst.CSTNode, child: cst.CSTNode) -> bool:
-    """Whether a part of a node is no expression of its own; or the body of a function, which is a scope of its own."""
+    """Return whether a part of a node is no expression of its own, or the body of a function, a scope of its own."""
     if isinstance(node, cst.FunctionDef):
         return child is node.name or child is node.body
     if isinstance(node, (cst.ClassDef, cst.Param)):

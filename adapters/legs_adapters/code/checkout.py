@@ -110,13 +110,13 @@ class Checkout:
         return self._together[module.path]
 
     def _users(self, module: Module) -> List[Module]:
-        """The modules that import another."""
+        """Return the modules that import another."""
         path = PurePosixPath(module.path)
         name = path.parent.name if path.name == "__init__.py" else path.stem
         return [other for other in self.matching(re.compile(rf"\b{name}\b")) if module in self._imports(other)]
 
     def _imports(self, module: Module) -> List[Module]:
-        """The checkout's modules that a module imports."""
+        """Return the checkout's modules that a module imports."""
         found: List[Optional[Module]] = []
         for node in module.top.flow.imports:
             assert isinstance(node, (cst.Import, cst.ImportFrom))
@@ -156,8 +156,11 @@ class Checkout:
         return self.module(ends[0]) if len(ends) == 1 else None
 
     def _on_path(self, module: Module, stem: str, name: str) -> Optional[Module]:
-        """``from base import Trainer``: the nearest ``base.py`` that defines a Trainer, if a script can have put it
-        on sys.path; of a checkout that is a package itself also ``from its_name.base import Trainer``."""
+        """Find the nearest ``base.py`` that defines a Trainer, for ``from base import Trainer``.
+
+        A script can have put its folder on sys.path. In a checkout that is a package itself, the import may also be
+        ``from its_name.base import Trainer``.
+        """
         defines = re.compile(rf"^(?:class|def)[ \t]+{re.escape(name)}\b", re.M)
         own = stem.partition(".")[2].replace(".", "/") + ".py" if "__init__.py" in self.sources else ""
         known = [own] if own in self.sources else self._ending.get(stem, [])

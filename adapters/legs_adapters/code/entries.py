@@ -77,7 +77,7 @@ def formatted_key(node: cst.Subscript) -> Optional[str]:
 
 
 def computed_key(function: Function, node: cst.Subscript) -> Optional[str]:
-    """What is literal in the key of ``target["target_" + key]``; of ``pred[key]`` beside it, nothing."""
+    """Return what is literal in the key of ``target["target_" + key]``; of ``pred[key]`` beside it, nothing."""
     index = node.slice[0].slice
     if len(node.slice) != 1 or not isinstance(index, cst.Index):
         return None
@@ -89,7 +89,7 @@ def computed_key(function: Function, node: cst.Subscript) -> Optional[str]:
 
 
 def default_key(function: Function, node: cst.Subscript) -> object:
-    """``preds[key]`` of a function with the parameter ``key="rgb"``."""
+    """Return ``"rgb"`` for ``preds[key]`` of a function with the parameter ``key="rgb"``."""
     index = node.slice[0].slice
     if len(node.slice) != 1 or not isinstance(index, cst.Index) or not isinstance(index.value, cst.Name):
         return None
@@ -98,6 +98,6 @@ def default_key(function: Function, node: cst.Subscript) -> object:
 
 
 def _added_text(node: cst.BinaryOperation) -> Optional[str]:
-    """``target_`` of ``"target_" + key``."""
+    """Return ``target_`` of ``"target_" + key``."""
     texts = [text for text in map(constant, (node.left, node.right)) if isinstance(text, str)]
     return "_".join(texts) if texts and isinstance(node.operator, cst.Add) else None

@@ -331,7 +331,7 @@ def _statements(body: cst.BaseSuite | cst.Module) -> Sequence[cst.CSTNode]:
 
 
 def _counts(value: Optional[cst.CSTNode]) -> bool:
-    """``enumerate(...)``, ``zip(...)``: what a loop goes over in step with something."""
+    """Return whether a loop goes over something in step with something else: ``enumerate(...)``, ``zip(...)``."""
     return isinstance(value, cst.Call) and call_name(value) in ("enumerate", "zip")
 
 

@@ -16,6 +16,7 @@ __all__ = [
     "Skipped",
     "folders_of",
     "foreign_folder",
+    "own_and_excluded",
     "walk",
     "why_left_out",
 ]
@@ -52,6 +53,12 @@ def walk(root: Path, exclude: Sequence[str] = ()) -> Iterator[str]:
     """
     for files, _ in folders_of(root, exclude):
         yield from files
+
+
+def own_and_excluded(root: Path, exclude: Sequence[str]) -> Tuple[List[str], List[str]]:
+    """Return the paths of the checkout's own Python files, and of those that ``exclude`` leaves out."""
+    own = list(walk(root, exclude))
+    return own, sorted(set(walk(root)) - set(own)) if exclude else []
 
 
 def why_left_out(root: Path, path: str, exclude: Sequence[str] = ()) -> Optional[str]:

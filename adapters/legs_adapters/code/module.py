@@ -132,7 +132,7 @@ class Function:
         return known and all(definition.kind == "parameter" for definition in self.flow.reaching(node))
 
     def given(self, call: cst.Call, parameter: str) -> Optional[cst.BaseExpression]:
-        """What a call of it gives for a parameter; None where it leaves that out, or it cannot be seen."""
+        """Return the argument that a call of it gives for a parameter; None where it is left out, or cannot be seen."""
         positional, keywords, _ = arguments(call)
         if parameter in keywords or parameter not in self.parameters:
             return keywords.get(parameter)
@@ -141,7 +141,7 @@ class Function:
 
     @property
     def static(self) -> bool:
-        """Whether it is a static method."""
+        """Return whether it is a static method."""
         return "staticmethod" in self.decorators
 
     @property

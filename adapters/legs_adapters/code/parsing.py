@@ -26,7 +26,7 @@ _LONE_RETURN = re.compile(rb"\r(?!\n)")
 
 
 class Place(NamedTuple):
-    """Where a node stands: bytes of the file without its byte order mark; lines count from 1, columns from 0."""
+    """The place of a node: bytes of the file without its byte order mark; lines count from 1, columns from 0."""
 
     start: int
     end: int

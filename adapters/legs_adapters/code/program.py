@@ -25,7 +25,7 @@ _MADE = ("instance", "made by")
 
 
 class Reference(NamedTuple):
-    """What an expression refers to.
+    """A function, class, module or library name that an expression refers to.
 
     ``kind``: "function", "class", "instance" (of a class), "module", "external" (a dotted name outside of the
     checkout), "lambda". ``guess``: found by its name alone.
@@ -37,7 +37,7 @@ class Reference(NamedTuple):
 
 
 class Conventions(NamedTuple):
-    """What the libraries that a program uses do with objects: it is not in their names, and not in the checkout.
+    """The ways in which libraries pass objects on, which neither names nor the checkout show.
 
     Attributes:
         returning_self: methods that return the object itself, ``model.cuda()``.
@@ -152,7 +152,7 @@ class Program(Checkout):
         return []
 
     def handed(self, function: Function, node: cst.Name) -> List[Reference]:
-        """The modules that a parameter is given, ``model`` of ``train_epoch(model, loader)``."""
+        """Return the modules that a parameter is given, ``model`` of ``train_epoch(model, loader)``."""
         kinds = {definition.kind for definition in function.flow.reaching(node)}
         if not function.name or kinds - {"store"} != {"parameter"}:
             return []
@@ -168,7 +168,7 @@ class Program(Checkout):
         )
 
     def _wrapped(self, function: Function, node: cst.Call, index: int, depth: int) -> List[Reference]:
-        """``DataParallel(model)``, ``model, optimizer = accelerator.prepare(model, optimizer)``."""
+        """Resolve ``DataParallel(model)``, and ``model, optimizer = accelerator.prepare(model, optimizer)``."""
         given = arguments(node)[0] if self._wraps(node) else []
         if index >= len(given):
             return []
@@ -180,7 +180,7 @@ class Program(Checkout):
         return call_name(node) in self._conventions.wrapping or any(name.endswith(known) for known in with_dot)
 
     def _returned(self, made: List[Reference], index: Optional[int], depth: int) -> List[Reference]:
-        """What functions return, or one of those in a tuple: ``render = get_renderer(kind)``, ``net = get_model()``."""
+        """Resolve what functions return, or one of a tuple: ``render = get_renderer(kind)``, ``net = get_model()``."""
         found: List[Reference] = []
         for ref in made:
             if ref.kind != "function" or ref.guess or not isinstance(ref.target, Function) or depth > _DEPTH:
@@ -291,7 +291,7 @@ class Program(Checkout):
         return None
 
     def _overrides(self, owner: Class, name: str) -> List[Reference]:
-        """``self.step()`` in a base class: the methods of classes that derive from it."""
+        """Resolve ``self.step()`` in a base class: the methods of classes that derive from it."""
         if name.startswith("__"):
             return []
         found = []

@@ -1,4 +1,4 @@
-"""What a function returns: one expression, with its local names filled in; or one of its parameters, passed on."""
+"""Reduce a function to the expression that it returns, local names filled in, or to the parameter that it passes on."""
 
 from __future__ import annotations
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Dict, List, NamedTuple, Sequence
 
+from legs_adapters.code.folders import own_and_excluded
 from legs_adapters.code.limits import LARGEST, too_deep
 from legs_loss import LegsError
 
-__all__ = ["BOM", "Source", "Unreadable", "check_root", "decode", "read_source"]
+__all__ = ["BOM", "Files", "Source", "Unreadable", "check_root", "decode", "read_files", "read_source"]
 
 BOM = b"\xef\xbb\xbf"
 
@@ -46,6 +49,20 @@ class Unreadable:
     reason: str
 
 
+class Files(NamedTuple):
+    """The Python files of a checkout.
+
+    Attributes:
+        readable: those that are to be looked at.
+        unreadable: those that cannot be.
+        unread: by path, the text of what is excluded or no Python: names in it may be of functions that are patched.
+    """
+
+    readable: List[Source]
+    unreadable: List[Unreadable]
+    unread: Dict[str, str]
+
+
 def check_root(path: str | os.PathLike[str]) -> Path:
     """Return the folder to work in, absolute.
 
@@ -60,6 +77,18 @@ def check_root(path: str | os.PathLike[str]) -> Path:
     if root == root.parent:
         raise LegsError(f"{root} is the root of the file system: give the folder of one checkout")
     return root
+
+
+def read_files(root: Path, exclude: Sequence[str]) -> Files:
+    """Read the Python files of a checkout, but for those that are excluded."""
+    own, excluded = own_and_excluded(root, exclude)
+    read = [read_source(root, name) for name in own]
+    unreadable = [source for source in read if isinstance(source, Unreadable)]
+    unread: Dict[str, str] = {}
+    for path in sorted([*excluded, *(source.path for source in unreadable)]):
+        with contextlib.suppress(OSError):
+            unread[path] = (root / path).read_text(encoding="utf-8", errors="replace")
+    return Files([source for source in read if isinstance(source, Source)], unreadable, unread)
 
 
 def read_source(root: Path, path: str) -> Source | Unreadable:

@@ -214,7 +214,7 @@ def loops_around(root: cst.CSTNode, node: cst.CSTNode) -> List[cst.CSTNode]:
 
 
 def _is_node(kind: type) -> bool:
-    """Whether a class is one of LibCST's nodes: to ask isinstance of every node costs more than all the rest."""
+    """Return whether a class is one of LibCST's nodes: to ask isinstance of every node costs more than all the rest."""
     if kind not in _NODES:
         _NODES[kind] = issubclass(kind, cst.CSTNode)
     return _NODES[kind]

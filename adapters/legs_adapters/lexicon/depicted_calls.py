@@ -1,4 +1,4 @@
-"""What a call depicts: a rendering, a loaded photograph, what a function makes of the image that it is given."""
+"""Tell what a call depicts: a rendering, a loaded photograph, what a function makes of the image that it is given."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, dept
 
 
 def _is_module(program: Program, function: Function, node: cst.Name) -> bool:
-    """Whether a name is a module's, ``th`` of ``import torch as th``."""
+    """Return whether a name is a module's, ``th`` of ``import torch as th``."""
     definitions = program.lookup(function, node)
     return bool(definitions) and all(isinstance(d.value, cst.Import) for _, d in definitions or ())
 
 
 def _made_by(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int) -> Optional[Meaning]:
-    """``rasterizer = GaussianRasterizer(...)``, then ``rasterizer(...)``; a function whose returns are images."""
+    """Return the meaning by what is called: an instance of a rasterizer, a function whose returns are images."""
     for reference in meanings.program.resolve(function, node):
         if reference.kind in ("instance", "class", "made by", "external", "function"):
             name = getattr(reference.target, "name", str(reference.target))

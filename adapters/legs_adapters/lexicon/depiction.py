@@ -1,4 +1,4 @@
-"""What an expression stands for in a training step: which kind of picture it is, and whether it was rendered.
+"""Tell what an expression depicts in a training step: which kind of picture, and whether it was rendered.
 
 The evidence is the dataflow (where a value comes from, through assignments, clamps, indexing, exposure, ``.cuda()``)
 and the field's words in the names on the way. A name that says "depth" or "feature" on the way outweighs one
@@ -211,7 +211,7 @@ class Meanings:
         return Meaning(None, meaning.role)
 
     def _returned(self, function: Function, call: cst.Call, index: int, depth: int, by_name: bool) -> Meaning:
-        """What an element of a returned tuple is: of a renderer's, which may join a depth to its colours, by name."""
+        """Return the meaning of an element of a returned tuple; a renderer's may join depth and colours: by name."""
         found = []
         for reference in self.program.resolve(function, call.func):
             if reference.kind == "function" and isinstance(reference.target, Function) and not reference.guess:
@@ -241,7 +241,7 @@ class Meanings:
         return given if said is None else given._replace(kind=said)
 
     def _said_by_class(self, function: Function) -> Optional[str]:
-        """What a loss class's name says that its method is given, where one call in a base class serves several."""
+        """Return the kind that a loss class is named for, where one call in a base class serves several."""
         owner = function.owner
         if owner is None or not set(words(owner.name)) & LOSS_CLASS:
             return None
@@ -251,7 +251,7 @@ class Meanings:
         return kind if kind in COMPARED else None
 
     def _calls_of(self, function: Function) -> List[Tuple[Function, cst.Call]]:
-        """The calls of a function that training does not go through."""
+        """Return the calls of a function that training does not go through."""
         if function not in self._calls:
             self._calls[function] = list(sure_calls(self.program, function))
         return self._calls[function]
@@ -294,7 +294,7 @@ class Meanings:
         return self.of(function, node.value, depth)
 
     def _entry(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
-        """``package["photo"]``, of a package that the codebase's own function made.
+        """Return the meaning of ``package["photo"]``, of a package that the codebase's own function made.
 
         What a renderer writes into its dictionary has the names that the loss knows; inside, it is made of depths, too.
         """
@@ -303,7 +303,7 @@ class Meanings:
         return mix([self.of(maker, value, depth) for maker, value in held])
 
     def role_of_holder(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[str]:
-        """``outputs["rgb"]`` was rendered, ``batch["rgb"]`` and ``viewpoint.image`` were photographed."""
+        """Return the role by the holder: ``outputs["rgb"]`` is rendered, ``batch["rgb"]`` a target."""
         if isinstance(node, cst.Name):
             found = set(words(node.value))
             name_role = role_of_words(node.value)
@@ -322,7 +322,7 @@ class Meanings:
         return self.of(function, node, depth).role
 
     def _given_role(self, function: Function, node: cst.Name) -> Optional[str]:
-        """The role of a parameter ``data`` that is given ``data["render_results"]`` wherever training calls it."""
+        """Return the role of a parameter ``data`` that training gives ``data["render_results"]`` at each call."""
         if {definition.kind for definition in function.flow.reaching(node)} != {"parameter"}:
             return None
         given = [function.given(call, node.value) for _, call in self.training.sites.get(function, [])]
@@ -332,7 +332,7 @@ class Meanings:
 
     @staticmethod
     def _is_rendered(function: Function, node: cst.Name) -> bool:
-        """``view = render(camera)``; not ``data = render(data)``, which has what it had before, too."""
+        """Return whether ``view = render(camera)`` made it; ``data = render(data)`` has what it had before, too."""
         made = [definition.value for definition in function.flow.reaching(node)]
         return any(
             isinstance(call, cst.Call)
@@ -343,6 +343,6 @@ class Meanings:
 
 
 def _is_called_for_another(value: cst.CSTNode, place: str, kind: Optional[str]) -> bool:
-    """Whether the kind is only in a function's name, and the name of this one of its results says image."""
+    """Return whether the kind is only in a function's name, and the name of this one of its results says image."""
     named = isinstance(value, cst.Call) and kind is not None and kind_of_words(call_name(value)) == kind
     return named and kind != "image" and kind_of_words(place) == "image"

@@ -1,4 +1,4 @@
-"""Whether pictures are pictures still: masks that pick pixels of them, reshapes that make lists of pixels of them."""
+"""Tell images from lists of pixels: masks that pick pixels, reshapes that flatten images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _DEPTH = 4
 
 
 def is_mask(meanings: Meanings, function: Function, element: cst.SubscriptElement) -> bool:
-    """Whether an index is a mask of pixels."""
+    """Return whether an index is a mask of pixels."""
     if not isinstance(element.slice, cst.Index):
         return False
     node: cst.CSTNode = element.slice.value
@@ -36,7 +36,7 @@ def is_mask(meanings: Meanings, function: Function, element: cst.SubscriptElemen
 
 
 def _is_list_of_views(function: Function, node: cst.CSTNode) -> bool:
-    """``torch.tensor([camera.is_seen for camera in batch])``: a mask that was made of a list picks whole views."""
+    """Return whether a mask was made of a list, and picks views: ``tensor([camera.is_seen for camera in batch])``."""
     made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
     made = [value.body if isinstance(value, cst.IfExp) else value for value in made]
     return bool(made) and all(
@@ -48,7 +48,7 @@ def _is_list_of_views(function: Function, node: cst.CSTNode) -> bool:
 
 
 def _is_list(function: Function, node: cst.CSTNode) -> bool:
-    """``[... for camera in batch]``, or a name for a list that is filled by appending."""
+    """Return whether an expression is a list, ``[... for camera in batch]``, or a name for one."""
     if isinstance(node, (cst.ListComp, cst.List)):
         return True
     made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"] if isinstance(node, cst.Name) else []
@@ -56,17 +56,17 @@ def _is_list(function: Function, node: cst.CSTNode) -> bool:
 
 
 def makes_mask(call: cst.Call) -> bool:
-    """Whether a function makes a mask of an error map, going by its name."""
+    """Return whether a function makes a mask of an error map, going by its name."""
     return bool(set(words(call_name(call))) & PICKING) or call_name(call) == "quantile"
 
 
 def _is_picked(meanings: Meanings, function: Function, node: Optional[cst.CSTNode]) -> bool:
-    """``image[:, mask]``: the pixels of a mask."""
+    """Return whether an expression is the pixels of a mask, ``image[:, mask]``."""
     return isinstance(node, cst.Subscript) and any(is_mask(meanings, function, part) for part in node.slice)
 
 
 def picked_from(meanings: Meanings, function: Function, node: cst.CSTNode) -> Optional[cst.Subscript]:
-    """``image[:, mask]``, for a name that stands for that and nothing else."""
+    """Return ``image[:, mask]``, for a name that stands for that and nothing else."""
     found = function.flow.reaching(node) if isinstance(node, cst.Name) else ()
     values = [definition.value for definition in found if definition.kind == "assign"]
     value = values[0] if len(found) == len(values) == 1 else None
@@ -74,7 +74,7 @@ def picked_from(meanings: Meanings, function: Function, node: cst.CSTNode) -> Op
 
 
 def is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
-    """Whether an expression is a list of pixels, ``image.reshape(-1, 3)``: their neighbours are not known any more."""
+    """Return whether an expression is a list of pixels, ``image.reshape(-1, 3)``, whose neighbours are lost."""
 
     def are(parts: Iterable[Tuple[Function, cst.CSTNode]]) -> bool:
         return any(is_rows(meanings, where, part, depth + 1) for where, part in parts)
@@ -105,7 +105,7 @@ def is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: in
 
 
 def _flattens(node: cst.Call) -> bool:
-    """``image.flatten()``, ``image.reshape(3, -1)``, ``torch.masked_select(image, mask)``."""
+    """Return whether a call makes rows: ``image.flatten()``, ``image.reshape(3, -1)``, ``torch.masked_select(...)``."""
     if call_name(node) in ("reshape", "view"):
         sizes = [constant(value) for value in arguments(node)[0]]
         return -1 in sizes and len(sizes) < 3

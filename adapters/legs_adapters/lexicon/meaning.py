@@ -43,7 +43,7 @@ def mix(parts: Iterable[Meaning]) -> Meaning:
 
 
 def swapped(a: Meaning, b: Meaning) -> Optional[bool]:
-    """Which of the two is the ground truth: False for the second; None where that is not clear."""
+    """Return whether the first of two is the ground truth; None where that is not clear."""
     if b.role == "target" and a.role != "target":
         return False
     if a.role == "target" and b.role != "target":

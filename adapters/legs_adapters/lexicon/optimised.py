@@ -37,7 +37,7 @@ class Optimised:
         self.program = program
 
     def words(self, function: Function, step: cst.Call) -> Set[str]:
-        """The words in an optimiser's name, and in what it was made of."""
+        """Return the words in an optimiser's name, and in what it was made of."""
         assert isinstance(step.func, cst.Attribute)
         parts: List[cst.CSTNode] = [step.func.value, *(arg.value for arg in step.args)]
         return {word for part in parts for word in self._words_of(function, part, 0)} - PLUMBING
@@ -66,14 +66,14 @@ class Optimised:
         return found
 
     def _stored(self, function: Function, node: cst.CSTNode) -> List[Tuple[Function, Definition]]:
-        """What the methods of its class store in ``self.optimizer``."""
+        """Return what the methods of its class store in ``self.optimizer``."""
         owner = self.program.owner_of(function)
         if owner is None or not isinstance(node, cst.Attribute) or dotted(node.value) != "self":
             return []
         return owner.stores(node.attr.value)
 
     def _handed_in(self, function: Function, node: cst.CSTNode) -> Optional[Set[str]]:
-        """The words in what ``model.setup(pose)`` made ``model.optimizer`` of, if of the model's own nothing learns."""
+        """Return the words in what ``model.setup(pose)`` gave ``model.optimizer``, if nothing of the model learns."""
         if not isinstance(node, cst.Attribute):
             return None
         place = f"self.{node.attr.value}"
@@ -95,7 +95,7 @@ class Optimised:
         return found - GAUSSIANS if found & POSES else None
 
     def _given(self, where: Function, node: cst.CSTNode) -> Set[str]:
-        """The words in an argument of an optimiser; of a list with a name also in what is added to it."""
+        """Return the words in an argument of an optimiser; of a list with a name also in what is added to it."""
         found = self._moved(where, node)
         if isinstance(node, cst.Name):  # opt_params = [], then opt_params.append(...)
             for other in where.flow.definitions.get(node.value, []):
@@ -105,7 +105,7 @@ class Optimised:
         return found
 
     def _moved(self, where: Function, node: cst.CSTNode) -> Set[str]:
-        """The words in what an optimiser is given; of ``model._rot`` those of the model's class, if it is a pose's."""
+        """Return the words in what an optimiser is given; of ``model._rot`` those of the model's class, if a pose's."""
         found: Set[str] = set()
         held: Set[str] = set()
         for part in _learning(node):
@@ -119,7 +119,7 @@ class Optimised:
 
 
 def _handed_to(call: cst.Call) -> Set[str]:
-    """The words in what a codebase's own ``setup_optimizer(config, cams=[camera])`` gets; of a setting's name none."""
+    """Return the words in what ``setup_optimizer(config, cams=[camera])`` gets, without names of settings."""
     found: Set[str] = set()
     for arg in call.args:
         if constant(arg.value, _NOTHING) is _NOTHING:

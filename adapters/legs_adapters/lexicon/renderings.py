@@ -1,4 +1,4 @@
-"""Which calls a value came out of, whatever the names are that it had on the way: what the makers' names are for."""
+"""Trace a value to the calls that produced it, and tell renderings by those calls' names."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ __all__ = ["is_of_mesh", "is_rendering"]
 
 
 def is_rendering(function: Function, node: cst.CSTNode) -> bool:
-    """Whether a value came out of functions that render, each of the ways that it can have come."""
+    """Return whether a value came out of functions that render, each of the ways that it can have come."""
     makers = _makers(function, node, set())
     return bool(makers) and all(maker is not None and _renders(maker) for maker in makers)
 
 
 def is_of_mesh(program: Program, function: Function, node: cst.CSTNode) -> bool:
-    """Whether a value can have come out of a rasterizer of triangles, or is sampled from their texture."""
+    """Return whether a value can have come out of a rasterizer of triangles, or is sampled from their texture."""
     return any(
         _draws_mesh(maker) or _rasterizes_mesh(program, function, maker, 0)
         for maker in _makers(function, node, set())
@@ -33,7 +33,7 @@ def is_of_mesh(program: Program, function: Function, node: cst.CSTNode) -> bool:
 
 
 def _rasterizes_mesh(program: Program, function: Function, call: cst.Call, depth: int) -> bool:
-    """Whether a call is of a rasterizer of triangles, or of a method that calls one."""
+    """Return whether a call is of a rasterizer of triangles, or of a method that calls one."""
     for reference in program.resolve(function, call.func):
         if reference.kind in ("external", "made by") and str(reference.target).startswith(MESH_RASTERIZERS):
             return True
@@ -48,7 +48,7 @@ def _rasterizes_mesh(program: Program, function: Function, call: cst.Call, depth
 
 
 def _samples_texture(function: Function) -> bool:
-    """Whether what it returns is ``grid_sample(texture, uv)``."""
+    """Return whether what it returns is ``grid_sample(texture, uv)``."""
     makers = [maker for value in function.flow.returns for maker in _makers(function, value, set())]
     return bool(makers) and all(
         maker is not None
@@ -60,7 +60,7 @@ def _samples_texture(function: Function) -> bool:
 
 
 def _draws_mesh(call: cst.Call) -> bool:
-    """``render_mesh(...)``, ``mesh_renderer(...)``."""
+    """Return whether a call draws a mesh by its name: ``render_mesh(...)``, ``mesh_renderer(...)``."""
     spoken = words(call_name(call))
     return "mesh" in spoken and any(word.startswith(("render", "raster")) for word in spoken)
 
@@ -71,7 +71,7 @@ def _renders(call: cst.Call) -> bool:
 
 
 def _makers(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> List[Optional[cst.Call]]:
-    """The calls that a value comes out of as it is, but for its type, its axes and its range; None for anything else.
+    """Return the calls that produced a value, but for its type, axes and range; None for anything else.
 
     What depends on itself has no maker there.
     """
@@ -107,7 +107,7 @@ def _is_empty(node: Optional[cst.CSTNode]) -> bool:
 
 
 def _value(definition: Definition) -> Optional[cst.CSTNode]:
-    """What is assigned, or what a loop goes over."""
+    """Return what is assigned, or what a loop goes over."""
     value = definition.value
     if definition.kind == "mutate" and isinstance(value, cst.Call):  # renderings.append(image)
         given = arguments(value)[0]

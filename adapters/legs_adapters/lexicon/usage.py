@@ -1,4 +1,4 @@
-"""What the code around an expression shows of it, whatever its name says: a mask, a crop, a rendering."""
+"""Tell by the code around an expression what it is, whatever its name says: a mask, a crop, a rendering."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ __all__ = [
 
 
 def draws(values: List[cst.BaseExpression]) -> bool:
-    """Whether a function is given the Gaussians and a camera, ``imlsplat(gaussians, viewpoint_cam, background)``."""
+    """Return whether a function is given Gaussians and a camera, ``imlsplat(gaussians, viewpoint_cam, background)``."""
     names = [root_of(value) for value in values if isinstance(value, (cst.Name, cst.Attribute))]
     spoken = [set(words(name)) for name in names]
     return any(each & GAUSSIANS for each in spoken) and any(each & CAMERAS for each in spoken)
 
 
 def is_box(function: Function, node: cst.CSTNode) -> bool:
-    """Whether a kernel is all ones, which blurs."""
+    """Return whether a kernel is all ones, which blurs."""
     found = function.flow.definitions.get(node.value, []) if isinstance(node, cst.Name) else []
     made = [definition.value for definition in found if definition.kind == "assign"]
     return bool(made) and all(isinstance(value, cst.Call) and call_name(value) == "ones" for value in made)
 
 
 def is_cropped(function: Function, node: cst.Name) -> bool:
-    """Whether a name stands for a part of a picture, ``image[:, :half]``, and for nothing else."""
+    """Return whether a name stands for a part of a picture, ``image[:, :half]``, and for nothing else."""
     made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
     return len(made) == len(function.flow.reaching(node)) and all(
         isinstance(value, cst.Subscript) and all(isinstance(part.slice, cst.Slice) for part in value.slice)
@@ -47,7 +47,7 @@ def is_cropped(function: Function, node: cst.Name) -> bool:
 
 
 def is_masked(function: Function, node: cst.Name) -> bool:
-    """Whether a name that speaks of an image, too, stands for a product and for nothing else."""
+    """Return whether a name that speaks of an image, too, stands for a product and for nothing else."""
     made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
     products = [v for v in made if isinstance(v, cst.BinaryOperation) and isinstance(v.operator, cst.Multiply)]
     says_image = any(kind_of_words(word) == "image" for word in words(node.value))
@@ -55,7 +55,7 @@ def is_masked(function: Function, node: cst.Name) -> bool:
 
 
 def is_taken_from_one(function: Function, node: cst.Name) -> bool:
-    """Whether ``1 - objects`` stands somewhere: whatever it is called, it is a mask."""
+    """Return whether ``1 - objects`` stands somewhere: whatever it is called, it is a mask."""
     return any(
         isinstance(part, cst.BinaryOperation)
         and isinstance(part.operator, cst.Subtract)
@@ -66,12 +66,12 @@ def is_taken_from_one(function: Function, node: cst.Name) -> bool:
 
 
 def are_neighbours(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:
-    """``x[1:] - x[:-1]``: a picture's own slope."""
+    """Return whether two expressions are shifted parts of one picture: ``x[1:] - x[:-1]``."""
     return isinstance(left, cst.Subscript) and isinstance(right, cst.Subscript) and same(left.value, right.value)
 
 
 def is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
-    """Whether a dictionary is what a data loader hands out, and the entry its own: nothing has rendered it."""
+    """Return whether a dictionary is what a data loader hands out, and the entry its own: nothing has rendered it."""
     made = [d for d in function.flow.reaching(node) if d.kind != "store" or d.key in (None, key)]
     sources = [part for d in made if d.kind == "element" and d.value is not None for part in walk_expressions(d.value)]
     loaders = [part for part in sources if isinstance(part, cst.Name) and set(words(part.value)) & LOADERS]
@@ -79,5 +79,5 @@ def is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
 
 
 def is_asked_for(key: str) -> bool:
-    """``images_output``: nothing but that it is what comes out says that it is a rendering."""
+    """Return whether a key says no more than that it is a result: ``images_output``."""
     return all(role_of_words(word) != "render" or word in RESULT for word in words(key))

@@ -1,4 +1,4 @@
-"""Whether a camera's name is that of one photograph alone: only then may a view be named by it.
+"""Tell whether a camera's name is that of one photograph alone: only then may a view be named by it.
 
 The camera's class has to store a name, and the readers have to give each image its own; nothing may put another image
 into a camera, or make a camera anew; and one run may not go through several scenes.
@@ -80,7 +80,7 @@ class Names:
         return self._named()
 
     def _named(self) -> Optional[str]:
-        """Why what the cameras get as a name is none of a photograph, if it is none wherever they are made."""
+        """Return why what the cameras get as a name is none of a photograph, if it is none wherever they are made."""
         makers = [
             (function, keywords[NAME])
             for name in {camera.name for camera in self._cameras or ()}
@@ -100,14 +100,14 @@ class Names:
         return None
 
     def _is_used(self, function: Function, depth: int = 0) -> bool:
-        """Whether something can lead to a function: not to what a fork has kept of the codebase that it is made of."""
+        """Return whether something can lead to a function; to what a fork has kept and does not call, nothing does."""
         if function.owner is not None or function.parent is None or depth > _DEPTH:
             return True
         callers = [caller for caller in self.program.mentioning(function.name) if _calls(caller, function)]
         return any(self._is_used(caller, depth + 1) for caller in callers)
 
     def _of_scenes_in_turn(self, function: Function) -> Optional[str]:
-        """Why a name may be of several pictures: one run goes through several scenes, ``args.source_path = folder``."""
+        """Return why a name may be of several images: one run reads several scenes, ``args.source_path = folder``."""
         for module in self.program.matching(_PLACED):
             for other in module.scopes(_PLACED.search):
                 definitions = [d for found in other.flow.definitions.values() for d in found]
@@ -117,7 +117,7 @@ class Names:
         return None
 
     def _remade(self, function: Function, holder: cst.Name, attribute: str) -> Optional[str]:
-        """Why the camera may be another than the one that has the name: ``view = scaled(camera, 0.5)``."""
+        """Return why the camera may be another than the one that has the name: ``view = scaled(camera, 0.5)``."""
         for definition in function.flow.reaching(holder):
             made = definition.value if definition.kind == "assign" else None
             for reference in self.program.resolve(function, made.func) if isinstance(made, cst.Call) else ():
@@ -127,7 +127,7 @@ class Names:
         return None
 
     def _reads_twice(self) -> bool:
-        """Whether a reader makes cameras of the same poses a second time, with the pictures of another folder."""
+        """Return whether a reader makes cameras of the same poses again, with the images of another folder."""
         for module in self.program.matching(_POSES):
             for function in module.scopes(_POSES.search):
                 read = [(call_name(call), arguments(call)[1].get("cam_extrinsics")) for call in function.flow.calls]
@@ -137,7 +137,7 @@ class Names:
         return False
 
     def _nameless(self, function: Function, node: cst.CSTNode, seen: Set[int]) -> Optional[str]:
-        """Why the camera may have no name: one whose class stores none is added, ``stack.append(view)``."""
+        """Return why the camera may have no name: one whose class stores none is added, ``stack.append(view)``."""
         for definition in function.flow.reaching(node):
             value = definition.value
             if value is None or id(definition) in seen:
@@ -166,7 +166,7 @@ class Names:
 
 
 def _calls(caller: Function, function: Function) -> bool:
-    """Whether it calls a function of this name, or hands it on."""
+    """Return whether it calls a function of this name, or hands it on."""
     if caller is function:
         return False
     read = [part.value for part in caller.flow.reads]
@@ -174,7 +174,7 @@ def _calls(caller: Function, function: Function) -> bool:
 
 
 def _of_no_photograph(function: Function, site: cst.CSTNode) -> Optional[str]:
-    """Why the cameras have none here: ``if camera.is_virtual:``."""
+    """Return why the cameras have no photograph here: ``if camera.is_virtual:``."""
     for name in function.flow.conditions.get(id(site), ()):
         if NO_PHOTOGRAPHS & set(words(name)):
             return f"only where {name}"
@@ -182,7 +182,7 @@ def _of_no_photograph(function: Function, site: cst.CSTNode) -> Optional[str]:
 
 
 def _of_several(function: Function, node: cst.CSTNode, seen: Set[int]) -> Optional[str]:
-    """Why names may come again: ``for scene in scenes: ... scene.getTrainCameras()``."""
+    """Return why names may come again: ``for scene in scenes: ... scene.getTrainCameras()``."""
     for definition in function.flow.reaching(node):
         if definition.value is None or id(definition) in seen:
             continue
@@ -198,13 +198,13 @@ def _of_several(function: Function, node: cst.CSTNode, seen: Set[int]) -> Option
 
 
 def _is_turn(function: Function, definition: Definition) -> bool:
-    """Whether a name is what a loop goes over, or a part of that."""
+    """Return whether a name is what a loop goes over, or a part of that."""
     loops = [loop for loop in loops_around(function.body, definition.node) if isinstance(loop, cst.For)]
     return any(definition.node is part for loop in loops for part in walk_expressions(loop.target))
 
 
 def _told_apart(function: Function, holder: str) -> Optional[str]:
-    """Why a name alone may be of several pictures: ``masks[time, camera.image_name]`` asks for more."""
+    """Return why a name alone may be of several images: ``masks[time, camera.image_name]`` asks for more."""
     for node in walk_expressions(function.body):
         if isinstance(node, cst.Subscript):
             keys = [part.slice.value for part in node.slice if isinstance(part.slice, cst.Index)]
@@ -216,7 +216,7 @@ def _told_apart(function: Function, holder: str) -> Optional[str]:
 
 
 def _changes(function: Function, definition: Definition) -> bool:
-    """Whether a value is another at each turn of a loop, or for each item of a dataset."""
+    """Return whether a value is another at each turn of a loop, or for each item of a dataset."""
     loops = [loop for loop in loops_around(function.body, definition.node) if isinstance(loop, cst.For)]
     turns = {part.value for loop in loops for part in walk_expressions(loop.target) if isinstance(part, cst.Name)}
     turns |= set(function.parameters) if function.name == "__getitem__" else set()
@@ -224,7 +224,7 @@ def _changes(function: Function, definition: Definition) -> bool:
 
 
 def _names_again(function: Function, call: cst.Call) -> bool:
-    """``for frame in frames: ... CameraInfo(image=image, image_name=image_name)``, where the name is the camera's.
+    """Return whether a camera is made for each frame with one name: ``CameraInfo(image=image, image_name=image_name)``.
 
     The image depends on what the innermost loop goes over, the name does not.
     """
@@ -237,7 +237,7 @@ def _names_again(function: Function, call: cst.Call) -> bool:
 
 
 def _overwritten(function: Function, holder: str, attribute: str) -> Optional[str]:
-    """Why the image may be another by then: it is written here, or the file puts others in their places."""
+    """Return why the image may be another by then: it is written here, or the file puts others in their places."""
     for definition in function.flow.definitions.get(f"{holder}.{attribute}", []):
         return f"{holder}.{attribute} is written here: {brief(definition.node)}"
     for scope in function.module.scopes(re.compile(rf"\.{attribute}\s*=[^=]").search):
@@ -250,13 +250,13 @@ def _overwritten(function: Function, holder: str, attribute: str) -> Optional[st
 
 
 def _of_same(value: cst.CSTNode, attribute: str) -> bool:
-    """``None``, or what was stored before: ``camera.original_image_backup.cuda()``."""
+    """Return whether a value is ``None``, or what was stored before: ``camera.original_image_backup.cuda()``."""
     parts = attribute_chain(value)
     stored = any(isinstance(part, cst.Attribute) and part.attr.value.startswith(attribute) for part in parts)
     return stored or constant(value, value) is None
 
 
 def _is_no_name(node: cst.CSTNode) -> bool:
-    """``image_name=info.image_path``, or the same for all: ``image_name=None``."""
+    """Return whether a value names no image: ``info.image_path``, or the same for all, ``None``."""
     path = dotted(node) is not None and "path" in words(code(node).split(".")[-1])
     return path or constant(node, node) is not node

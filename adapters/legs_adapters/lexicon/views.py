@@ -1,4 +1,4 @@
-"""Whether a target is a view's own stored image, untouched between loading and the loss: only then may it be named.
+"""Tell whether a target is a view's own stored image, untouched between loading and loss: only then is it named.
 
 The proof wants three things: the target is ``camera.original_image`` (or what the codebase calls it), moved between
 devices and types but not changed; ``camera`` is the same view where the name is asked; and its name is that image's.
@@ -125,7 +125,7 @@ class Views:
         return f"{definition.place} comes out of a batch"
 
     def _still(self, function: Function, holder: cst.Name, target: cst.CSTNode, site: cst.CSTNode) -> bool:
-        """Whether the camera's name at the loss can only be the camera that the target was taken from."""
+        """Return whether the camera's name at the loss can only be the camera that the target was taken from."""
         then = function.flow.reaching(holder)
         now = function.flow.names_at(site, holder.value)
         return bool(then) and now == then
@@ -139,7 +139,7 @@ def _unit_range(node: cst.Call, skip: int) -> bool:
 
 
 def _first_channels(node: cst.Subscript) -> bool:
-    """``[:3]``, ``[0:3, :, :]``, ``[:3, ...]``: the colour channels of a channels-first image, all of its pixels."""
+    """Return whether an index keeps all pixels of the colour channels: ``[:3]``, ``[0:3, :, :]``, ``[:3, ...]``."""
     for i, element in enumerate(node.slice):
         part = element.slice
         if isinstance(part, cst.Index):

@@ -136,7 +136,7 @@ class _Finder:
         verdicts = self.verdicts
         found = [
             (callback.form, verdicts.of_callback(function, callback))
-            for callback in self.analysis.callbacks.by_holder.get(function, ())
+            for callback in self.analysis.callbacks.of(function)
         ]
         for call in function.flow.calls if registered.MENTIONED.search(function.text) else ():
             forms = registered.forms_of(self.analysis.program, function, call)

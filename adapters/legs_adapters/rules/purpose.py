@@ -114,7 +114,7 @@ class Purposes:
         return bool(calls) and all(self._is_emptied_after(caller, call) for caller, call in calls)
 
     def _is_emptied_after(self, caller: Function, call: cst.Call) -> bool:
-        """``accumulate(scene)``, then ``gaussians.prune(count)``, then ``optimizer.zero_grad()``."""
+        """Return whether gradients are read, then emptied, after a call: ``prune()``, then ``zero_grad()``."""
         at = caller.place(call).last_line
         after = sorted((caller.place(other).line, i) for i, other in enumerate(caller.flow.calls))
         read = False
@@ -170,7 +170,7 @@ class Purposes:
         )
 
     def _made_here(self, function: Function, model: cst.Name) -> bool:
-        """``gaussians = GaussianModel(3)``, whatever is stored in it then."""
+        """Return whether a model is made here, ``gaussians = GaussianModel(3)``, whatever is stored in it then."""
         made = [definition.value for definition in function.flow.reaching(model) if definition.kind != "store"]
         return bool(made) and all(isinstance(v, cst.Call) and set(words(call_name(v))) & GAUSSIANS for v in made)
 

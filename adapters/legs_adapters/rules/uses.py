@@ -95,7 +95,7 @@ def _unknown(use: Use) -> Evidence:
 
 
 def _whole(node: cst.CSTNode) -> cst.CSTNode:
-    """``gt`` of ``gt[:3]``; what a dictionary holds, ``batch["image"]``, is none of its parts."""
+    """Return ``gt`` of ``gt[:3]``; what a dictionary holds, ``batch["image"]``, is none of its parts."""
     while isinstance(node, cst.Subscript) and not isinstance(key_of(node), str):
         node = node.value
     return node

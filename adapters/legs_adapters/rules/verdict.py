@@ -135,7 +135,7 @@ class Verdicts:
         return Kept(module.path, line, module.lines.text(line), purpose, _called(function), use.call, use.caller)
 
     def _picked(self, function: Function, form: Form) -> Optional[Tuple[cst.Subscript, cst.Subscript]]:
-        """``image[:, mask]`` and ``photo[:, mask]`` of a form that compares names of theirs.
+        """Return ``image[:, mask]`` and ``photo[:, mask]`` of a form that compares names of theirs.
 
         None where the names stand for anything else, or where image, photo or mask is another by then.
         """

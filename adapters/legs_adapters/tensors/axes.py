@@ -1,4 +1,4 @@
-"""Which axes an operation moves, adds or reduces: permutations, swaps, einops patterns, indices with ``None``."""
+"""Tell which axes an operation moves, adds or reduces: permutations, swaps, einops patterns, indices with ``None``."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def permutation(node: cst.Call) -> Optional[Tuple[int, ...]]:
 
 
 def swapped_axes(node: cst.Call) -> Optional[Dict[int, int]]:
-    """``x.transpose(-1, -2)``: which axis becomes which, counted from the last."""
+    """Return which axis becomes which, counted from the last, in ``x.transpose(-1, -2)``."""
     if call_name(node) not in ("transpose", "swapaxes", "swapdims"):
         return None
     axes = [constant(value) for value in arguments(node)[0][-2:]]
@@ -59,7 +59,7 @@ def swapped_axes(node: cst.Call) -> Optional[Dict[int, int]]:
 
 
 def reduced_axis(node: cst.Call) -> Optional[int]:
-    """The one axis that ``x.mean(dim=-1)`` goes over, if it can only be the channels: the last, or the first."""
+    """Return the one axis that ``x.mean(dim=-1)`` reduces, if it can only be the channels: the last, or the first."""
     if call_name(node) not in ("mean", "sum"):
         return None
     positional, keywords, _ = arguments(node)
@@ -99,13 +99,13 @@ def einops_pattern(node: cst.Call) -> Optional[str]:
 
 
 def adds_batch_axis(node: cst.Subscript) -> bool:
-    """``x[None]``, ``x[None, ...]``, ``x[None, :, :, :]``."""
+    """Return whether an index only adds an axis: ``x[None]``, ``x[None, ...]``, ``x[None, :, :, :]``."""
     parts = index_parts(node)
     return parts[0] is None and all(part in (..., ":") for part in parts[1:])
 
 
 def unsqueezed_axis(node: cst.CSTNode) -> Optional[int]:
-    """``mask.unsqueeze(-1)``; of ``colour.unsqueeze(-1).unsqueeze(-1)`` they are first."""
+    """Return the channels' axis of ``mask.unsqueeze(-1)``: last; of ``colour.unsqueeze(-1).unsqueeze(-1)``: first."""
     count = 0
     while isinstance(node, cst.Call) and call_name(node) == "unsqueeze" and isinstance(node.func, cst.Attribute):
         if [constant(value) for value in arguments(node)[0]] != [-1]:

@@ -81,7 +81,7 @@ class Training:
                 self._upwards(function, value)
 
     def _upwards(self, function: Function, value: cst.CSTNode) -> None:
-        """``def step(loss): loss.backward()``: what is trained stands where step is called."""
+        """Follow ``def step(loss): loss.backward()`` to its calls: what is trained stands there."""
         for definition in function.flow.reaching(value):
             if definition.kind != "parameter" or definition.place not in function.parameters:
                 continue
@@ -227,7 +227,7 @@ class Training:
         return False
 
     def _filled_in(self, function: Function, node: cst.Name, key: object) -> None:
-        """``self.compute(image, output)``, then ``output["loss"]`` or all of it: the method put it there."""
+        """Follow ``self.compute(image, output)``, which puts ``output["loss"]`` into the dictionary trained on."""
         for call in function.flow.calls:
             positional, keywords, starred = arguments(call)
             named: List[Tuple[object, cst.BaseExpression]] = [*enumerate(positional), *keywords.items()]
@@ -289,6 +289,6 @@ class Training:
 
 
 def _begins_empty(definitions: Optional[List[Tuple[Function, Definition]]]) -> bool:
-    """``losses = {}``: a dictionary that is filled before it is returned."""
+    """Return whether a dictionary is empty where it is made, ``losses = {}``, and filled before it is returned."""
     values = [definition.value for _, definition in definitions or () if definition.kind == "assign"]
     return bool(values) and all(isinstance(value, cst.Dict) and not value.elements for value in values)

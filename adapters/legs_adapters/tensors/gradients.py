@@ -1,4 +1,4 @@
-"""Where gradients are cut: ``torch.no_grad()`` and its like around an expression, ``detach()`` in it."""
+"""Tell where gradients are cut: by ``torch.no_grad()`` and its like around an expression, by ``detach()`` in it."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Fu
 
 
 def is_detached(node: cst.CSTNode) -> bool:
-    """Whether no gradient goes that way."""
+    """Return whether no gradient goes that way."""
     return any(isinstance(part, cst.Call) and call_name(part) in ENDS_GRADIENT for part in attribute_chain(node))
 
 
 def detaches(node: cst.CSTNode) -> bool:
-    """Whether a gradient is cut off somewhere in an expression."""
+    """Return whether a gradient is cut off somewhere in an expression."""
     return any(isinstance(part, cst.Call) and call_name(part) == "detach" for part in walk_expressions(node))
 
 

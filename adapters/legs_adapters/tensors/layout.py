@@ -1,4 +1,4 @@
-"""Where the channel stands in an image, from the code around it: [C, H, W] as in 3DGS, or [H, W, C] as in gsplat."""
+"""Tell where the channels stand in an image, from the code around it: [C, H, W] as in 3DGS, [H, W, C] as in gsplat."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def is_channels_last(
 
 
 def lies_last(function: Function, index: cst.CSTNode) -> bool:
-    """Whether a mask that pictures are indexed by was spread over channels that are last, ``m.repeat(1, 1, 1, 3)``."""
+    """Return whether a mask was spread over channels that are last, ``m.repeat(1, 1, 1, 3)``, before it indexes."""
     for part in walk_expressions(index):
         if isinstance(part, cst.Name):
             made = [definition.value for definition in function.flow.reaching(part)]
@@ -76,7 +76,7 @@ def lies_last(function: Function, index: cst.CSTNode) -> bool:
 
 
 def _without_factor(*images: cst.CSTNode) -> Tuple[cst.CSTNode, ...]:
-    """``image`` and ``gt`` of ``weight * image`` and ``weight * gt``: how a weight came about says nothing of them."""
+    """Return ``image`` and ``gt`` of ``weight * image`` and ``weight * gt``: the weight says nothing of the layout."""
     products = [i for i in images if isinstance(i, cst.BinaryOperation) and isinstance(i.operator, cst.Multiply)]
     if len(products) == 2:
         one, other = products
@@ -161,7 +161,7 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
 
 
 def _is_picture(function: Function, node: cst.CSTNode) -> bool:
-    """``Image.open(path).resize(size)``: what Pillow opens, which lies [H, W, C] as an array."""
+    """Return whether Pillow opened it, ``Image.open(path).resize(size)``: [H, W, C] as an array."""
     for part in attribute_chain(node):
         if isinstance(part, cst.Attribute) and dotted(part) == "Image.open":
             return True
@@ -201,7 +201,7 @@ def _votes_of_callees(training: Training, function: Function, images: Tuple[cst.
 
 
 def _callees(training: Training, function: Function, call: cst.Call) -> Iterator[Function]:
-    """The functions of the codebase that a call runs; of an object what it does when it is called."""
+    """Yield the functions of the codebase that a call runs; of an object what calling it runs."""
     for reference in training.program.resolve(function, call.func):
         found = [reference]
         if reference.kind == "instance" and isinstance(reference.target, Class):
@@ -212,7 +212,7 @@ def _callees(training: Training, function: Function, call: cst.Call) -> Iterator
 
 
 def _without_batch(node: cst.CSTNode) -> cst.CSTNode:
-    """``image`` of ``image.unsqueeze(0)``."""
+    """Return ``image`` of ``image.unsqueeze(0)``."""
     if isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) == "unsqueeze":
         positional = arguments(node)[0]
         return node.func.value if len(positional) == 1 and constant(positional[0]) == 0 else node
@@ -220,7 +220,7 @@ def _without_batch(node: cst.CSTNode) -> cst.CSTNode:
 
 
 def _beside(function: Function) -> List[Function]:
-    """The function, and where it is nested in another one those beside it that take the same."""
+    """Return the function, and where it is nested in another one those beside it that take the same."""
     parent = function.parent
     if parent is None or parent.parent is None:
         return [function]
@@ -229,7 +229,7 @@ def _beside(function: Function) -> List[Function]:
 
 
 def _of_parameter(function: Function, name: str) -> List[Vote]:
-    """How a function takes a parameter, by what it does with it in any case."""
+    """Return votes for a parameter's layout, by what the function does with it in any case."""
     given = frozenset(d for d in function.flow.definitions.get(name, []) if d.kind == "parameter")
     certain = [line for line in function.body.body if isinstance(line, cst.SimpleStatementLine)]
     calls = [part for line in certain for part in walk_expressions(line) if isinstance(part, cst.Call)]
@@ -237,7 +237,7 @@ def _of_parameter(function: Function, name: str) -> List[Vote]:
 
 
 def _uses(function: Function, node: cst.CSTNode) -> List[Vote]:
-    """What else the function does with the same value: permuting it for SSIM tells how it lay before."""
+    """Return votes by what else the function does with the value: permuting it for SSIM tells how it lay before."""
     place, definitions = path_of(node), function.flow.reaching(node)
     if place is None or (isinstance(node, cst.Name) and not definitions):
         return []
@@ -290,7 +290,7 @@ def _before(node: Optional[cst.CSTNode], order: Optional[Tuple[int, ...]]) -> Li
 
 
 def _shape_vote(node: cst.Call) -> List[Vote]:
-    """``x.reshape(height, width, 3)``: what stood where before does not count."""
+    """Return the vote of ``x.reshape(height, width, 3)``: what stood where before does not count."""
     sizes = [constant(value) for value in arguments(node)[0]]
     sizes = list(sizes[0]) if len(sizes) == 1 and isinstance(sizes[0], tuple) else sizes
     if call_name(node) not in ("reshape", "view") or len(sizes) not in (3, 4):
@@ -320,7 +320,7 @@ def _slice_vote(node: cst.Subscript) -> List[Vote]:
 
 
 def _added(function: Function, node: cst.CSTNode) -> Optional[int]:
-    """Where the channels of an image are by the axes that are added to what is laid over it."""
+    """Return where an image's channels are by the axes that are added to what is laid over it."""
     if isinstance(node, cst.Name):
         made = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
         return _added(function, made[0]) if len(made) == 1 and isinstance(made[0], (cst.Call, cst.Subscript)) else None

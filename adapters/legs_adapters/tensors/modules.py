@@ -1,4 +1,4 @@
-"""What torch and the libraries around it do with an ``nn.Module``: move it, wrap it, return it."""
+"""Say how torch and the libraries around it pass an ``nn.Module`` on: they move it, wrap it, return it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What torch's operations, and Python's around them, do to a value: one table, by what an operation does.
+"""Say what torch's operations, and Python's around them, do to a value: one table, by what an operation does.
 
 An operation may stand in several rows: ``detach`` moves a value, and ends its gradient.
 """

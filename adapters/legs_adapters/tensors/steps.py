@@ -29,7 +29,7 @@ def is_backward(call: cst.Call) -> bool:
 
 
 def is_step(call: cst.Call) -> bool:
-    """``gaussians.optimizer.step()``, ``optimizers.optimizer_step_all()``."""
+    """Return whether a call steps an optimiser: ``optimizer.step()``, ``optimizers.optimizer_step_all()``."""
     said = set(words(call_name(call)))
     if not isinstance(call.func, cst.Attribute) or not (said == {"step"} or ("step" in said and said & OPTIMISERS)):
         return False
@@ -37,7 +37,7 @@ def is_step(call: cst.Call) -> bool:
 
 
 def may_step(calls: Iterable[cst.Call]) -> bool:
-    """Whether a call says that it steps, under whatever name: ``gaussians.update(opt)``; not ``pbar.update(1)``."""
+    """Return whether a call is named for a step: ``gaussians.update(opt)``; not ``pbar.update(1)``."""
     return any(set(words(call_name(call))) & STEPS and not _is_of_schedule(call) for call in calls)
 
 
@@ -46,12 +46,12 @@ def _is_of_schedule(call: cst.Call) -> bool:
 
 
 def has_step(function: Function) -> bool:
-    """Whether an optimiser steps in it. Its text may be its whole file's, so that only leads to a closer look."""
+    """Return whether an optimiser steps in a function; its text may be its whole file's, and is no proof."""
     return "step" in function.text and any(map(is_step, function.flow.calls))
 
 
 def only_reads_gradients(scope: cst.CSTNode, calls: List[cst.Call], for_good: bool) -> bool:
-    """Whether the gradients are read after each backward pass, and nothing can have stepped.
+    """Return whether the gradients are read after each backward pass, and nothing can have stepped.
 
     They are set to nothing then; where nobody steps, ``for_good``, they need not be.
     """
@@ -66,7 +66,7 @@ def only_reads_gradients(scope: cst.CSTNode, calls: List[cst.Call], for_good: bo
 
 
 def gradients_read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
-    """The gradients that are read, ``xyz.grad``; none where a step by hand takes one of them."""
+    """Return the gradients that are read, ``xyz.grad``; none where a step by hand takes one of them."""
     asked = {id(p) for part in parts if _asks(part) for p in walk_all(part)}
     taken = {id(p) for part in parts for given in _taken(part) for p in walk_all(given)}
     read = [p for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in asked]
@@ -74,19 +74,19 @@ def gradients_read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
 
 
 def _empties(node: cst.CSTNode) -> bool:
-    """``xyz.grad = None``: in a loop each pass but the last loses its gradients, wherever in it that stands."""
+    """Return whether ``xyz.grad = None`` stands here: in a loop each pass but the last loses its gradients."""
     if not isinstance(node, cst.Assign) or constant(node.value, _NOTHING) is not None:
         return False
     return any(isinstance(t.target, cst.Attribute) and t.target.attr.value == "grad" for t in node.targets)
 
 
 def _asks(node: cst.CSTNode) -> bool:
-    """``xyz.grad is not None``."""
+    """Return whether a gradient is only asked for: ``xyz.grad is not None``."""
     return isinstance(node, cst.Comparison) or _empties(node)
 
 
 def _taken(node: cst.CSTNode) -> List[cst.CSTNode]:
-    """What a step by hand takes: ``xyz -= lr * xyz.grad``, ``xyz - xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``."""
+    """Return what a step by hand takes: ``xyz -= lr * xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``."""
     if isinstance(node, cst.AugAssign):
         return [node.value] if isinstance(node.operator, cst.SubtractAssign) else []
     if isinstance(node, cst.BinaryOperation):  # xyz.grad - other.grad compares the two

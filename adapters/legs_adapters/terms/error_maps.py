@@ -72,7 +72,7 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
 
 
 def is_huber(training: Training, function: Function, form: Form) -> bool:
-    """``torch.where(error < d, error ** 2 / 2, d * (error - d / 2))``: an L1 above a threshold, and a square below.
+    """Return whether an error is squared below a threshold: ``where(error < d, error ** 2 / 2, d * (error - d / 2))``.
 
     A mean that is squared for a log line, ``torch.log10(1 / torch.sqrt(loss ** 2))``, makes none.
     """
@@ -94,7 +94,7 @@ def is_huber(training: Training, function: Function, form: Form) -> bool:
 
 
 def is_rescaled(function: Function, form: Form) -> bool:
-    """Whether a map is only put between 0 and 1, ``(error - error.min()) / (error.max() - error.min())``: to cut at."""
+    """Return whether a map is only scaled to 0..1, ``(e - e.min()) / (e.max() - e.min())``, to be cut."""
     reads = [read for read in function.flow.reads if form.node in _values(function, read)]
     ranges = {id(part) for node in function.flow.expressions for part in _of_range(node)}
     extremes = [call for call in function.flow.calls if call_name(call) in EXTREMES and not call.args]
@@ -113,7 +113,7 @@ def _of_range(node: cst.CSTNode) -> List[cst.CSTNode]:
 
 
 def is_measured(function: Function, form: Form) -> bool:
-    """Whether a term is turned into a number, ``error.mean().item()``, from which no gradient comes back."""
+    """Return whether a term is turned into a number, ``error.mean().item()``, from which no gradient comes back."""
     return any(
         call_name(call) in LEAVES and any(part is form.node for part in attribute_chain(call))
         for call in function.flow.calls
@@ -121,7 +121,7 @@ def is_measured(function: Function, form: Form) -> bool:
 
 
 def is_asked(function: Function, form: Form) -> bool:
-    """Whether a term is only compared with something, ``while abs(height - wanted) > 0.1``."""
+    """Return whether a term is only compared with something, ``while abs(height - wanted) > 0.1``."""
     parts = walk_expressions(function.body)
     return any(isinstance(part, cst.Comparison) and part.left is form.node for part in parts)
 
@@ -138,7 +138,7 @@ def _values(function: Function, node: cst.CSTNode) -> List[Optional[cst.CSTNode]
 
 
 def _edited(function: Function) -> Set[int]:
-    """The ids of the names whose tensors are changed in place: ``error[mask] *= 2``, ``error.mul_(2)``."""
+    """Return the ids of the names whose tensors are changed in place: ``error[mask] *= 2``, ``error.mul_(2)``."""
     changes = [d for definitions in function.flow.definitions.values() for d in definitions]
     changed: List[cst.CSTNode] = [d.node.target for d in changes if isinstance(d.node, cst.AugAssign)]
     changed += [d.value for d in changes if d.kind == "inplace" and d.value is not None]
@@ -146,13 +146,13 @@ def _edited(function: Function) -> Set[int]:
 
 
 def _asked_for_size(function: Function) -> Set[int]:
-    """The ids of the names that are only asked how large they are: ``error.shape``, ``error.dim()``."""
+    """Return the ids of the names that are only asked for their size: ``error.shape``, ``error.dim()``."""
     parts = [part for part in walk_expressions(function.body) if isinstance(part, cst.Attribute)]
     return {id(part.value) for part in parts if part.attr.value in SIZES}
 
 
 def takes_no_gradient(training: Training, function: Function, call: cst.Call, given: cst.CSTNode) -> bool:
-    """Whether a call makes a mask of an error that it is given, or measures it: ``normalise(error).detach()``."""
+    """Return whether a call makes a mask of a given error, or measures it: ``normalise(error).detach()``."""
     return makes_mask(call) or _only_measured(training, function, call, given)
 
 

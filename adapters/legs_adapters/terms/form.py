@@ -54,17 +54,17 @@ class Form:
 
     @property
     def is_map(self) -> bool:
-        """Whether the term is an unreduced error map."""
+        """Return whether the term is an unreduced error map."""
         return False
 
     @property
     def is_mean(self) -> bool:
-        """Whether the term is the plain mean."""
+        """Return whether the term is the plain mean."""
         return False
 
     @property
     def takes_index(self) -> bool:
-        """Whether `indexed` keeps the term's value."""
+        """Return whether `indexed` keeps the term's value."""
         return False
 
     def why_by_hand(self) -> str:

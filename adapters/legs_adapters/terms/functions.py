@@ -205,11 +205,11 @@ class L1Functions:
         return reference.kind in ("external", "made by") and self.shape_of_reference(reference, node) is not None
 
     def _is_handed_l1(self, function: Function, node: cst.BaseExpression, depth: int) -> bool:
-        """Whether an argument is an L1 function itself, as in ``masked_loss(pred, gt, l1, mask=mask)``."""
+        """Return whether an argument is an L1 function itself, as in ``masked_loss(pred, gt, l1, mask=mask)``."""
         return isinstance(node, cst.Name) and self.is_l1(function, node, depth)
 
     def _is_made_by(self, function: Function, node: cst.CSTNode) -> bool:
-        """Whether an expression calls a function of the codebase."""
+        """Return whether an expression calls a function of the codebase."""
         calls = [part for part in walk_expressions(node) if isinstance(part, cst.Call)]
         return any(
             r.kind == "function" and not r.guess for call in calls for r in self.program.resolve(function, call.func)
@@ -219,7 +219,7 @@ class L1Functions:
 def _picked_pairs(
     function: Function, nodes: List[cst.CSTNode], a: str, b: str
 ) -> Tuple[List[Tuple[str, str]], Set[int]]:
-    """The two parameters and what is picked alike out of them, ``x = a[:, mask]``, ``y = b[:, mask]``.
+    """Return the two parameters and what is picked alike out of them, ``x = a[:, mask]``, ``y = b[:, mask]``.
 
     Returns:
         Those pairs of names, and the ids of the assignments' parts.

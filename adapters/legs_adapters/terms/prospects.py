@@ -54,13 +54,13 @@ class Prospects:
         self._answers: Dict[str, bool] = {}
 
     def of(self, text: str) -> bool:
-        """Whether a text can lead to an L1."""
+        """Return whether a text can lead to an L1."""
         if text not in self._answers:
             self._answers[text] = bool(SPEAKS_OF_L1.search(text)) or not self._names.isdisjoint(_WORD.findall(text))
         return self._answers[text]
 
     def near(self, text: str) -> bool:
-        """Whether a text speaks of an L1, or of something whose own text does."""
+        """Return whether a text speaks of an L1, or of something whose own text does."""
         return bool(SPEAKS_OF_L1.search(text)) or not self._near.isdisjoint(_WORD.findall(text))
 
 

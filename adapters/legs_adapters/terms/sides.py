@@ -20,7 +20,7 @@ __all__ = ["Pair", "are_counterparts", "is_role", "of_rays", "pair_of", "same_ro
 
 
 class Pair(NamedTuple):
-    """What is compared.
+    """The two sides that are compared.
 
     Attributes:
         first, second: the two sides, without an index by a mask that both carry.
@@ -36,7 +36,7 @@ class Pair(NamedTuple):
 
     @property
     def speaks_of_images(self) -> bool:
-        """Whether both sides have a name that speaks of an image."""
+        """Return whether both sides have a name that speaks of an image."""
         return _speaks_of_images(self.first) and _speaks_of_images(self.second)
 
 
@@ -54,7 +54,7 @@ def pair_of(meanings: Meanings, function: Function, form: Form) -> Pair:
 
 
 def _without_shared_factors(first: cst.BaseExpression, second: cst.BaseExpression) -> List[cst.BaseExpression]:
-    """``image * (1 - mask)`` and ``gt * (1 - mask)`` are ``image`` and ``gt``."""
+    """Return ``image`` and ``gt`` of ``image * (1 - mask)`` and ``gt * (1 - mask)``."""
     if not (isinstance(first, cst.BinaryOperation) and isinstance(second, cst.BinaryOperation)):
         return [first, second]
     if not (isinstance(first.operator, cst.Multiply) and isinstance(second.operator, cst.Multiply)):
@@ -67,7 +67,7 @@ def _without_shared_factors(first: cst.BaseExpression, second: cst.BaseExpressio
 
 
 def same_root(form: Form) -> bool:
-    """``x[1:] - x[:-1]``: a picture against itself."""
+    """Return whether a picture is compared with itself: ``x[1:] - x[:-1]``."""
     a, b = form.first, form.second
     if not (isinstance(a, cst.Subscript) and isinstance(b, cst.Subscript)) or isinstance(key_of(a), str):
         return False
@@ -75,7 +75,7 @@ def same_root(form: Form) -> bool:
 
 
 def are_counterparts(form: Form) -> bool:
-    """``rendered_lips`` and ``gt_lips``: the same thing, once rendered and once photographed."""
+    """Return whether two names are of the same thing, once rendered and once photographed: ``gt_lips``."""
     names = []
     for node in (form.first, form.second):
         key = key_of(node)
@@ -88,12 +88,12 @@ def are_counterparts(form: Form) -> bool:
 
 
 def of_rays(form: Form) -> bool:
-    """Whether the names speak of rays, or of a field that they go through: a list of colours, whatever it is called."""
+    """Return whether the names speak of rays, or of a field that they go through: a list of colours."""
     return any(OF_RAYS.search(code(node)) for node in (form.first, form.second))
 
 
 def is_role(node: cst.CSTNode) -> bool:
-    """Whether a name says nothing but what it is to the loss: ``pred``, ``target``."""
+    """Return whether a name says nothing but what it is to the loss: ``pred``, ``target``."""
     return isinstance(node, cst.Name) and all(role_of_words(word) is not None for word in words(node.value))
 
 

@@ -17,7 +17,7 @@ _Side = TypeVar("_Side")
 
 
 class Writing(NamedTuple):
-    """How a term is written at one call site.
+    """The settings of the weighted call at one call site.
 
     Attributes:
         package: the name that legs_loss has in the file.

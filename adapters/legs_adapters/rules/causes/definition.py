@@ -35,7 +35,7 @@ class Definition(Rule):
             return []
         calls = analysis.training.sites.get(function) or list(sure_calls(analysis.program, function))
         known = {id(form.call) for caller, _ in calls for form in analysis.forms.of(caller)}
-        own = function in analysis.callbacks.functions or all(
+        own = analysis.callbacks.includes(function) or all(
             id(call) in known or shape(caller) is not None for caller, call in calls
         )
         return [header(function)] if own else []

@@ -124,7 +124,7 @@ def _is_given_whole(function: Function, node: cst.CSTNode) -> bool:
 
 
 def _one_channel_of(node: cst.CSTNode) -> Optional[str]:
-    """``scan`` of ``scan[1:2, ...]``."""
+    """Return ``scan`` of ``scan[1:2, ...]``."""
     if not isinstance(node, cst.Subscript) or not isinstance(node.value, cst.Name):
         return None
     first = node.slice[0].slice

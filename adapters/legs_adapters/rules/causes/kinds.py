@@ -197,14 +197,14 @@ def _is_named_picture(term: Term, meaning: Meaning, side: cst.CSTNode, beside: M
 
 
 def _is_under_mask(form: Form, side: cst.CSTNode, meaning: Meaning) -> bool:
-    """``l1_loss_masked(image, data["seg_im"], mask)``: the photograph under the mask that the L1 is given beside it."""
+    """Return whether ``l1_loss_masked(image, data["seg_im"], mask)`` compares a photograph under the mask beside it."""
     masked = form.callee is not None and MASKED & set(words(call_name(form.call))) and form.extras
     name = side.value if isinstance(side, cst.Name) else str(key_of(side) or "")
     return bool(masked) and meaning.kind == "mask" and any(kind_of_words(word) == "image" for word in words(name))
 
 
 def _is_change(term: Term, node: cst.CSTNode) -> bool:
-    """``image_b - image_a``: how a picture changes, from view to view or under a filter."""
+    """Return whether a side is a change, ``image_b - image_a``, from view to view or under a filter."""
     sides = (node.left, node.right) if isinstance(node, cst.BinaryOperation) else ()
     changes = isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Subtract)
     return changes and all(term.analysis.meanings.of(term.function, side).kind == "image" for side in sides)

@@ -84,7 +84,7 @@ class OfModel(_Regulariser):
 
 
 def _is_of_points(sides: Sequence[cst.CSTNode]) -> bool:
-    """``model.rgb_colors[point_indexes]``: rows of points, no picture."""
+    """Return whether a side is rows of points, ``model.rgb_colors[point_indexes]``, and no image."""
     indexed = [node for node in sides if isinstance(node, cst.Subscript)]
     names = [element.slice.value for node in indexed for element in node.slice if isinstance(element.slice, cst.Index)]
     return any(isinstance(name, cst.Name) and POINTS & set(words(name.value)) for name in names)

@@ -174,7 +174,7 @@ def _callers(term: Term, function: Function) -> List[Function]:
 
 
 def _leaves(function: Function, node: cst.CSTNode) -> List[Decider]:
-    """``image = torch.tensor(array).requires_grad_()``: whose gradient is looked at, made by no rendering.
+    """Return the calls that make a leaf, ``torch.tensor(array).requires_grad_()``, made by no rendering.
 
     ``torch.cat(images).requires_grad_()`` has those of the renderings.
     """

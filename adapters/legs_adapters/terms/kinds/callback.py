@@ -13,7 +13,6 @@ from legs_adapters.code.syntax import code, dotted
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.forms import Forms
-from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text
 from legs_adapters.terms.writing import Writing
 
@@ -55,66 +54,84 @@ class Callback(NamedTuple):
 
 
 class Callbacks:
-    """The callbacks of one program.
-
-    Attributes:
-        functions: the L1 functions that are passed as callbacks.
-        by_holder: the callbacks, by the function or top level that names them.
-    """
+    """The callbacks of one program, looked for when they are first asked for."""
 
     def __init__(self, program: Program, training: Training, forms: Forms) -> None:
-        self.functions: Set[Function] = set()
-        self.by_holder: Dict[Function, List[Callback]] = {}
-        self._program, self._forms = program, forms
-        own = forms.functions
-        for function, calls in list(training.sites.items()):
-            shape = own.shape(function)
-            if shape is None:
-                continue
-            known = {id(form.call) for caller, _ in calls for form in forms.of(caller)}
-            unknown = [
-                (caller, call)
-                for caller, call in calls
-                if id(call) not in known and own.shape(caller) is None and len(call.args) == 2
-            ]
-            for holder in program.mentioning(function.name) if unknown else ():
-                for definition in [d for found in holder.flow.definitions.values() for d in found]:
-                    value = definition.value
-                    if definition.kind != "assign" or not isinstance(value, (cst.Name, cst.Attribute)):
-                        continue
-                    references = program.resolve(holder, value)
-                    if [r.target for r in references] != [function] or references[0].guess:
-                        continue
-                    if not _is_read(holder, definition.place):
-                        continue
-                    self.functions.add(function)
-                    near = [(c, call) for c, call in unknown if c.module is holder.module] or unknown
-                    caller, call = near[0]
-                    sides = call.args[0].value, call.args[1].value
-                    form = PassedByName(value, call, *sides, value, mean=shape == "mean")
-                    self.by_holder.setdefault(holder, []).append(Callback(form, caller))
-        for function in list(training.sites):
-            self._in_lists(own, training, function)
+        self._program = program
+        self._training = training
+        self._forms = forms
+        self._assigned: Set[Function] = set()
+        self._by_holder: Optional[Dict[Function, List[Callback]]] = None
 
-    def _in_lists(self, own: L1Functions, training: Training, function: Function) -> None:
-        """``on_crops(image, gt, [l1, perceptual])``, which calls ``losses[i](image, gt)``."""
+    def of(self, holder: Function) -> List[Callback]:
+        """Return the callbacks that a function, or a top level, names."""
+        return self._found().get(holder, [])
+
+    def includes(self, function: Function) -> bool:
+        """Return whether an L1 function is given to a name that is called."""
+        self._found()  # which fills them
+        return function in self._assigned
+
+    def _found(self) -> Dict[Function, List[Callback]]:
+        if self._by_holder is None:
+            self._by_holder = {}
+            for function in list(self._training.sites):
+                self._add_assigned(function)
+            for function in list(self._training.sites):
+                self._add_listed(function)
+        return self._by_holder
+
+    def _add(self, holder: Function, callback: Callback) -> None:
+        assert self._by_holder is not None
+        self._by_holder.setdefault(holder, []).append(callback)
+
+    def _add_assigned(self, function: Function) -> None:
+        """Add the names that a function is given, ``self.criterion = l1_loss``, and that training calls."""
+        own, calls = self._forms.functions, self._training.sites[function]
+        shape = own.shape(function)
+        if shape is None:
+            return
+        known = {id(form.call) for caller, _ in calls for form in self._forms.of(caller)}
+        unknown = [
+            (caller, call)
+            for caller, call in calls
+            if id(call) not in known and own.shape(caller) is None and len(call.args) == 2
+        ]
+        for holder in self._program.mentioning(function.name) if unknown else ():
+            for definition in [d for found in holder.flow.definitions.values() for d in found]:
+                value = definition.value
+                if definition.kind != "assign" or not isinstance(value, (cst.Name, cst.Attribute)):
+                    continue
+                references = self._program.resolve(holder, value)
+                if [r.target for r in references] != [function] or references[0].guess:
+                    continue
+                if not _is_read(holder, definition.place):
+                    continue
+                self._assigned.add(function)
+                near = [(c, call) for c, call in unknown if c.module is holder.module] or unknown
+                caller, call = near[0]
+                sides = call.args[0].value, call.args[1].value
+                self._add(holder, Callback(PassedByName(value, call, *sides, value, mean=shape == "mean"), caller))
+
+    def _add_listed(self, function: Function) -> None:
+        """Add the functions of a list, ``on_crops(image, gt, [l1, other])``, which ``losses[i](image, gt)`` calls."""
         for call in function.flow.calls:
             table = call.func.value if isinstance(call.func, cst.Subscript) else None
             if not isinstance(table, cst.Name) or len(call.args) != 2:
                 continue
             if {definition.kind for definition in function.flow.reaching(table)} != {"parameter"}:
                 continue
-            for caller, outer in training.sites[function]:
+            for caller, outer in self._training.sites[function]:
                 given = function.given(outer, table.value)
                 for element in given.elements if isinstance(given, cst.List) else ():
-                    if own.is_l1(caller, element.value):
+                    if self._forms.functions.is_l1(caller, element.value):
                         sides = call.args[0].value, call.args[1].value
                         form = PassedByName(element.value, call, *sides, element.value)
-                        self.by_holder.setdefault(caller, []).append(Callback(form, function, outer))
+                        self._add(caller, Callback(form, function, outer))
 
     def uncalled(self, function: Function) -> Iterator[Tuple[str, cst.BaseExpression]]:
         """Yield the names that a function gives to L1 functions and that no call in sight uses, each with the L1."""
-        known = {id(callback.form.node) for callback in self.by_holder.get(function, ())}
+        known = {id(callback.form.node) for callback in self.of(function)}
         for form in self._forms.of(function):  # and what is called by a name of its own
             named = function.flow.reaching(form.callee) if form.callee is not None else ()
             known |= {id(definition.value) for definition in named}

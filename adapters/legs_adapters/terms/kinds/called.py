@@ -77,17 +77,17 @@ class Called(Form):
 
     @property
     def is_map(self) -> bool:
-        """Whether the function returns the map."""
+        """Return whether the function returns the map."""
         return self.makes == "none"
 
     @property
     def is_mean(self) -> bool:
-        """Whether the function returns the mean."""
+        """Return whether the function returns the mean."""
         return self.makes == "mean"
 
     @property
     def takes_index(self) -> bool:
-        """Whether nothing but a mean is taken after the pixel by pixel difference."""
+        """Return whether nothing but a mean is taken after the pixel by pixel difference."""
         return self.makes != "own" or (self._is_torchs() and not self.extras)
 
     def _is_torchs(self) -> bool:
@@ -132,7 +132,7 @@ class Called(Form):
 
 
 def _handed_on(program: Program, function: Function, node: cst.Call) -> List[Reference]:
-    """``def on_crops(image, gt, loss_fn)``: a parameter is torch's L1 where that is what every caller gives."""
+    """Return torch's L1 for a parameter ``loss_fn``, where that is what every caller gives."""
     name = call_name(node)
     if not function.is_parameter(node.func) or arguments(node)[2]:
         return []

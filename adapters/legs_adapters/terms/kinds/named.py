@@ -58,12 +58,12 @@ class Named(Form):
 
     @property
     def is_map(self) -> bool:
-        """Whether no mean is taken."""
+        """Return whether no mean is taken."""
         return not self.mean
 
     @property
     def is_mean(self) -> bool:
-        """Whether the mean is taken."""
+        """Return whether the mean is taken."""
         return self.mean
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:

@@ -43,7 +43,7 @@ def chosen_at_run_time(program: Program, training: Training, function: Function,
 
 
 def _is_looked_up(program: Program, function: Function, call: cst.Call) -> bool:
-    """Whether it is not known what is called before the settings are."""
+    """Return whether it is not known what is called before the settings are."""
     if program.resolve(function, call.func) or is_l1_name(call_name(call)):
         return False
     definitions = program.lookup(function, call.func) or []
@@ -55,7 +55,7 @@ def _is_looked_up(program: Program, function: Function, call: cst.Call) -> bool:
 
 
 def _looks_up(value: Optional[cst.CSTNode]) -> bool:
-    """``eval(name)``, ``getattr(losses, name)``, ``globals()[name]``, ``losses[name]``; not ``losses["l2"]``."""
+    """Return whether settings say what is called: ``eval(name)``, ``getattr(losses, name)``, ``losses[name]``."""
     if isinstance(value, cst.Subscript):
         return key_of(value) is None
     if not isinstance(value, cst.Call) or call_name(value) not in BY_NAME:

@@ -13,7 +13,6 @@ from legs_adapters.code.syntax import attribute_chain, call_name, children, cons
 
 __all__ = ["BY_NAME", "Calls", "calls_of", "likely_calls", "sure_calls"]
 
-_CALLED = ("forward", "__call__")  # by calling the instance
 _METHODS = {"staticmethod", "classmethod"}  # decorators that hand a function to nobody
 BY_NAME = {"getattr", "attrgetter", "methodcaller", "eval"}  # what looks a name up at run time
 _NAMESPACES = {"globals", "locals", "vars"}
@@ -76,7 +75,7 @@ def calls_of(program: Program, function: Function) -> Calls:
     ``forward`` is called by the names that the instances of its class get. What is handed on as a value may be called
     wherever that goes.
     """
-    owner = function.owner if function.name in _CALLED else None
+    owner = function.owner if function.runs_by_instance else None
     if owner is None and set(function.decorators) - _METHODS:
         return Calls([], _where(function.parent or function, function.node))
     known: List[Tuple[Function, cst.Call]] = []

@@ -21,8 +21,7 @@ def called_makers(program: Program, function: Function, package: cst.CSTNode) ->
     call = made[0].value if len(made) == 1 and made[0].kind == "assign" else None
     if not isinstance(call, cst.Call):
         return []
-    called = [reference.target for reference in program.resolve(function, call.func) if not reference.guess]
-    return [target for target in called if isinstance(target, Function)]
+    return program.callees(function, call)
 
 
 def forward_maker(function: Function, package: cst.CSTNode) -> List[Function]:

@@ -14,7 +14,9 @@ from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import arguments, dotted
 
-__all__ = ["Class", "Function", "Module", "parse"]
+__all__ = ["CALLED", "Class", "Function", "Module", "parse"]
+
+CALLED = ("forward", "__call__")  # what calling an instance runs: a torch module's own, and Python's
 
 _PRINT_STATEMENT = re.compile(
     r"^\s*(print\s+[\"'\w]|exec\s+[\"']|raise\s+\w+\s*,)|^\s*except\s+[\w.]+\s*,\s*\w+\s*:", re.M
@@ -138,6 +140,11 @@ class Function:
             return keywords.get(parameter)
         position = self.parameters.index(parameter)
         return positional[position] if position < len(positional) else None
+
+    @property
+    def runs_by_instance(self) -> bool:
+        """Whether calling an instance of its class runs it."""
+        return self.name in CALLED
 
     @property
     def static(self) -> bool:

@@ -6,12 +6,12 @@ is returned.
 
 from __future__ import annotations
 
-from typing import Dict, FrozenSet, Iterable, List, Mapping, NamedTuple, Optional, Set, Tuple
+from typing import Dict, FrozenSet, Iterable, Iterator, List, Mapping, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.checkout import Checkout, imported_name
-from legs_adapters.code.module import Class, Function, Module
+from legs_adapters.code.module import CALLED, Class, Function, Module
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import arguments, call_name, dotted, path_of, word_set
@@ -151,6 +151,25 @@ class Program(Checkout):
             return self._returned(self.resolve(where, definition.value.func, depth), definition.index, depth)
         return []
 
+    def callees(self, function: Function, call: cst.Call) -> List[Function]:
+        """Return the functions of the checkout that a call runs, as far as that is sure; an instance's not."""
+        found = [ref.target for ref in self.resolve(function, call.func) if ref.kind == "function" and not ref.guess]
+        return [target for target in found if isinstance(target, Function)]
+
+    def run_by(self, reference: Reference) -> List[Function]:
+        """Return the functions that calling a reference runs: itself, or what an instance of a class runs."""
+        found = [reference]
+        if reference.kind == "instance" and isinstance(reference.target, Class):
+            found = [ref for name in CALLED for ref in self.member(reference.target, name)]
+        return [ref.target for ref in found if ref.kind == "function" and isinstance(ref.target, Function)]
+
+    def given_to(self, function: Function, parameter: str) -> Iterator[Tuple[Function, Optional[cst.BaseExpression]]]:
+        """Yield what calls of a function's name give for a parameter, None where it is left out, and the callers."""
+        for caller in self.mentioning(function.name, called=True):
+            for call in caller.flow.calls if caller is not function else ():
+                if call_name(call) == function.name:
+                    yield caller, function.given(call, parameter)
+
     def handed(self, function: Function, node: cst.Name) -> List[Reference]:
         """Return the modules that a parameter is given, ``model`` of ``train_epoch(model, loader)``."""
         kinds = {definition.kind for definition in function.flow.reaching(node)}
@@ -158,10 +177,7 @@ class Program(Checkout):
             return []
         return _unique(
             reference
-            for caller in self.mentioning(function.name, called=True)
-            for call in caller.flow.calls
-            if caller is not function and call_name(call) == function.name
-            for value in [function.given(call, node.value)]
+            for caller, value in self.given_to(function, node.value)
             if value is not None
             for reference in self.resolve(caller, value)
             if reference.kind == "instance"

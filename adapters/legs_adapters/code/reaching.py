@@ -78,6 +78,15 @@ class Reaching:
         self._names: Dict[int, List[Env]] = {}
         self._made: Dict[Tuple[int, str, str], Definition] = {}
 
+    @property
+    def every_definition(self) -> List[Definition]:
+        """All definitions, place by place."""
+        return [definition for definitions in self.definitions.values() for definition in definitions]
+
+    def assigned(self, node: cst.CSTNode) -> List[cst.CSTNode]:
+        """Return the values that assignments give a place, of those that reach this use."""
+        return [d.value for d in self.reaching(node) if d.kind == "assign" and d.value is not None]
+
     def reaching(self, node: cst.CSTNode) -> FrozenSet[Definition]:
         """Return the definitions that this use of a place can come from; empty for what is not local."""
         return frozenset(self._reaching.get(id(node), ()))

@@ -213,17 +213,16 @@ class Meanings:
     def _returned(self, function: Function, call: cst.Call, index: int, depth: int, by_name: bool) -> Meaning:
         """Return the meaning of an element of a returned tuple; a renderer's may join depth and colours: by name."""
         found = []
-        for reference in self.program.resolve(function, call.func):
-            if reference.kind == "function" and isinstance(reference.target, Function) and not reference.guess:
-                for value in reference.target.flow.returns:
-                    if isinstance(value, cst.Tuple) and index < len(value.elements):
-                        element = value.elements[index].value
-                        passed = passed_on(reference.target, element)
-                        given = reference.target.given(call, passed) if passed is not None else None
-                        where, what = (reference.target, element) if given is None else (function, given)
-                        meaning = self.of(where, what, depth)
-                        says_image = isinstance(what, cst.Name) and kind_of_words(what.value) == "image"
-                        found.append(meaning._replace(kind="image") if by_name and says_image else meaning)
+        for callee in self.program.callees(function, call):
+            for value in callee.flow.returns:
+                if isinstance(value, cst.Tuple) and index < len(value.elements):
+                    element = value.elements[index].value
+                    passed = passed_on(callee, element)
+                    given = callee.given(call, passed) if passed is not None else None
+                    where, what = (callee, element) if given is None else (function, given)
+                    meaning = self.of(where, what, depth)
+                    says_image = isinstance(what, cst.Name) and kind_of_words(what.value) == "image"
+                    found.append(meaning._replace(kind="image") if by_name and says_image else meaning)
         return mix(found)
 
     def _parameter(self, function: Function, definition: Definition, depth: int) -> Meaning:

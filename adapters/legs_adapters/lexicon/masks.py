@@ -37,7 +37,7 @@ def is_mask(meanings: Meanings, function: Function, element: cst.SubscriptElemen
 
 def _is_list_of_views(function: Function, node: cst.CSTNode) -> bool:
     """Return whether a mask was made of a list, and picks views: ``tensor([camera.is_seen for camera in batch])``."""
-    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
+    made = function.flow.assigned(node)
     made = [value.body if isinstance(value, cst.IfExp) else value for value in made]
     return bool(made) and all(
         isinstance(value, cst.Call)
@@ -51,7 +51,7 @@ def _is_list(function: Function, node: cst.CSTNode) -> bool:
     """Return whether an expression is a list, ``[... for camera in batch]``, or a name for one."""
     if isinstance(node, (cst.ListComp, cst.List)):
         return True
-    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"] if isinstance(node, cst.Name) else []
+    made = function.flow.assigned(node) if isinstance(node, cst.Name) else []
     return bool(made) and all(isinstance(value, (cst.ListComp, cst.List)) for value in made)
 
 

@@ -51,10 +51,8 @@ class Optimised:
         for where, definition in self.program.lookup(function, node) or self._stored(function, node):
             made = definition.value
             if definition.kind == "parameter" and depth < _DEPTH:
-                for caller in self.program.mentioning(where.name, called=True):
-                    for call in caller.flow.calls if caller is not where else ():
-                        given = where.given(call, definition.place) if call_name(call) == where.name else None
-                        found |= self._words_of(caller, given, depth + 1) if given is not None else set()
+                for caller, given in self.program.given_to(where, definition.place):
+                    found |= self._words_of(caller, given, depth + 1) if given is not None else set()
             if definition.kind != "assign" or not isinstance(made, cst.Call):
                 continue
             if set(words(call_name(made))) & OPTIMISERS:

@@ -39,7 +39,7 @@ def is_box(function: Function, node: cst.CSTNode) -> bool:
 
 def is_cropped(function: Function, node: cst.Name) -> bool:
     """Return whether a name stands for a part of a picture, ``image[:, :half]``, and for nothing else."""
-    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
+    made = function.flow.assigned(node)
     return len(made) == len(function.flow.reaching(node)) and all(
         isinstance(value, cst.Subscript) and all(isinstance(part.slice, cst.Slice) for part in value.slice)
         for value in made
@@ -48,7 +48,7 @@ def is_cropped(function: Function, node: cst.Name) -> bool:
 
 def is_masked(function: Function, node: cst.Name) -> bool:
     """Return whether a name that speaks of an image, too, stands for a product and for nothing else."""
-    made = [d.value for d in function.flow.reaching(node) if d.kind == "assign"]
+    made = function.flow.assigned(node)
     products = [v for v in made if isinstance(v, cst.BinaryOperation) and isinstance(v.operator, cst.Multiply)]
     says_image = any(kind_of_words(word) == "image" for word in words(node.value))
     return says_image and bool(made) and len(products) == len(made)

@@ -110,8 +110,9 @@ class Names:
         """Return why a name may be of several images: one run reads several scenes, ``args.source_path = folder``."""
         for module in self.program.matching(_PLACED):
             for other in module.scopes(_PLACED.search):
-                definitions = [d for found in other.flow.definitions.values() for d in found]
-                placed = [d for d in definitions if d.place.endswith(".source_path") and _changes(other, d)]
+                placed = [
+                    d for d in other.flow.every_definition if d.place.endswith(".source_path") and _changes(other, d)
+                ]
                 if placed and module.path in self.program.together(function.module):
                     return f"{other.name or module.path} reads several scenes, where names come again"
         return None

@@ -20,8 +20,6 @@ from legs_adapters.terms.sides import is_role, pair_of, same_root
 
 __all__ = ["Doubt", "Doubts"]
 
-_FORWARD = ("forward", "__call__")
-
 
 class Doubt(NamedTuple):
     """A term that was left and may be the loss after all.
@@ -51,7 +49,7 @@ class Doubts:
             return False
         pair = term.pair
         pictures = "image" in (pair.a.kind, pair.b.kind)
-        pictures = pictures or (function.name in _FORWARD and is_role(form.first) and is_role(form.second))
+        pictures = pictures or (function.runs_by_instance and is_role(form.first) and is_role(form.second))
         roles = "target" in (pair.a.role, pair.b.role) or not rule.needs_target
         return pictures and roles and not same_root(form) and not is_asked(function, form)
 

@@ -28,8 +28,6 @@ from legs_adapters.terms.writing import Writing
 
 __all__ = ["Verdicts"]
 
-_FORWARD = ("forward", "__call__")
-
 
 class Verdicts:
     """Gives the verdicts on the forms of one program."""
@@ -191,4 +189,4 @@ def _in_a_copy(function: Function, uses: Sequence[Use]) -> str:
 
 def _called(function: Function) -> str:
     """Return the name that calls use: of a ``forward`` that of its class."""
-    return function.owner.name if function.owner is not None and function.name in _FORWARD else function.name
+    return function.owner.name if function.owner is not None and function.runs_by_instance else function.name

@@ -8,7 +8,7 @@ from typing import Callable, Dict, List, Optional, Set, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Class, Function
-from legs_adapters.code.program import Program, Reference
+from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import arguments, call_name, children, constant, key_of
 from legs_adapters.tensors.operations import BACKWARD, ENDS_GRADIENT, SIZES
@@ -85,12 +85,9 @@ class Training:
         for definition in function.flow.reaching(value):
             if definition.kind != "parameter" or definition.place not in function.parameters:
                 continue
-            for caller in self.program.mentioning(function.name, called=True):
-                for call in caller.flow.calls:
-                    if call_name(call) == function.name and caller is not function:
-                        given = function.given(call, definition.place)
-                        if given is not None:
-                            self._push(caller, given)
+            for caller, given in self.program.given_to(function, definition.place):
+                if given is not None:
+                    self._push(caller, given)
 
     # -- the slice
 
@@ -175,7 +172,11 @@ class Training:
         if not references and isinstance(node.func, cst.Name):
             references = self.program.handed(function, node.func)
         for reference in references:
-            self._callee(function, node, reference, key)
+            if reference.kind == "lambda" and isinstance(reference.target, cst.Lambda):
+                self._push(function, reference.target)
+            for callee in self.program.run_by(reference):
+                self._called(function, node, callee)
+                self._returned(callee, key)
         for arg in node.args:
             self._push(function, arg.value)
         if isinstance(node.func, cst.Attribute):
@@ -183,22 +184,11 @@ class Training:
         elif not isinstance(node.func, cst.Name):
             self._push(function, node.func)
 
-    def _callee(self, function: Function, node: cst.Call, reference: Reference, key: object) -> None:
-        if reference.kind == "function" and isinstance(reference.target, Function):
-            self._enter(function, node, reference.target, key)
-        elif reference.kind == "instance" and isinstance(reference.target, Class):
-            for name in ("forward", "__call__"):
-                for member in self.program.member(reference.target, name):
-                    if member.kind == "function" and isinstance(member.target, Function):
-                        self._enter(function, node, member.target, key)
-        elif reference.kind == "lambda" and isinstance(reference.target, cst.Lambda):
-            self._push(function, reference.target)
-
-    def _enter(self, caller: Function, call: cst.Call, callee: Function, key: object) -> None:
+    def _called(self, caller: Function, call: cst.Call, callee: Function) -> None:
+        """Note a call through which a function contributes."""
         sites = self.sites.setdefault(callee, [])
         if (caller, call) not in sites:
             sites.append((caller, call))
-        self._returned(callee, key)
 
     def _returned(self, function: Function, key: object = _ANY) -> None:
         if self._matters(function):
@@ -246,9 +236,7 @@ class Training:
                     if isinstance(key, str):
                         stores += callee.flow.definitions.get(f"{parameter}[{key!r}]", [])
                     if stores:
-                        sites = self.sites.setdefault(callee, [])
-                        if (function, call) not in sites:
-                            sites.append((function, call))
+                        self._called(function, call, callee)
                     for definition in stores:
                         self._definition(callee, definition, key)
 

@@ -6,7 +6,7 @@ from typing import FrozenSet, Iterator, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.module import Class, Function
+from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import (
     arguments,
@@ -193,22 +193,12 @@ def _votes_of_callees(training: Training, function: Function, images: Tuple[cst.
             given = [_without_batch(value) for value in (*positional, *keywords.values())]
             if starred or not all(any(same(value, image) for value in given) for image in images):
                 continue
-            for callee in _callees(training, scope, call):
+            references = [r for r in training.program.resolve(scope, call.func) if not r.guess]
+            for callee in [each for reference in references for each in training.program.run_by(reference)]:
                 for name, value in zip((*callee.parameters[: len(positional)], *keywords), given):
                     if any(same(value, image) for image in images):
                         votes.extend(_of_parameter(callee, name))
     return votes
-
-
-def _callees(training: Training, function: Function, call: cst.Call) -> Iterator[Function]:
-    """Yield the functions of the codebase that a call runs; of an object what calling it runs."""
-    for reference in training.program.resolve(function, call.func):
-        found = [reference]
-        if reference.kind == "instance" and isinstance(reference.target, Class):
-            found = [ref for name in ("forward", "__call__") for ref in training.program.member(reference.target, name)]
-        for ref in found:
-            if ref.kind == "function" and isinstance(ref.target, Function) and not ref.guess:
-                yield ref.target
 
 
 def _without_batch(node: cst.CSTNode) -> cst.CSTNode:
@@ -322,7 +312,7 @@ def _slice_vote(node: cst.Subscript) -> List[Vote]:
 def _added(function: Function, node: cst.CSTNode) -> Optional[int]:
     """Return where an image's channels are by the axes that are added to what is laid over it."""
     if isinstance(node, cst.Name):
-        made = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
+        made = function.flow.assigned(node)
         return _added(function, made[0]) if len(made) == 1 and isinstance(made[0], (cst.Call, cst.Subscript)) else None
     if isinstance(node, cst.Call):
         return unsqueezed_axis(node)

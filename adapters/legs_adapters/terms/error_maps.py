@@ -35,8 +35,7 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
     """
     made = [
         definition
-        for definitions in function.flow.definitions.values()
-        for definition in definitions
+        for definition in function.flow.every_definition
         if definition.kind == "assign" and definition.value is form.node and "." not in definition.place
     ]
     if not form.is_map or not made:
@@ -139,7 +138,7 @@ def _values(function: Function, node: cst.CSTNode) -> List[Optional[cst.CSTNode]
 
 def _edited(function: Function) -> Set[int]:
     """Return the ids of the names whose tensors are changed in place: ``error[mask] *= 2``, ``error.mul_(2)``."""
-    changes = [d for definitions in function.flow.definitions.values() for d in definitions]
+    changes = function.flow.every_definition
     changed: List[cst.CSTNode] = [d.node.target for d in changes if isinstance(d.node, cst.AugAssign)]
     changed += [d.value for d in changes if d.kind == "inplace" and d.value is not None]
     return {id(part) for node in changed for part in attribute_chain(node)}

@@ -62,7 +62,7 @@ class L1Functions:
             shape = self._shape_of(function, value, a, b, depth)
             if shape is not None:
                 return shape
-        return "own" if SPEAKS_OF_LOSS.search(function.name) or function.name in ("forward", "__call__") else None
+        return "own" if SPEAKS_OF_LOSS.search(function.name) or function.runs_by_instance else None
 
     def shape_of_reference(self, reference: Reference, node: cst.Call) -> Optional[str]:
         """Say what a function makes of its first two arguments where it is called, as `shape` does: torch's, too."""
@@ -198,7 +198,7 @@ class L1Functions:
         return bool(names) and all(id(node) in allowed for node in names)
 
     def _is_l1_reference(self, function: Function, reference: Reference, node: cst.Call, depth: int) -> bool:
-        if reference.kind == "made by" and function.name not in ("forward", "__call__"):
+        if reference.kind == "made by" and not function.runs_by_instance:
             return False  # self.l1_loss(...) in a method of its name: there it is the term itself
         if reference.kind == "function" and isinstance(reference.target, Function):
             return self.shape(reference.target, node, depth + 1) is not None

@@ -20,8 +20,8 @@ def patched_nodes(program: Program, function: Function) -> List[cst.CSTNode]:
     if PACKAGE not in function.module.text:
         return []
     nodes: List[cst.CSTNode] = [call.func for call in function.flow.calls]
-    for definitions in function.flow.definitions.values():
-        nodes.extend(d.value for d in definitions if d.kind == "assign" and isinstance(d.value, cst.Attribute))
+    named = [d.value for d in function.flow.every_definition if d.kind == "assign"]
+    nodes += [value for value in named if isinstance(value, cst.Attribute)]
     return [
         node
         for node in nodes

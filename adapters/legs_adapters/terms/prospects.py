@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from typing import Dict, Iterable, Iterator, List, Set, Tuple
 
+from legs_adapters.code.module import CALLED
 from legs_adapters.lexicon.words import SPEAKS_OF_L1
 
 __all__ = ["Prospects"]
@@ -27,7 +28,6 @@ _CALLEE = re.compile(r"([\w.]+)[ \t]*\(")
 _RENAMED = re.compile(r"\b(\w+)[ \t]+as[ \t]+(\w+)")
 _DEFAULT = re.compile(r"\b(\w+)(?:[ \t]*:[^=,()\n]+)?[ \t]*=[ \t]*([\w.]*[lL]1\w*)(?![\w.]*[ \t]*\()")
 _HOLDERS = {"dict", "partial", "functools.partial", "nn.ModuleDict", "ModuleDict", "torch.nn.ModuleDict", "OrderedDict"}
-_CALLED = {"forward", "__call__"}
 
 
 class Prospects:
@@ -76,7 +76,7 @@ def _said(text: str) -> Iterator[Tuple[str, str]]:
             classes.append((depth, name))
         elif not name.startswith("__") and name != "backward":
             yield name, text[match.end() : end]
-        if name in _CALLED and classes:
+        if name in CALLED and classes:
             yield classes[-1][1], text[match.end() : end]
     for match in _GIVEN.finditer(text):
         if not match.group(1).startswith("__") and match.group(1) != "_":

@@ -11,8 +11,6 @@ from legs_adapters.terms.findings import Decider
 
 __all__ = ["Definition"]
 
-_FORWARD = ("forward", "__call__")
-
 
 class Definition(Rule):
     """It is the body of the codebase's own L1 function, whose calls are what counts.
@@ -43,4 +41,4 @@ class Definition(Rule):
     def may_be_loss(self, term: Term) -> bool:
         """Return whether it is the body of a module, or of a method that is named a loss."""
         function = term.function
-        return function.name in _FORWARD or (function.owner is not None and "loss" in words(function.name))
+        return function.runs_by_instance or (function.owner is not None and "loss" in words(function.name))

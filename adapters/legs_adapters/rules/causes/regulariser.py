@@ -107,7 +107,7 @@ def _is_number(meanings: Meanings, function: Function, node: cst.CSTNode, depth:
             if _is_number(meanings, function, side, depth) and meanings.of(function, other).kind != "image":
                 return True
     if isinstance(node, cst.Name) and depth < 3:
-        made = [d.value for d in function.flow.reaching(node) if d.kind == "assign" and d.value is not None]
+        made = function.flow.assigned(node)
         return bool(made) and all(_is_number(meanings, function, value, depth + 1) for value in made)
     return False
 

@@ -178,7 +178,10 @@ def _leaves(function: Function, node: cst.CSTNode) -> List[Decider]:
 
     ``torch.cat(images).requires_grad_()`` has those of the renderings.
     """
-    values = [definition.value for definition in function.flow.reaching(node) if definition.kind == "assign"]
-    calls = [value for value in values if isinstance(value, cst.Call) and call_name(value) == "requires_grad_"]
+    calls = [
+        value
+        for value in function.flow.assigned(node)
+        if isinstance(value, cst.Call) and call_name(value) == "requires_grad_"
+    ]
     bases = [(call, call.func.value) for call in calls if isinstance(call.func, cst.Attribute)]
     return [(function, call) for call, of in bases if not (isinstance(of, cst.Call) and call_name(of) in JOINS)]

@@ -98,7 +98,7 @@ class Callbacks:
             if id(call) not in known and own.shape(caller) is None and len(call.args) == 2
         ]
         for holder in self._program.mentioning(function.name) if unknown else ():
-            for definition in [d for found in holder.flow.definitions.values() for d in found]:
+            for definition in holder.flow.every_definition:
                 value = definition.value
                 if definition.kind != "assign" or not isinstance(value, (cst.Name, cst.Attribute)):
                     continue
@@ -135,7 +135,7 @@ class Callbacks:
         for form in self._forms.of(function):  # and what is called by a name of its own
             named = function.flow.reaching(form.callee) if form.callee is not None else ()
             known |= {id(definition.value) for definition in named}
-        for definition in [each for found in function.flow.definitions.values() for each in found]:
+        for definition in function.flow.every_definition:
             value = definition.value
             if definition.kind != "assign" or id(value) in known or not isinstance(value, (cst.Name, cst.Attribute)):
                 continue

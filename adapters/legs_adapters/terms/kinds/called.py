@@ -136,18 +136,14 @@ def _handed_on(program: Program, function: Function, node: cst.Call) -> List[Ref
     name = call_name(node)
     if not function.is_parameter(node.func) or arguments(node)[2]:
         return []
-    if not function.name or function.name in ("forward", "__call__"):
+    if not function.name or function.runs_by_instance:
         return []
     found: List[Reference] = []
-    for caller in program.mentioning(function.name, called=True):
-        for call in caller.flow.calls:
-            if call_name(call) != function.name:
-                continue
-            value = function.given(call, name)
-            references = program.resolve(caller, value) if value is not None else []
-            if not references or not all(r.kind == "external" and TORCH_L1.search(str(r.target)) for r in references):
-                return []
-            found += references
+    for caller, value in program.given_to(function, name):
+        references = program.resolve(caller, value) if value is not None else []
+        if not references or not all(r.kind == "external" and TORCH_L1.search(str(r.target)) for r in references):
+            return []
+        found += references
     return found
 
 

@@ -1,14 +1,13 @@
 """Prove on the CPU that a patch took: train the patched and the unpatched script, and compare what they did.
 
 Three runs of copies of the checkout, on the embedded scene, from the same seed: unpatched, patched, and patched with
-LEGS_OFF=1. Each is a process of its own, which is watched (see :func:`watch`) and otherwise runs the script as it is.
+LEGS_OFF=1. Each is a process of its own, see :mod:`legs_adapters.watched`.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import random
 import shlex
 import shutil
 import socket
@@ -16,9 +15,8 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence
+from typing import Dict, List, NamedTuple, Optional, Sequence
 
 from legs_adapters.checkout.replace import locked
 from legs_adapters.code.sources import check_root
@@ -27,7 +25,7 @@ from legs_adapters.plan import plan
 from legs_adapters.undo import undo
 from legs_loss import LegsError
 
-__all__ = ["ITERATIONS", "Run", "Verdict", "verify", "watch"]
+__all__ = ["ITERATIONS", "Run", "Verdict", "verify"]
 
 ITERATIONS = 40
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 96, 64, 800  # of the embedded scene
@@ -220,7 +218,7 @@ def _run(root: Path, script: str, arguments: Sequence[str], iterations: int, rep
     command = [
         sys.executable,
         "-m",
-        "legs_adapters.verify",
+        "legs_adapters.watched",
         str(report),
         str(iterations),
         str(root),
@@ -242,94 +240,3 @@ def _run(root: Path, script: str, arguments: Sequence[str], iterations: int, rep
     except (OSError, ValueError):
         found = {field: [] if field in ("losses", "seconds") else 0 for field in Run._fields[1:-1]}
     return Run(code=code, error="\n".join(error.replace("\r", "\n").strip().splitlines()[-12:]), **found)
-
-
-class _Enough(BaseException):
-    """As many steps as were asked for."""
-
-
-class watch:
-    """Watch this process train: every backward pass from one number, and every call of ``legs_loss.l1_loss``."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.losses: List[str] = []
-        self.times: List[float] = []
-        self.without_gradient = 0
-
-    def __enter__(self) -> watch:
-        import torch
-
-        import legs_loss
-        from legs_loss.runtime import counts
-
-        self._backward, self._l1_loss = torch.Tensor.backward, legs_loss.l1_loss
-
-        def backward(tensor: Any, *args: Any, **kwargs: Any) -> Any:
-            if tensor.numel() == 1:
-                if len(self.losses) >= self.limit:
-                    raise _Enough
-                self.losses.append(float(tensor.detach()).hex())
-                self.times.append(time.perf_counter())
-            return self._backward(tensor, *args, **kwargs)
-
-        def l1_loss(*args: Any, **kwargs: Any) -> Any:
-            before = counts().weighted
-            result = self._l1_loss(*args, **kwargs)
-            self.without_gradient += counts().weighted - before if not torch.is_grad_enabled() else 0
-            return result
-
-        torch.Tensor.backward = backward  # type: ignore
-        legs_loss.l1_loss = l1_loss
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        import torch
-
-        import legs_loss
-
-        torch.Tensor.backward = self._backward  # type: ignore[method-assign]
-        legs_loss.l1_loss = self._l1_loss
-
-    def report(self) -> Dict[str, Any]:
-        """Return all fields of a `Run` that the process itself knows."""
-        from legs_loss.runtime import counts
-
-        found = counts()
-        return {
-            "losses": self.losses,
-            "seconds": [after - before for before, after in zip(self.times, self.times[1:])],
-            "weighted": found.weighted,
-            "weighted_without_gradient": self.without_gradient,
-            "plain": found.plain,
-            "stored": found.stored,
-            "computed": found.computed,
-            "remembered": found.remembered,
-        }
-
-
-def _main(report: str, limit: str, root: str, script: str, *arguments: str) -> int:
-    """Run a script, watched; what was seen goes to a file, whatever happens."""
-    import numpy as np
-    import torch
-
-    from legs_adapters.runner import execute
-
-    random.seed(0)
-    np.random.seed(0)
-    torch.manual_seed(0)
-    with watch(int(limit)) as seen:
-        try:
-            return execute(script, arguments, {}, Path(root))
-        except _Enough:
-            return 0
-        finally:
-            Path(report).write_text(json.dumps(seen.report()))
-
-
-if __name__ == "__main__":
-    try:
-        sys.exit(_main(*sys.argv[1:]))
-    except LegsError as error:
-        print(f"legs: error: {error}", file=sys.stderr)
-        sys.exit(2)

@@ -7,11 +7,12 @@ from typing import Iterator, List, NamedTuple, Optional, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.members import Reference, unique
 from legs_adapters.code.module import Class, Function, Module
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import attribute_chain, call_name, children, constant, path_of
 
-__all__ = ["BY_NAME", "Calls", "calls_of", "likely_calls", "sure_calls"]
+__all__ = ["BY_NAME", "Calls", "callees", "calls_of", "given_to", "handed", "likely_calls", "sure_calls"]
 
 _METHODS = {"staticmethod", "classmethod"}  # decorators that hand a function to nobody
 BY_NAME = {"getattr", "attrgetter", "methodcaller", "eval"}  # what looks a name up at run time
@@ -66,6 +67,36 @@ def _named(
         for call in caller.flow.calls if caller is not function else ():
             if call_name(call) == function.name:
                 yield caller, call, [r.target for r in program.resolve(caller, call.func) if not r.guess]
+
+
+def callees(program: Program, function: Function, call: cst.Call) -> List[Function]:
+    """Return the functions of the checkout that a call runs, as far as that is sure; an instance's not."""
+    found = [ref.target for ref in program.resolve(function, call.func) if ref.kind == "function" and not ref.guess]
+    return [target for target in found if isinstance(target, Function)]
+
+
+def given_to(
+    program: Program, function: Function, parameter: str
+) -> Iterator[Tuple[Function, Optional[cst.BaseExpression]]]:
+    """Yield what calls of a function's name give for a parameter, None where it is left out, and the callers."""
+    for caller in program.mentioning(function.name, called=True):
+        for call in caller.flow.calls if caller is not function else ():
+            if call_name(call) == function.name:
+                yield caller, function.given(call, parameter)
+
+
+def handed(program: Program, function: Function, node: cst.Name) -> List[Reference]:
+    """Return the modules that a parameter is given, ``model`` of ``train_epoch(model, loader)``."""
+    kinds = {definition.kind for definition in function.flow.reaching(node)}
+    if not function.name or kinds - {"store"} != {"parameter"}:
+        return []
+    return unique(
+        reference
+        for caller, value in given_to(program, function, node.value)
+        if value is not None
+        for reference in program.resolve(caller, value)
+        if reference.kind == "instance"
+    )
 
 
 def calls_of(program: Program, function: Function) -> Calls:

@@ -6,6 +6,7 @@ from typing import Iterable, List, Optional, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.calls import callees
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import constant, same
@@ -21,7 +22,7 @@ def called_makers(program: Program, function: Function, package: cst.CSTNode) ->
     call = made[0].value if len(made) == 1 and made[0].kind == "assign" else None
     if not isinstance(call, cst.Call):
         return []
-    return program.callees(function, call)
+    return callees(program, function, call)
 
 
 def forward_maker(function: Function, package: cst.CSTNode) -> List[Function]:

@@ -6,74 +6,27 @@ is returned.
 
 from __future__ import annotations
 
-from typing import Dict, FrozenSet, Iterable, Iterator, List, Mapping, NamedTuple, Optional, Set, Tuple
+from typing import List, Optional, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.checkout import Checkout, imported_name
-from legs_adapters.code.module import CALLED, Class, Function, Module
+from legs_adapters.code.checkout import imported_name
+from legs_adapters.code.members import DEPTH, Members, Reference, unique
+from legs_adapters.code.module import Class, Function, Module
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.sources import Source
-from legs_adapters.code.syntax import arguments, call_name, dotted, path_of, word_set
+from legs_adapters.code.syntax import arguments, call_name, dotted, path_of
 
-__all__ = ["Conventions", "Program", "Reference"]
+__all__ = ["Program"]
 
-# Methods that are too common to say whose they are.
-_COMMON = word_set("__init__ get items keys values copy load save append update close write read format join split pop")
-_DEPTH = 12
 _MADE = ("instance", "made by")
 
 
-class Reference(NamedTuple):
-    """A function, class, module or library name that an expression refers to.
-
-    ``kind``: "function", "class", "instance" (of a class), "module", "external" (a dotted name outside of the
-    checkout), "lambda". ``guess``: found by its name alone.
-    """
-
-    kind: str
-    target: object
-    guess: bool = False
-
-
-class Conventions(NamedTuple):
-    """The ways in which libraries pass objects on, which neither names nor the checkout show.
-
-    Attributes:
-        returning_self: methods that return the object itself, ``model.cuda()``.
-        wrapping: functions that return what they are given, wrapped: ``DataParallel(model)``; with a dot where the name
-            alone says too little.
-        common: names of methods that are too common to say whose they are.
-    """
-
-    returning_self: FrozenSet[str] = frozenset()
-    wrapping: FrozenSet[str] = frozenset()
-    common: FrozenSet[str] = frozenset()
-
-
-class Program(Checkout):
-    """The files of a checkout, linked by the names in them.
-
-    Args:
-        sources: the readable files.
-        unread: by path, the text of those that are not to be looked at, or cannot be: all that is asked of it is
-            whether it says a name.
-        conventions: of the libraries that it uses.
-    """
-
-    def __init__(
-        self,
-        sources: Iterable[Source],
-        unread: Optional[Mapping[str, str]] = None,
-        conventions: Optional[Conventions] = None,
-    ) -> None:
-        super().__init__(sources, unread)
-        self._conventions = conventions or Conventions()
-        self._common = _COMMON | self._conventions.common
+class Program(Members):
+    """The files of a checkout, linked by the names in them."""
 
     def resolve(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[Reference]:
         """Return what an expression may refer to; empty where nothing is known."""
-        if depth > _DEPTH:
+        if depth > DEPTH:
             return []
         if isinstance(node, cst.Name):
             found = self._definitions(function, node)
@@ -82,7 +35,7 @@ class Program(Checkout):
             references: List[Reference] = []
             for where, definition in found:
                 references.extend(self.of_definition(where, definition, depth + 1))
-            return _unique(references)
+            return unique(references)
         if isinstance(node, cst.Attribute):
             return self._attribute(function, node, depth + 1)
         if isinstance(node, cst.Call):
@@ -100,15 +53,13 @@ class Program(Checkout):
             made = self.resolve(function, node.func, depth + 1)
             instances = [Reference("instance", ref.target) for ref in made if ref.kind == "class"]
             instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
-            return _unique(instances + self._returned(made, None, depth + 1))
+            return unique(instances + self._returned(made, None, depth + 1))
         if isinstance(node, cst.Subscript):
             return self._subscript(function, node, depth + 1)
         if isinstance(node, cst.IfExp):
-            return _unique(
-                self.resolve(function, node.body, depth + 1) + self.resolve(function, node.orelse, depth + 1)
-            )
+            return unique(self.resolve(function, node.body, depth + 1) + self.resolve(function, node.orelse, depth + 1))
         if isinstance(node, cst.BooleanOperation):
-            return _unique(self.resolve(function, node.left, depth + 1) + self.resolve(function, node.right, depth + 1))
+            return unique(self.resolve(function, node.left, depth + 1) + self.resolve(function, node.right, depth + 1))
         if isinstance(node, cst.Lambda):
             return [Reference("lambda", node)]
         return []
@@ -151,38 +102,6 @@ class Program(Checkout):
             return self._returned(self.resolve(where, definition.value.func, depth), definition.index, depth)
         return []
 
-    def callees(self, function: Function, call: cst.Call) -> List[Function]:
-        """Return the functions of the checkout that a call runs, as far as that is sure; an instance's not."""
-        found = [ref.target for ref in self.resolve(function, call.func) if ref.kind == "function" and not ref.guess]
-        return [target for target in found if isinstance(target, Function)]
-
-    def run_by(self, reference: Reference) -> List[Function]:
-        """Return the functions that calling a reference runs: itself, or what an instance of a class runs."""
-        found = [reference]
-        if reference.kind == "instance" and isinstance(reference.target, Class):
-            found = [ref for name in CALLED for ref in self.member(reference.target, name)]
-        return [ref.target for ref in found if ref.kind == "function" and isinstance(ref.target, Function)]
-
-    def given_to(self, function: Function, parameter: str) -> Iterator[Tuple[Function, Optional[cst.BaseExpression]]]:
-        """Yield what calls of a function's name give for a parameter, None where it is left out, and the callers."""
-        for caller in self.mentioning(function.name, called=True):
-            for call in caller.flow.calls if caller is not function else ():
-                if call_name(call) == function.name:
-                    yield caller, function.given(call, parameter)
-
-    def handed(self, function: Function, node: cst.Name) -> List[Reference]:
-        """Return the modules that a parameter is given, ``model`` of ``train_epoch(model, loader)``."""
-        kinds = {definition.kind for definition in function.flow.reaching(node)}
-        if not function.name or kinds - {"store"} != {"parameter"}:
-            return []
-        return _unique(
-            reference
-            for caller, value in self.given_to(function, node.value)
-            if value is not None
-            for reference in self.resolve(caller, value)
-            if reference.kind == "instance"
-        )
-
     def _wrapped(self, function: Function, node: cst.Call, index: int, depth: int) -> List[Reference]:
         """Resolve ``DataParallel(model)``, and ``model, optimizer = accelerator.prepare(model, optimizer)``."""
         given = arguments(node)[0] if self._wraps(node) else []
@@ -199,7 +118,7 @@ class Program(Checkout):
         """Resolve what functions return, or one of a tuple: ``render = get_renderer(kind)``, ``net = get_model()``."""
         found: List[Reference] = []
         for ref in made:
-            if ref.kind != "function" or ref.guess or not isinstance(ref.target, Function) or depth > _DEPTH:
+            if ref.kind != "function" or ref.guess or not isinstance(ref.target, Function) or depth > DEPTH:
                 continue
             for value in ref.target.flow.returns:
                 part: cst.CSTNode = value
@@ -213,17 +132,17 @@ class Program(Checkout):
                         for r in self.resolve(ref.target, part, depth + 1)
                         if r.kind in ("function", "lambda", "instance") and not r.guess
                     )
-        return _unique(found)
+        return unique(found)
 
     def _global(self, module: Module, name: str, depth: int) -> List[Reference]:
-        if depth > _DEPTH:
+        if depth > DEPTH:
             return []
         definitions = module.top.flow.definitions.get(name)
         if definitions:
             references: List[Reference] = []
             for definition in definitions:
                 references.extend(self.of_definition(module.top, definition, depth + 1))
-            return _unique(references)
+            return unique(references)
         for node in module.top.flow.imports:
             if isinstance(node, cst.ImportFrom) and isinstance(node.names, cst.ImportStar):
                 other = self.imported_from(module, node)
@@ -269,15 +188,15 @@ class Program(Checkout):
             for definition in sorted(local, key=_order):
                 references.extend(self.of_definition(function, definition, depth))
             if references:
-                return _unique(references)
+                return unique(references)
         if isinstance(node.value, cst.Name) and node.value.value in ("self", "cls"):
             owner = self.owner_of(function)
             if owner is not None:
-                return _unique(self.member(owner, name, depth) + self._overrides(owner, name))
+                return unique(self.member(owner, name, depth) + self.overrides(owner, name))
         if isinstance(node.value, cst.Call) and call_name(node.value) == "super":
             owner = self.owner_of(function)
             found = [self.member(base, name, depth) for base in self.bases(owner)] if owner is not None else []
-            return _unique([ref for refs in found for ref in refs])
+            return unique([ref for refs in found for ref in refs])
         references = []
         for base in self.resolve(function, node.value, depth):
             if base.kind == "module":
@@ -292,71 +211,10 @@ class Program(Checkout):
                 assert isinstance(base.target, Class)
                 references.extend(self.member(base.target, name, depth))
         if references:
-            return _unique(references)
+            return unique(references)
         if name in self._common:
             return []
         return [Reference("function", method, True) for method in self.methods_named(name)]
-
-    def owner_of(self, function: Function) -> Optional[Class]:
-        """Return the class whose ``self`` a function sees."""
-        scope: Optional[Function] = function
-        while scope is not None:
-            if scope.owner is not None:
-                return scope.owner
-            scope = scope.parent
-        return None
-
-    def _overrides(self, owner: Class, name: str) -> List[Reference]:
-        """Resolve ``self.step()`` in a base class: the methods of classes that derive from it."""
-        if name.startswith("__"):
-            return []
-        found = []
-        for method in self.methods_named(name) if name not in self._common else []:
-            assert method.owner is not None
-            if method.owner is not owner and self._derives(method.owner, owner):
-                found.append(Reference("function", method))
-        return found
-
-    def _derives(self, derived: Class, owner: Class) -> bool:
-        seen: Set[int] = set()
-        queue = self.bases(derived)
-        while queue:
-            current = queue.pop()
-            if current is owner:
-                return True
-            if id(current) not in seen:
-                seen.add(id(current))
-                queue.extend(self.bases(current))
-        return False
-
-    def bases(self, owner: Class) -> List[Class]:
-        """Return the base classes that stand in the checkout."""
-        found = []
-        for arg in owner.node.bases:
-            for ref in self.resolve(owner.parent, arg.value):
-                if ref.kind == "class" and isinstance(ref.target, Class) and ref.target is not owner:
-                    found.append(ref.target)
-        return found
-
-    def member(self, owner: Class, name: str, depth: int = 0) -> List[Reference]:
-        """Return what ``instance.name`` may be: a method, or what methods of the class store there."""
-        references: List[Reference] = []
-        seen: Set[int] = set()
-        queue = [owner]
-        while queue and depth <= _DEPTH:
-            current = queue.pop(0)
-            if id(current) in seen:
-                continue
-            seen.add(id(current))
-            if name in current.methods:
-                references.append(Reference("function", current.methods[name]))
-                break
-            if name in current.fields:
-                references.extend(self.resolve(current.parent, current.fields[name], depth + 1))
-            for method, definition in current.stores(name):
-                references.extend(self.of_definition(method, definition, depth + 1))
-            queue.extend(self.bases(current))
-        return _unique(references)
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> List[Reference]:
         definitions = self._definitions(function, node.value)
@@ -368,13 +226,13 @@ class Program(Checkout):
                 if definition.kind == "import":
                     references.extend(self._dictionary(where, definition, depth))
             if references:
-                return _unique(references)
+                return unique(references)
         else:
             literals = [(function, node.value)]
         references = []
         for where, value in literals:
             references.extend(self._values(where, value, depth))
-        return _unique(references)
+        return unique(references)
 
     def _dictionary(self, where: Function, definition: Definition, depth: int) -> List[Reference]:
         alias, node = definition.node, definition.value
@@ -403,11 +261,3 @@ class Program(Checkout):
 
 def _order(definition: Definition) -> int:
     return definition.order
-
-
-def _unique(references: Iterable[Reference]) -> List[Reference]:
-    found: Dict[Tuple[str, object], Reference] = {}
-    for ref in references:
-        key = (ref.kind, ref.target if isinstance(ref.target, str) else id(ref.target))
-        found.setdefault(key, ref)
-    return list(found.values())

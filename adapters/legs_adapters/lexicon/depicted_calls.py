@@ -9,6 +9,7 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import arguments, call_name, constant, words
+from legs_adapters.lexicon.holders import role_of_holder
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.usage import draws, is_box
@@ -31,7 +32,7 @@ def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, dept
     module = isinstance(base, cst.Name) and (base.value in MODULES or _is_module(meanings.program, function, base))
     if name == "get" and positional and isinstance(constant(positional[0]), str) and base is not None:
         key = constant(positional[0])
-        role = role_of_words(key) or meanings.role_of_holder(function, base, depth)
+        role = role_of_words(key) or role_of_holder(meanings, function, base, depth)
         return Meaning(kind_of_words(key), role)
     if "prompt" in keywords and OF_DIFFUSION & set(keywords):
         return Meaning("warp", None)
@@ -68,7 +69,7 @@ def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, dept
     if kind is not None and kind not in ("image", "mask", "parameter"):
         return Meaning(kind, role_of_words(name))
     if kind == "image" and (role_of_words(name) == "target" or spoken & LOADING):
-        holder = meanings.role_of_holder(function, base, depth) if base is not None else None
+        holder = role_of_holder(meanings, function, base, depth) if base is not None else None
         return Meaning("image", role_of_words(name) or holder or "target")
     # A function of an image is an image, unless its name says otherwise: exposure, appearance, a background.
     parts = [meanings.of(function, value, depth) for value in values]

@@ -11,7 +11,7 @@ from typing import Callable, Dict, List, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import sure_calls
+from legs_adapters.code.calls import callees, sure_calls
 from legs_adapters.code.entries import (
     called_makers,
     computed_key,
@@ -25,8 +25,9 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.returned import passed_on
-from legs_adapters.code.syntax import arguments, call_name, key_of, root_of, same, walk_expressions, words
+from legs_adapters.code.syntax import arguments, call_name, key_of, root_of, words
 from legs_adapters.lexicon.depicted_calls import meaning_of_call
+from legs_adapters.lexicon.holders import role_of_holder
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.usage import (
@@ -40,11 +41,9 @@ from legs_adapters.lexicon.usage import (
 from legs_adapters.lexicon.words import (
     BACKGROUND,
     COMPARED,
-    DATA,
     KINDS,
     LOSS_CLASS,
     PARAMETERS,
-    RENDERERS,
     STEPS_OR_DYNAMIC,
 )
 from legs_adapters.tensors.backward import Training
@@ -105,11 +104,11 @@ class Meanings:
 
     def origin(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Return what a name's definitions say of it, whatever the name itself says."""
-        return self._flow(function, node, 0) if isinstance(node, cst.Name) else self.of(function, node)
+        return self.flow(function, node, 0) if isinstance(node, cst.Name) else self.of(function, node)
 
     def _of(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
         if isinstance(node, cst.Name):
-            flow = self._flow(function, node, depth)
+            flow = self.flow(function, node, depth)
             if flow.kind == "image" and kind_of_words(node.value) == "gradient" and is_cropped(function, node):
                 return flow  # colors_grad = colors[:, :, :half]: the part that gets gradients
             if flow.kind == "image" and kind_of_words(node.value) == "mask" and is_masked(function, node):
@@ -154,7 +153,7 @@ class Meanings:
         kinds = [k for k in (kind, flow.kind) if k is not None]
         return Meaning(min(kinds, key=KINDS.index) if kinds else None, role_of_words(name) or flow.role)
 
-    def _flow(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
+    def flow(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
         """Join what the definitions say that reach this use."""
         return self._asked(("definitions", id(node)), function, node, depth, self._defined)
 
@@ -176,7 +175,7 @@ class Meanings:
             return UNKNOWN
         if definition.kind == "augment":
             assert isinstance(definition.node, cst.AugAssign)
-            old = self._flow(function, definition.node.target, depth)
+            old = self.flow(function, definition.node.target, depth)
             return mix([old, self.of(function, value, depth)])
         if definition.kind == "element" and definition.index is not None:
             meaning = self._element(function, value, definition.index, depth)
@@ -213,7 +212,7 @@ class Meanings:
     def _returned(self, function: Function, call: cst.Call, index: int, depth: int, by_name: bool) -> Meaning:
         """Return the meaning of an element of a returned tuple; a renderer's may join depth and colours: by name."""
         found = []
-        for callee in self.program.callees(function, call):
+        for callee in callees(self.program, function, call):
             for value in callee.flow.returns:
                 if isinstance(value, cst.Tuple) and index < len(value.elements):
                     element = value.elements[index].value
@@ -259,7 +258,7 @@ class Meanings:
         name = node.attr.value
         if isinstance(node.value, cst.Name) and node.value.value in PARAMETERS:
             return Meaning("parameter", None)
-        local = self._flow(function, node, depth) if function.flow.reaching(node) else UNKNOWN
+        local = self.flow(function, node, depth) if function.flow.reaching(node) else UNKNOWN
         if local == UNKNOWN and isinstance(node.value, cst.Name) and node.value.value == "self":
             owner = self.program.owner_of(function)
             stores = owner.stores(name) if owner is not None else []
@@ -269,7 +268,7 @@ class Meanings:
             return self.of(function, node.value, depth)
         role = role_of_words(name) or local.role
         if role is None or role == "target":
-            role = role or self.role_of_holder(function, node.value, depth)
+            role = role or role_of_holder(self, function, node.value, depth)
         return Meaning(more_special(kind, local.kind), role)
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> Meaning:
@@ -278,18 +277,18 @@ class Meanings:
             return Meaning("parameter", None)
         if isinstance(key, str):
             here = bool(function.flow.reaching(node))
-            local = self._flow(function, node, depth) if here else self._entry(function, node.value, key, depth)
+            local = self.flow(function, node, depth) if here else self._entry(function, node.value, key, depth)
             role = role_of_words(key) or local.role
             if role == "render" and not here and is_asked_for(key) and is_loaded(function, node.value, key):
                 role = "target"
             if role is None and not BACKGROUND & set(words(key)):
-                role = self.role_of_holder(function, node.value, depth)
+                role = role_of_holder(self, function, node.value, depth)
             return Meaning(more_special(kind_of_words(key), local.kind), role)
         computed = computed_key(function, node)
         if computed is not None:  # which entry that is only the words in its key can say, or the holder's own name
             name = root_of(node.value) if isinstance(node.value, (cst.Name, cst.Attribute)) else ""
             kind = kind_of_words(computed) or kind_of_words(name)
-            return Meaning(kind, role_of_words(computed) or self.role_of_holder(function, node.value, depth))
+            return Meaning(kind, role_of_words(computed) or role_of_holder(self, function, node.value, depth))
         return self.of(function, node.value, depth)
 
     def _entry(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
@@ -300,45 +299,6 @@ class Meanings:
         held = stored(called_makers(self.program, function, node), key)
         held = held or written(forward_maker(function, node), key)
         return mix([self.of(maker, value, depth) for maker, value in held])
-
-    def role_of_holder(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[str]:
-        """Return the role by the holder: ``outputs["rgb"]`` is rendered, ``batch["rgb"]`` a target."""
-        if isinstance(node, cst.Name):
-            found = set(words(node.value))
-            name_role = role_of_words(node.value)
-            if name_role is not None:
-                return name_role
-            if found & DATA and not self._is_rendered(function, node):
-                return self._given_role(function, node) or "target"  # a camera may have been anywhere before
-            return self._flow(function, node, depth + 1).role
-        if isinstance(node, cst.Attribute):
-            role = role_of_words(node.attr.value)
-            return role or (
-                "target" if set(words(node.attr.value)) & DATA else self.role_of_holder(function, node.value, depth + 1)
-            )
-        if isinstance(node, cst.Subscript):
-            return self.role_of_holder(function, node.value, depth + 1)
-        return self.of(function, node, depth).role
-
-    def _given_role(self, function: Function, node: cst.Name) -> Optional[str]:
-        """Return the role of a parameter ``data`` that training gives ``data["render_results"]`` at each call."""
-        if {definition.kind for definition in function.flow.reaching(node)} != {"parameter"}:
-            return None
-        given = [function.given(call, node.value) for _, call in self.training.sites.get(function, [])]
-        keys = [key_of(value) for value in given if isinstance(value, cst.Subscript)]
-        said = [isinstance(key, str) and bool(set(words(key)) & RENDERERS) for key in keys]
-        return "render" if said and all(said) and len(said) == len(given) else None
-
-    @staticmethod
-    def _is_rendered(function: Function, node: cst.Name) -> bool:
-        """Return whether ``view = render(camera)`` made it; ``data = render(data)`` has what it had before, too."""
-        made = [definition.value for definition in function.flow.reaching(node)]
-        return any(
-            isinstance(call, cst.Call)
-            and bool(set(words(call_name(call))) & RENDERERS)
-            and not any(same(part, node) for arg in call.args for part in walk_expressions(arg.value))
-            for call in made
-        )
 
 
 def _is_called_for_another(value: cst.CSTNode, place: str, kind: Optional[str]) -> bool:

@@ -7,6 +7,7 @@ from typing import Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.calls import given_to
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
@@ -51,7 +52,7 @@ class Optimised:
         for where, definition in self.program.lookup(function, node) or self._stored(function, node):
             made = definition.value
             if definition.kind == "parameter" and depth < _DEPTH:
-                for caller, given in self.program.given_to(where, definition.place):
+                for caller, given in given_to(self.program, where, definition.place):
                     found |= self._words_of(caller, given, depth + 1) if given is not None else set()
             if definition.kind != "assign" or not isinstance(made, cst.Call):
                 continue

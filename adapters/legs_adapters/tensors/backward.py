@@ -7,6 +7,7 @@ from typing import Callable, Dict, List, Optional, Set, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.calls import given_to, handed
 from legs_adapters.code.module import Class, Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
@@ -85,7 +86,7 @@ class Training:
         for definition in function.flow.reaching(value):
             if definition.kind != "parameter" or definition.place not in function.parameters:
                 continue
-            for caller, given in self.program.given_to(function, definition.place):
+            for caller, given in given_to(self.program, function, definition.place):
                 if given is not None:
                     self._push(caller, given)
 
@@ -170,7 +171,7 @@ class Training:
                 return
         references = self.program.resolve(function, node.func)
         if not references and isinstance(node.func, cst.Name):
-            references = self.program.handed(function, node.func)
+            references = handed(self.program, function, node.func)
         for reference in references:
             if reference.kind == "lambda" and isinstance(reference.target, cst.Lambda):
                 self._push(function, reference.target)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import FrozenSet, Iterator, List, NamedTuple, Optional, Set, Tuple
+from typing import Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import (
     arguments,
     attribute_chain,
@@ -24,26 +23,16 @@ from legs_adapters.tensors.axes import (
     LAST,
     TO_FIRST,
     TO_LAST,
-    adds_batch_axis,
     einops_pattern,
-    index_parts,
     permutation,
-    reduced_axis,
     subject,
     swapped_axes,
-    unsqueezed_axis,
 )
 from legs_adapters.tensors.backward import Training
-from legs_adapters.tensors.operations import CHANNELS_LAST, KEEPS_AXES
+from legs_adapters.tensors.operations import CHANNELS_LAST
+from legs_adapters.tensors.votes import Vote, added_axis, permuted, shape_vote, slice_vote
 
-__all__ = ["Vote", "is_channels_last", "lies_last"]
-
-
-class Vote(NamedTuple):
-    """A sign that the channels are on an axis, -3 to -1 (on the way between two transpositions also -2)."""
-
-    axis: int
-    strength: int
+__all__ = ["is_channels_last", "lies_last"]
 
 
 def is_channels_last(
@@ -55,7 +44,7 @@ def is_channels_last(
     """
     votes = [vote for image in _without_factor(*images) for vote in _votes(training, function, image, set(), 0)]
     votes += _votes_of_callees(training, function, images)
-    axes = [_added(function, factor) for factor in _factors_of(function, error)]
+    axes = [added_axis(function, factor) for factor in _factors_of(function, error)]
     votes += [Vote(axis, 2) for axis in axes if axis is not None]
     last, first = (sum(vote.strength for vote in votes if vote.axis == axis) for axis in (LAST, FIRST))
     return last > first
@@ -122,7 +111,7 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
         if {"transform", "transforms"} & set(words(call_name(node))):  # what it may do besides is not known
             return []
         if call_name(node) in ("reshape", "view", "flatten", "mv", "mm", "matmul"):
-            return _shape_vote(node)
+            return shape_vote(node)
         inner: List[cst.CSTNode] = [node.func.value] if isinstance(node.func, cst.Attribute) else []
         inner += arguments(node)[0][:1]
         votes = [vote for part in inner for vote in _votes(training, function, part, seen, depth + 1)]
@@ -130,12 +119,12 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
         return votes if swap is None else [vote._replace(axis=swap.get(vote.axis, vote.axis)) for vote in votes]
     if isinstance(node, cst.Subscript):
         votes.extend(_uses(function, node))
-        votes.extend(_slice_vote(node))
+        votes.extend(slice_vote(node))
         votes.extend(_votes(training, function, node.value, seen, depth + 1))
         return votes
     if isinstance(node, cst.BinaryOperation):
         for side in (node.left, node.right):
-            axis = _added(function, side)
+            axis = added_axis(function, side)
             if axis is not None:
                 votes.append(Vote(axis, 2))
             else:
@@ -223,7 +212,7 @@ def _of_parameter(function: Function, name: str) -> List[Vote]:
     given = frozenset(d for d in function.flow.definitions.get(name, []) if d.kind == "parameter")
     certain = [line for line in function.body.body if isinstance(line, cst.SimpleStatementLine)]
     calls = [part for line in certain for part in walk_expressions(line) if isinstance(part, cst.Call)]
-    return list(_permuted(function, calls, name, given)) if given else []
+    return list(permuted(function, calls, name, given)) if given else []
 
 
 def _uses(function: Function, node: cst.CSTNode) -> List[Vote]:
@@ -231,98 +220,4 @@ def _uses(function: Function, node: cst.CSTNode) -> List[Vote]:
     place, definitions = path_of(node), function.flow.reaching(node)
     if place is None or (isinstance(node, cst.Name) and not definitions):
         return []
-    return list(_permuted(function, function.flow.calls, place, definitions))
-
-
-def _permuted(
-    function: Function, calls: List[cst.Call], place: str, definitions: FrozenSet[Definition]
-) -> Iterator[Vote]:
-    """Yield what calls say that permute, or reduce, the value which a place has from these definitions."""
-    for call in calls:
-        order, pattern, axis = permutation(call), einops_pattern(call), reduced_axis(call)
-        if order is None and pattern is None and axis is None:
-            continue
-        moved = next((part for part in _before(subject(call), order) if path_of(part) == place), None)
-        if moved is None:
-            continue
-        reaching = function.flow.reaching(moved)
-        if reaching != definitions and not reaching & definitions:
-            continue
-        if order in TO_FIRST:
-            yield Vote(LAST, 3)
-        elif order in TO_LAST:
-            yield Vote(FIRST, 3)
-        elif axis is not None:  # a grey image, a norm of the channels
-            yield Vote(LAST if axis == -1 else FIRST, 1)
-        elif pattern is not None:
-            yield Vote(LAST if pattern.split("->")[0].split()[-1:] == ["c"] else FIRST, 3)
-
-
-def _before(node: Optional[cst.CSTNode], order: Optional[Tuple[int, ...]]) -> List[cst.CSTNode]:
-    """Return ``x`` of what is permuted, ``x.clip(0, 1)[None]``: only an axis for the batch has come before x's own.
-
-    Of a product, ``x * mask``, each factor.
-    """
-    while node is not None:
-        if isinstance(node, cst.Call) and call_name(node) in KEEPS_AXES:
-            node = subject(node)
-        elif isinstance(node, cst.Call) and call_name(node) == "unsqueeze" and order is not None:
-            if constant(node.args[-1].value if node.args else None) != 0 or len(order) != 4:
-                return []
-            node = subject(node)
-        elif isinstance(node, cst.Subscript) and order is not None and len(order) == 4 and adds_batch_axis(node):
-            node = node.value
-        elif isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Multiply) and order is not None:
-            return [*_before(node.left, order), *_before(node.right, order)]
-        else:
-            return [node]
-    return []
-
-
-def _shape_vote(node: cst.Call) -> List[Vote]:
-    """Return the vote of ``x.reshape(height, width, 3)``: what stood where before does not count."""
-    sizes = [constant(value) for value in arguments(node)[0]]
-    sizes = list(sizes[0]) if len(sizes) == 1 and isinstance(sizes[0], tuple) else sizes
-    if call_name(node) not in ("reshape", "view") or len(sizes) not in (3, 4):
-        return []
-    return [Vote(axis, 3) for axis in (LAST, FIRST) if sizes[axis] == 3][:1]
-
-
-def _slice_vote(node: cst.Subscript) -> List[Vote]:
-    parts = [element.slice for element in node.slice]
-    spread = isinstance(parts[0], cst.Index) and isinstance(parts[0].value, cst.Ellipsis)
-    last = parts[-1]
-    if spread and len(parts) == 2 and isinstance(last, cst.Slice) and constant(last.upper) == 3:
-        return [Vote(LAST, 2)]
-    first = parts[0]
-    if isinstance(first, cst.Index) and constant(first.value, "") is None and len(parts) == 3:
-        return [Vote(FIRST, 2)]  # grey[None, :, :]
-    if isinstance(first, cst.Slice) and constant(first.upper) == 3:
-        return [Vote(FIRST, 2)]
-    if (
-        len(parts) >= 2
-        and isinstance(parts[1], cst.Slice)
-        and constant(parts[1].upper) == 3
-        and isinstance(first, cst.Slice)
-    ):
-        return [Vote(FIRST, 2)]
-    return []
-
-
-def _added(function: Function, node: cst.CSTNode) -> Optional[int]:
-    """Return where an image's channels are by the axes that are added to what is laid over it."""
-    if isinstance(node, cst.Name):
-        made = function.flow.assigned(node)
-        return _added(function, made[0]) if len(made) == 1 and isinstance(made[0], (cst.Call, cst.Subscript)) else None
-    if isinstance(node, cst.Call):
-        return unsqueezed_axis(node)
-    if not isinstance(node, cst.Subscript):
-        return None
-    parts = index_parts(node)
-    if parts in ([None, None, ":"], [":", None, None, ":"]):
-        return LAST  # colour[None, None, :]
-    if parts[-2:] == [None, None] and len(parts) > 2:
-        return FIRST  # colour[:, None, None]
-    if parts[-1] is None and (parts[0] is ... or parts[:2] == [":", ":"]):
-        return LAST  # mask[..., None]
-    return FIRST if parts in ([":", None], [":", None, ":", ":"]) else None  # mask[:, None]
+    return list(permuted(function, function.flow.calls, place, definitions))

@@ -8,8 +8,10 @@ from typing import List, Optional, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.calls import given_to
+from legs_adapters.code.members import Reference
 from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program, Reference
+from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import arguments, call_name, code, constant
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
 from legs_adapters.terms.form import Form
@@ -139,7 +141,7 @@ def _handed_on(program: Program, function: Function, node: cst.Call) -> List[Ref
     if not function.name or function.runs_by_instance:
         return []
     found: List[Reference] = []
-    for caller, value in program.given_to(function, name):
+    for caller, value in given_to(program, function, name):
         references = program.resolve(caller, value) if value is not None else []
         if not references or not all(r.kind == "external" and TORCH_L1.search(str(r.target)) for r in references):
             return []

@@ -1,0 +1,108 @@
+"""Run a training script watched: every backward pass from one number, and every call of ``legs_loss.l1_loss``.
+
+The process that ``legs-patch --verify`` starts for each of its runs.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import sys
+import time
+from pathlib import Path
+from typing import Any, Dict, List
+
+from legs_loss import LegsError
+
+__all__ = ["watch"]
+
+
+class _Enough(BaseException):
+    """As many steps as were asked for."""
+
+
+class watch:
+    """Watch this process train: every backward pass from one number, and every call of ``legs_loss.l1_loss``."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.losses: List[str] = []
+        self.times: List[float] = []
+        self.without_gradient = 0
+
+    def __enter__(self) -> watch:
+        import torch
+
+        import legs_loss
+        from legs_loss.runtime import counts
+
+        self._backward, self._l1_loss = torch.Tensor.backward, legs_loss.l1_loss
+
+        def backward(tensor: Any, *args: Any, **kwargs: Any) -> Any:
+            if tensor.numel() == 1:
+                if len(self.losses) >= self.limit:
+                    raise _Enough
+                self.losses.append(float(tensor.detach()).hex())
+                self.times.append(time.perf_counter())
+            return self._backward(tensor, *args, **kwargs)
+
+        def l1_loss(*args: Any, **kwargs: Any) -> Any:
+            before = counts().weighted
+            result = self._l1_loss(*args, **kwargs)
+            self.without_gradient += counts().weighted - before if not torch.is_grad_enabled() else 0
+            return result
+
+        torch.Tensor.backward = backward  # type: ignore
+        legs_loss.l1_loss = l1_loss
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        import torch
+
+        import legs_loss
+
+        torch.Tensor.backward = self._backward  # type: ignore[method-assign]
+        legs_loss.l1_loss = self._l1_loss
+
+    def report(self) -> Dict[str, Any]:
+        """Return all fields of a `Run` that the process itself knows."""
+        from legs_loss.runtime import counts
+
+        found = counts()
+        return {
+            "losses": self.losses,
+            "seconds": [after - before for before, after in zip(self.times, self.times[1:])],
+            "weighted": found.weighted,
+            "weighted_without_gradient": self.without_gradient,
+            "plain": found.plain,
+            "stored": found.stored,
+            "computed": found.computed,
+            "remembered": found.remembered,
+        }
+
+
+def _main(report: str, limit: str, root: str, script: str, *arguments: str) -> int:
+    """Run a script, watched; what was seen goes to a file, whatever happens."""
+    import numpy as np
+    import torch
+
+    from legs_adapters.runner import execute
+
+    random.seed(0)
+    np.random.seed(0)
+    torch.manual_seed(0)
+    with watch(int(limit)) as seen:
+        try:
+            return execute(script, arguments, {}, Path(root))
+        except _Enough:
+            return 0
+        finally:
+            Path(report).write_text(json.dumps(seen.report()))
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(_main(*sys.argv[1:]))
+    except LegsError as error:
+        print(f"legs: error: {error}", file=sys.stderr)
+        sys.exit(2)

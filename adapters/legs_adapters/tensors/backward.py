@@ -12,15 +12,13 @@ from legs_adapters.code.module import Class, Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import arguments, call_name, children, constant, key_of
-from legs_adapters.tensors.operations import BACKWARD, ENDS_GRADIENT, SIZES
+from legs_adapters.tensors.operations import BACKWARD, ENDS_GRADIENT, HOOKS, SIZES
 from legs_adapters.tensors.steps import is_backward
 
 __all__ = ["Training"]
 
 _BACKWARD = re.compile(r"\b(manual_)?backward\s*\(")
-# Methods whose result a framework trains on: Lightning, nerfstudio.
-_HOOKS = {"training_step", "get_loss_dict", "get_train_loss_dict"}
-_HOOK = re.compile(rf"def\s+({'|'.join(sorted(_HOOKS))})\s*\(")
+_HOOK = re.compile(rf"def\s+({'|'.join(sorted(HOOKS))})\s*\(")
 _ANY = object()
 
 
@@ -48,7 +46,7 @@ class Training:
             for function in module.scopes(_BACKWARD.search):
                 self._start(function)
         for module in program.matching(_HOOK):
-            for function in (f for name in sorted(_HOOKS) for f in module.named(name)):
+            for function in (f for name in sorted(HOOKS) for f in module.named(name)):
                 if function.owner is not None:
                     self._root(function)
                     for value in function.flow.returns:

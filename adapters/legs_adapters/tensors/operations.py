@@ -41,6 +41,13 @@ transforms    exp log log10 log1p log2 pow sigmoid sqrt square tanh
 other_losses  huber_loss mse_loss norm smooth_l1_loss
 channels_last rasterization rasterization_2dgs rasterization_inria_wrapper rasterize_gaussians
 modules       F TF einops functional nn np numpy torch
+module_self   cpu cuda double eval float half requires_grad_ to train
+module_wraps  DDP DataParallel DistributedDataParallel compile convert_sync_batchnorm fabric.setup prepare
+everyday      clamp clone cpu cuda detach eval item mean permute reshape size squeeze step sum to train unsqueeze
+everyday      view zero_grad
+transparent   autocast classmethod compile jaxtyped script staticmethod typechecked
+holders       ModuleDict OrderedDict dict functools.partial nn.ModuleDict partial torch.nn.ModuleDict
+hooks         get_loss_dict get_train_loss_dict training_step
 optimisers    optimiser optimisers optimizer optimizers
 steps         adam optim optimise optimize sgd step steps update
 schedules     bar lr pbar profiler progress sched scheduler schedulers strategy tqdm
@@ -77,6 +84,12 @@ TRANSFORMS = _ROWS["transforms"]  # an absolute value is none any more
 OTHER_LOSSES = _ROWS["other_losses"]  # than an L1
 CHANNELS_LAST = _ROWS["channels_last"]  # renderers that return [H, W, C]: gsplat's
 MODULES = _ROWS["modules"]  # the names under which torch and its neighbours are imported
+MODULE_SELF = _ROWS["module_self"]  # methods of an nn.Module that return it
+MODULE_WRAPS = _ROWS["module_wraps"]  # what returns a module wrapped; Lightning's fabric.setup, accelerate's prepare
+EVERYDAY = _ROWS["everyday"]  # methods of tensors, modules and optimisers: the name alone does not say whose
+TRANSPARENT = _ROWS["transparent"]  # decorators that return what the function returns
+HOLDERS = _ROWS["holders"]  # what is made of what it holds
+HOOKS = _ROWS["hooks"]  # methods whose result a framework trains on: Lightning, nerfstudio
 # Words in the names of optimisers, of what steps them, and of what has a step() of another kind.
 OPTIMISERS, STEPS, SCHEDULES = _ROWS["optimisers"], _ROWS["steps"], _ROWS["schedules"]
 # What leaves a picture a picture: its methods, which keep its values, pick some of them or mix in others...

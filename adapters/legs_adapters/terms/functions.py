@@ -15,15 +15,13 @@ from legs_adapters.code.syntax import arguments, call_name, code, constant, key_
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
 from legs_adapters.tensors.absolute import abs_argument, is_abs, mean_of
-from legs_adapters.tensors.operations import ASKS, LIKE, OTHER_LOSSES, SIZES, TRANSFORMS, depends
+from legs_adapters.tensors.operations import ASKS, LIKE, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
 from legs_adapters.terms.prospects import Prospects
 
 __all__ = ["L1Functions"]
 
 _GSPLAT_L1 = re.compile(r"^gsplat\.losses\.l1_loss$")
 _TORCH_MODULE = re.compile(r"(^|\.)L1Loss$")  # nerfstudio hands torch's on
-# Decorators that return what the function returns.
-_TRANSPARENT = {"staticmethod", "classmethod", "script", "compile", "jaxtyped", "typechecked", "autocast"}
 
 
 class L1Functions:
@@ -55,7 +53,7 @@ class L1Functions:
         a, b = names[:2]
         if not self._only_differences(function, a, b, depth):
             return None
-        if set(function.decorators) - _TRANSPARENT:
+        if set(function.decorators) - TRANSPARENT:
             return "own"  # what is returned is the decorator's to say: a mean, a weight
         known = known_arguments(function, call)
         value = returned(function, known)

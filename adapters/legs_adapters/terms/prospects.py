@@ -12,6 +12,7 @@ from typing import Dict, Iterable, Iterator, List, Set, Tuple
 
 from legs_adapters.code.module import CALLED
 from legs_adapters.lexicon.words import SPEAKS_OF_L1
+from legs_adapters.tensors.operations import HOLDERS
 
 __all__ = ["Prospects"]
 
@@ -27,7 +28,6 @@ _ADDED = re.compile(r"\bself\.(\w+)\.(?:append|add|extend|update|setdefault)\(([
 _CALLEE = re.compile(r"([\w.]+)[ \t]*\(")
 _RENAMED = re.compile(r"\b(\w+)[ \t]+as[ \t]+(\w+)")
 _DEFAULT = re.compile(r"\b(\w+)(?:[ \t]*:[^=,()\n]+)?[ \t]*=[ \t]*([\w.]*[lL]1\w*)(?![\w.]*[ \t]*\()")
-_HOLDERS = {"dict", "partial", "functools.partial", "nn.ModuleDict", "ModuleDict", "torch.nn.ModuleDict", "OrderedDict"}
 
 
 class Prospects:
@@ -89,7 +89,7 @@ def _said(text: str) -> Iterator[Tuple[str, str]]:
 def _made(value: str) -> str:
     """Return what a value is made by: of one call that is all of it the function, which its arguments do not change."""
     call = _CALLEE.match(value)
-    if call is None or call.group(1) in _HOLDERS:
+    if call is None or call.group(1) in HOLDERS:
         return value
     depth = 0
     for i, letter in enumerate(value[call.end() - 1 :], call.end()):

@@ -12,19 +12,19 @@ from typing import Callable, Dict, List, Optional, Set, Tuple
 import libcst as cst
 
 from legs_adapters.code.calls import callees, sure_calls
-from legs_adapters.code.entries import (
+from legs_adapters.code.module import Function
+from legs_adapters.code.program import Program
+from legs_adapters.code.reaching import Definition
+from legs_adapters.code.returned import (
     called_makers,
     computed_key,
     default_key,
     formatted_key,
     forward_maker,
+    passed_on,
     stored,
     written,
 )
-from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program
-from legs_adapters.code.reaching import Definition
-from legs_adapters.code.returned import passed_on
 from legs_adapters.code.syntax import arguments, call_name, key_of, root_of, words
 from legs_adapters.lexicon.depicted_calls import meaning_of_call
 from legs_adapters.lexicon.holders import role_of_holder

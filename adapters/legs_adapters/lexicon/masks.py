@@ -6,8 +6,8 @@ from typing import Iterable, Optional, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.entries import called_makers, written
 from legs_adapters.code.module import Function
+from legs_adapters.code.returned import called_makers, written
 from legs_adapters.code.syntax import arguments, call_name, constant, key_of, words
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.words import PICKING

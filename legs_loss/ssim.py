@@ -23,8 +23,8 @@ C2 = 0.03**2
 
 
 def ssim(
-    prediction: Tensor,
-    target: Tensor,
+    img1: Tensor,
+    img2: Tensor,
     padding: Union[str, int] = "zeros",
     channels_last: Optional[bool] = None,
     *,
@@ -39,8 +39,9 @@ def ssim(
     (docs/performance.md): equal up to rounding, differentiable once; with LEGS_OFF=1 they are 3DGS's own there, too.
 
     Args:
-        prediction: floats in [0, 1], [C, H, W] or [B, C, H, W]; channels-last on request.
-        target: the same shape; or one image of a batch of one and the other without its axis, as 3DGS's takes them.
+        img1, img2: the two images, in either order, by 3DGS's names: floats in [0, 1], [C, H, W] or [B, C, H, W],
+            channels-last on request, of one shape; or one image of a batch of one and the other without its axis, as
+            3DGS's takes them.
         padding: "zeros" as in 3DGS's code, "reflect", "replicate", or "valid" (only windows inside the image). A
             number is taken for 3DGS's third argument, ``window_size``, and what follows it for ``size_average``.
         channels_last: where the channel stands.
@@ -64,15 +65,15 @@ def ssim(
             size_average = bool(channels_last)
         window_size, padding, channels_last = padding, "zeros", None
     last = bool(channels_last)
-    prediction, target = _of_one_rank(prediction, target)
+    img1, img2 = _of_one_rank(img1, img2)
     if window_size == WINDOW_SIZE and size_average and torch.is_grad_enabled() and not is_off():
-        check_pair(prediction, target)
-        trained, constant = (prediction, target) if prediction.requires_grad else (target, prediction)
+        check_pair(img1, img2)
+        trained, constant = (img1, img2) if img1.requires_grad else (img2, img1)
         if trained.requires_grad:
             fused = fused_ssim(trained, constant, padding, last)
             if fused is not None:
                 return fused
-    similarity = ssim_map(prediction, target, padding, last, window_size)
+    similarity = ssim_map(img1, img2, padding, last, window_size)
     return similarity.mean() if size_average else similarity.mean(-3).mean(-2).mean(-1)
 
 

@@ -220,11 +220,3 @@ class TestBadInput:
         target[0, 0, 0] = float("nan")
         with pytest.raises(LegsError, match="NaN"):
             legs_loss(torch.rand(3, 4, 4), target)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(torch, "compile"), reason="this torch has no torch.compile")
-def test_it_compiles_whole():
-    prediction, target = pair(3, 24, 24)
-    compiled = torch.compile(lambda p, t: legs_loss(p, t), fullgraph=True)
-    torch.testing.assert_close(compiled(prediction, target), legs_loss(prediction, target))

@@ -126,6 +126,8 @@ class TestDropIn:
         assert torch.equal(ssim(prediction, target, 11), value)
         assert torch.equal(ssim(prediction, target, 11, True), value)
         assert torch.equal(ssim(prediction, target, window_size=11, size_average=True), value)
+        assert torch.equal(ssim(img1=prediction, img2=target), value)
+        assert torch.equal(ssim(img2=target, img1=prediction, size_average=True, window_size=11), value)
         each = torch.stack([formula_of_3dgs(*images) for images in zip(prediction, target)])
         torch.testing.assert_close(ssim(prediction, target, size_average=False), each)
         torch.testing.assert_close(ssim(prediction, target, 11, False), each)

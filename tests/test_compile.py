@@ -1,0 +1,94 @@
+"""torch.compile(fullgraph=True) of the losses, as a training script calls them: value and gradient equal eager's."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from legs_loss import LEGSLoss, WeightSpec, l1_loss, legs_loss, ssim, weight_map, weighted_l1
+from legs_loss.runtime import state
+from tests.support import legs_environment
+
+
+def _compiles() -> bool:
+    if not hasattr(torch, "compile"):
+        return False
+    supported = getattr(torch._dynamo, "is_dynamo_supported", None)  # by this Python and platform
+    return supported is None or bool(supported())
+
+
+pytestmark = pytest.mark.skipif(not _compiles(), reason="this torch has no torch.compile for this Python")
+
+MASK = torch.linspace(0.0, 1.0, 16 * 20).reshape(16, 20)
+LOSSES = {
+    "legs_loss": legs_loss,
+    "legs_loss of a map and a mask": lambda a, b: legs_loss(a, b, weight=weight_map(b), mask=MASK, renormalise=True),
+    "legs_loss, Sobel and C5": lambda a, b: legs_loss(a, b, WeightSpec(operator="sobel", p=1.0, curve="C5")),
+    "legs_loss, unweighted": lambda a, b: legs_loss(a, b, "3dgs"),
+    "LEGSLoss": LEGSLoss(),
+    "l1_loss": l1_loss,
+    "l1_loss and ssim, a step of 3DGS": lambda a, b: 0.8 * l1_loss(a, b) + 0.2 * (1.0 - ssim(a, b)),
+    "weighted_l1": lambda a, b: weighted_l1(a, b, weight_map(b)),
+}
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch, tmp_path):
+    """Each test is a run of its own, started in an empty folder; nothing is compiled yet."""
+    for name in [name for name in os.environ if name.startswith("LEGS_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    monkeypatch.chdir(tmp_path)
+    state.reset()
+    torch._dynamo.reset()
+
+
+def value_and_gradient(loss, prediction, target):
+    value = loss(prediction, target)
+    return value.detach(), torch.autograd.grad(value, prediction)[0]
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_value_and_gradient_are_those_of_eager_from_the_first_call(name):
+    loss = LOSSES[name]
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    for _ in range(2):  # the second call runs what the first one compiled, with other pixels
+        prediction, target = torch.rand(3, 16, 20, requires_grad=True), torch.rand(3, 16, 20)
+        found = value_and_gradient(compiled, prediction, target)
+        for mine, eager in zip(found, value_and_gradient(loss, prediction, target)):
+            torch.testing.assert_close(mine, eager, rtol=1e-4, atol=1e-7)
+
+
+SCRIPT = """
+import torch
+from legs_loss import LEGSLoss, l1_loss, legs_loss
+
+torch.manual_seed(0)
+for loss in (legs_loss, l1_loss, LEGSLoss("legs-l")):
+    compiled = torch.compile(loss, fullgraph=True)
+    results = []
+    prediction, target = torch.rand(3, 16, 20, requires_grad=True), torch.rand(3, 16, 20)
+    for function in (compiled, loss):  # compiled first: nothing was asked of the package before
+        value = function(prediction, target)
+        results.append((value.detach(), *torch.autograd.grad(value, prediction)))
+    for mine, eager in zip(*results):
+        torch.testing.assert_close(mine, eager, rtol=1e-4, atol=1e-7)
+print("equal")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (os.environ.get("CXX") or shutil.which("g++")), reason="torch.compile needs a C++ compiler")
+def test_a_script_whose_first_call_is_compiled(tmp_path):
+    script = tmp_path / "train.py"
+    script.write_text(SCRIPT)
+    environment = {key: value for key, value in legs_environment().items() if not key.startswith("LEGS_")}
+    done = subprocess.run(
+        [sys.executable, str(script)], cwd=str(tmp_path), env=environment, capture_output=True, text=True
+    )
+    assert done.stdout == "equal\n", done.stderr[-3000:]

@@ -27,7 +27,8 @@ from tests.support import legs_environment
 pytest.importorskip("numba")
 
 from legs_loss.kernels.numba_loss import fused_loss
-from legs_loss.kernels.numba_response import extremes, map_of_responses, photograph_response, supports_response
+from legs_loss.kernels.numba_passes import extremes, map_of_responses, photograph_response
+from legs_loss.kernels.numba_response import supports_response
 
 COMPILED = [name for name in operator_names() if supports_response(WeightSpec(operator=name))]
 

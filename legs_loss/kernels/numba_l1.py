@@ -6,6 +6,7 @@ import numpy as np
 from numba import prange
 
 from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.numba_response import Piece
 from legs_loss.kernels.numba_weights import weights_of_row
 from legs_loss.kernels.simd import LANES, absolute, load, multiply_add, sign, splat, store, total
 
@@ -31,7 +32,7 @@ def all_strips(images, source, gradient, sums):  # type: ignore[no-untyped-def]
         view, strip = task // strips, task % strips
         weights = np.empty(images.width + LANES if source.kind > 0 else 0, np.float32)
         for row in range(strip * ROWS, min((strip + 1) * ROWS, images.height)):
-            weights_of_row(images, source, view, row, 0, images.width, weights, 0)
+            weights_of_row(images, source, Piece(view, row, 0, images.width), weights, 0)
             for channel in range(images.channels):
                 at = ((view * images.channels + channel) * images.height + row) * images.width
                 sums[task] += _row(images.x, images.y, at, images.width, weights, scale, gradient)

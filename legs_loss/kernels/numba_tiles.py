@@ -14,10 +14,13 @@ for all of its channels.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
 
 from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.numba_response import Piece
 from legs_loss.kernels.numba_weights import weights_of_row
 from legs_loss.kernels.simd import LANES, absolute, load, multiply_add, prefetch, shifted, sign, splat, store, total
 from legs_loss.ssim import C1, C2, SIGMA, WINDOW_SIZE
@@ -50,6 +53,27 @@ _SLOPES = _MOMENTS + _KEPT * _RING_ROW
 _STATE = _SLOPES + _KEPT * _RING_ROW
 
 
+class Tile(NamedTuple):
+    """A tile of a channel of a view.
+
+    plane: where in memory the channel begins.
+    top, bottom, left, right: the tile's edges, pixels.
+    """
+
+    plane: int
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+
+class Weights(NamedTuple):
+    """The weights of a tile's pixels, float32 [height * width], or empty; their row is of the widest tile."""
+
+    values: np.ndarray
+    width: int
+
+
 @compiled(parallel=True, fastmath=False)
 def all_tiles(images, down, across, share, source, gradient, sums):  # type: ignore[no-untyped-def]
     """Compute the whole loss tile by tile, and its gradient if that has a size.
@@ -69,9 +93,9 @@ def all_tiles(images, down, across, share, source, gradient, sums):  # type: ign
     # As even as whole vectors allow.
     tile_width = (width + across * LANES - 1) // (across * LANES) * LANES
     for task in prange(views * down * across):
-        view, tile = task // (down * across), task % (down * across)
-        top, bottom = height * (tile // across) // down, height * (tile // across + 1) // down
-        left = tile_width * (tile % across)
+        view, place = task // (down * across), task % (down * across)
+        top, bottom = height * (place // across) // down, height * (place // across + 1) // down
+        left = tile_width * (place % across)
         right = min(left + tile_width, width)
         if left < right:
             weights = np.empty((bottom - top) * tile_width if source.kind > 0 else 0, np.float32)
@@ -81,30 +105,18 @@ def all_tiles(images, down, across, share, source, gradient, sums):  # type: ign
                         ahead = ((view * channels + channel) * height + row + _STEP) * width
                         for j in range(ahead + left, ahead + right, _LINE):
                             prefetch(y, j)
-                weights_of_row(images, source, view, row, left, right, weights, (row - top) * tile_width)
+                weights_of_row(images, source, Piece(view, row, left, right), weights, (row - top) * tile_width)
             memory = np.empty(_STATE + _LINE, np.float32)
             state = memory[-(memory.ctypes.data // 4) % _LINE :]  # from the start of a cache line
             for channel in range(channels):
-                plane = (view * channels + channel) * height * width
-                _tile(
-                    x,
-                    y,
-                    plane,
-                    (height, width),
-                    (top, bottom, left, right),
-                    scales,
-                    weights,
-                    tile_width,
-                    state,
-                    gradient,
-                    sums[task],
-                )
+                tile = Tile((view * channels + channel) * height * width, top, bottom, left, right)
+                _tile(images, tile, scales, Weights(weights, tile_width), state, gradient, sums[task])
 
 
 @compiled(fastmath=False)
-def _tile(x, y, plane, size, edges, scales, weights, weight_width, state, gradient, sums):  # type: ignore[no-untyped-def]
-    height, width = size
-    top, bottom, left, right = edges
+def _tile(images, tile, scales, weights, state, gradient, sums):  # type: ignore[no-untyped-def]
+    x, y, height, width = images.x, images.y, images.height, images.width
+    plane, top, bottom, left, right = tile
     inner = right - left
     vectors = (inner + LANES - 1) // LANES
     needed = LANES * vectors + 2 * _FAR
@@ -154,9 +166,9 @@ def _tile(x, y, plane, size, edges, scales, weights, weight_width, state, gradie
                 count = min(_BLOCK * LANES, inner - begin)
                 for k in range(min(_STEP, bottom - row)):
                     source = plane + (row + k) * width + left + begin
-                    weight = (row + k - top) * weight_width + begin
+                    weight = (row + k - top) * weights.width + begin
                     at = _WORK + k * 4 * _WORK_ROW + begin
-                    sums[0] += _errors(x, y, source, width, count, scales, weights, weight, state, at, gradient)
+                    sums[0] += _errors(images, source, count, scales, weights.values, weight, state, at, gradient)
 
 
 @compiled(fastmath=False)
@@ -297,8 +309,12 @@ def _sum(state, at, count):  # type: ignore[no-untyped-def]
 
 
 @compiled(fastmath=False)
-def _errors(x, y, source, width, count, scales, weights, weight, slopes, at, gradient):  # type: ignore[no-untyped-def]
-    """Return the sum of a row's weighted errors; write the row of the gradient."""
+def _errors(images, source, count, scales, weights, weight, slopes, at, gradient):  # type: ignore[no-untyped-def]
+    """Return the sum of the weighted errors of `count` pixels from `source`; write their gradient.
+
+    Their weights begin at `weight`, the slopes of SSIM at `at`.
+    """
+    x, y, width = images.x, images.y, images.width
     l1_scale, ssim_scale = scales
     l1, structural, one = splat(l1_scale), splat(ssim_scale), splat(_ONE)
     wanted, weighted = gradient.size > 0, weights.size > 0

@@ -10,7 +10,16 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, shape_of
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.numba_response import CURVES, extremes, settings_of, supports_response, weight_row
+from legs_loss.kernels.numba_passes import extremes
+from legs_loss.kernels.numba_response import (
+    CURVES,
+    Operator,
+    Shape,
+    Weighting,
+    operator_of,
+    supports_response,
+    weight_row,
+)
 from legs_loss.spec import WeightSpec
 
 __all__ = ["Images", "WeightSource", "images_of", "response_range", "source_of", "supports", "weights_of_row"]
@@ -35,7 +44,7 @@ class WeightSource(NamedTuple):
 
     stored: kind 1: float32 [height * width] for all views, or [views * height * width].
     ranges: kind 2: float32 [views, 2]: the least response, and the greatest less the least plus eps.
-    stencil, side, middle, norm: kind 2: of the response, as :func:`settings_of` returns them.
+    stencil, side, middle, norm: kind 2: an Operator's; a parallel loop takes no group in a group.
     curve, beta: kind 2: of the weight.
     """
 
@@ -85,7 +94,7 @@ def source_of(
     if isinstance(weight, WeightSpec):
         found = response_range(target, weight) if ranges is None else ranges.numpy().copy()
         found[:, 1] += np.float32(weight.eps)
-        return WeightSource(2, _EMPTY, found, *settings_of(weight), CURVES[weight.curve], np.float32(weight.beta))
+        return WeightSource(2, _EMPTY, found, *operator_of(weight), CURVES[weight.curve], np.float32(weight.beta))
     stored, pixels = _flat(weight), images.height * images.width
     if stored.size not in (pixels, images.views * pixels):
         raise LegsError(f"weight {shape_of(weight)} does not fit images {shape_of(target)}")
@@ -105,18 +114,19 @@ def response_range(target: Tensor, spec: WeightSpec) -> np.ndarray:
 
 
 @compiled(fastmath=False)
-def weights_of_row(images, source, view, row, left, right, out, at):  # type: ignore[no-untyped-def]
-    """Write the weights of a row's pixels left <= j < right to out[at:], rounded up to whole vectors."""
+def weights_of_row(images, source, piece, out, at):  # type: ignore[no-untyped-def]
+    """Write the weights of a Piece of a row to out[at:], rounded up to whole vectors."""
     height, width = images.height, images.width
     if source.kind == 1:
         one_for_all = source.stored.size == height * width
-        start = (row if one_for_all else view * height + row) * width
-        out[at : at + right - left] = source.stored[start + left : start + right]
+        row = (piece.row if one_for_all else piece.view_index * height + piece.row) * width
+        out[at : at + piece.right - piece.left] = source.stored[row + piece.left : row + piece.right]
     elif source.kind == 2:
-        shape = images.views, images.channels, height, width
-        low, span = source.ranges[view, 0], source.ranges[view, 1]
-        settings = (source.stencil, source.side, source.middle, source.norm)
-        weight_row(images.y, view, shape, row, left, right, settings, source.curve, low, span, source.beta, out, at)
+        shape = Shape(images.views, images.channels, height, width)
+        low, span = source.ranges[piece.view_index, 0], source.ranges[piece.view_index, 1]
+        weighting = Weighting(source.curve, source.beta, low, span)
+        operator = Operator(source.stencil, source.side, source.middle, source.norm)
+        weight_row(images.y, shape, piece, operator, weighting, out, at)
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

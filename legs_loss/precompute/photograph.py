@@ -39,7 +39,8 @@ def normalised_map_and_levels(image: np.ndarray, spec: WeightSpec) -> Tuple[np.n
 def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
     if compiles(image.size):
-        from legs_loss.kernels.numba_response import photograph_response, supports_response
+        from legs_loss.kernels.numba_passes import photograph_response
+        from legs_loss.kernels.numba_response import supports_response
 
         if supports_response(spec):
             return torch.from_numpy(photograph_response(image, spec))
@@ -86,8 +87,9 @@ def compiled_anew(spec: WeightSpec) -> bool:
     from numba.core import event
     from PIL import Image
 
+    from legs_loss.kernels.numba_passes import photograph_response
     from legs_loss.kernels.numba_resize import resized as resize
-    from legs_loss.kernels.numba_response import photograph_response, supports_response
+    from legs_loss.kernels.numba_response import supports_response
 
     with event.install_recorder("numba:compile") as compiled:
         small = resize(Image.new("RGB", (64, 64)), (32, 32))

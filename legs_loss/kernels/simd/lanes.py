@@ -1,0 +1,93 @@
+"""Work across lanes: single values, shuffles and sums."""
+
+from __future__ import annotations
+
+from llvmlite import ir
+from numba import types
+from numba.core.errors import RequireLiteralValue
+
+from legs_loss.kernels.compiling import inlined
+from legs_loss.kernels.simd.vectors import INTEGERS, LANES, float8, integer8, intrinsic
+
+__all__ = ["halves_added", "lane", "shifted", "total", "totals", "without_fourths"]
+
+
+@intrinsic
+def shifted(typingctx, a, b, count):  # type: ignore[no-untyped-def]
+    """Return array[i + count : i + count + 8] where a and b are its values from i and from i + 4; count is 1, 2 or 3.
+
+    It takes one instruction of the shuffling units, where a load across two cache lines takes two of the loading ones.
+    """
+    if not isinstance(count, types.IntegerLiteral):
+        raise RequireLiteralValue("count")
+    count = count.literal_value
+    lanes = [half + (k + count if k + count < 4 else LANES + k + count - 4) for half in (0, 4) for k in range(4)]
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.shuffle_vector(args[0], args[1], ir.Constant(INTEGERS, lanes))
+
+    return float8(float8, float8, types.IntegerLiteral(count)), generate
+
+
+@intrinsic
+def halves_added(typingctx, a, b):  # type: ignore[no-untyped-def]
+    """Return four values, a's lower half plus its upper, then b's, of two integer vectors."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        lower, upper = ([half + k for half in (start, LANES + start) for k in range(4)] for start in (0, 4))
+        return builder.add(*(builder.shuffle_vector(*args, ir.Constant(INTEGERS, half)) for half in (lower, upper)))
+
+    return integer8(integer8, integer8), generate
+
+
+@intrinsic
+def without_fourths(typingctx, a):  # type: ignore[no-untyped-def]
+    """Return of two times four values the first three each, side by side, and two more of no meaning."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        nothing = ir.Constant(INTEGERS, ir.Undefined)
+        return builder.shuffle_vector(args[0], nothing, ir.Constant(INTEGERS, [0, 1, 2, 4, 5, 6, 7, 7]))
+
+    return integer8(integer8), generate
+
+
+@intrinsic
+def _pairs_added(typingctx, a, b, distance):  # type: ignore[no-untyped-def]
+    """Return sums of two lanes of a, `distance` apart, and of two of b, in turn for every `distance` lanes."""
+    if not isinstance(distance, types.IntegerLiteral):
+        raise RequireLiteralValue("distance")
+    distance = distance.literal_value
+    firsts = [k if k % (2 * distance) < distance else LANES + k - distance for k in range(LANES)]
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        both = args[:2]
+        first = builder.shuffle_vector(*both, ir.Constant(INTEGERS, firsts))
+        second = builder.shuffle_vector(*both, ir.Constant(INTEGERS, [k + distance for k in firsts]))
+        return builder.fadd(first, second)
+
+    return float8(float8, float8, types.IntegerLiteral(distance)), generate
+
+
+@inlined
+def totals(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
+    """Return the sums of eight vectors, each always added in the same order."""
+    ab, cd, ef, gh = _pairs_added(a, b, 1), _pairs_added(c, d, 1), _pairs_added(e, f, 1), _pairs_added(g, h, 1)
+    return _pairs_added(_pairs_added(ab, cd, 2), _pairs_added(ef, gh, 2), 4)
+
+
+@intrinsic
+def lane(typingctx, a, index):  # type: ignore[no-untyped-def]
+    """Return one of the eight values."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.extract_element(args[0], builder.trunc(args[1], ir.IntType(32)))
+
+    return types.float32(float8, types.intp), generate
+
+
+@inlined
+def total(a):  # type: ignore[no-untyped-def]
+    """Return the sum of the eight values, always added in the same order."""
+    pairs = _pairs_added(a, a, 1)
+    fours = _pairs_added(pairs, pairs, 2)
+    return lane(_pairs_added(fours, fours, 4), 0)

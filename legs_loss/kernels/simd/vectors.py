@@ -1,0 +1,79 @@
+"""The types of vectors, and Python's operators on them."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any, Sequence, Tuple
+
+from llvmlite import ir
+from numba import extending, types
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import lower_builtin, models, register_model
+
+__all__ = ["FLOATS", "INTEGERS", "KINDS", "LANES", "float8", "integer8", "intrinsic", "mask8"]
+
+LANES = 8
+
+FLOATS = ir.VectorType(ir.FloatType(), LANES)
+INTEGERS = ir.VectorType(ir.IntType(32), LANES)
+MASK = ir.VectorType(ir.IntType(1), LANES)
+
+
+class _Vector(types.Type):
+    def __init__(self, name: str, lanes: Any) -> None:
+        super().__init__(name=name)
+        self.lanes = lanes
+
+
+float8: _Vector = _Vector("float8", FLOATS)
+integer8: _Vector = _Vector("integer8", INTEGERS)
+mask8: _Vector = _Vector("mask8", MASK)
+KINDS = {types.float32: float8, types.int32: integer8}
+
+
+def intrinsic(function: Any) -> Any:
+    """Make of a function, which says what LLVM is to do, one to be called: numba's decorator, typed."""
+    return extending.intrinsic(function)
+
+
+@register_model(_Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, kind.lanes)
+
+
+def _operator(symbol: Any, kind: Any, instruction: str) -> None:
+    class Template(ConcreteTemplate):
+        cases = [signature(kind, kind, kind)]
+
+    infer_global(symbol)(Template)
+
+    @lower_builtin(symbol, kind, kind)
+    def lower(context: Any, builder: Any, sig: Any, args: Tuple[Any, Any]) -> Any:
+        return getattr(builder, instruction)(*args)
+
+
+for _symbol, _kind, _instruction in (
+    (operator.add, float8, "fadd"),
+    (operator.sub, float8, "fsub"),
+    (operator.mul, float8, "fmul"),
+    (operator.truediv, float8, "fdiv"),
+    (operator.add, integer8, "add"),
+    (operator.mul, integer8, "mul"),
+    (operator.lshift, integer8, "shl"),
+    (operator.rshift, integer8, "ashr"),
+    (operator.and_, mask8, "and_"),
+):
+    _operator(_symbol, _kind, _instruction)
+
+
+class _Negative(ConcreteTemplate):
+    cases = [signature(float8, float8)]
+
+
+infer_global(operator.neg)(_Negative)
+
+
+@lower_builtin(operator.neg, float8)
+def _negative(context: Any, builder: Any, sig: Any, args: Sequence[Any]) -> Any:
+    return builder.fneg(*args)

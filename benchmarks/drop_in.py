@@ -9,12 +9,21 @@ Nothing is stored; a kept map is one that the script holds itself. Writes JSON.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
-from typing import Callable
 
 import torch
-from loss import LAMBDA, LEGS, Contenders, Pairs, machine, reference_ssim, set_threads, side_by_side, some_images
+from loss import (
+    LAMBDA,
+    LEGS,
+    Contenders,
+    Pairs,
+    in_turns,
+    machine,
+    reference_ssim,
+    set_threads,
+    side_by_side,
+    some_images,
+)
 from torch import Tensor
 
 from legs_loss import configure, l1_loss, ssim, weight_map
@@ -69,19 +78,6 @@ def steps(pairs: Pairs) -> Contenders:
         "l1_loss, 3DGS's ssim (torch)": in_turns(pairs, lambda a, b, i: mixed(l1_loss(a, b), reference_ssim(a, b))),
         "3DGS's both (torch)": in_turns(pairs, lambda a, b, i: mixed(plain(a, b), reference_ssim(a, b))),
     }
-
-
-def in_turns(pairs: Pairs, loss: Callable[[Tensor, Tensor, int], Tensor]) -> Callable[[], None]:
-    """Return a function that computes a loss and its gradient, each time of the next pair."""
-    turn = itertools.cycle(range(len(pairs)))
-
-    def run() -> None:
-        i = next(turn)
-        image, target = pairs[i]
-        image.grad = None
-        loss(image, target, i).backward()
-
-    return run
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ import statistics
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any, Callable, Dict, List, Sequence, Tuple
 
 import torch
@@ -43,11 +44,12 @@ SLOW_ROUNDS = 3
 TOO_LONG = 2.0  # seconds
 STEPS = 10  # between two events of a GPU
 COPIED = 1 << 28  # bytes
-# Bytes a value of RGB, and a pixel: prediction and target are read, the gradient is written; where weights come from.
-MUST_MOVE = {"LEGS, weights in the kernel": (16, 0), "LEGS, stored map": (12, 4), "3DGS by the kernel": (12, 0)}
+# The least bytes a value, and a pixel: prediction and target are read, the gradient is written. Weights from the kernel
+# take another pass over the target; a stored map is read.
+LEAST = (12, 0)
+MUST_MOVE = {"LEGS, weights in the kernel": (16, 0), "LEGS, stored map": (12, 4)}
 
 PAIRS = 8  # of images that take turns: one alone would stay in a GPU's cache, which no training's does
-
 Contenders = Dict[str, Callable[[], Any]]
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]  # of prediction, target and the target's weight map
 Pairs = Sequence[Tuple[Tensor, Tensor]]
@@ -66,9 +68,7 @@ def main() -> None:
     for part in args.parts:
         result[part] = {"loss": loss, "weights": weights, "memory": memory, "growth": growth}[part](args)
     if args.json:
-        with open(args.json, "w", encoding="utf-8") as file:
-            json.dump(result, file, indent=1)
-            file.write("\n")
+        Path(args.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
 def loss(args: argparse.Namespace) -> Any:
@@ -86,21 +86,24 @@ def where(args: argparse.Namespace) -> str:
     return torch.cuda.get_device_name(args.device) if args.device.type == "cuda" else f"threads: {args.threads}"
 
 
-def at_bandwidth(table: Dict[str, Any], size: Tuple[int, int], device: torch.device) -> None:
-    """Add to the rows of ours, and print, what their bytes would take at the bandwidth of a copy."""
+def copy_bandwidth(device: torch.device) -> float:
+    """Return how many bytes a second a copy on the device moves, read and written."""
     source = torch.empty(COPIED, dtype=torch.uint8, device=device)
     copy = torch.empty_like(source)
-    seconds = statistics.median(timed(lambda: copy.copy_(source), device) for _ in range(9))
-    bandwidth = 2 * COPIED / seconds  # read and written
+    return 2 * COPIED / statistics.median(timed(lambda: copy.copy_(source), device) for _ in range(9))
+
+
+def at_bandwidth(table: Dict[str, Any], size: Tuple[int, int], device: torch.device) -> None:
+    """Add to the rows, and print, the bytes that must move at least, and their share of the bandwidth of a copy."""
+    bandwidth = copy_bandwidth(device)
     print(f"a copy moves {bandwidth / 1e9:.0f} GB/s")
-    for name, (of_value, of_pixel) in MUST_MOVE.items():
-        if name in table:
-            row, pixels = table[name], size[0] * size[1]
-            row["bytes"] = (3 * of_value + of_pixel) * pixels
-            least = 1e3 * row["bytes"] / bandwidth
-            row["ms at a copy's bandwidth"] = least
-            megabytes, share = row["bytes"] / 1e6, least / row["median ms"]
-            print(f"{name:<46} {megabytes:10.1f} MB   at that {least:.3f} ms, {share:.2f} of its time")
+    for name, row in table.items():
+        (of_value, of_pixel), pixels = MUST_MOVE.get(name, LEAST), size[0] * size[1]
+        row["bytes"] = (3 * of_value + of_pixel) * pixels
+        least = 1e3 * row["bytes"] / bandwidth
+        row["ms at a copy's bandwidth"], row["share of a copy's bandwidth"] = least, least / row["median ms"]
+        megabytes, share = row["bytes"] / 1e6, row["share of a copy's bandwidth"]
+        print(f"{name:<46} {megabytes:10.1f} MB   at that {least:.3f} ms, {share:.2f} of its time")
 
 
 def weights(args: argparse.Namespace) -> Any:
@@ -210,19 +213,27 @@ def losses(pairs: Pairs) -> Contenders:
     except ImportError:
         pass
 
-    def step(name: str, function: Loss) -> Callable[[], None]:
-        turn = itertools.cycle(range(len(pairs)))
-
-        def run() -> None:
-            i = next(turn)
-            image, target = pairs[i]
-            image.grad = None
+    def switched(name: str, function: Loss) -> Callable[[Tensor, Tensor, int], Tensor]:
+        def loss(image: Tensor, target: Tensor, i: int) -> Tensor:
             torch.backends.mkldnn.enabled = name != "3DGS (torch, oneDNN off)"  # type: ignore[assignment]
-            function(image, target, stored[i]).backward()
+            return function(image, target, stored[i])
 
-        return run
+        return loss
 
-    return {name: step(name, function) for name, function in contenders.items()}
+    return {name: in_turns(pairs, switched(name, function)) for name, function in contenders.items()}
+
+
+def in_turns(pairs: Pairs, loss: Callable[[Tensor, Tensor, int], Tensor]) -> Callable[[], None]:
+    """Return a function that computes a loss and its gradient, each time of the next pair, which is the i-th."""
+    turn = itertools.cycle(range(len(pairs)))
+
+    def run() -> None:
+        i = next(turn)
+        image, target = pairs[i]
+        image.grad = None
+        loss(image, target, i).backward()
+
+    return run
 
 
 def reference_ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -234,7 +245,7 @@ def weightings(target: Tensor) -> Contenders:
     """Return each way to the weights of a photograph as a function."""
     found: Contenders = {"weight_map": lambda: weight_map(target, LEGS)}
     if not target.is_cuda and finding("numba", target.device).backend is not None:
-        from legs_loss.kernels.numba_response import extremes
+        from legs_loss.kernels.numba_passes import extremes
 
         batch = target.unsqueeze(0).numpy()
         found["its extremes by numba (all the kernel keeps)"] = lambda: extremes(batch, LEGS)

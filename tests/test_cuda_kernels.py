@@ -1,4 +1,7 @@
-"""The CUDA kernels' own source on the CPU, behind their own Python layer, against torch in float64."""
+"""The CUDA kernels' own source, behind their own Python layer, against torch in float64.
+
+On the CPU, compiled with g++; with LEGS_TEST_DEVICE=cuda on a GPU, compiled by NVRTC.
+"""
 
 from __future__ import annotations
 
@@ -31,11 +34,12 @@ from legs_loss.kernels.trial import difference_from_torch
 from legs_loss.response import response
 from legs_loss.runtime import state
 from legs_loss.spec import PRESETS
-from tests.cuda_emulation import COMPILER, EmulatedDriver, emulated
+from tests.cuda_emulation import COMPILER
+from tests.kernels_on_device import DEVICE, MISSING, new_backend, new_driver
 from tests.kernels_support import compare, images, used
 from tests.support import legs_environment
 
-pytestmark = pytest.mark.skipif(COMPILER is None, reason="needs g++")
+pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
 
 LEGS = PRESETS["legs"]
 SHAPES = [(3, 1, 1), (1, 5, 7), (3, 44, 45), (2, 3, 30, 47), (4, 90, 3), (3, 137, 251), (6, 300, 109), (2, 1, 8, 300)]
@@ -43,18 +47,28 @@ SHAPES = [(3, 1, 1), (1, 5, 7), (3, 44, 45), (2, 3, 30, 47), (4, 90, 3), (3, 137
 
 @pytest.fixture(scope="module")
 def backend():
-    return emulated()
+    return new_backend()
 
 
 @pytest.fixture
 def chosen(monkeypatch):
-    """Make the emulated backend the one for images on the CPU, and return it and its driver."""
-    driver = EmulatedDriver()
-    found = backends.Finding(emulated(driver), True, "")
-    monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("no module", "cpu")})
-    monkeypatch.setattr(backends, "_findings", {"cuda cpu": found})
+    """Make the backend under test the one for images on the device, and return it and its driver."""
+    driver = new_driver()
+    found = backends.Finding(new_backend(driver), True, "")
+    monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("no module", DEVICE.type)})
+    monkeypatch.setattr(backends, "_findings", {f"cuda {DEVICE.type}": found})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return found.backend, driver
+
+
+@pytest.fixture(autouse=True)
+def on_device():
+    """Make new tensors on the device."""
+    if DEVICE.type == "cpu":
+        yield
+        return
+    with DEVICE:
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -108,7 +122,7 @@ class TestLoss:
     @given(st.integers(1, 300), st.integers(1, 300), st.integers(1, 4), st.floats(0.05, 1), st.integers(1, 200))
     def test_any_size_share_and_number_of_multiprocessors(self, height, width, channels, share, multiprocessors):
         prediction, target = images((channels, height, width))
-        backend = emulated(EmulatedDriver(multiprocessors))
+        backend = new_backend(new_driver(multiprocessors))
         compare(by_signature(backend), prediction, target, weight_map(target), share)
 
     @pytest.mark.parametrize("dtypes", [(torch.float16,) * 2, (torch.bfloat16,) * 2, (torch.float16, torch.float32)])
@@ -151,9 +165,9 @@ class TestLoss:
         prediction, target = images((2, 3, 61, 133))
         results = []
         for backwards in (False, False, True):
-            driver = EmulatedDriver()
+            driver = new_driver()
             driver.backwards = backwards
-            backend = emulated(driver)
+            backend = new_backend(driver)
             for weights in (Weights(spec=LEGS), Weights(spec=WeightSpec(operator="sobel", p=float("inf")))):
                 for loss in (
                     backend.loss(prediction, target, weights, 0.2),
@@ -275,7 +289,7 @@ class TestAutograd:
 
 class TestSelection:
     def test_its_trial_agrees_with_torch(self, backend):
-        assert difference_from_torch(backend, torch.device("cpu")) is None
+        assert difference_from_torch(backend, DEVICE) is None
 
     @pytest.mark.parametrize("channels_last", [False, True])
     def test_the_front_ends_mean_the_same_as_torch(self, chosen, channels_last):
@@ -341,6 +355,7 @@ class TestSelection:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(DEVICE.type != "cpu", reason="the sanitizers are g++'s")
 def test_no_access_is_out_of_bounds(tmp_path):
     """Run every kernel with the address and undefined behaviour sanitizers, which end the process at a fault."""
     found = subprocess.run([str(COMPILER), "-print-file-name=libasan.so"], capture_output=True, text=True)

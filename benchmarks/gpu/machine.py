@@ -1,0 +1,36 @@
+"""Versions, and the bandwidth of a copy."""
+
+from __future__ import annotations
+
+import subprocess
+
+from benchmarks import loss as timing
+from benchmarks.gpu.options import Options, Record
+from legs_loss.kernels import backends
+
+__all__ = ["machine"]
+
+
+def machine(options: Options, record: Record) -> None:
+    """Record what the numbers depend on, whether the kernels are used, and how fast a copy is."""
+    device = options.device()
+    record(**timing.machine(device), emulated=options.emulate)
+    for name, command in (
+        ("driver", ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]),
+        ("nvcc", ["nvcc", "--version"]),
+    ):
+        record(**{name: _said_by(command)})
+    backend = backends.backend_for(device)
+    reason = backends.finding("cuda", device).reason
+    record(**{"backend": f"{backend}: {reason}", "GB/s of a copy": timing.copy_bandwidth(device) / 1e9})
+    if backend != "cuda":
+        raise RuntimeError(f"the kernels are not used: {reason}")
+
+
+def _said_by(command: list[str]) -> str:
+    """Return the last line that a command prints, or that there is no such command."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    except OSError:
+        return "not installed"
+    return (done.stdout.strip().splitlines() or [f"exit code {done.returncode}"])[-1]

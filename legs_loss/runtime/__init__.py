@@ -1,8 +1,8 @@
 """The drop-in ``l1_loss`` that a training script calls in place of the codebase's own.
 
 It weights only a prediction that is being trained on; under ``no_grad`` it is the plain mean, so that reported metrics
-do not change. call.py is the call and the loss, sources.py where its weights come from, memo.py what is remembered of
-them, state.py the settings and counts of the process.
+do not change. call.py is the call, checked, and the loss that it gives; sources.py finds its weights in memo.py, in
+stored.py or from the target; state.py has the settings and the counts of the process.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def l1_loss(
     run, call = current_run(), call.aligned()
     counted.weighted += 1
     with torch.no_grad():
-        weights = run.source.weights(call, counted)
+        weights = run.source.weights(call)
     run.say_what_is_used()
     return call.weighted(weights)
 

@@ -37,7 +37,7 @@ class Call(NamedTuple):
     shape: Optional[Sequence[int]] = None
 
     def check_options(self) -> None:
-        """Check what does not depend on the images.
+        """Check what does not depend on the images; these are checked by :meth:`aligned`, once they need a weight.
 
         Raises:
             LegsError: an unknown reduction, or options that exclude one another.

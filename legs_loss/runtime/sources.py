@@ -8,13 +8,12 @@ numbers of it, the least response and the span; torch wants the map.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Callable, Dict, Optional, Set, Tuple
+from typing import Callable, Optional
 
 import torch
 from torch import Tensor
 
 from legs_loss.config import Config
-from legs_loss.errors import LegsError
 from legs_loss.images import check_values
 from legs_loss.kernels.backends import fused_range, is_capturing
 from legs_loss.kernels.contract import Weights
@@ -22,10 +21,8 @@ from legs_loss.levels import RunningLevels, response_levels
 from legs_loss.response import normalise_response, response
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.memo import WeightMemo
-from legs_loss.weights import error_weight_map, weight_from_response, weight_map, weight_over_scene
-
-if TYPE_CHECKING:
-    from legs_loss.store import Entry, WeightStore
+from legs_loss.runtime.stored import StoredWeights
+from legs_loss.weights import error_weight_map, weight_map, weight_over_scene
 
 __all__ = ["Counts", "WeightSource"]
 
@@ -55,24 +52,23 @@ class WeightSource:
     Args:
         config: of the run.
         memo_bytes: how much memory the memo may take.
+        counts: counts where each weight came from.
         say_once: prints a line (kind of message, message) the first time that its kind occurs.
     """
 
-    def __init__(self, config: Config, memo_bytes: int, say_once: Callable[[str, str], None]) -> None:
+    def __init__(self, config: Config, memo_bytes: int, counts: Counts, say_once: Callable[[str, str], None]) -> None:
         self.config = config
         self.memo: WeightMemo = WeightMemo(memo_bytes)
+        self._counts = counts
         self._say_once = say_once
-        self._asked: Set[Tuple[str, int, int]] = set()
+        self._stored: StoredWeights = StoredWeights(config, say_once)
         self._seen: RunningLevels = RunningLevels()
-        self._of_store: Dict[int, Optional[Tensor]] = {}
-        self._store: Optional[WeightStore] = None
-        self._store_opened = False
 
-    def weights(self, call: Call, counts: Counts) -> Weights:
+    def weights(self, call: Call) -> Weights:
         """Return the weights of a call's target, and count where each of them came from."""
         names = call.view_names()
         images = [call.target] if call.target.dim() == 3 else [call.target[i] for i in range(len(names))]
-        found = [self._weight(image, name, call, counts) for image, name in zip(images, names)]
+        found = [self._weight(image, name, call) for image, name in zip(images, names)]
         spec = self.config.spec
         if spec.error > 0.0:
             normalised = found[0] if call.target.dim() == 3 else torch.stack(found)
@@ -88,12 +84,13 @@ class WeightSource:
         ]
         return Weights(map=maps[0] if call.target.dim() == 3 else torch.stack(maps))
 
-    def _weight(self, image: Tensor, view: Optional[str], call: Call, counts: Counts) -> Tensor:
+    def _weight(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
         """Return an image's weight map [1, H, W] (channels-last [H, W, 1]), or the range that makes it, [1, 2].
 
         Where weights follow the rendering's error it is E^, all that is known of them before; where they are normalised
         over the scene it is E, since the scene's levels change with each view that is seen.
         """
+        counts = self._counts
         if is_capturing(image.device):
             # A CUDA graph is replayed with other pixels in the target's memory: their weight is part of the graph.
             counts.computed += 1
@@ -105,16 +102,16 @@ class WeightSource:
                 counts.computed += 1
                 return found
         before = counts.stored + counts.computed
-        weight = self.memo.recall(image, lambda: self._made(image, view, call, counts), call.is_mean())
+        weight = self.memo.recall(image, lambda: self._made(image, view, call), call.is_mean())
         counts.remembered += counts.stored + counts.computed == before
         return weight
 
-    def _made(self, image: Tensor, view: Optional[str], call: Call, counts: Counts) -> Tensor:
-        weight = self._stored(image, view, call.channels_last)
+    def _made(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
+        weight = self._stored.weight(image, view, call.channels_last)
         if weight is not None:
-            counts.stored += 1
+            self._counts.stored += 1
             return weight
-        counts.computed += 1
+        self._counts.computed += 1
         return self._computed(image, call)
 
     def _computed(self, image: Tensor, call: Call, again: bool = False) -> Tensor:
@@ -132,92 +129,18 @@ class WeightSource:
         found = fused_range(image, spec, call.channels_last) if call.is_mean() else None
         return weight_map(image, spec, call.channels_last) if found is None else found
 
-    def _stored(self, image: Tensor, view: Optional[str], channels_last: bool) -> Optional[Tensor]:
-        store = self._open_store()
-        if store is None:
-            return None
-        try:
-            entry = self._entry(store, image.movedim(-1, 0) if channels_last else image, view)
-            if entry is None:
-                return None
-            over_scene = self.config.spec.over == "scene"
-            values = store.response(entry) if over_scene else store.normalised_response(entry)
-        except LegsError as error:
-            self._say_once("damaged", f"{error}; the weights of such views are computed")
-            return None
-        known = torch.from_numpy(values).to(image.device).unsqueeze(0)
-        weight = known.float()
-        if self.config.spec.error == 0.0 and not over_scene:
-            weight = weight_from_response(known, self.config.spec)
-        return weight.movedim(0, -1) if channels_last else weight
-
     def _scene_levels(self, pixels: int) -> Optional[Tensor]:
         """Return the levels of the scene: of all the store's views of this size, else of those seen so far."""
-        store = self._open_store()
-        if store is not None and pixels not in self._of_store:
-            self._of_store[pixels] = store.scene_levels(self.config.spec, pixels)
-        levels = self._of_store.get(pixels)
+        levels = self._stored.scene_levels(pixels)
         if levels is not None:
             return levels
         self._say_once("running", _RUNNING)
         return self._seen.scene()
 
-    def _entry(self, store: WeightStore, image: Tensor, view: Optional[str]) -> Optional[Entry]:
-        """Return the store's entry that was made from an image [C, H, W]."""
-        from legs_loss.store import fingerprint
-
-        height, width = image.shape[1:]
-        named = None if view is None else store.find(view, height, width, self.config.spec)
-        if image.device.type != "cpu":
-            # A fingerprint waits for the device: once a view. A target that is a new tensor at each step is computed.
-            if named is None:
-                reason = "the call names no view (view=)" if view is None else f"it has no map of view {view!r}"
-                self._say_once(
-                    "absent", f"{store.path} is not used: {reason} at {width}x{height}; weights are computed"
-                )
-                return None
-            if (str(view), height, width) in self._asked:
-                self._say_once("renewed", _RENEWED.format(view=view))
-                return None
-            self._asked.add((str(view), height, width))
-            if named.fingerprint == fingerprint(image):
-                return named
-        else:
-            name = fingerprint(image)
-            entry = named if named is not None and named.fingerprint == name else None
-            entry = entry or store.find_image(name, height, width, self.config.spec)
-            if entry is not None:
-                return entry
-        if named is not None:
-            self._say_once("changed", _CHANGED.format(view=view))
-        elif view is not None:
-            self._say_once("absent", f"the store has no map of view {view!r} at {width}x{height}: computed instead")
-        return None
-
-    def _open_store(self) -> Optional[WeightStore]:
-        if not self._store_opened:
-            self._store_opened = True
-            if self.config.store is not None:
-                from legs_loss.store import WeightStore
-
-                try:
-                    self._store = WeightStore(self.config.store)
-                except LegsError as error:
-                    self._say_once("damaged", f"{error}; weights are computed instead")
-        return self._store
-
 
 _RUNNING = (
     "weights are normalised over the views seen so far, a running estimate; legs precompute --preset legs-robust knows "
     "all views from the first step"
-)
-_CHANGED = (
-    "view {view!r}: the training image is not the one that the stored map was made from, so its weight is computed "
-    "(said once; see docs/precompute.md)"
-)
-_RENEWED = (
-    "view {view!r}: its training image is a new tensor at each step, which on a GPU cannot be proven to be the stored "
-    "map's without waiting for the device, so its weight is computed (said once; see docs/precompute.md)"
 )
 
 

@@ -39,7 +39,7 @@ class Run:
 
     def __init__(self, config: Config, memo_bytes: int = DEFAULT_LIMIT) -> None:
         self.config = config
-        self.source: WeightSource = WeightSource(config, memo_bytes, self.say_once)
+        self.source: WeightSource = WeightSource(config, memo_bytes, counted, self.say_once)
         self._said: Set[str] = set()
         for note in config.notes:
             self.say_once(note, note)

@@ -20,7 +20,6 @@ from legs_loss.cli import main
 from legs_loss.kernels.backends import finding
 from legs_loss.levels import levels_of, response_levels
 from legs_loss.precompute import precompute
-from legs_loss.reference.training.dataset import load_dataset
 from legs_loss.response import gaussian_blur, response
 from legs_loss.runtime import state
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
@@ -98,7 +97,7 @@ class TestValues:
         views = [view.double() for view in photographs(1, 6, 8.0)]
         strengths = []
         for view in views:
-            smooth = [ndimage.gaussian_filter(band, 0.7, mode="mirror", radius=3) for band in view.numpy()]
+            smooth = [ndimage.gaussian_filter(band, 0.7, mode="mirror") for band in view.numpy()]
             strengths.append(np.sqrt(sum(ndimage.laplace(band, mode="mirror") ** 2 for band in smooth)))
         count = strengths[0].size
         median = np.median([np.sort(one.ravel())[(count + 1) // 2 - 1] for one in strengths])
@@ -222,6 +221,7 @@ class TestStore:
         assert (
             main(["precompute", str(scene), "--preset", "legs-robust", "--out", str(tmp_path), "--workers", "1"]) == 0
         )
+        pytest.importorskip("matplotlib")
         sheet = tmp_path / "sheet.png"
         for what in (scene, tmp_path, scene / "images" / "0.png"):
             assert main(["show", str(what), "--preset", "legs-robust", "--out", str(sheet)]) == 0
@@ -275,6 +275,9 @@ class TestTraining:
         torch.testing.assert_close(legs_loss(prediction, views[0], "legs-robust"), alone)
 
     def test_the_trainers_views(self, tiny_scene, tmp_path):
+        pytest.importorskip("numba")
+        from legs_loss.reference.training.dataset import load_dataset
+
         scene = read_scene(tiny_scene)
         computed = load_dataset(scene, ROBUST)
         for view, weight in zip(computed.train, weight_maps([view.image for view in computed.train], ROBUST)):
@@ -285,6 +288,20 @@ class TestTraining:
         for view in stored.train:
             expected = weight_map(view.image, ROBUST, scene=levels)
             assert float((view.weight - expected).abs().mean()) < 0.01
+
+    def test_a_study_degrades_every_third_training_view_and_no_other(self, tiny_scene):
+        pytest.importorskip("numba")
+        from legs_loss.reference.training.dataset import load_dataset
+
+        scene = read_scene(tiny_scene)
+        sharp, worse, again = (load_dataset(scene, PRESETS["3dgs"], worse=worse) for worse in (False, True, True))
+        changed = [not torch.equal(a.image, b.image) for a, b in zip(sharp.train, worse.train)]
+        assert changed == [index % 3 == 1 for index in range(len(changed))]
+        assert all(torch.equal(a.image, b.image) for a, b in zip(worse.train, again.train))
+        assert all(torch.equal(a.image, b.image) for a, b in zip(sharp.test, worse.test))
+        blurred, shaken, noise = (float(response(worse.train[i].image).mean()) for i in (1, 4, 7))
+        before = [float(response(sharp.train[i].image).mean()) for i in (1, 4, 7)]
+        assert blurred < before[0] and shaken < before[1] and noise > before[2]
 
     def test_no_backend_takes_it_for_another(self):
         for name, changes in (("over", {"over": "scene"}), ("smooth", {"smooth": 0.7})):

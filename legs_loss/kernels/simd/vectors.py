@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from typing import Any, Sequence, Tuple
+from typing import Any, Dict, Sequence, Tuple
 
 from llvmlite import ir
 from numba import extending, types
@@ -14,9 +14,9 @@ __all__ = ["FLOATS", "INTEGERS", "KINDS", "LANES", "float8", "integer8", "intrin
 
 LANES = 8
 
-FLOATS = ir.VectorType(ir.FloatType(), LANES)
-INTEGERS = ir.VectorType(ir.IntType(32), LANES)
-MASK = ir.VectorType(ir.IntType(1), LANES)
+FLOATS: Any = ir.VectorType(ir.FloatType(), LANES)
+INTEGERS: Any = ir.VectorType(ir.IntType(32), LANES)
+MASK: Any = ir.VectorType(ir.IntType(1), LANES)
 
 
 class _Vector(types.Type):
@@ -28,7 +28,7 @@ class _Vector(types.Type):
 float8: _Vector = _Vector("float8", FLOATS)
 integer8: _Vector = _Vector("integer8", INTEGERS)
 mask8: _Vector = _Vector("mask8", MASK)
-KINDS = {types.float32: float8, types.int32: integer8}
+KINDS: Dict[Any, _Vector] = {types.float32: float8, types.int32: integer8}
 
 
 def intrinsic(function: Any) -> Any:

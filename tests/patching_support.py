@@ -12,7 +12,12 @@ from tests.support import legs_environment
 
 CASES = Path(__file__).resolve().parent / "patching"
 NAMES = sorted(path.stem for path in CASES.glob("*.txt") if path.stem != "common")
-_MARK = re.compile(r"^\s*# (weighted|plain|left|error): (.*)$")
+_MARK = re.compile(r"^\s*# (weighted|plain|fused|left|error): (.*)$")
+
+
+def with_ssim(name):
+    """Return whether a case is of legs-patch --ssim."""
+    return name.startswith("ssim")
 
 
 def files(name):

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from gaussian_renderer import render
 from scene import Scene
 from scene.gaussian_model import GaussianModel
-from utils.loss_utils import l1_loss
+from utils.loss_utils import l1_loss, ssim
 
 
 """
@@ -38,7 +38,7 @@ def training(cameras, gaussians, initial_scaling):
 """
 
 
-def planned(folder, example):
+def planned(folder, example, ssim=False):
     """Return the plan of a codebase whose train.py is an example, and the example's first and last line in it."""
     text = example if re.match("(import|from) ", example) else IMPORTS + example
     if not re.search("^(import|from|def|class) ", example, re.M):
@@ -46,13 +46,13 @@ def planned(folder, example):
     text += "\n"
     first = text[: text.index(example.splitlines()[0])].count("\n") + 1
     other = IMPORTS + STEP.format("        loss = l1_loss(image, gt)")  # so that no other term has to be the loss
-    texts = dict(files("inria"), **{"train.py": text, "other.py": other})
-    return plan(checkout(folder, texts)), first, first + example.count("\n")
+    texts = dict(files("ssim" if ssim else "inria"), **{"train.py": text, "other.py": other})
+    return plan(checkout(folder, texts), ssim=ssim), first, first + example.count("\n")
 
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=lambda rule: rule.id)
 def test_a_rule_leaves_its_example_and_names_the_line_that_decided(rule, tmp_path):
-    found, first, last = planned(tmp_path, describe(rule).left)
+    found, first, last = planned(tmp_path, describe(rule).left, rule.id.startswith("ssim-"))
     left = [entry for entry in found.findings.left if entry.path == "train.py"]
     assert rule.id in [entry.evidence.rule for entry in left]
     for entry in left:
@@ -68,7 +68,7 @@ def test_a_rule_leaves_its_example_and_names_the_line_that_decided(rule, tmp_pat
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=lambda rule: rule.id)
 def test_the_other_example_of_a_rule_is_weighted(rule, tmp_path):
-    found, first, last = planned(tmp_path, describe(rule).weighted)
+    found, first, last = planned(tmp_path, describe(rule).weighted, rule.id.startswith("ssim-"))
     lines = [site.line for site in found.findings.sites if site.path == "train.py"]
     assert lines
     assert first <= min(lines) <= max(lines) <= last

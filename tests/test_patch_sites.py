@@ -7,7 +7,7 @@ from legs_adapters.code.sources import decode
 from legs_adapters.plan import plan
 from legs_adapters.terms.functions import L1Functions
 
-from tests.patching_support import NAMES, checkout, expected, files, legs_patch
+from tests.patching_support import NAMES, checkout, expected, files, legs_patch, with_ssim
 
 
 def changed_lines(found, path):
@@ -19,10 +19,11 @@ def changed_lines(found, path):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_term_gets_the_verdict_that_its_comment_asks_for(name, tmp_path):
     texts = files(name)
-    found = plan(checkout(tmp_path, texts))
+    found = plan(checkout(tmp_path, texts), ssim=with_ssim(name))
     verdicts = {}
     for site in found.findings.sites:
-        verdicts[site.path, site.line] = "weighted", changed_lines(found, site.path)[site.line - 1].strip()
+        becomes = "weighted" if site.form.weighs else "fused"
+        verdicts[site.path, site.line] = becomes, changed_lines(found, site.path)[site.line - 1].strip()
     for kept in found.findings.kept:
         verdicts[kept.path, kept.line] = "plain", changed_lines(found, kept.path)[kept.line - 1].strip()
     for entry in found.findings.left:
@@ -42,17 +43,18 @@ def test_every_term_gets_the_verdict_that_its_comment_asks_for(name, tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_patched_files_compile_and_a_second_patch_finds_nothing(name, tmp_path):
-    found = plan(checkout(tmp_path, files(name)))
+    found = plan(checkout(tmp_path, files(name)), ssim=with_ssim(name))
     for path, data in found.after.items():
         compile(data, path, "exec")
         (tmp_path / path).write_bytes(data)
-    assert plan(tmp_path).after == {}
+    assert plan(tmp_path, ssim=with_ssim(name)).after == {}
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_in_place_every_line_keeps_its_number(name, tmp_path):
     root = checkout(tmp_path, files(name))
-    here, on_disk = plan(root, in_place=True), plan(root)
+    ssim = with_ssim(name)
+    here, on_disk = plan(root, in_place=True, ssim=ssim), plan(root, ssim=ssim)
     assert sorted(here.after) == sorted(on_disk.after)
     for path, data in here.after.items():
         before = (root / path).read_bytes()

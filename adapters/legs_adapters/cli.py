@@ -112,6 +112,12 @@ def _parser() -> argparse.ArgumentParser:
         help="patch although git has uncommitted changes; with --undo: put the patch's own lines back in files that "
         "were edited since, and leave the edits",
     )
+    parser.add_argument(
+        "--ssim",
+        action="store_true",
+        help="also rewrite the training step's SSIM to legs_loss.ssim, which is faster, where the checkout's own is "
+        "provably the SSIM of 3DGS",
+    )
     parser.add_argument("--partial", action="store_true", help="patch what can be decided although something cannot")
     parser.add_argument(
         "--site", action="append", default=[], metavar="FILE:LINE", help="patch this term, and no other; repeatable"
@@ -153,7 +159,7 @@ def _patch(args: argparse.Namespace) -> int:
     chosen = any(value is not None for value in given.values())
     if not chosen and (root / SETTINGS_FILE).exists():
         settings = None  # the user's, or an earlier run's: it stays
-    found = plan(root, args.exclude, [_site(root, text) for text in args.site])
+    found = plan(root, args.exclude, [_site(root, text) for text in args.site], ssim=args.ssim)
     problems, nothing = found.findings.problems, not found.after
     if not found.findings.sites and not found.findings.patched:
         settings = None

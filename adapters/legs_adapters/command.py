@@ -17,6 +17,7 @@ HELP = "run a training script with the LEGS loss, its files untouched"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--cpu", action="store_true", help="run without a GPU, with shims for CUDA modules")
+    parser.add_argument("--ssim", action="store_true", help="also compute the SSIM of the loss by legs_loss.ssim")
     parser.add_argument("script", metavar="SCRIPT", help="the training script")
     parser.add_argument("arguments", metavar="...", nargs=argparse.REMAINDER, help="its own arguments")
 
@@ -29,4 +30,4 @@ def run(args: argparse.Namespace) -> int:
         if error.name != "libcst":
             raise
         raise LegsError("legs run wants LibCST: pip install 'legs-loss[patch]'") from None
-    return run_script(args.script, args.arguments, args.cpu)
+    return run_script(args.script, args.arguments, args.cpu, args.ssim)

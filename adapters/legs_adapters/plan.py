@@ -62,6 +62,7 @@ def plan(
     by_hand: Sequence[Tuple[str, int]] = (),
     settings: Optional[str] = None,
     in_place: bool = False,
+    ssim: bool = False,
 ) -> Plan:
     """Work out what a patch would do, and write nothing.
 
@@ -71,6 +72,7 @@ def plan(
         by_hand: (relative path, line) of the sites; the others are not sites then.
         settings: the text of legs.toml.
         in_place: keep every line's number (for running in memory).
+        ssim: rewrite the SSIM terms, too.
 
     Raises:
         LegsError: no such folder; a site named by hand is not there; an expression that is nested too deeply.
@@ -78,7 +80,7 @@ def plan(
     root = check_root(path)
     files = read_files(root, exclude)
     with _deep_recursion():
-        findings = find(files.readable, by_hand, files.unread)
+        findings = find(files.readable, by_hand, files.unread, ssim)
     findings.unreadable[:0] = files.unreadable
     for name, line in by_hand:
         if not any(site.path == name and site.named_by(line) for site in findings.sites) and not any(

@@ -23,8 +23,7 @@ def as_table(plan: Plan) -> str:
     rows: List[Tuple[str, int, str, str]] = []
     found = plan.findings
     for site in found.sites:
-        verdict = f"view={site.view.text}" if site.view.text else "no view="
-        rows.append((site.path, site.line, "patched", f"{verdict}: {site.view.reason}"))
+        rows.append((site.path, site.line, "patched", site.form.said(site.view)))
     for kept, site in found.kept.items():
         why = f"{kept.reason}: {kept.function} is weighted at {site.path}:{site.line}, in this call it is not"
         rows.append((kept.path, kept.line, "plain", why))
@@ -65,6 +64,7 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
                 "view": site.view.text,
                 "view_reason": site.view.reason,
                 "channels_last": site.channels_last,
+                **({} if site.form.weighs else {"term": "ssim"}),
             }
             for site in found.sites
         ],

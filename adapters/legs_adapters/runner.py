@@ -41,13 +41,14 @@ def checkout_of(script: Path) -> Path:
     return folder
 
 
-def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bool = False) -> int:
+def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bool = False, ssim: bool = False) -> int:
     """Run a script as ``python script arguments`` does, with the LEGS loss in it.
 
     Args:
         script: the script.
         arguments: its arguments.
         cpu: run it without a GPU: what it asks of CUDA is answered by the CPU, and its rasterizer by a shim.
+        ssim: let legs_loss.ssim compute the training step's SSIM where that is 3DGS's.
 
     Returns:
         The exit code, where the script does not leave by ``sys.exit`` (which goes on as it is).
@@ -60,7 +61,7 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
     if not path.is_file():
         raise LegsError(f"{script} is not a file: give the training script")
     root = check_root(checkout_of(path))
-    found = plan(root, in_place=True)
+    found = plan(root, in_place=True, ssim=ssim)
     if found.findings.problems:
         problem = found.findings.problems[0]
         raise LegsError(f"{problem.path}:{problem.line}: {problem.reason}; write there by hand: {problem.advice}")
@@ -70,7 +71,7 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
         _say(f"no photometric L1 term was found in {root}: nothing is weighted")
     sources = {os.path.realpath(str(root / name)): data for name, data in found.after.items()}
     for site in found.findings.sites:
-        _say(f"{site.path}:{site.line} is weighted in this run")
+        _say(f"{site.path}:{site.line} {site.form.done} in this run")
     for kept in found.findings.kept:
         _say(f"{kept.path}:{kept.line} stays plain in this run")
     return execute(str(script), arguments, sources, root if cpu else None)

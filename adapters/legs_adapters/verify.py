@@ -1,7 +1,8 @@
 """Prove on the CPU that a patch took: train the patched and the unpatched script, and compare what they did.
 
 Three runs of copies of the checkout, on the embedded scene, from the same seed: unpatched, patched, and patched with
-LEGS_OFF=1. Each is a process of its own, see :mod:`legs_adapters.watched`.
+LEGS_OFF=1; of a patch with --ssim also a fourth, patched with beta 0, where nothing but the SSIM differs. Each is a
+process of its own, see :mod:`legs_adapters.watched`.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ __all__ = ["ITERATIONS", "Run", "Verdict", "verify"]
 ITERATIONS = 40
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 96, 64, 800  # of the embedded scene
 SECONDS = 1800  # that a run may take
+FIRST_STEP, LATER_STEPS = 1e-5, 1e-3  # relative differences of losses that rounding explains
 # What a script that takes arguments in the way of Inria's is given, where its source has these words. (Inria's options
 # are made of attributes' names, but for those that its train.py adds itself.)
 ARGUMENTS = (
@@ -51,6 +53,7 @@ class Run(NamedTuple):
         weighted, weighted_without_gradient, plain: calls of legs_loss.l1_loss.
         stored, computed, remembered: where weight maps came from.
         error: the last lines of its stderr.
+        ssims: calls of legs_loss.ssim in training.
     """
 
     code: int
@@ -63,6 +66,7 @@ class Run(NamedTuple):
     computed: int
     remembered: int
     error: str
+    ssims: int = 0
 
 
 class Verdict(NamedTuple):
@@ -91,6 +95,8 @@ class Verdict(NamedTuple):
             f"{'l1_loss':<10} {patched.weighted} calls weighted in training, {patched.weighted_without_gradient} in "
             f"no-grad code; {patched.plain} plain"
         )
+        if patched.ssims:
+            lines.append(f"{'ssim':<10} {patched.ssims} calls in training")
         lines.append(
             f"{'maps':<10} {patched.stored} from the store, {patched.computed} computed; {patched.remembered} times "
             "one of these again"
@@ -140,18 +146,25 @@ def verify(
             for copy in (patched, unpatched):
                 shutil.copytree(str(root), str(copy), symlinks=True, ignore=_unneeded)
         undo(unpatched, force=True)
-        runs = {}
-        for name, copy, off in (("unpatched", unpatched, ""), ("patched", patched, ""), ("LEGS_OFF", patched, "1")):
+        runs: Dict[str, Run] = {}
+        for name, (copy, settings) in {
+            "unpatched": (unpatched, {}),
+            "patched": (patched, {}),
+            "LEGS_OFF": (patched, {"LEGS_OFF": "1"}),
+            "beta 0": (patched, {"LEGS_BETA": "0"}),
+        }.items():
+            if name == "beta 0" and not runs["patched"].ssims:
+                continue
             output = Path(work) / f"output-{name}"
             given = _arguments(copy / script, arguments, iterations, scene=scene, output=output)
-            runs[name] = _run(copy, script, given, iterations, Path(work) / f"{name}.json", off)
+            runs[name] = _run(copy, script, given, iterations, Path(work) / f"{name}.json", settings)
     return Verdict(runs, _claims(runs))
 
 
 def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
     unpatched, patched, off = runs["unpatched"], runs["patched"], runs["LEGS_OFF"]
     steps = len(unpatched.losses)
-    return {
+    claims = {
         "all three trained": all(run.code == 0 and run.losses for run in runs.values()),
         "as many steps each": steps == len(patched.losses) == len(off.losses),
         "with LEGS_OFF=1 every loss is the unpatched one, to the last bit": steps > 0
@@ -162,6 +175,19 @@ def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
         "nothing was weighted in no-grad code": patched.weighted_without_gradient == 0,
         "nothing was weighted with LEGS_OFF=1": off.weighted == 0,
     }
+    if "beta 0" in runs:
+        equal = _are_close(unpatched.losses, runs["beta 0"].losses)
+        claims["with beta 0 every loss is the unpatched one, up to the rounding of the SSIM"] = equal
+    return claims
+
+
+def _are_close(losses: Sequence[str], others: Sequence[str]) -> bool:
+    """Return whether the losses of two trainings agree: the first to rounding, which the later steps carry on."""
+    pairs = [(float.fromhex(one), float.fromhex(other)) for one, other in zip(losses, others)]
+    bounds = [FIRST_STEP, *[LATER_STEPS] * len(pairs)]
+    return 0 < len(pairs) == len(losses) == len(others) and all(
+        abs(one - other) <= bound * abs(one) for (one, other), bound in zip(pairs, bounds)
+    )
 
 
 def _script(root: Path) -> str:
@@ -204,7 +230,9 @@ def _unneeded(folder: str, names: List[str]) -> List[str]:
     return sorted(left)
 
 
-def _run(root: Path, script: str, arguments: Sequence[str], iterations: int, report: Path, off: str) -> Run:
+def _run(
+    root: Path, script: str, arguments: Sequence[str], iterations: int, report: Path, settings: Dict[str, str]
+) -> Run:
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
     environment.update(
         {
@@ -213,8 +241,7 @@ def _run(root: Path, script: str, arguments: Sequence[str], iterations: int, rep
             "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
         }
     )
-    if off:
-        environment["LEGS_OFF"] = off
+    environment.update(settings)
     command = [
         sys.executable,
         "-m",
@@ -238,5 +265,6 @@ def _run(root: Path, script: str, arguments: Sequence[str], iterations: int, rep
     try:
         found = json.loads(report.read_text())
     except (OSError, ValueError):
-        found = {field: [] if field in ("losses", "seconds") else 0 for field in Run._fields[1:-1]}
+        counted = [field for field in Run._fields if field not in ("code", "error")]
+        found = {field: [] if field in ("losses", "seconds") else 0 for field in counted}
     return Run(code=code, error="\n".join(error.replace("\r", "\n").strip().splitlines()[-12:]), **found)

@@ -22,13 +22,14 @@ class _Enough(BaseException):
 
 
 class watch:
-    """Watch this process train: every backward pass from one number, and every call of ``legs_loss.l1_loss``."""
+    """Watch this process train: every backward pass from one number, and every call of the two losses."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self.losses: List[str] = []
         self.times: List[float] = []
         self.without_gradient = 0
+        self.ssims = 0
 
     def __enter__(self) -> watch:
         import torch
@@ -36,7 +37,7 @@ class watch:
         import legs_loss
         from legs_loss.runtime import counts
 
-        self._backward, self._l1_loss = torch.Tensor.backward, legs_loss.l1_loss
+        self._backward, self._l1_loss, self._ssim = torch.Tensor.backward, legs_loss.l1_loss, legs_loss.ssim
 
         def backward(tensor: Any, *args: Any, **kwargs: Any) -> Any:
             if tensor.numel() == 1:
@@ -52,8 +53,12 @@ class watch:
             self.without_gradient += counts().weighted - before if not torch.is_grad_enabled() else 0
             return result
 
+        def ssim(*args: Any, **kwargs: Any) -> Any:
+            self.ssims += torch.is_grad_enabled()
+            return self._ssim(*args, **kwargs)
+
         torch.Tensor.backward = backward  # type: ignore
-        legs_loss.l1_loss = l1_loss
+        legs_loss.l1_loss, legs_loss.ssim = l1_loss, ssim
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -62,7 +67,7 @@ class watch:
         import legs_loss
 
         torch.Tensor.backward = self._backward  # type: ignore[method-assign]
-        legs_loss.l1_loss = self._l1_loss
+        legs_loss.l1_loss, legs_loss.ssim = self._l1_loss, self._ssim
 
     def report(self) -> Dict[str, Any]:
         """Return all fields of a `Run` that the process itself knows."""
@@ -78,6 +83,7 @@ class watch:
             "stored": found.stored,
             "computed": found.computed,
             "remembered": found.remembered,
+            "ssims": self.ssims,
         }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Iterable, Mapping, Optional
+from typing import TYPE_CHECKING, Iterable, Mapping, Optional, Pattern
 
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
@@ -17,11 +17,18 @@ from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.kinds.callback import Callbacks
 from legs_adapters.terms.prospects import Prospects
 
+if TYPE_CHECKING:
+    from legs_adapters.terms.structural.calls import SsimCalls
+
 __all__ = ["Analysis"]
 
 
 class Analysis:
     """The analyses of one program, made once, each from those before it.
+
+    Args:
+        program: the program.
+        speaks: what a text says that has a term itself; without, the words of an L1.
 
     Attributes:
         program: its files, linked by names.
@@ -32,16 +39,38 @@ class Analysis:
         forms: its L1 expressions.
         purposes: what its backward passes are for.
         splats: which of its functions are about Gaussian splatting.
-        callbacks: the L1 functions that are passed by name.
     """
 
-    def __init__(self, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> None:
-        self.program = Program(sources, unread, TORCH)
-        self.prospects = Prospects(source.text for source in self.program.sources.values())
+    def __init__(self, program: Program, speaks: Optional[Pattern[str]] = None) -> None:
+        self.program = program
+        texts = [source.text for source in program.sources.values()]
+        self.prospects = Prospects(texts, speaks) if speaks is not None else Prospects(texts)
         self.training = Training(self.program, self.prospects.of)
         self.meanings = Meanings(self.program, self.training)
         self.views = Views(self.program)
         self.forms = Forms(L1Functions(self.program, self.prospects))
         self.purposes = Purposes(self.program, self.training)
         self.splats = Splats(self.program, self.training)
-        self.callbacks = Callbacks(self.program, self.training, self.forms)
+        self._callbacks: Optional[Callbacks] = None
+        self._ssims: Optional[SsimCalls] = None
+
+    @classmethod
+    def of(cls, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> Analysis:
+        """Analyse the L1 terms of these files; ``unread`` are the texts of files that are not to be looked at."""
+        return cls(Program(sources, unread, TORCH))
+
+    @property
+    def callbacks(self) -> Callbacks:
+        """The L1 functions that are passed by name."""
+        if self._callbacks is None:
+            self._callbacks = Callbacks(self.program, self.training, self.forms)
+        return self._callbacks
+
+    @property
+    def ssims(self) -> SsimCalls:
+        """What the calls of SSIM functions compute."""
+        if self._ssims is None:
+            from legs_adapters.terms.structural.calls import SsimCalls  # NumPy is not needed without --ssim
+
+            self._ssims = SsimCalls(self.program)
+        return self._ssims

@@ -15,6 +15,7 @@ from legs_adapters.code.sources import Source
 from legs_adapters.lexicon.words import SPEAKS_OF_L1, STRUCTURAL
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.doubts import Doubt, Doubts
+from legs_adapters.rules.structural import with_ssims
 from legs_adapters.rules.verdict import Verdicts
 from legs_adapters.terms.findings import Findings, Left, Problem, Site
 from legs_adapters.terms.kinds.fused import fused_losses
@@ -33,6 +34,7 @@ def find(
     sources: Iterable[Source],
     by_hand: Sequence[Tuple[str, int]] = (),
     unread: Optional[Mapping[str, str]] = None,
+    ssim: bool = False,
 ) -> Findings:
     """Find the photometric terms of a checkout.
 
@@ -40,8 +42,10 @@ def find(
         sources: its files.
         by_hand: (path, line) of L1 terms that are sites because the user says so; nothing else is a site then.
         unread: by path, the text of files that are not to be looked at, or cannot be.
+        ssim: find the SSIM terms, too.
     """
-    return _Finder(Analysis(sources, unread), by_hand).run()
+    found = _Finder(Analysis.of(sources, unread), by_hand).run()
+    return with_ssims(found, by_hand) if ssim else found
 
 
 class _Finder:

@@ -11,9 +11,9 @@ from legs_adapters.rules.causes import (
     features,
     huber,
     kinds,
-    not_torch,
     other,
     regulariser,
+    structural,
     tracking,
     unknown,
     untrained,
@@ -22,7 +22,7 @@ from legs_adapters.rules.causes import (
 from legs_adapters.rules.rule import CallOfTerm, Rule, Term
 from legs_adapters.terms.findings import Evidence
 
-__all__ = ["AMBIGUOUS", "DEFINITION", "HUBER", "ORDER", "RULES", "UNREAD", "first", "first_of_call"]
+__all__ = ["AMBIGUOUS", "DEFINITION", "HUBER", "ORDER", "RULES", "SSIM", "UNREAD", "first", "first_of_call"]
 
 DEFINITION = (definition.Definition(),)
 ORDER: Tuple[Rule, ...] = (
@@ -40,7 +40,7 @@ ORDER: Tuple[Rule, ...] = (
     untrained.Scoring(),
     untrained.Evaluation(),
     untrained.Untrained(),
-    not_torch.NotTorch(),
+    other.NotTorch(),
     # What is compared, at a closer look.
     unknown.Unknown(),
     regulariser.Statistic(),
@@ -68,7 +68,32 @@ ORDER: Tuple[Rule, ...] = (
 AMBIGUOUS = (unknown.Ambiguous(),)
 HUBER = (huber.Huber(),)
 UNREAD = (weighting.ErrorMask(), weighting.UnreadError())
-RULES = {rule.id: rule for rule in (*DEFINITION, *ORDER, *AMBIGUOUS, *HUBER, *UNREAD)}
+# Asked of an SSIM, with legs-patch --ssim: nothing is weighted there, so that it does not matter what is compared.
+_OF_SSIM = (
+    structural.Library(),
+    structural.Settings(),
+    structural.Value(),
+    structural.Unproven(),
+    structural.Twice(),
+)
+_OF_TRAINING = (
+    untrained.Scoring,
+    untrained.Evaluation,
+    untrained.Untrained,
+    other.NotTorch,
+    tracking.Tracking,
+    evaluation.EvaluationName,
+    evaluation.EmbeddingFit,
+    tracking.PoseStep,
+    evaluation.EmbeddingStep,
+    untrained.NoStep,
+)
+SSIM: Tuple[Rule, ...] = (
+    structural.Definition(),
+    *(rule for rule in ORDER if isinstance(rule, _OF_TRAINING)),
+    *_OF_SSIM,
+)
+RULES = {rule.id: rule for rule in (*DEFINITION, *ORDER, *AMBIGUOUS, *HUBER, *UNREAD, *SSIM)}
 
 
 def first(term: Term, rules: Tuple[Rule, ...] = ORDER) -> Optional[Evidence]:

@@ -10,6 +10,7 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import one_line
 from legs_adapters.lexicon.masks import without_rows
+from legs_adapters.lexicon.views import View
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text
 from legs_adapters.terms.writing import Writing
@@ -33,6 +34,8 @@ class Form:
         selection: for a difference with a name of its own, the index that it is taken with, ``[mask]``; empty without.
         order: of the kinds that recognise one call, the least is taken.
         is_named: whether the difference has a name of its own, so that there is no one expression to replace.
+        weighs: whether the edit weights the term.
+        done: what the edit does to it, in words.
     """
 
     node: cst.BaseExpression
@@ -46,6 +49,8 @@ class Form:
 
     order: ClassVar[int] = 0
     is_named: ClassVar[bool] = False
+    weighs: ClassVar[bool] = True
+    done: ClassVar[str] = "is weighted"
 
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
@@ -78,6 +83,10 @@ class Form:
             LegsError: the term has to be weighted by hand.
         """
         raise NotImplementedError(type(self).__name__)
+
+    def said(self, view: View) -> str:
+        """Return what the report says of the edited term."""
+        return f"view={view.text}: {view.reason}" if view.text else f"no view=: {view.reason}"
 
     def advice(self, writing: Writing, rows: bool) -> str:
         """Return what to write by hand; ``rows`` where the images are lists of pixels."""

@@ -54,12 +54,14 @@ class Forms:
 
 
 def _kinds() -> List[Type[Form]]:
-    """Return the kinds that are found in calls, in their order."""
+    """Return the kinds of L1 that are found in calls, in their order."""
     modules = [
         importlib.import_module(f"{kinds.__name__}.{info.name}") for info in pkgutil.iter_modules(kinds.__path__)
     ]
     classes = {value for module in modules for value in vars(module).values() if inspect.isclass(value)}
-    found = [kind for kind in classes if issubclass(kind, Form) and "find" in vars(kind) and kind is not Form]
+    found = [
+        kind for kind in classes if issubclass(kind, Form) and "find" in vars(kind) and kind is not Form and kind.weighs
+    ]
     return sorted(found, key=lambda kind: kind.order)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List
+from typing import List, Sequence
 
 import libcst as cst
 
@@ -15,8 +15,8 @@ __all__ = ["patched_nodes"]
 _PATCHED = (f"{PACKAGE}.l1_loss", f"{PACKAGE}.unweighted")
 
 
-def patched_nodes(program: Program, function: Function) -> List[cst.CSTNode]:
-    """Return what refers to legs_loss in a function: what is called, and what names are given."""
+def patched_nodes(program: Program, function: Function, names: Sequence[str] = _PATCHED) -> List[cst.CSTNode]:
+    """Return what refers to legs_loss's own in a function, by these names: what is called, and what names are given."""
     if PACKAGE not in function.module.text:
         return []
     nodes: List[cst.CSTNode] = [call.func for call in function.flow.calls]
@@ -25,5 +25,5 @@ def patched_nodes(program: Program, function: Function) -> List[cst.CSTNode]:
     return [
         node
         for node in nodes
-        if any(r.kind == "external" and r.target in _PATCHED for r in program.resolve(function, node))
+        if any(r.kind == "external" and r.target in names for r in program.resolve(function, node))
     ]

@@ -1,4 +1,4 @@
-"""Find by its words which text can lead to an L1 at all: the others need no closer look.
+"""Find by its words which text can lead to an L1, or to an SSIM, at all: the others need no closer look.
 
 A text can lead to one if it speaks of one, or of a name that does: a function's, a class's whose ``forward`` does, or
 one that such a thing was given (``self.criterion = nn.L1Loss()``). That is too often so, never too seldom, and costs a
@@ -8,7 +8,7 @@ hundredth of parsing.
 from __future__ import annotations
 
 import re
-from typing import Dict, Iterable, Iterator, List, Set, Tuple
+from typing import Dict, Iterable, Iterator, List, Pattern, Set, Tuple
 
 from legs_adapters.code.module import CALLED
 from legs_adapters.lexicon.words import SPEAKS_OF_L1
@@ -31,15 +31,21 @@ _DEFAULT = re.compile(r"\b(\w+)(?:[ \t]*:[^=,()\n]+)?[ \t]*=[ \t]*([\w.]*[lL]1\w
 
 
 class Prospects:
-    """Answers for the texts of one program."""
+    """Answers for the texts of one program.
 
-    def __init__(self, texts: Iterable[str]) -> None:
+    Args:
+        texts: its files.
+        speaks: what a text says that has it itself; without, the words of an L1.
+    """
+
+    def __init__(self, texts: Iterable[str], speaks: Pattern[str] = SPEAKS_OF_L1) -> None:
+        self._speaks = speaks
         said = [(name, text) for whole in texts for name, text in _said(whole)]
         known = {name for name, _ in said}
         speakers: Dict[str, List[str]] = {}
         self._names: Set[str] = set()
         for name, text in said:
-            if SPEAKS_OF_L1.search(text):
+            if speaks.search(text):
                 self._names.add(name)
             else:
                 for word in known.intersection(_WORD.findall(text)):
@@ -56,12 +62,12 @@ class Prospects:
     def of(self, text: str) -> bool:
         """Return whether a text can lead to an L1."""
         if text not in self._answers:
-            self._answers[text] = bool(SPEAKS_OF_L1.search(text)) or not self._names.isdisjoint(_WORD.findall(text))
+            self._answers[text] = bool(self._speaks.search(text)) or not self._names.isdisjoint(_WORD.findall(text))
         return self._answers[text]
 
     def near(self, text: str) -> bool:
         """Return whether a text speaks of an L1, or of something whose own text does."""
-        return bool(SPEAKS_OF_L1.search(text)) or not self._near.isdisjoint(_WORD.findall(text))
+        return bool(self._speaks.search(text)) or not self._near.isdisjoint(_WORD.findall(text))
 
 
 def _said(text: str) -> Iterator[Tuple[str, str]]:

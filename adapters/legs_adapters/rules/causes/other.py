@@ -1,7 +1,8 @@
-"""Leave a term that is not the loss of a Gaussian model: of rays, a mesh, a network, a hidden message."""
+"""Leave a term that is not the loss of a Gaussian model in torch: of rays, a mesh, a network, a hidden message."""
 
 from __future__ import annotations
 
+import re
 from typing import List
 
 import libcst as cst
@@ -16,7 +17,12 @@ from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import of_rays
 from legs_adapters.terms.ssim import is_beside_ssim
 
-__all__ = ["FixedTarget", "NotSplats"]
+__all__ = ["FixedTarget", "NotSplats", "NotTorch"]
+
+_TORCH = re.compile(r"^[ \t]*(import|from)[ \t]+torch", re.M)
+_OTHERS = re.compile(
+    r"^[ \t]*(import|from)[ \t]+(drjit|flax|jax|jittor|megengine|mindspore|mlx|paddle|tensorflow|tinygrad)\b", re.M
+)
 
 
 class _Other(Rule):
@@ -83,6 +89,34 @@ class NotSplats(_Other):
         mesh = any(is_of_mesh(analysis.program, function, side) for side in term.sides)
         eikonal = "eikonal" in function.module.text and RAY_COLOURS.search(code(term.form.node))
         return term.here if mesh or eikonal else []
+
+
+class NotTorch(Rule):
+    """The file is of Jittor, JAX, Paddle or their like, and ``legs_loss`` takes torch's tensors.
+
+    left:
+        import jittor
+        from gaussian_renderer import render
+        from utils.loss_utils import l1_loss
+
+        def training(gaussians, camera):
+            image = render(camera, gaussians, None, None)["render"]
+            loss = l1_loss(image, camera.original_image)
+            loss.backward()
+            gaussians.optimizer.step()
+
+    weighted: loss = l1_loss(image, gt)
+    """
+
+    id = "not-torch"
+    reason = "not torch"
+
+    def evidence(self, term: Term) -> List[Decider]:
+        module = term.function.module
+        if _TORCH.search(module.text) or not _OTHERS.search(module.text):
+            return []
+        imports = [node for node in module.top.flow.imports if _OTHERS.search(code(node))]
+        return [(module.top, node) for node in imports[:1]] or term.here
 
 
 def _ray_method(term: Term) -> List[Decider]:

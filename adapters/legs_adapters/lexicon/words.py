@@ -125,12 +125,13 @@ POINTS = word_set("point points")
 LOSS = word_set("loss losses")
 LOSS_CLASS = LOSS | {"criterion"}
 EVALUATING = word_set("eval evaluate evaluation evaluator test")
+_SHOWING = word_set("render validate validation")
 # A function's first word, where it does not train ...
-NOT_TRAINING = word_set("render eval evaluate test validate validation inference")
+NOT_TRAINING = _SHOWING | word_set("eval evaluate test inference")
 # ... and any word of one through which nothing is trained.
 REPORTING = (
     EVALUATING
-    | NOT_TRAINING
+    | _SHOWING
     | word_set("testing report reports metric metrics valid visualize vis benchmark compare psnr quality")
 )
 FITTING = word_set("optimize optimise fit optim eval")  # an embedding, to a test view

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import stat
@@ -53,8 +54,9 @@ class FileLock:
                     os.close(self._descriptor)
                     continue
                 if note:
-                    os.ftruncate(self._descriptor, 0)
-                    os.write(self._descriptor, note.encode("utf-8", "backslashreplace"))
+                    with contextlib.suppress(OSError):  # on a full disk it is a lock all the same
+                        os.ftruncate(self._descriptor, 0)
+                        os.write(self._descriptor, note.encode("utf-8", "backslashreplace"))
                 return
             except BaseException:
                 os.close(self._descriptor)

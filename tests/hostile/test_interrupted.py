@@ -11,6 +11,7 @@ import os
 import signal
 import subprocess
 import sys
+import traceback
 
 import pytest
 
@@ -38,7 +39,7 @@ def test_at_many_points(what, name, tiny_scene, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stdout.decode()[-3000:]
     results = json.loads(done.stdout.decode().splitlines()[-1])
-    assert len(results) >= min(POINTS, 5)
+    assert len(results) >= 4
     assert {result["ended"] for result in results} <= {-signal.SIGKILL, 130, 0}, results
     assert any(result["ended"] for result in results)
     for result in results:
@@ -70,6 +71,8 @@ def _fork(arguments, act=None, at=0, folder=""):
         code = 99
         try:
             code = main(arguments)
+        except BaseException:
+            traceback.print_exc()
         finally:
             sys.stdout.flush()
             sys.stderr.flush()

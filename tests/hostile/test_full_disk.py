@@ -1,0 +1,230 @@
+"""A full disk under each writer: one clear error, nothing of the user's lost, and once there is room it goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+
+from legs_loss.cli import main
+from legs_loss.errors import LegsError
+from legs_loss.kernels.cuda.cache import BinaryCache
+from legs_loss.reference.embedded import write_embedded_scene
+from legs_loss.reference.gaussians import Gaussians
+from legs_loss.reference.ply import read_ply, write_ply
+from legs_loss.reference.training.checkpoint import read_state
+from legs_loss.store import WeightStore
+from tests.support import colmap_scene, legs
+
+pytestmark = pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="mounting a small disk needs root")
+
+FULL = "No space left on device"
+
+
+class Disk:
+    """A disk of one megabyte."""
+
+    def __init__(self, path):
+        self.path = path
+
+    @contextmanager
+    def full(self, room=0):
+        """Leave so many bytes of it meanwhile."""
+        filler = self.path / "filler"
+        with open(str(filler), "wb", buffering=0) as file:
+            with contextlib.suppress(OSError):
+                while True:
+                    file.write(bytes(4096))
+            file.truncate(file.tell() // 4096 * 4096 - room)
+        yield
+        filler.unlink()
+
+    def state(self):
+        return {
+            str(path.relative_to(self.path)): path.read_bytes()
+            for path in sorted(self.path.rglob("*"))
+            if path.is_file() and path.name not in ("filler", ".lock")
+        }
+
+
+@pytest.fixture
+def disk(tmp_path):
+    path = tmp_path / "disk"
+    path.mkdir()
+    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(path)], capture_output=True)
+    if made.returncode:
+        pytest.skip(f"cannot mount a tmpfs: {made.stderr.decode().strip()}")
+    yield Disk(path)
+    subprocess.run(["umount", "-l", str(path)], check=True)
+
+
+def one_error(capsys, code):
+    said = capsys.readouterr().err
+    errors = [line for line in said.splitlines() if "error:" in line]
+    assert (code, len(errors)) == (2, 1), said
+    assert FULL in errors[0]
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("room", [0, 4096, 8192])
+def test_patch_and_undo(room, disk, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("libcst")
+    from legs_adapters.cli import main as legs_patch
+
+    from tests.patching_support import checkout, files
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    root = checkout(disk.path / "checkout", files("inria"))
+    before = disk.state()
+    with disk.full(room):
+        one_error(capsys, legs_patch([str(root)]))
+        assert disk.state() == before
+    assert legs_patch([str(root)]) == 0
+    patched = disk.state()
+    assert patched != before
+    capsys.readouterr()
+    with disk.full(room):
+        code = legs_patch(["--undo", str(root)])
+        if code:  # it may fit: what is put back is smaller than what goes
+            one_error(capsys, code)
+            assert disk.state() == patched
+    assert disk.state() == before or legs_patch(["--undo", str(root)]) == 0
+    assert disk.state() == before
+
+
+def test_the_journal_s_key(disk, tmp_path, monkeypatch):
+    """Without room for a key a patch is made without a seal, as without a home; no half of a key stays."""
+    pytest.importorskip("libcst")
+    from legs_adapters.cli import main as legs_patch
+
+    from tests.patching_support import checkout, files
+
+    (disk.path / "legs-loss").mkdir()
+    monkeypatch.setenv("XDG_STATE_HOME", str(disk.path))
+    root = checkout(tmp_path / "checkout", files("inria"))
+    with disk.full():
+        assert legs_patch([str(root)]) == 0
+        assert os.listdir(str(disk.path / "legs-loss")) == []
+    assert legs_patch(["--undo", str(root)]) == 2
+    assert "legs_loss" in (root / "train.py").read_text()
+
+
+def test_precompute(disk, tmp_path, capsys):
+    scene = colmap_scene(tmp_path / "scene", names=[f"{i}.png" for i in range(4)], width=200, height=150)
+    store = disk.path / "store"
+    assert main(["precompute", str(scene), "--out", str(store), "-r", "2", "--workers", "1"]) == 0
+    capsys.readouterr()
+    before = disk.state()
+    with disk.full(40_960):
+        one_error(capsys, main(["precompute", str(scene), "--out", str(store), "--workers", "1"]))
+        after = disk.state()
+        assert all(after[name] == data for name, data in before.items() if name.endswith(".npy"))
+        assert WeightStore(store).check().damaged == []
+    assert main(["precompute", str(scene), "--out", str(store), "--workers", "1"]) == 0
+    assert len(WeightStore(store).entries) == 8
+    assert not [name for name in disk.state() if ".writing" in name or name.endswith(".part")]
+
+
+def test_train(disk, tiny_scene, capsys):
+    out = disk.path / "run"
+    small = ["--iterations", "8", "-r", "2", "--threads", "1", "--checkpoint_every", "4"]
+    with disk.full(4096):
+        one_error(capsys, main(["train", str(tiny_scene), "--out", str(out), *small]))
+    with disk.full(450_000):  # for one checkpoint, not for two at once
+        one_error(capsys, main(["train", str(tiny_scene), "--out", str(out), *small]))
+        assert read_state(out / "checkpoint.npz")[1]["iteration"] == 0
+        assert not list(out.rglob("*.part"))
+    go_on = ["train", str(tiny_scene), "--out", str(out), "--resume", "--threads", "1"]
+    assert main(go_on) == 0
+    assert len(read_ply(out / "point_cloud" / "iteration_8" / "point_cloud.ply")) > 0
+
+
+@pytest.mark.slow
+def test_compare_and_report(disk, tiny_scene, capsys, monkeypatch):
+    pytest.importorskip("jinja2")
+    from legs_loss.experiments import running
+    from legs_loss.reference.training.side_by_side import train_arm
+
+    def train(arms, processes, on_progress, on_done=None):
+        for arm in arms:
+            on_done(arm.name, train_arm(arm, lambda progress: None))
+
+    monkeypatch.setattr(running, "train_side_by_side", train)
+    subprocess.run(["mount", "-o", "remount,size=8m", str(disk.path)], check=True)
+    out = disk.path / "out"
+    compare = ["compare", str(tiny_scene), "--out", str(out), "--iterations", "6", "-r", "2", "--seeds", "1"]
+    compare += ["--arms", "legs"]
+    for room in (0, 8192, 450_000):
+        with disk.full(room):
+            one_error(capsys, main(compare))
+    assert main(compare) == 0
+    assert main(["report", str(out)]) == 0
+    capsys.readouterr()
+    before = disk.state()
+    with disk.full(40_960):
+        one_error(capsys, main(["report", str(out)]))
+        assert disk.state() == before
+        assert main(compare) == 0, "there is nothing to train"
+
+
+def test_show(disk, tiny_scene, capsys):
+    pytest.importorskip("matplotlib")
+    image, sheet = str(next((tiny_scene / "images").iterdir())), disk.path / "sheet.png"
+    sheet.write_bytes(b"of before")
+    with disk.full(8192):
+        one_error(capsys, main(["show", image, "--out", str(sheet)]))
+        assert disk.state() == {"sheet.png": b"of before"}
+    assert main(["show", image, "--out", str(sheet)]) == 0
+
+
+def test_the_demo_s_scene_and_pictures(disk):
+    from legs_loss.report.comparison import Compared, save_pictures
+
+    with disk.full(8192):
+        with pytest.raises(LegsError, match=FULL):
+            write_embedded_scene(disk.path / "scene", views=3, width=96, height=64, points=300, samples=1)
+        assert not (disk.path / "scene" / "sparse" / "0" / "points3D.bin").exists(), "taken for a whole scene"
+        assert not list(disk.path.rglob("*.part"))
+    pytest.importorskip("matplotlib")
+    picture = torch.rand(3, 64, 96)
+    with disk.full(8192), pytest.raises(LegsError, match=FULL):
+        save_pictures(disk.path / "p", "title", picture, [Compared("legs", picture, torch.ones(1, 64, 96), "a")])
+    assert not list(disk.path.rglob("*.part"))
+
+
+def test_gaussians(disk):
+    some = Gaussians.from_points(np.random.rand(500, 3).astype(np.float32), np.full((500, 3), 9, np.uint8), 1)
+    path = disk.path / "g.ply"
+    write_ply(path, some)
+    before = path.read_bytes()
+    with disk.full(8192):
+        with pytest.raises(LegsError, match=FULL):
+            write_ply(path, some)
+        assert disk.state() == {"g.ply": before}
+
+
+def test_compiled_kernels(disk, tiny_scene):
+    """What cannot be kept is compiled again next time; nothing ends for it."""
+    cache = BinaryCache(disk.path / "cuda")
+    with disk.full():
+        cache.put(b"key", b"binary")
+        assert cache.get(b"key") is None
+    cache.put(b"key", b"binary")
+    with disk.full():
+        cache.put(b"key", bytes(100_000))
+        assert cache.get(b"key") == b"binary"
+    assert [path.suffix for path in (disk.path / "cuda").iterdir()] == [".bin"]
+
+
+@pytest.mark.slow
+def test_numba_s_cache(disk, tiny_scene, tmp_path):
+    environment = dict(os.environ, NUMBA_CACHE_DIR=str(disk.path / "numba"))
+    with disk.full(4096):
+        done = legs("precompute", tiny_scene, "--out", tmp_path / "store", "--workers", 1, env=environment)
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 0, done.stderr

@@ -24,13 +24,14 @@ from legs_loss.experiments.arms import ArmSpec, needed, parse_arm
 from legs_loss.experiments.baseline import prove_unweighted
 from legs_loss.experiments.losses import LOSSES
 from legs_loss.experiments.on_cluster import train_on_cluster
+from legs_loss.experiments.schema import PLAN, ROW, SETTINGS, what_is_wrong
 from legs_loss.experiments.weighting import WEIGHTINGS
 from legs_loss.reference.training.dataset import Dataset, load_dataset
 from legs_loss.reference.training.side_by_side import Arm, train_arm, train_side_by_side
 from legs_loss.reference.training.trainer import CHECKPOINT, Progress, TrainConfig, default_threshold, step_loss
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
-from legs_loss.system import write_whole
+from legs_loss.system import read_regular, write_whole
 from legs_loss.weights import weight_maps
 
 __all__ = [
@@ -49,12 +50,8 @@ __all__ = [
 ]
 
 BASELINE = "3dgs"
+_LARGEST = 256 << 20  # bytes of a file of a comparison
 EVALUATIONS = 10  # of the held-out views during a run, for the plots
-
-# What the files must hold to be of use; one that was cut off, or is something else, is called damaged.
-_SETTINGS = ("scene", "path", "images", "base", "baseline")
-_PLAN = ("arm", "seed", "config", "weighting", "loss", "caps")
-_ROW = (*_PLAN, "versions", "metrics")
 
 Row = Dict[str, Any]
 
@@ -109,7 +106,7 @@ class Comparison:
     def row(self, arm: ArmSpec, seed: int) -> Optional[Row]:
         """Return the row of an arm and seed, None if it is not trained yet."""
         path = self.folder(arm, seed) / "row.json"
-        return read_json(path, _ROW) if path.is_file() else None
+        return read_json(path, ROW) if path.is_file() else None
 
     def train(
         self,
@@ -168,7 +165,7 @@ class Comparison:
             "loss": arm.loss,
             "caps": None if caps is None else sorted(caps.items()),
         }
-        keep(folder / "plan.json", json.loads(json.dumps(plan)), "row", _PLAN)
+        keep(folder / "plan.json", json.loads(json.dumps(plan)), "row", PLAN)
         return _planned(name, plan, self.root, self.images, folder)
 
     def _config(self, arm: ArmSpec, seed: int) -> Tuple[TrainConfig, Optional[Dict[int, int]]]:
@@ -185,7 +182,7 @@ class Comparison:
         folder = self.folder(arm, seed)
         if arm.name == BASELINE and metrics["mean_weight"] != 1.0:
             raise LegsError(f"the baseline was trained with weights of mean {metrics['mean_weight']}")
-        row = dict(read_json(folder / "plan.json", _PLAN), versions=versions(), metrics=metrics)
+        row = dict(read_json(folder / "plan.json", PLAN), versions=versions(), metrics=metrics)
         write_json(folder / "row.json", row)
         (folder / CHECKPOINT).unlink()
 
@@ -197,10 +194,10 @@ class Comparison:
             "base": replace(self.base, densify_grad_threshold=self.threshold).as_dict(),
         }
         path = self.out / "comparison.json"
-        keep(path, dict(settings, baseline=None), "comparison", _SETTINGS, ("path", "baseline"))
+        keep(path, dict(settings, baseline=None), "comparison", SETTINGS, ("path", "baseline"))
         # Anew each time: a comparison that goes on may do so with other code than it was begun with.
         self.proof: Dict[str, Any] = prove_unweighted(self.data.train, self.base)
-        write_json(path, dict(read_json(path, _SETTINGS), baseline=self.proof))
+        write_json(path, dict(read_json(path, SETTINGS), baseline=self.proof))
 
 
 def read_rows(out: Path) -> Tuple[Dict[str, Any], List[Row]]:
@@ -211,10 +208,10 @@ def read_rows(out: Path) -> Tuple[Dict[str, Any], List[Row]]:
     """
     if not (out / "comparison.json").is_file():
         raise LegsError(f"{out}: there is no comparison here (comparison.json): `legs compare` makes one")
-    rows = [read_json(path, _ROW) for path in sorted(out.glob("*/seed-*/row.json"))]
+    rows = [read_json(path, ROW) for path in sorted(out.glob("*/seed-*/row.json"))]
     if not rows:
         raise LegsError(f"{out}: none of this comparison's rows is trained yet")
-    return read_json(out / "comparison.json", _SETTINGS), sorted(rows, key=lambda row: (row["arm"], row["seed"]))
+    return read_json(out / "comparison.json", SETTINGS), sorted(rows, key=lambda row: (row["arm"], row["seed"]))
 
 
 def scene_of(settings: Mapping[str, Any], moved: Optional[Path] = None) -> Scene:
@@ -240,7 +237,7 @@ def read_row(path: Path) -> Row:
     """
     if path.name != "row.json" or not path.is_file():
         raise LegsError(f"{path}: there is no row here: a row is COMPARISON/ARM/seed-N/row.json")
-    return read_json(path, _ROW)
+    return read_json(path, ROW)
 
 
 def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progress], None]) -> Row:
@@ -250,7 +247,7 @@ def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progre
         LegsError: it is no row, or its scene is not there.
     """
     row = read_row(path)
-    settings = read_json(path.resolve().parents[2] / "comparison.json", _SETTINGS)
+    settings = read_json(path.resolve().parents[2] / "comparison.json", SETTINGS)
     training = _planned(row["arm"], row, scene_of(settings, moved).root, settings["images"], None)
     return dict(row, versions=versions(), metrics=train_arm(training, on_progress))
 
@@ -330,15 +327,20 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[Tuple[str, An
 
 
 def read_json(path: Path, names: Sequence[str]) -> Dict[str, Any]:
-    """Return the values of a JSON file that must have these names."""
+    """Return the values of a JSON file of a comparison that must have these names.
+
+    Raises:
+        LegsError: it cannot be read, or is damaged; the message names what of it.
+    """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(read_regular(path, _LARGEST).decode("utf-8"))
     except OSError as error:
         raise LegsError(f"cannot read {path}: {error.strerror or error}") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         values = None
-    if not isinstance(values, dict) or not set(names) <= set(values):
-        raise LegsError(f"{path}: this file is damaged: delete it and run the comparison again")
+    wrong = what_is_wrong(values, names)
+    if wrong is not None:
+        raise LegsError(f"{path}: this file is damaged ({wrong}): delete it and run the comparison again")
     return values
 
 

@@ -56,6 +56,7 @@ def _fork(arguments, act=None, at=0, folder=""):
     if child == 0:
         os.dup2(written, 1)
         os.dup2(written, 2)
+        sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         seen = [0]
 

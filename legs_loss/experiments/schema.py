@@ -1,0 +1,144 @@
+"""What the files of a comparison hold, checked where they are read and nowhere else.
+
+A comparison's folder may come from somebody else: names in it become paths and words on a page.
+"""
+
+from __future__ import annotations
+
+from pathlib import PurePosixPath
+from typing import Any, Callable, Dict, Iterable, Mapping, Optional
+
+from legs_loss.errors import LegsError
+from legs_loss.experiments.arms import parse_arm
+from legs_loss.experiments.losses import LOSSES
+from legs_loss.experiments.weighting import WEIGHTINGS
+from legs_loss.reference.training.config import TrainConfig
+
+__all__ = ["PLAN", "ROW", "SETTINGS", "what_is_wrong"]
+
+# What the files must hold to be of use.
+SETTINGS = ("scene", "path", "images", "base", "baseline")
+PLAN = ("arm", "seed", "config", "weighting", "loss", "caps")
+ROW = (*PLAN, "versions", "metrics")
+_LARGEST_SEED = 1 << 63
+
+
+def what_is_wrong(values: Any, names: Iterable[str]) -> Optional[str]:
+    """Return the name of what is missing in a file's content or is none of its kind; None where all is well.
+
+    Args:
+        values: what the file holds.
+        names: what it must hold.
+    """
+    if not isinstance(values, dict):
+        return "all of it"
+    for name in names:
+        if name not in values:
+            return name
+    return next((name for name, fits in _FIELDS.items() if name in values and not _holds(fits, values[name])), None)
+
+
+def _holds(fits: Callable[[Any], bool], value: Any) -> bool:
+    try:
+        return fits(value)
+    except (LegsError, TypeError, ValueError, LookupError, AttributeError, RecursionError, OverflowError):
+        return False
+
+
+def _number(value: Any) -> bool:
+    return type(value) in (int, float)
+
+
+def _count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < _LARGEST_SEED
+
+
+def _text(value: Any) -> bool:
+    return type(value) is str and "\0" not in value
+
+
+def _scores(value: Any) -> bool:
+    return isinstance(value, dict) and all(_text(name) and _number(score) for name, score in value.items())
+
+
+def _optional(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: value is None or fits(value)
+
+
+def _each(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and all(fits(one) for one in value)
+
+
+def _of_names(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, dict) and all(_text(name) and fits(one) for name, one in value.items())
+
+
+def _pair(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_count, value))
+
+
+def _config(value: Any) -> bool:
+    """Whether its own class takes the settings, and each is of the kind that it has there."""
+    return _alike(TrainConfig.from_dict(value).as_dict(), TrainConfig().as_dict())
+
+
+def _alike(found: Mapping[str, Any], like: Mapping[str, Any]) -> bool:
+    for name, value in like.items():
+        if isinstance(value, dict):
+            fits = isinstance(found[name], dict) and _alike(found[name], value)
+        elif value is None:
+            fits = found[name] is None or _number(found[name])
+        else:
+            fits = _number(found[name]) if _number(value) else type(found[name]) is type(value)
+        if not fits:
+            return False
+    return True
+
+
+def _metrics(value: Any) -> bool:
+    whole = {
+        "train": _optional(_scores),
+        "test": _optional(_scores),
+        "gaussians": _count,
+        "mean_weight": _number,
+        "seconds": _number,
+        "processor_seconds": _number,
+        "iterations": _count,
+        "growth": _each(_pair),
+        "history": _each(_scores),
+        "views": _of_names(_of_names(_scores)),
+    }
+    needed = ("train", "test", "gaussians", "mean_weight", "seconds", "views")
+    return all(name in value for name in needed) and all(
+        fits(value[name]) for name, fits in whole.items() if name in value
+    )
+
+
+def _inside(value: Any) -> bool:
+    """Whether a path stays in the comparison's folder, seen from a row's own: two levels may be left, no more."""
+    parts = PurePosixPath(value.replace("\\", "/")).parts
+    ups = next((number for number, part in enumerate(parts) if part != ".."), len(parts))
+    rooted = value.startswith(("/", "\\")) or ":" in value
+    return _text(value) and not rooted and ups <= 2 and ".." not in parts[ups:]
+
+
+def _upstream(value: Any) -> bool:
+    return isinstance(value, dict) and ("pictures" not in value or _of_names(_inside)(value["pictures"]))
+
+
+_FIELDS: Dict[str, Callable[[Any], bool]] = {
+    "arm": lambda value: parse_arm(value).name == value,
+    "seed": _count,
+    "config": _config,
+    "weighting": _optional(lambda value: value in WEIGHTINGS),
+    "loss": _optional(lambda value: value in LOSSES),
+    "caps": _optional(_each(_pair)),
+    "versions": _of_names(_text),
+    "metrics": _metrics,
+    "upstream": _upstream,
+    "scene": lambda value: _text(value["name"]) and _text(value["sha256"]),
+    "path": _text,
+    "images": _optional(_text),
+    "base": _config,
+    "baseline": _optional(lambda value: isinstance(value, dict)),
+}

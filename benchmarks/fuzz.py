@@ -140,6 +140,37 @@ def make_checkpoint(folder: Path) -> None:
     read_state(folder / "c.npz")
 
 
+def make_comparison(folder: Path) -> None:
+    """Write a comparison of one row, as ``legs compare`` does."""
+    from legs_loss.experiments.running import read_rows, write_json
+    from legs_loss.reference.training.config import TrainConfig
+
+    scene = {"name": "a", "views": 2, "sha256": "0" * 16}
+    base = TrainConfig(densify_grad_threshold=1e-3).as_dict()
+    settings = {"scene": scene, "path": "/nowhere", "images": None, "base": base, "baseline": {"loss": 0.5}}
+    write_json(folder / "comparison.json", settings)
+    scores = {"psnr": 20.5, "ssim": 0.5}
+    metrics = {"train": scores, "test": scores, "gaussians": 9, "mean_weight": 2.5, "seconds": 1.5, "iterations": 30}
+    metrics.update(growth=[[45, 18]], history=[{"iteration": 30, "train_psnr": 15.5}])
+    metrics.update(views={"train": {"images/a.png": scores}, "test": {"images/b.png": scores}})
+    row = {"arm": "legs", "seed": 0, "config": base, "weighting": None, "loss": None, "caps": [[45, 18]]}
+    row.update(versions={"legs_loss": "0.1.0"}, metrics=metrics)
+    write_json(folder / "legs" / "seed-0" / "row.json", row)
+    read_rows(folder)
+
+
+def read_comparison(folder: Path) -> None:
+    from legs_loss.experiments.arms import parse_arm
+    from legs_loss.experiments.running import read_rows
+    from legs_loss.experiments.tables import scores_table
+
+    _, rows = read_rows(folder)
+    for row in rows:
+        place = (folder / parse_arm(row["arm"]).folder / f"seed-{row['seed']}").resolve()
+        assert folder.resolve() in place.parents, f"{place} is outside"
+    scores_table(rows, sorted({row["arm"] for row in rows}))
+
+
 def make_checkout(folder: Path) -> None:
     (folder / "train.py").write_bytes(TRAIN)
     (folder / "utils.py").write_bytes(UTILS)
@@ -214,6 +245,7 @@ READERS: Dict[str, Reader] = {
     "transforms": (make_transforms, ["transforms.json"], read_scene),
     "ply": (lambda folder: write_ply(folder / "g.ply", some_gaussians()), ["g.ply"], lambda f: read_ply(f / "g.ply")),
     "checkpoint": (make_checkpoint, ["c.npz"], lambda folder: read_state(folder / "c.npz")),
+    "comparison": (make_comparison, ["comparison.json", "legs/seed-0/row.json"], read_comparison),
     "settings": (lambda folder: void((folder / "legs.toml").write_bytes(TOML)), ["legs.toml"], read_settings),
 }
 

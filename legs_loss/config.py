@@ -13,6 +13,7 @@ from typing import Any, Dict, List, Mapping, Optional, Tuple
 
 from legs_loss.errors import LegsError, did_you_mean
 from legs_loss.spec import PRESETS, WeightSpec, as_spec
+from legs_loss.system.files import read_regular
 
 __all__ = ["CONFIG_FILE", "STORE_FOLDER", "Config", "find_config", "is_off"]
 
@@ -24,6 +25,7 @@ _DEFAULTS = "defaults"
 _SETTINGS = ("preset", "store", *(field.name for field in fields(WeightSpec)))
 _TEXT_FIELDS = ("operator", "curve", "normalise", "over")
 _OTHER_VARIABLES = ("off", "backend")
+_LARGEST = 1 << 20  # bytes of a legs.toml
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("", "0", "false", "no", "off")
 
 
@@ -113,7 +115,9 @@ def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> 
                 known = ", ".join(_SETTINGS)
                 raise LegsError(f"unknown setting {key!r}; there are {known}{did_you_mean(key, _SETTINGS)}")
         preset = settings.pop("preset", None)
-        store = settings.pop("store", None)
+        if preset is not None and not isinstance(preset, str):
+            raise LegsError(f"preset must be a text, got {repr(preset)[:100]}")
+        store = _store(settings.pop("store", None), base)
         spec = config.spec if preset is None else as_spec(preset)
         spec = replace(spec, **{key: _typed(key, value) for key, value in settings.items()})
     except LegsError as error:
@@ -122,18 +126,34 @@ def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> 
         config,
         spec=spec,
         preset=config.preset if preset is None else preset,
-        store=config.store if not store else (base / Path(str(store)).expanduser()),
+        store=config.store if store is None else store,
         source=where if config.source == _DEFAULTS else f"{config.source}, {where}",
     )
 
 
 def _typed(key: str, value: Any) -> Any:
     if key in _TEXT_FIELDS:
-        return str(value)
+        if not isinstance(value, str):
+            raise LegsError(f"{key} must be a text, got {repr(value)[:100]}")
+        return value
     try:
+        if isinstance(value, bool):
+            raise TypeError
         return float(value)
-    except (TypeError, ValueError):
-        raise LegsError(f"{key} must be a number, got {value!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise LegsError(f"{key} must be a number, got {repr(value)[:100]}") from None
+
+
+def _store(value: Any, base: Path) -> Optional[Path]:
+    """Return the folder that a setting names, seen from another; None where it names none."""
+    if value is None or value == "":
+        return None
+    if not isinstance(value, str) or "\0" in value:
+        raise LegsError(f"store must be a path, got {repr(value)[:100]}")
+    try:
+        return base / Path(value).expanduser()
+    except RuntimeError:
+        raise LegsError(f"store must be a path, got {repr(value)[:100]}, and there is no such user") from None
 
 
 def _is_true(value: str) -> bool:
@@ -185,8 +205,10 @@ def _read_toml(path: Path) -> Dict[str, Any]:
     else:
         import tomli as tomllib
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        return tomllib.loads(read_regular(path, _LARGEST).decode("utf-8"))
+    except OSError as error:
+        raise LegsError(f"{path} cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:  # all that a parser of TOML says, and of numbers and texts in it
         raise LegsError(f"{path} cannot be read: {error}") from None
 
 
@@ -200,5 +222,5 @@ def _store_of_scene(argv: List[str]) -> Optional[Path]:
             else:
                 continue
             store = Path(scene) / STORE_FOLDER
-            return store if store.is_dir() else None
+            return store if os.path.isdir(str(store)) else None  # False, too, for what no file can be called
     return None

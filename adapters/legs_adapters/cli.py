@@ -44,23 +44,30 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
         say(f"legs-patch: error: {error}", sys.stderr)
         return 2
     except KeyboardInterrupt:
-        # What is written is written with the journal, all of it or nothing: the journal knows.
-        if _journal(folder) == before:
-            what = "nothing was changed"
-        elif undoing:
-            what = "by then the patch was taken back"
-        else:
-            what = f"by then it was patched; take it back with: legs-patch --undo {folder}"
-        say(f"legs-patch: interrupted; {what}", sys.stderr)
+        say(f"legs-patch: interrupted; {_so_far(folder, undoing, before)}", sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 0
+    except OSError as error:  # a full disk under --verify, a folder that went away
+        where = f"{error.filename}: " if error.filename is not None else ""
+        what = _so_far(folder, undoing, before)
+        say(f"legs-patch: error: {where}{error.strerror or str(error)[:500]}; {what}", sys.stderr)
+        return 2
     except ModuleNotFoundError as error:
         if error.name != "libcst":
             raise
         say("legs-patch: error: LibCST is missing: pip install 'legs-loss[patch]'", sys.stderr)
         return 2
+
+
+def _so_far(folder: str, undoing: bool, before: bytes) -> str:
+    """Say what was done by now. It is written with the journal, all of it or nothing: the journal knows."""
+    if _journal(folder) == before:
+        return "nothing was changed"
+    if undoing:
+        return "by then the patch was taken back"
+    return f"by then it was patched; take it back with: legs-patch --undo {folder}"
 
 
 def _arguments(argv: Optional[Sequence[str]]) -> argparse.Namespace:

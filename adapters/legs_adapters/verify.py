@@ -145,6 +145,8 @@ def verify(
         with locked(root, f"legs-patch --verify {folder}"):
             for copy in (patched, unpatched):
                 shutil.copytree(str(root), str(copy), symlinks=True, ignore=_unneeded)
+            if not (root / JOURNAL).is_file():  # taken back by another one, before this one had the lock
+                raise LegsError(f"{root} is not patched any more: nothing to verify")
         undo(unpatched, force=True)
         runs: Dict[str, Run] = {}
         for name, (copy, settings) in {
@@ -209,6 +211,7 @@ def _arguments(script: Path, given: Optional[str], iterations: int, **places: Pa
         source = "\n".join(
             path.read_text(encoding="utf-8", errors="replace")
             for path in (script, *script.parent.glob("arguments/*.py"))
+            if path.is_file()
         )
         given = " ".join(words for word, words in ARGUMENTS if word in source)
     values = {"iterations": iterations, "port": port, **places}
@@ -225,7 +228,8 @@ def _unneeded(folder: str, names: List[str]) -> List[str]:
     left = {".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs"} & set(names)
     for name in names:
         path = os.path.join(folder, name)
-        if os.path.isfile(path) and os.path.getsize(path) > 64 << 20:
+        special = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)  # pipes, sockets
+        if special or (os.path.isfile(path) and os.path.getsize(path) > 64 << 20):
             left.add(name)
     return sorted(left)
 

@@ -20,7 +20,7 @@ __all__ = ["PLAN", "ROW", "SETTINGS", "what_is_wrong"]
 SETTINGS = ("scene", "path", "images", "base", "baseline")
 PLAN = ("arm", "seed", "config", "weighting", "loss", "caps")
 ROW = (*PLAN, "versions", "metrics")
-_LARGEST_SEED = 1 << 63
+_LARGEST = 1 << 63
 
 
 def what_is_wrong(values: Any, names: Iterable[str]) -> Optional[str]:
@@ -46,11 +46,11 @@ def _holds(fits: Callable[[Any], bool], value: Any) -> bool:
 
 
 def _number(value: Any) -> bool:
-    return type(value) in (int, float)
+    return type(value) is float or (type(value) is int and abs(value) < _LARGEST)
 
 
 def _count(value: Any) -> bool:
-    return type(value) is int and 0 <= value < _LARGEST_SEED
+    return type(value) is int and 0 <= value < _LARGEST
 
 
 def _text(value: Any) -> bool:
@@ -71,6 +71,10 @@ def _each(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 def _of_names(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, dict) and all(_text(name) and fits(one) for name, one in value.items())
+
+
+def _with(fits: Callable[[Any], bool], *names: str) -> Callable[[Any], bool]:
+    return lambda value: fits(value) and all(name in value for name in names)
 
 
 def _pair(value: Any) -> bool:
@@ -97,18 +101,18 @@ def _alike(found: Mapping[str, Any], like: Mapping[str, Any]) -> bool:
 
 def _metrics(value: Any) -> bool:
     whole = {
-        "train": _optional(_scores),
-        "test": _optional(_scores),
+        "train": _optional(_with(_scores, "psnr")),
+        "test": _optional(_with(_scores, "psnr")),
         "gaussians": _count,
         "mean_weight": _number,
         "seconds": _number,
         "processor_seconds": _number,
-        "iterations": _count,
+        "iterations": lambda number: _count(number) and number > 0,
         "growth": _each(_pair),
-        "history": _each(_scores),
-        "views": _of_names(_of_names(_scores)),
+        "history": _each(_with(_scores, "iteration")),
+        "views": _with(_of_names(_of_names(_scores)), "train", "test"),
     }
-    needed = ("train", "test", "gaussians", "mean_weight", "seconds", "views")
+    needed = ("train", "test", "gaussians", "iterations", "growth", "history", "views")
     return all(name in value for name in needed) and all(
         fits(value[name]) for name, fits in whole.items() if name in value
     )

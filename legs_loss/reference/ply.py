@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import List, Tuple, Union
 
@@ -14,6 +15,7 @@ from legs_loss.system import read_regular, write_whole
 
 __all__ = ["read_ply", "write_ply"]
 
+_COUNT = re.compile("[0-9]{1,20}")
 _LARGEST = 64 << 30  # bytes: some 270 million Gaussians
 
 
@@ -83,12 +85,12 @@ def _parse_header(path: Union[str, Path], lines: List[str]) -> Tuple[int, List[s
         words = line.split()
         if words[:1] in (["comment"], ["obj_info"], []):
             continue
-        if words[:2] == ["element", "vertex"] and len(words) == 3 and words[2].isdigit() and count < 0:
+        if words[:2] == ["element", "vertex"] and len(words) == 3 and _COUNT.fullmatch(words[2]) and count < 0:
             count = int(words[2])
         elif words[0] == "property" and len(words) == 3 and words[1] in ("float", "float32") and count >= 0:
             names.append(words[2])
         else:
-            raise LegsError(f"{path}: cannot read the header line {line!r} of a .ply of 3D Gaussians")
+            raise LegsError(f"{path}: cannot read the header line {line[:80]!r} of a .ply of 3D Gaussians")
     if count < 0:
         raise LegsError(f"{path}: the header has no `element vertex`")
     return count, names

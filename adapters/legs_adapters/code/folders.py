@@ -8,6 +8,8 @@ import re
 from pathlib import Path
 from typing import Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
+from legs_loss.system import read_regular
+
 __all__ = [
     "PATCHABLE",
     "SUBMODULE",
@@ -34,6 +36,7 @@ _FOREIGN = {
     for name in names.split()
 }
 PATCHABLE = (VENDORED, TESTS, SUBMODULE, _CHECKOUT)
+_LARGEST = 1 << 20  # bytes of a .gitmodules
 _TEST_FILE = re.compile(r"^(test_.*|.*_test|conftest)\.py$")
 
 
@@ -144,7 +147,7 @@ def _excluded(path: str, patterns: Sequence[str]) -> bool:
 
 def _submodules(root: Path) -> List[str]:
     try:
-        text = (root / ".gitmodules").read_text(encoding="utf-8", errors="replace")
+        text = read_regular(root / ".gitmodules", _LARGEST).decode("utf-8", "replace")
     except OSError:
         return []
     return [match.strip().rstrip("/") for match in re.findall(r"^\s*path\s*=\s*(.+)$", text, re.M)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 from dataclasses import dataclass
@@ -12,9 +13,11 @@ from typing import Dict, List, NamedTuple, Sequence
 from legs_adapters.code.folders import own_and_excluded
 from legs_adapters.code.limits import LARGEST, too_deep
 from legs_loss import LegsError
+from legs_loss.system import read_regular
 
 __all__ = ["BOM", "Files", "Source", "Unreadable", "check_root", "decode", "read_files", "read_source"]
 
+_LARGEST_UNREAD = 64 << 20  # bytes; of what is larger it is not asked which names it says
 BOM = b"\xef\xbb\xbf"
 
 _CODING = re.compile(rb"^[ \t\f]*#.*?coding[:=][ \t]*([-\w.]+)")
@@ -87,19 +90,17 @@ def read_files(root: Path, exclude: Sequence[str]) -> Files:
     unread: Dict[str, str] = {}
     for path in sorted([*excluded, *(source.path for source in unreadable)]):
         with contextlib.suppress(OSError):
-            unread[path] = (root / path).read_text(encoding="utf-8", errors="replace")
+            unread[path] = read_regular(root / path, _LARGEST_UNREAD).decode("utf-8", "replace")
     return Files([source for source in read if isinstance(source, Source)], unreadable, unread)
 
 
 def read_source(root: Path, path: str) -> Source | Unreadable:
     """Read one file; what cannot be read as UTF-8 is returned with its reason."""
     try:
-        size = (root / path).stat().st_size
-        data = (root / path).read_bytes() if size <= LARGEST else b""
+        data = read_regular(root / path, LARGEST)
     except OSError as error:
-        return Unreadable(path, f"cannot be read: {error.strerror}")
-    if size > LARGEST:
-        return Unreadable(path, f"larger than {LARGEST >> 20} MiB")
+        large = error.errno == errno.EFBIG
+        return Unreadable(path, f"larger than {LARGEST >> 20} MiB" if large else f"cannot be read: {error.strerror}")
     deep = too_deep(data)
     return Unreadable(path, deep) if deep else decode(path, data)
 

@@ -5,7 +5,6 @@ A comparison's folder may come from somebody else: names in it become paths and 
 
 from __future__ import annotations
 
-from pathlib import PurePosixPath
 from typing import Any, Callable, Dict, Iterable, Mapping, Optional
 
 from legs_loss.errors import LegsError
@@ -118,16 +117,8 @@ def _metrics(value: Any) -> bool:
     )
 
 
-def _inside(value: Any) -> bool:
-    """Whether a path stays in the comparison's folder, seen from a row's own: two levels may be left, no more."""
-    parts = PurePosixPath(value.replace("\\", "/")).parts
-    ups = next((number for number, part in enumerate(parts) if part != ".."), len(parts))
-    rooted = value.startswith(("/", "\\")) or ":" in value
-    return _text(value) and not rooted and ups <= 2 and ".." not in parts[ups:]
-
-
 def _upstream(value: Any) -> bool:
-    return isinstance(value, dict) and ("pictures" not in value or _of_names(_inside)(value["pictures"]))
+    return isinstance(value, dict) and ("pictures" not in value or _of_names(_text)(value["pictures"]))
 
 
 _FIELDS: Dict[str, Callable[[Any], bool]] = {

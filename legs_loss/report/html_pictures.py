@@ -78,9 +78,10 @@ def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView, scene: Op
 def _upstreams_own(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Tensor:
     """Return the codebase's own rendering of a held-out view."""
     path = row["upstream"]["pictures"].get(view.name)
-    if path is None or not (folder / path).is_file():
+    full = (folder / path).resolve() if path is not None else None
+    if full is None or folder.resolve().parents[1] not in full.parents or not full.is_file():
         raise LegsError(f"{row['arm']} left no rendering of {view.name}: choose held-out views (--views)")
-    return read_picture(folder / path)
+    return read_picture(full)
 
 
 def _weight(spec: WeightSpec, photograph: Tensor, rendering: Tensor, scene: Optional[Tensor]) -> Optional[Tensor]:

@@ -20,6 +20,7 @@ __all__ = ["copied", "fastgs_modules", "fused_ssim", "mend"]
 # Functors that CUDA 13's cub no longer has, and what to write in their place.
 GONE = {"cub::Max()": "cuda::maximum<>()", "cub::Min()": "cuda::minimum<>()"}
 HEADER = "#include <cuda/functional>\n"
+USUAL_HOME = Path("/usr/local/cuda")
 
 
 def fused_ssim(options: Options, record: Record) -> None:
@@ -90,6 +91,8 @@ def _build(source: Path, site: Path) -> None:
     environment = dict(os.environ, MAX_JOBS=os.environ.get("MAX_JOBS", str(os.cpu_count() or 1)))
     if not torch.cuda.is_available():
         environment.setdefault("TORCH_CUDA_ARCH_LIST", "9.0")
+    if USUAL_HOME.is_dir():  # torch guesses it from nvcc, which may be a script elsewhere
+        environment.setdefault("CUDA_HOME", str(USUAL_HOME))
     done = subprocess.run(
         [*command, "--target", str(site), str(source)],
         env=environment,
@@ -122,9 +125,9 @@ def _compile_without_torch(module: Path) -> List[Path]:
 
 
 def _why(output: str) -> str:
-    """Return the first line that a compiler calls an error, else the last line."""
+    """Return the first line that a compiler or linker calls an error, else the last line."""
     lines = output.strip().splitlines() or ["no message"]
-    return next((line.strip() for line in lines if "error" in line.lower()), lines[-1])[:300]
+    return next((line.strip() for line in lines if "error:" in line or "cannot find" in line), lines[-1])[:300]
 
 
 def _need_cuda() -> None:

@@ -1,4 +1,4 @@
-"""What the files of a comparison hold, checked where they are read and nowhere else.
+"""The schema of a comparison's files, checked where they are read and nowhere else.
 
 A comparison's folder may come from somebody else: names in it become paths and words on a page.
 """
@@ -81,7 +81,7 @@ def _pair(value: Any) -> bool:
 
 
 def _config(value: Any) -> bool:
-    """Whether its own class takes the settings, and each is of the kind that it has there."""
+    """Return whether its own class takes the settings, and each is of the kind that it has there."""
     return _alike(TrainConfig.from_dict(value).as_dict(), TrainConfig().as_dict())
 
 

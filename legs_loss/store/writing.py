@@ -39,8 +39,8 @@ class StoreWriter:
         >>> with StoreWriter(folder) as writer:
         ...     made = Entry("images/1.png", 4, 3, "laplacian", 2.0, 1e-8, None, "", 0, 0)
         ...     writer.commit([stage(writer.staging, made, np.zeros((3, 4), np.float16))])
-        >>> WeightStore(folder).find("1", 3, 4, WeightSpec()).file
-        'images_1-f5049e0ccc83ca46.npy'
+        >>> WeightStore(folder).find("1", 3, 4, WeightSpec()).view
+        'images/1.png'
     """
 
     def __init__(self, path: Union[str, Path]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from legs_loss import LegsError, configure, l1_loss, legs_loss, ssim
 from legs_loss.kernels import backends
 from legs_loss.kernels.contract import NotNow, Weights
+from legs_loss.kernels.cuda import cache as cache_module
 from legs_loss.kernels.cuda import driver as driver_module
 from legs_loss.kernels.cuda import nvrtc
 from legs_loss.kernels.cuda.backend import CudaBackend
@@ -115,6 +117,33 @@ class TestCache:
         assert cache_folder({"XDG_CACHE_HOME": "relative"}, "linux") == Path.home() / ".cache" / "legs-loss" / "kernels"
         assert cache_folder({"LOCALAPPDATA": str(tmp_path)}, "win32") == tmp_path / "legs-loss" / "kernels"
 
+    def test_a_user_without_a_home_compiles_each_time(self, monkeypatch):
+        def homeless():
+            raise RuntimeError("Could not determine home directory.")
+
+        monkeypatch.setattr(Path, "home", homeless)
+        assert cache_folder({}, "linux") is None
+        compiler = FakeCompiler()
+        for _ in range(2):
+            Modules(FakeDriver(), compiler, BinaryCache(None)).function("legs_scale", PLAIN)
+        assert len(compiler.calls) == 2
+
+    def test_two_processes_compile_at_once(self, tmp_path):
+        """Each writes a file of its own and puts it in place in one step: whoever comes second finds a whole one."""
+        writers = [BinaryCache(tmp_path) for _ in range(2)]
+        first, second = tempfile.mkstemp, []
+
+        def meanwhile(**options):
+            if not second:
+                second.append(True)
+                writers[1].put(b"key", b"binary")
+            return first(**options)
+
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(cache_module.tempfile, "mkstemp", meanwhile)
+            writers[0].put(b"key", b"binary")
+        assert writers[0].get(b"key") == b"binary" and len(list(tmp_path.iterdir())) == 1
+
 
 class TestModules:
     def test_a_variant_is_compiled_and_loaded_once(self, parts, tmp_path):
@@ -183,6 +212,19 @@ class TestFindingNvrtc:
         self.files(tmp_path, "torch/lib/nvrtc64_112_0.dll", "torch/lib/nvrtc-builtins64_121.dll")
         assert self.found(tmp_path, "12", "win32") == ["torch/lib/nvrtc64_120_0.dll"]
         assert self.found(tmp_path, "11", "win32") == ["torch/lib/nvrtc64_112_0.dll"]
+        self.files(tmp_path, "nvidia/cu13/bin/x86_64/nvrtc64_130_0.dll", "nvidia/cuda_nvrtc/bin/nvrtc64_120_0.dll")
+        assert self.found(tmp_path, "13", "win32") == ["nvidia/cu13/bin/x86_64/nvrtc64_130_0.dll"]
+        assert self.found(tmp_path, "12", "win32")[1:] == ["nvidia/cuda_nvrtc/bin/nvrtc64_120_0.dll"]
+
+    @pytest.mark.parametrize(
+        ("platform", "names"),
+        [
+            ("linux", ["libnvrtc.so.11.2", "libnvrtc.so.12", "libnvrtc.so.13"]),
+            ("win32", ["nvrtc64_112_0.dll", "nvrtc64_120_0.dll", "nvrtc64_130_0.dll"]),
+        ],
+    )
+    def test_the_name_that_the_system_looks_for(self, platform, names):
+        assert [nvrtc._plain_name(major, platform) for major in ("11", "12", "13")] == names
 
     def test_nothing_there(self, tmp_path, monkeypatch):
         def refuse(name):
@@ -343,6 +385,15 @@ class TestLaunch:
         task, layout = Task(), Layout(2**40, 2**33, 3840, 1)
         task.of_target = layout
         assert (task.of_target.view, task.of_target.channel) == (2**40, 2**33)
+
+    def test_a_gradient_of_overlapping_windows_is_addressable(self, parts, monkeypatch):
+        """As dense as memory is it would have rows of 2^24 values, and the last of them beyond 31 bits."""
+        tasks = []
+        monkeypatch.setattr(parts[0], "launch", lambda function, blocks, threads, task: tasks.append((function, task)))
+        windows = torch.empty(1 << 17, device="meta").as_strided((1, 65536, 256, 256), (0, 1, 2, 512))
+        fused_loss(parts[2], windows.requires_grad_(), torch.empty(windows.shape, device="meta"), Weights(), Shares(0, 1))
+        layout = dict(tasks)["legs_ssim_gradient"].of_gradient
+        assert 255 * (layout.row + layout.column) < 2**31
 
 
 class Watched(TorchDispatchMode):

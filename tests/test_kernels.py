@@ -312,6 +312,12 @@ class TestSelection:
         assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         assert "its trial of the loss gave" in capfd.readouterr().err
 
+    def test_an_evaluation_that_comes_first_does_not_spoil_the_trial(self, chosen):
+        """In inference mode nothing has a gradient, which the trial compares."""
+        with torch.inference_mode():
+            legs_loss(torch.rand(3, 20, 30), torch.rand(3, 20, 30))
+        assert used(legs_loss(*images((3, 20, 30)))) == "fused"
+
     def test_a_broken_install(self, tmp_path):
         (tmp_path / "numba").mkdir()
         (tmp_path / "numba" / "__init__.py").write_text("raise ImportError('needs NumPy 1.99 or less')\n")

@@ -108,6 +108,14 @@ class TestByIdentity:
         memo.recall(target, make)
         assert (make.made, len(memo)) == (2, 0)
 
+    def test_each_stream_computes_for_itself(self, by_identity, monkeypatch):
+        """What one stream is still writing, another must not read; nothing tells the second one to wait."""
+        memo, make, target = WeightMemo(), Maker(), torch.rand(3, 4, 4)
+        for stream in (7, 8, 7, 8):
+            monkeypatch.setattr(memo_module, "_current_stream", lambda device, stream=stream: stream)
+            memo.recall(target, make)
+        assert make.made == 2
+
     def test_the_owner_of_a_view_is_its_base(self):
         base = torch.rand(4, 4)
         assert _storage_owner(base[1:]) is base

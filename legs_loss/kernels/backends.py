@@ -267,7 +267,8 @@ def _try(name: str, device: torch.device) -> Finding:
 
         backend = importlib.import_module(_KNOWN[name][0]).BACKEND
         threads = torch.get_num_threads()
-        problem = difference_from_torch(backend, device)
+        with torch.inference_mode(False):  # the first call may be an evaluation's; the trial needs gradients
+            problem = difference_from_torch(backend, device)
         torch.set_num_threads(threads)  # numba's first parallel loop sets OpenMP's number, which is torch's too
     except Exception as error:  # whatever a broken install, compiler or driver raises
         return Finding(None, True, _in_words(error))

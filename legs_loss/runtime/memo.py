@@ -6,7 +6,8 @@ from one step to the next, and a wrong weight never fails loudly. So a map is re
 - on the CPU, its bytes (a SHA-256 of them): memory that numpy shares can change without torch noticing;
 - on a device, where reading the bytes would wait for it, the tensor itself: the same storage, the same view of it,
   still alive, and never written to since (torch counts in-place writes; only one through ``.data`` escapes it). A
-  target that is uploaded anew each step is a new tensor, so its weight is computed anew.
+  target that is uploaded anew each step is a new tensor, so its weight is computed anew. On another CUDA stream it is
+  computed anew, too: what one stream is still writing, or has let go of, no other may read.
 """
 
 from __future__ import annotations
@@ -172,7 +173,12 @@ def _identity_key(target: Tensor) -> Optional[Hashable]:
         tuple(target.shape),
         tuple(target.stride()),
         target.dtype,
+        _current_stream(target.device),
     )
+
+
+def _current_stream(device: torch.device) -> Optional[int]:
+    return int(torch.cuda.current_stream(device).cuda_stream) if device.type == "cuda" else None
 
 
 def _storage_owner(target: Tensor) -> Tensor:

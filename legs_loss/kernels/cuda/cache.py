@@ -6,6 +6,7 @@ import hashlib
 import os
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Mapping, Optional
 
@@ -14,28 +15,33 @@ __all__ = ["BinaryCache", "cache_folder"]
 _DIGEST = hashlib.sha256().digest_size
 
 
-def cache_folder(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> Path:
-    """Return the folder of compiled kernels: in XDG_CACHE_HOME, LOCALAPPDATA (Windows) or ~/.cache."""
+def cache_folder(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> Optional[Path]:
+    """Return the folder of compiled kernels: in XDG_CACHE_HOME, LOCALAPPDATA (Windows) or ~/.cache; None without a home."""
     if platform == "win32" and environment.get("LOCALAPPDATA"):
         return Path(environment["LOCALAPPDATA"]) / "legs-loss" / "kernels"
     base = environment.get("XDG_CACHE_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "legs-loss" / "kernels"
+    try:
+        return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "legs-loss" / "kernels"
+    except RuntimeError:  # a container's user may have no home
+        return None
 
 
 class BinaryCache:
     """A folder of compiled kernels. What cannot be read or written is as if it were not there.
 
     Args:
-        folder: is made when something is kept.
+        folder: is made when something is kept; None keeps nothing.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Optional[Path]) -> None:
         self.folder = folder
 
     def get(self, key: bytes) -> Optional[bytes]:
         """Return what is kept under a key; None where there is nothing, or it is not what was written."""
+        if self.folder is None:
+            return None
         try:
-            content = self._path(key).read_bytes()
+            content = _path(self.folder, key).read_bytes()
         except OSError:
             return None
         digest, binary = content[:_DIGEST], content[_DIGEST:]
@@ -43,6 +49,8 @@ class BinaryCache:
 
     def put(self, key: bytes, binary: bytes) -> None:
         """Keep a binary: the file appears whole or not at all, whoever else writes it meanwhile."""
+        if self.folder is None:
+            return
         try:
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             handle, name = tempfile.mkstemp(dir=str(self.folder))
@@ -51,9 +59,11 @@ class BinaryCache:
         try:
             with os.fdopen(handle, "wb") as file:
                 file.write(hashlib.sha256(key + binary).digest() + binary)
-            os.replace(name, str(self._path(key)))
+            os.replace(name, str(_path(self.folder, key)))
         except OSError:
-            os.unlink(name)
+            with suppress(OSError):
+                os.unlink(name)
 
-    def _path(self, key: bytes) -> Path:
-        return self.folder / f"{hashlib.sha256(key).hexdigest()}.bin"
+
+def _path(folder: Path, key: bytes) -> Path:
+    return folder / f"{hashlib.sha256(key).hexdigest()}.bin"

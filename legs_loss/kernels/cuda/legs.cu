@@ -36,6 +36,11 @@ DEVICE unsigned as_bits(float value) { return __float_as_uint(value); }
 #endif
 
 #define ROWS 4             // rows a step of the streaming pass
+#if defined(__CUDACC_VER_MAJOR__) && __CUDACC_VER_MAJOR__ < 12
+#define ROWS_AT_ONCE 1  // of the vertical blur; more of them spill a few bytes with the compilers of CUDA 11
+#else
+#define ROWS_AT_ONCE ROWS
+#endif
 #define REACH 5            // of SSIM's window
 #define PITCH (THREADS + 16)  // a row with its margins: 5 zeros before it, 11 after it
 #define INFINITE as_float(0x7f800000u)
@@ -466,7 +471,7 @@ DEVICE void stream(const Task& k) {
             const int column = left + t;
             const bool inside = column >= 0 && column < k.width;
             const bool mine = t >= halo && t < halo + core && column < k.width;
-#pragma unroll
+#pragma unroll ROWS_AT_ONCE
             for (int r = 0; r < ROWS; ++r) {
                 const float* from = blurred + r * THREADS + t;
                 const float m1 = push(lane.moments[0], from[0]), m2 = push(lane.moments[1], from[ROWS * THREADS]);

@@ -46,7 +46,8 @@ def candidates(folders: Iterable[Path], major: str, platform: str = sys.platform
     """
     pattern = _WINDOWS if platform == "win32" else _LINUX
     for folder in folders:
-        nested = [folder] if folder.name == "lib" else sorted((folder / "nvidia").glob("*/*"))
+        wheels = folder / "nvidia"
+        nested = [folder] if folder.name == "lib" else sorted([*wheels.glob("*/*"), *wheels.glob("*/bin/x86_64")])
         for place in nested:
             if not place.is_dir():
                 continue
@@ -64,6 +65,12 @@ def _of_major(path: Path, major: str) -> bool:
     return number == major
 
 
+def _plain_name(major: str, platform: str = sys.platform) -> str:
+    if platform == "win32":
+        return f"nvrtc64_{'112' if major == '11' else major + '0'}_0.dll"
+    return f"libnvrtc.so.{'11.2' if major == '11' else major}"
+
+
 def find_compiler(folders: Optional[Sequence[Path]] = None, version: Optional[str] = None) -> Compiler:
     """Return the NVRTC of the CUDA that torch was built with; failing that the one that the system finds by name.
 
@@ -76,7 +83,7 @@ def find_compiler(folders: Optional[Sequence[Path]] = None, version: Optional[st
     major = version.split(".")[0]
     if folders is None:
         folders = [Path(torch.__file__).parent / "lib", *(Path(place) for place in sys.path if place)]
-    plain = {"win32": f"nvrtc64_{major}0_0.dll"}.get(sys.platform, f"libnvrtc.so.{'11.2' if major == '11' else major}")
+    plain = _plain_name(major)
     reason = "none lies beside torch or in a package named nvidia"
     for path in [*map(str, candidates(folders, major)), plain]:
         try:

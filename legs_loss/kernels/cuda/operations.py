@@ -113,7 +113,7 @@ def _loss_and_gradient(inputs: _Inputs, wanted: bool) -> Tuple[Tensor, Optional[
     held = _add_weights(task, modules, y, weights, spec) if shares.l1 else []
     gradient = None
     if wanted:
-        gradient = torch.empty_like(x, dtype=torch.float32)
+        gradient = addressable(torch.empty_like(x, dtype=torch.float32))  # dense, where x may be windows that overlap
         task.show("gradient", gradient)
     task.strip, blocks = strip_of(x, modules.driver.multiprocessors, wanted)
     if term == "l1":

@@ -9,8 +9,9 @@ within a round, and the table shows the median and the least and greatest of the
 time counts. kornia, pytorch-msssim and torchmetrics are measured where they are installed. "3DGS" is Inria's
 l1_loss + ssim: |a - b|.mean() and torch's SSIM, which tests/test_ssim.py holds equal to theirs to the last bit.
 torch.compile compiles the reference before it is timed. Contenders of more than two seconds get three rounds. On
-a GPU a time is that of ten steps between two events, and beside the table stands what the bytes that must move would
-take at the bandwidth of a copy.
+a GPU a time is that of ten steps between two events, all launched before the first of them begins, so that it is the
+GPU's own; what a step takes as Python launches it stands beside it, and what the bytes that must move would take at the
+bandwidth of a copy.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ GROWTH = ((400, 266), (800, 533), (1297, 840), (1600, 1066), (3840, 2160), (7680
 SLOW_ROUNDS = 3
 TOO_LONG = 2.0  # seconds
 STEPS = 10  # between two events of a GPU
+LONGEST_WAIT = 1.0  # seconds
+FASTEST_CLOCK = 3e9  # of any GPU, in cycles a second: a slower one waits longer
 COPIED = 1 << 28  # bytes
 # The least bytes a value, and a pixel: prediction and target are read, the gradient is written. Weights from the kernel
 # take another pass over the target; a stored map is read.
@@ -280,6 +283,7 @@ def side_by_side(contenders: Contenders, rounds: int, against: str, device: torc
                 times[name].append(timed(step, device))
     table = {}
     against = against if against in times else next(iter(times))
+    digits = 4 if device.type == "cuda" else 2
     for name, seconds in times.items():
         ratios = [ours / theirs for ours, theirs in zip(times[against], seconds)]
         table[name] = {
@@ -288,7 +292,11 @@ def side_by_side(contenders: Contenders, rounds: int, against: str, device: torc
             f"ratio of {against!r} to it": [statistics.median(ratios), min(ratios), max(ratios)],
         }
         spread = f"{statistics.median(ratios):7.4f}  ({min(ratios):.4f} to {max(ratios):.4f})"
-        print(f"{name:<46} {1e3 * statistics.median(seconds):10.2f} ms   ours / it {spread}", flush=True)
+        print(f"{name:<46} {1e3 * statistics.median(seconds):10.{digits}f} ms   ours / it {spread}", flush=True)
+        if device.type == "cuda":
+            launched = statistics.median(as_launched(contenders[name], device) for _ in range(SLOW_ROUNDS))
+            table[name]["ms as launched"] = 1e3 * launched
+            print(f"{'':<46} {1e3 * launched:10.{digits}f} ms as Python launches it", flush=True)
     return table
 
 
@@ -338,18 +346,34 @@ def some_images(size: Tuple[int, int], device: torch.device) -> Pairs:
 def timed(step: Callable[[], Any], device: torch.device) -> float:
     """Return the seconds of a step: on one thread the processor's own, which other people's work hardly changes."""
     if device.type == "cuda":
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        torch.cuda.synchronize(device)
-        start.record()
-        for _ in range(STEPS):
-            step()
-        end.record()
-        end.synchronize()
-        return start.elapsed_time(end) / 1e3 / STEPS
+        step()  # what is compiled or allocated now is not timed
+        return between_events(step, as_launched(step, device))
     clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
     before = clock()
     step()
     return clock() - before
+
+
+def as_launched(step: Callable[[], Any], device: torch.device) -> float:
+    """Return the seconds of a step on a GPU as Python launches it: of a small image, launching takes longest."""
+    torch.cuda.synchronize(device)
+    before = time.perf_counter()
+    for _ in range(STEPS):
+        step()
+    torch.cuda.synchronize(device)
+    return (time.perf_counter() - before) / STEPS
+
+
+def between_events(step: Callable[[], Any], launched: float) -> float:
+    """Return the seconds of a step on a GPU alone: the GPU is kept busy until all steps are launched, then timed."""
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    torch.cuda._sleep(int(min(2.0 * launched * STEPS, LONGEST_WAIT) * FASTEST_CLOCK))
+    start.record()
+    for _ in range(STEPS):
+        step()
+    end.record()
+    end.synchronize()
+    return start.elapsed_time(end) / 1e3 / STEPS
 
 
 def set_threads(threads: int) -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,8 +19,9 @@ import torch
 pytest.importorskip("numba")
 pytest.importorskip("libcst")
 
-from benchmarks.gpu import aims, building, measured
-from benchmarks.gpu.options import ROOT
+from benchmarks import loss
+from benchmarks.gpu import aims, building, imports, measured
+from benchmarks.gpu.options import ROOT, Skipped
 from benchmarks.gpu.stages import STAGES
 from tests.cuda_emulation import COMPILER
 from tests.support import legs_environment
@@ -69,7 +71,7 @@ def test_it_runs_to_its_end_with_the_emulated_kernels(tiny_scene: Path, tmp_path
     # Of the kernels' tests a few: all of them are run by this suite itself.
     done = run(
         "--emulate", "--sizes", "24x16", "--json", file, "--fastgs", root, "--scene", tiny_scene,
-        PATH="/usr/bin:/bin", PYTEST_ADDOPTS="-k TestRange",
+        "--iterations", 30, PATH="/usr/bin:/bin", PYTEST_ADDOPTS="-k TestRange",
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     found = json.loads(file.read_text())
@@ -138,6 +140,45 @@ def test_what_cub_no_longer_has_is_written_anew(tmp_path: Path) -> None:
     assert building.mend(tmp_path) == [tmp_path / "a.cu"]
     assert (tmp_path / "a.cu").read_text() == "#include <cuda/functional>\nx = Reduce(y, cuda::maximum<>());\n"
     assert building.mend(tmp_path) == []
+
+
+def test_what_a_script_lacks_is_known_before_anything_is_built(tmp_path: Path) -> None:
+    for name, text in (
+        ("train.py", "import os, torch.nn\nfrom scene import Scene\nimport utils\nimport rasterizer_module._C\n"),
+        ("scene/__init__.py", "from scene.cameras import Camera\n"),
+        ("scene/cameras.py", "from no_such_package.sub import thing\nfrom . import other\n"),
+        ("utils.py", "try:\n    import optional_package\nexcept ImportError:\n    pass\n"),
+        ("unused.py", "import another_package\n"),
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert imports.missing(tmp_path / "train.py") == ["no_such_package", "rasterizer_module"]
+    with pytest.raises(Skipped, match=r"^train.py needs what is not installed: no_such_package$"):
+        imports.need([tmp_path / "train.py"], built={"rasterizer_module"})
+    imports.need([tmp_path / "utils.py"])
+
+
+def test_a_gpus_time_begins_when_all_steps_are_launched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else of a small image it would be the time that Python takes to launch them."""
+    order: list[str] = []
+
+    class Event:
+        def __init__(self, enable_timing: bool) -> None:
+            pass
+
+        def record(self) -> None:
+            order.append("event")
+
+        def synchronize(self) -> None:
+            order.append("wait")
+
+        def elapsed_time(self, end: Any) -> float:
+            return 5.0
+
+    cuda = SimpleNamespace(Event=Event, _sleep=lambda cycles: order.append(f"sleep {cycles / loss.FASTEST_CLOCK:g} s"))
+    monkeypatch.setattr(loss, "torch", SimpleNamespace(cuda=cuda))
+    assert loss.between_events(lambda: order.append("step"), launched=0.001) == 5.0 / 1e3 / loss.STEPS
+    assert order == ["sleep 0.02 s", "event", *["step"] * loss.STEPS, "event", "wait"]
 
 
 @pytest.mark.parametrize("module", [aims, measured], ids=lambda module: module.__name__)

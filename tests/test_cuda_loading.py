@@ -391,7 +391,9 @@ class TestLaunch:
         tasks = []
         monkeypatch.setattr(parts[0], "launch", lambda function, blocks, threads, task: tasks.append((function, task)))
         windows = torch.empty(1 << 17, device="meta").as_strided((1, 65536, 256, 256), (0, 1, 2, 512))
-        fused_loss(parts[2], windows.requires_grad_(), torch.empty(windows.shape, device="meta"), Weights(), Shares(0, 1))
+        fused_loss(
+            parts[2], windows.requires_grad_(), torch.empty(windows.shape, device="meta"), Weights(), Shares(0, 1)
+        )
         layout = dict(tasks)["legs_ssim_gradient"].of_gradient
         assert 255 * (layout.row + layout.column) < 2**31
 

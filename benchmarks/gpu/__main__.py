@@ -97,7 +97,7 @@ def parse() -> Tuple[argparse.Namespace, Options]:
     parser.add_argument("--gsplat", metavar="CHECKOUT", help="gsplat, whose package is installed")
     parser.add_argument("--fused-ssim", metavar="CHECKOUT", help="default: the submodule of FastGS")
     parser.add_argument("--scene", metavar="FOLDER", help="a COLMAP scene to train on")
-    parser.add_argument("--iterations", type=int, help="of a training (default: 3000; emulated: 30)")
+    parser.add_argument("--iterations", type=int, help="of a training (default: 3000; emulated: 12)")
     parser.add_argument("-r", "--resolution", type=int, help="3DGS's -r (default: the codebase's; emulated: 48 wide)")
     parser.add_argument("--work", metavar="FOLDER", help="keep copies, built modules and trainings here")
     args = parser.parse_args()
@@ -110,7 +110,7 @@ def parse() -> Tuple[argparse.Namespace, Options]:
         parser.error("torch finds no CUDA GPU here (--emulate tries this script on the CPU)")
     usual: Dict[str, Any] = {"sizes": SIZES, "rounds": 9, "iterations": 3000, "resolution": None}
     if args.emulate:
-        usual = {"sizes": ("40x30",), "rounds": 1, "iterations": 30, "resolution": 48}
+        usual = {"sizes": ("40x30",), "rounds": 1, "iterations": 12, "resolution": 48}
     chosen = {name: value if getattr(args, name) is None else getattr(args, name) for name, value in usual.items()}
     paths = {
         name: getattr(args, name) and str(Path(getattr(args, name)).resolve())

@@ -12,6 +12,7 @@ from typing import List
 
 import torch
 
+from benchmarks.gpu.imports import need
 from benchmarks.gpu.options import Options, Record, Skipped
 from legs_loss.experiments.upstream.training import copy_checkout
 
@@ -51,6 +52,8 @@ def fastgs_modules(options: Options, record: Record) -> None:
         compiled = [str(path.relative_to(copy)) for module in modules for path in _compile_without_torch(module)]
         record(compiled=compiled)
         raise Skipped(f"the modules need a torch with CUDA; {len(compiled)} sources that need none were compiled")
+    packages = {path.name for module in modules for path in module.iterdir() if path.is_dir()}
+    need([copy / "train.py", copy / "render.py"], packages)
     built = []
     for module in modules:
         _build(module, options.site)

@@ -1,9 +1,11 @@
 """Run a training script as `legs run` does, and time its steps.
 
-    python -m benchmarks.gpu.measured REPORT [--emulate] [--cpu] SCRIPT ...
+    python -m benchmarks.gpu.measured REPORT EQUAL [--emulate] [--cpu] SCRIPT ...
 
 A step is the time from one call of `Tensor.backward` to the next. The report is that of
-`legs_loss.experiments.upstream.launch`, with the number of steps, their times, and the peak of the memory.
+`legs_loss.experiments.upstream.launch`, with the number of steps, their times, and the peak of the memory. The times
+are told twice: of the first EQUAL steps, in which no Gaussian is added yet, so that two losses have as many to draw;
+and of all steps, in which a loss that adds more of them takes longer for that.
 """
 
 from __future__ import annotations
@@ -20,10 +22,11 @@ import torch
 from benchmarks.gpu.options import emulate
 from legs_loss.experiments.upstream import launch
 
-FIRST = 0.1  # the share of the steps that is not timed: loading, compiling, first touches of memory
+EQUAL = "ms a step before Gaussians are added"
+FIRST = 0.03  # the share of the steps that is not timed: loading, compiling, first touches of memory
 
 
-def main(report: str, *words: str) -> int:
+def main(report: str, equal: str, *words: str) -> int:
     """Run the script; write the report, whatever happens."""
     if words[0] == "--emulate":
         emulate()
@@ -40,21 +43,29 @@ def main(report: str, *words: str) -> int:
     try:
         return launch.main(report, "0", *words)
     finally:
-        found = {**json.loads(path.read_text(encoding="utf-8")), **steps(stamps), **memory("--cpu" in words)}
+        found = {
+            **json.loads(path.read_text(encoding="utf-8")),
+            **steps(stamps, int(equal)),
+            **memory("--cpu" in words),
+        }
         path.write_text(json.dumps(found), encoding="utf-8")
 
 
-def steps(stamps: List[float]) -> Dict[str, Any]:
-    """Return the number of steps, and the mean and median milliseconds of all but the first.
+def steps(stamps: List[float], equal: int) -> Dict[str, Any]:
+    """Return the number of steps, and the milliseconds of one: of all but the first, and of those before ``equal``.
 
-    >>> steps([0.0, 5.0, 5.25, 5.5, 5.75, 6.0, 6.25, 6.5, 6.75, 7.0, 7.25, 8.0])
-    {'steps': 12, 'ms a step': 300.0, 'median ms a step': 250.0}
+    >>> found = steps([0.0, 5.0, 5.25, 5.5, 5.75, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5, 9.5], equal=6)
+    >>> found["steps"], found["ms a step"], found["median ms a step"], found["ms a step before Gaussians are added"]
+    (12, 450.0, 500.0, 250.0)
     """
-    timed = stamps[max(1, int(FIRST * len(stamps))) :]
-    if len(timed) < 2:
+    first = max(1, int(FIRST * len(stamps)))
+    apart = [1e3 * (after - before) for before, after in zip(stamps, stamps[1:])][first:]
+    if not apart:
         return {"steps": len(stamps)}
-    apart = [1e3 * (after - before) for before, after in zip(timed, timed[1:])]
-    return {"steps": len(stamps), "ms a step": statistics.mean(apart), "median ms a step": statistics.median(apart)}
+    found = {"steps": len(stamps), "ms a step": statistics.mean(apart), "median ms a step": statistics.median(apart)}
+    if equal - 1 > first:
+        found[EQUAL] = statistics.mean(apart[: equal - 1 - first])
+    return found
 
 
 def memory(cpu: bool) -> Dict[str, Any]:

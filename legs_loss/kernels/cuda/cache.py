@@ -16,7 +16,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def cache_folder(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> Optional[Path]:
-    """Return the folder of compiled kernels: in XDG_CACHE_HOME, LOCALAPPDATA (Windows) or ~/.cache; None without a home."""
+    """Return the folder of compiled kernels: in XDG_CACHE_HOME, LOCALAPPDATA (Windows) or ~/.cache; None if none is."""
     if platform == "win32" and environment.get("LOCALAPPDATA"):
         return Path(environment["LOCALAPPDATA"]) / "legs-loss" / "kernels"
     base = environment.get("XDG_CACHE_HOME", "")

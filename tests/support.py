@@ -55,7 +55,7 @@ def legs(*arguments, **options):
         legs_command(*arguments),
         capture_output=True,
         text=True,
-        **{"cwd": str(ROOT), "env": legs_environment(), "timeout": 300, **options},
+        **{"cwd": str(ROOT), "env": legs_environment(), "timeout": 900, **options},
     )
 
 

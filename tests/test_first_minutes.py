@@ -189,11 +189,11 @@ class TestCommandsToCopy:
     def test_extras_are_quoted_wherever_they_are_printed(self):
         from tests.support import ROOT
 
-        for folder in ("legs_loss", "adapters"):
-            for path in (ROOT / folder).rglob("*.py"):
-                for line in path.read_text(encoding="utf-8").splitlines():
-                    if "pip install legs-loss[" in line:
-                        pytest.fail(f"{path}: {line.strip()}")
+        texts = [path for folder in ("legs_loss", "adapters", "docs") for path in (ROOT / folder).rglob("*.py")]
+        for path in [*texts, *(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]:
+            for line in path.read_text(encoding="utf-8").splitlines():
+                if re.search(r"pip install [\w.-]+\[", line):
+                    pytest.fail(f"{path}: {line.strip()}")
 
 
 class TestCompletion:

@@ -230,3 +230,12 @@ class TestAsPythonRunsIt:
         assert done.stderr.startswith("legs: error: ")
         assert message in done.stderr
         assert done.stdout == ""
+
+    def test_a_mistyped_setting_is_one_line_before_the_script_starts(self, tmp_path):
+        (tmp_path / "plain.py").write_text("print('never')\n")
+        for variable, value, meant in (("LEGS_PRESET", "legz", "legs"), ("LEGS_CURVE", "C33", "C3")):
+            done = legs("run", "plain.py", cwd=str(tmp_path), env=dict(legs_environment(), **{variable: value}))
+            assert done.returncode == 2
+            assert done.stderr.startswith(f"legs: error: environment variable {variable}: ")
+            assert done.stderr.endswith(f"did you mean {meant!r}?\n")
+            assert done.stdout == ""

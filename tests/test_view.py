@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import signal
 import socket
+import subprocess
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from legs_loss.reference.ply import write_ply
 from legs_loss.scenes import read_scene
 from legs_loss.viewer.content import find_content
 from legs_loss.viewer.splats import left_of, splats
+from tests.support import legs_command, legs_environment
 
 
 def some(colour, count=400):
@@ -39,6 +42,12 @@ def runs(tmp_path):
             path = tmp_path / "runs" / name / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
             write_ply(path, some(colour, 400 if iteration == 7000 else 4))
     return tmp_path / "runs"
+
+
+def free_port():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
 
 
 class TestContent:
@@ -114,6 +123,10 @@ class TestBrowser:
         red, green = self.coloured(page)
         return red.mean(), green.mean()
 
+    def errors(self, page):
+        """What the page reported; of viser's own splat, a flat square, three.js can compute no bounding sphere."""
+        return [error for error in page.errors if "Computed radius is NaN" not in error]
+
     def until(self, page, holds):
         for _ in range(120):
             if holds():
@@ -124,7 +137,7 @@ class TestBrowser:
     def test_cameras_show_photographs_and_weight_maps(self, page, runs, tiny_scene):
         from legs_loss.viewer.server import serve
 
-        server = serve(find_content(runs / "red", tiny_scene), port=18437)
+        server = serve(find_content(runs / "red", tiny_scene), port=free_port())
         try:
             page.goto(f"http://127.0.0.1:{server.get_port()}")
             page.wait_for_selector("text=red: 400 Gaussians", timeout=60_000)
@@ -137,16 +150,14 @@ class TestBrowser:
                 page.wait_for_timeout(1500)
                 shots.append(self.shot(page))
             assert np.abs(shots[1] - shots[2])[:, :600].mean() > 0.2
+            assert self.errors(page) == []
         finally:
             server.stop()
 
     def test_methods_are_drawn_toggled_and_wiped(self, page, runs):
         from legs_loss.viewer.server import serve
 
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        server = serve(find_content(runs), port=port)
+        server = serve(find_content(runs), port=free_port())
         try:
             page.goto(f"http://127.0.0.1:{server.get_port()}")
             page.wait_for_selector("text=green: 400 Gaussians", timeout=60_000)
@@ -158,10 +169,40 @@ class TestBrowser:
             self.until(page, lambda: min(self.shares(page)) > 0.05)
             red, green = self.coloured(page)
             assert green.nonzero()[1].mean() < red.nonzero()[1].mean() - 50  # green is left of the line
-            # viser's own splat is a flat square, whose bounding sphere three.js cannot compute; nothing is missing.
-            assert [error for error in page.errors if "Computed radius is NaN" not in error] == []
+            assert self.errors(page) == []
         finally:
             server.stop()
+
+    def test_the_command_opens_a_comparison_until_ctrl_c(self, page, tiny_scene, tmp_path):
+        pytest.importorskip("numba")
+        out = tmp_path / "out"
+        arguments = ["compare", tiny_scene, "--out", out, "--arms", "legs", "--seeds", 1, "--iterations", 20]
+        assert main([str(argument) for argument in [*arguments, "-r", 2, "--processes", 1]]) == 0
+        rows = [json.loads(path.read_text()) for path in sorted(out.glob("*/seed-0/row.json"))]
+        assert [row["arm"] for row in rows] == ["3dgs", "legs"]
+        command = legs_command("view", out, "--port", free_port())
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        view = subprocess.Popen(command, env=legs_environment(), **pipes)
+        try:
+            said = next(line for line in view.stdout if line.endswith("(Ctrl-C ends)\n"))
+            assert said.startswith("3dgs, legs: http://127.0.0.1:")
+            page.goto(said.split()[2])
+            for row in rows:
+                label = f"{row['arm']}: {row['metrics']['gaussians']:,} Gaussians"
+                page.wait_for_selector(f"text={label}", timeout=60_000)
+            blank = np.full(3, 255)
+            self.until(page, lambda: (self.shot(page)[:, :600] != blank).any(axis=-1).mean() > 0.1)
+            before = self.shot(page)[:, :600]
+            page.get_by_text("3dgs: ").click()  # nothing is shown any more
+            self.until(page, lambda: np.abs(self.shot(page)[:, :600] - before).mean() > 5)
+            assert self.errors(page) == []
+            view.send_signal(signal.SIGINT)
+            _, errors = view.communicate(timeout=60)
+            assert view.returncode == 130
+            assert errors.splitlines() == ["legs: interrupted"]
+        finally:
+            view.kill()
+            view.wait()
 
 
 class TestTensorboard:

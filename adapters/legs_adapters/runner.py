@@ -21,6 +21,7 @@ from legs_adapters.code.sources import check_root
 from legs_adapters.plan import plan
 from legs_adapters.rewritten import Loader, install, main_module
 from legs_loss import LegsError
+from legs_loss.config import find_config
 from legs_loss.system import is_first_process
 
 __all__ = ["checkout_of", "execute", "run_script"]
@@ -54,12 +55,13 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
         The exit code, where the script does not leave by ``sys.exit`` (which goes on as it is).
 
     Raises:
-        LegsError: there is no such script; or its codebase has a term that cannot be decided, or, unless ``cpu``,
-            none; or, with ``cpu``, the script wants something of CUDA that has no shim.
+        LegsError: there is no such script; or a setting is wrong; or its codebase has a term that cannot be decided,
+            or, unless ``cpu``, none; or, with ``cpu``, the script wants something of CUDA that has no shim.
     """
     path = Path(script)
     if not path.is_file():
         raise LegsError(f"{script} is not a file: give the training script")
+    find_config(path, argv=[])  # a mistake in the settings is told now, not at the first training step
     root = check_root(checkout_of(path))
     found = plan(root, in_place=True, ssim=ssim)
     if found.findings.problems:

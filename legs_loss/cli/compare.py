@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
     missing = sum(comparison.row(arm, seed) is None for arm in arms for seed in seeds)
     say(f"{len(arms)} arms, {len(seeds)} seed(s); {missing} of {len(arms) * len(seeds)} trainings to do")
     reached: Dict[str, int] = {}
-    bar = tqdm(total=missing * base.iterations, desc="iterations", mininterval=0.5, disable=not missing)
+    bar = tqdm(total=missing * base.iterations, desc="iterations", mininterval=0.5, disable=not missing, delay=0.001)
     with bar, tensorboard_log(args.tensorboard) as log:
 
         def show(name: str, progress: Progress) -> None:

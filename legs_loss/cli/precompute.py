@@ -184,7 +184,8 @@ class _Bar:
     def __enter__(self) -> _Bar:
         from tqdm import tqdm
 
-        self._bar = tqdm(total=0, desc=self._title(), unit="view")
+        # With a delay nothing is shown before the first view, nor of what fails before it.
+        self._bar = tqdm(total=0, desc=self._title(), unit="view", delay=0.001)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -8,11 +8,6 @@ import threading
 from contextlib import contextmanager
 from typing import Callable, Iterator, List
 
-try:
-    from multiprocessing.resource_tracker import ensure_running
-except ImportError:  # Python 3.7's name
-    from multiprocessing.semaphore_tracker import ensure_running  # type: ignore[no-redef]
-
 __all__ = ["held_back", "kept_from_children", "noted"]
 
 _RAISES = hasattr(signal, "raise_signal")  # from Python 3.8 on
@@ -25,7 +20,7 @@ def kept_from_children() -> Iterator[None]:
     Where signals cannot be held back, on Windows, it is ignored meanwhile.
     """
     if hasattr(signal, "pthread_sigmask"):
-        ensure_running()  # started by the first process, it would let signals through again
+        _ensure_tracker()  # started by the first process, it would let signals through again
         held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             yield  # the mask is inherited, for good
@@ -37,6 +32,15 @@ def kept_from_children() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _ensure_tracker() -> None:
+    """Start multiprocessing's resource tracker, if it does not run."""
+    try:
+        from multiprocessing.resource_tracker import ensure_running
+    except ImportError:  # Python 3.7's name
+        from multiprocessing.semaphore_tracker import ensure_running  # type: ignore[no-redef]
+    ensure_running()
 
 
 @contextmanager

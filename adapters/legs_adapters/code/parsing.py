@@ -11,10 +11,11 @@ import ast
 import bisect
 import re
 import warnings
-from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Iterator, List, Mapping, NamedTuple, Optional, Sequence, Tuple, cast
 
 import libcst as cst
-from libcst.metadata import ByteSpanPositionProvider, CodeSpan, MetadataWrapper
+from libcst.metadata import ByteSpanPositionProvider, CodeSpan
+from libcst.metadata.span_provider import SpanProvidingCodegenState, byte_length_in_utf8
 
 from legs_adapters.code.syntax import code
 
@@ -63,6 +64,18 @@ class Lines:
         return Place(start, end, line, start - self._starts[line - 1], max(line, last))
 
 
+class _Written(ByteSpanPositionProvider):
+    """Write a tree once, for its text and its spans: LibCST's own wrapper walks it three times for them."""
+
+    def of(self, tree: cst.Module) -> Tuple[bytes, Mapping[cst.CSTNode, CodeSpan]]:
+        """Return the bytes of a tree, and where its nodes stand in them."""
+        state = SpanProvidingCodegenState(
+            tree.default_indent, tree.default_newline, provider=self, get_length=byte_length_in_utf8
+        )
+        tree._codegen(state)
+        return "".join(state.tokens).encode(tree.encoding), cast("Mapping[cst.CSTNode, CodeSpan]", self._computed)
+
+
 class Part:
     """Bytes that were parsed by themselves, and how they map to the file.
 
@@ -76,7 +89,7 @@ class Part:
         self.text = text
         self._lines = lines
         self._shifts = shifts
-        self._spans: Dict[cst.CSTNode, CodeSpan] = {}
+        self._spans: Mapping[cst.CSTNode, CodeSpan] = {}
 
     def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
         """Say where a node stands in the file, on request with the brackets around it.
@@ -85,9 +98,10 @@ class Part:
             ValueError: LibCST would write another text than it read.
         """
         if not self._spans:
-            if self.tree.bytes != self.text:
+            text, self._spans = _Written().of(self.tree)
+            if text != self.text:
+                self._spans = {}
                 raise ValueError("LibCST would write another text")
-            self._spans.update(MetadataWrapper(self.tree, unsafe_skip_copy=True).resolve(ByteSpanPositionProvider))
         span = self._spans[node]
         start, end = span.start, span.start + span.length
         if brackets and isinstance(node, cst.BaseExpression):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import re
 from typing import Any, Dict, FrozenSet, Iterable, Iterator, List, Optional, Set, Tuple
 
@@ -78,15 +79,11 @@ def words(name: str) -> Tuple[str, ...]:
 
 def constant(node: Optional[cst.CSTNode], default: Any = None) -> Any:
     """Return the value of a literal (also a negative number, a tuple of literals), else ``default``."""
-    if node is None:
-        return default
-    if isinstance(node, cst.SimpleString):
+    if isinstance(node, (cst.SimpleString, cst.Integer, cst.Float)):
         try:
-            return node.evaluated_value
-        except Exception:
+            return _literal(node.value)
+        except (SyntaxError, ValueError):  # "\x", or of a newer Python
             return default
-    if isinstance(node, (cst.Integer, cst.Float)):
-        return ast.literal_eval(node.value)
     if isinstance(node, cst.Name) and node.value in ("None", "True", "False"):
         return {"None": None, "True": True, "False": False}[node.value]
     if isinstance(node, cst.UnaryOperation) and isinstance(node.operator, cst.Minus):
@@ -96,6 +93,11 @@ def constant(node: Optional[cst.CSTNode], default: Any = None) -> Any:
         values = [constant(element.value, _MISSING) for element in node.elements]
         return default if _MISSING in values else tuple(values)
     return default
+
+
+@functools.lru_cache(maxsize=4096)
+def _literal(text: str) -> Any:
+    return ast.literal_eval(text)
 
 
 def key_of(node: cst.CSTNode) -> Any:

@@ -230,8 +230,8 @@ def _names_again(function: Function, call: cst.Call) -> bool:
     The image depends on what the innermost loop goes over, the name does not.
     """
     keywords = arguments(call)[1]
-    loops = loops_around(function.body, call)
-    if not loops or not isinstance(loops[0], cst.For) or not {"image", NAME} <= set(keywords):
+    loops = loops_around(function.body, call) if {"image", NAME} <= set(keywords) else []
+    if not loops or not isinstance(loops[0], cst.For):
         return False
     turns = {name.value for name in walk_expressions(loops[0].target) if isinstance(name, cst.Name)}
     return depends(function, keywords["image"], turns) and not depends(function, keywords[NAME], turns)

@@ -7,7 +7,7 @@
 The contenders take turns in every round, on the same eight pairs of images and the same threads; a ratio is taken
 within a round, and the table shows the median and the least and greatest of them. On one thread the processor's own
 time counts. kornia, pytorch-msssim and torchmetrics are measured where they are installed. "3DGS" is Inria's
-l1_loss + ssim: |a - b|.mean() and torch's SSIM, which tests/test_ssim.py holds equal to theirs to the last bit.
+l1_loss + ssim: |a - b|.mean() and torch's SSIM, which tests/loss/test_ssim.py holds equal to theirs to the last bit.
 torch.compile compiles the reference before it is timed. Contenders of more than two seconds get three rounds. On
 a GPU a time is that of ten steps between two events, all launched before the first of them begins, so that it is the
 GPU's own; what a step takes as Python launches it stands beside it, and what the bytes that must move would take at the

@@ -110,7 +110,7 @@ def test_the_suite_is_collected_in_the_source_distribution(source):
     done = subprocess.run(command, cwd=str(source), env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:]
     assert re.search(r"^\d{3,} tests collected", done.stdout, re.MULTILINE)
-    command = [sys.executable, "-m", "pytest", "-q", "tests/test_curves.py", "tests/test_spec.py"]
+    command = [sys.executable, "-m", "pytest", "-q", "tests/loss/test_curves.py", "tests/loss/test_spec.py"]
     done = subprocess.run(command, cwd=str(source), env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:]
 

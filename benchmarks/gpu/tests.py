@@ -10,11 +10,11 @@ from benchmarks.gpu.options import ROOT, Options, Record
 
 __all__ = ["tests"]
 
-FILE = ROOT / "tests" / "test_cuda_kernels.py"
+FILE = ROOT / "tests" / "kernels" / "test_cuda_kernels.py"
 
 
 def tests(options: Options, record: Record) -> None:
-    """Run tests/test_cuda_kernels.py on the device; record how many passed, and each failure, as they come."""
+    """Run tests/kernels/test_cuda_kernels.py on the device; record how many passed, and each failure, as they come."""
     import pytest
 
     os.environ["LEGS_TEST_DEVICE"] = "cpu" if options.emulate else "cuda"

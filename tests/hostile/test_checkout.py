@@ -16,7 +16,7 @@ from legs_adapters import verify as verifying
 from legs_adapters.cli import main
 from legs_adapters.journal import JOURNAL
 
-from tests.patching_support import checkout, files
+from tests.patcher.support import checkout, files
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in this file system")
 

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("libcst")
 
-from tests.patching_support import checkout, files
+from tests.patcher.support import checkout, files
 from tests.support import legs_environment
 
 TRAIN = """import torch

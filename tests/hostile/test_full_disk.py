@@ -76,7 +76,7 @@ def test_patch_and_undo(room, disk, tmp_path, capsys, monkeypatch):
     pytest.importorskip("libcst")
     from legs_adapters.cli import main as legs_patch
 
-    from tests.patching_support import checkout, files
+    from tests.patcher.support import checkout, files
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     root = checkout(disk.path / "checkout", files("inria"))
@@ -102,7 +102,7 @@ def test_the_journal_s_key(disk, tmp_path, monkeypatch):
     pytest.importorskip("libcst")
     from legs_adapters.cli import main as legs_patch
 
-    from tests.patching_support import checkout, files
+    from tests.patcher.support import checkout, files
 
     (disk.path / "legs-loss").mkdir()
     monkeypatch.setenv("XDG_STATE_HOME", str(disk.path))

@@ -18,7 +18,7 @@ from legs_adapters.checkout.seal import seal
 from legs_adapters.cli import main
 from legs_adapters.journal import JOURNAL
 
-from tests.patching_support import checkout, files, legs_patch, run_git, snapshot
+from tests.patcher.support import checkout, files, legs_patch, run_git, snapshot
 from tests.support import legs_environment
 
 COMMAND = 'touch "$LEGS_ATTACK"; false'

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from legs_loss.store import WeightStore
-from tests.patching_support import checkout, files
+from tests.patcher.support import checkout, files
 from tests.support import legs_command, legs_environment, photograph, save
 
 

@@ -15,7 +15,7 @@ from legs_adapters.journal import JOURNAL
 from legs_adapters.plan import plan, write
 from legs_adapters.undo import undo
 
-from tests.patching_support import checkout, legs_patch, snapshot
+from tests.patcher.support import checkout, legs_patch, snapshot
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork, to start at the same moment")
 

@@ -1,0 +1,157 @@
+"""A file that is parsed in parts is read as one that is parsed as a whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+cst = pytest.importorskip("libcst")
+
+from legs_adapters.code.module import Module, parse  # noqa: E402
+from legs_adapters.code.sources import Source, Unreadable  # noqa: E402
+from legs_adapters.code.syntax import code, walk_expressions  # noqa: E402
+from legs_adapters.terms.prospects import Prospects  # noqa: E402
+
+FILES = sorted(Path(__file__).parent.glob("test_*.py"))
+
+AWKWARD = '''# é: bytes and letters are counted apart
+"""A docstring
+def not_a_function():
+    pass
+"""
+import torch
+def one(a): return a
+def continued(a): \\
+    return a
+def commented(a):  # of what follows
+    # before the first statement
+
+    return a  # after the last
+
+    # still inside
+# outside
+
+class Outer(torch.nn.Module):
+\tdef method(self, x):
+\t\t"""Not
+    indented."""
+\t\t@decorated(
+\t\t\tx
+\t\t)
+\t\tasync def nested(y, z=lambda: 1):
+\t\t\treturn await y
+
+\t\treturn nested(x); y = 2
+\tclass Inner:
+\t\tasync def other(self): return 1
+if torch:
+    def here():
+        yield from [1, 2]
+elif one:
+    def here():
+        return """
+dedented"""
+else:
+    try:
+        def here(): pass
+    finally:
+        def here():
+
+            class Local:
+                def deep(self):
+                    return 7
+            return Local
+def last(*, a=1, **more) -> "int":
+    return 1 + \\
+        2'''
+
+
+def check(text: str) -> Module:
+    module = parse(Source("file.py", text.encode(), text))
+    assert isinstance(module, Module)
+    whole = cst.parse_module(text)
+    data = text.encode()
+    wanted = [node.name.value for node in _functions(whole)]
+    functions = [module.top, *module.functions(bool)]
+    assert [function.name for function in functions[1:]] == wanted
+    counted = 0
+    for function in functions:
+        for node in walk_expressions(function.body):
+            if isinstance(node, (cst.Name, cst.SimpleString, cst.Integer)):
+                place = function.place(node)
+                assert data[place.start : place.end].decode() == code(node)
+                before = data[: place.start].replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+                assert place.line == before.count(b"\n") + 1
+                counted += 1
+    assert counted > 10
+    return module
+
+
+def _functions(tree: cst.Module) -> list:
+    found = []
+
+    class Visitor(cst.CSTVisitor):
+        def visit_FunctionDef(self, node: cst.FunctionDef) -> None:
+            found.append(node)
+
+    tree.visit(Visitor())
+    return found
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("end", ["", "\n"])
+def test_every_node_stands_where_it_stands_in_the_file(newline: str, end: str) -> None:
+    check((AWKWARD + end).replace("\n", newline))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_every_node_of_a_real_file_stands_where_it_stands(path: Path) -> None:
+    check(path.read_text(encoding="utf-8"))
+
+
+def test_a_body_is_parsed_only_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed = []
+    real = cst.parse_module
+    monkeypatch.setattr(cst, "parse_module", lambda text: parsed.append(text) or real(text))
+    module = check("import a\n\n\ndef f(x):\n    return b(x, 1, 2, 3, 4, 5)\n\n\ndef g():\n    return c(1, 2, 3, 4)\n")
+    parsed.clear()
+    again = Module("file.py", module.text)
+    if len(again.outline_text) < len(module.text):  # before Python 3.8 a file is parsed as a whole
+        assert not any("return" in text for text in parsed)
+        assert [f.name for f in again.functions(lambda text: "c(" in text)] == ["g"]
+        next(again.named("f")).flow.calls.clear()
+        assert any("b(x" in text for text in parsed) and not any("c(1" in text for text in parsed)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("def f():\n    print 'x'\n", "Python 2"),
+        ("def f(:\n    pass\n", "does not parse (line 2)"),
+        ("x = 1\n\n\ndef f():\n    return 1 2\n", "does not parse (line 5)"),
+    ],
+)
+def test_what_does_not_parse_is_said_of_the_file(text: str, reason: str) -> None:
+    assert parse(Source("file.py", text.encode(), text)) == Unreadable("file.py", reason)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "def training():\n    loss = l1_loss(a, b)\n",
+        "def inner(a, b):\n    return (a - b).abs()\ndef middle(c):\n    inner(c, c)\ndef training():\n    middle(1)\n",
+        "class T:\n    def __init__(self):\n        self.f = L1Loss()\n    def training(self):\n        self.f(1, 2)\n",
+        "class C:\n    def forward(self, a, b):\n        abs(a - b)\nphoto = C()\ndef training():\n    photo(1, 2)\n",
+        "from losses import l1_loss as photometric\ndef training():\n    photometric(1, 2)\n",
+        "LOSSES = {\n    'rgb': l1_loss,\n}\ndef training():\n    LOSSES['rgb'](1, 2)\n",
+        "def training(criterion=F.l1_loss):\n    criterion(1, 2)\n",
+    ],
+)
+def test_what_can_lead_to_an_l1_is_found_by_its_words(text: str) -> None:
+    other = "def render(camera):\n    return camera.project(points)\n"
+    prospects = Prospects([text + other])
+    module = Module("file.py", text + other)
+    assert prospects.of(next(module.named("training")).text)
+    if len(module.outline_text) < len(module.text):
+        assert not prospects.of(next(module.named("render")).text)

@@ -1,0 +1,183 @@
+"""`legs compare --upstream`: a codebase's own script, real subprocesses, end to end on a miniature; and profiles."""
+
+from __future__ import annotations
+
+import ast
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from legs_loss import LegsError
+from legs_loss.cli import main
+from legs_loss.experiments.upstream.profile import PROFILES, fill, find_profile, read_profile
+from legs_loss.experiments.upstream.training import Checkout
+from tests.experiments.miniature import write_miniature
+
+pytest.importorskip("libcst")
+pytest.importorskip("numba")
+
+# Profiles
+
+
+@pytest.mark.parametrize("path", sorted(PROFILES.glob("*.toml")), ids=lambda path: path.stem)
+def test_built_in_profiles_are_whole(path: Path) -> None:
+    profile = read_profile(path)
+    assert profile.name == path.stem
+    assert bool(profile.threshold) != bool(profile.number)  # densifies by a threshold, or to a fixed number
+    checkout = Checkout(Path("copy"), profile, Path("my scene"), iterations=1000, extra=["--more"])
+    command = checkout.commands(Path("out/legs/seed-0/output"), 0.5)[-1]
+    assert any("my scene" in word for word in command) and "--more" in command
+    assert any("1000" in word for word in command)
+    for threshold in profile.threshold:
+        assert f"{0.5 * threshold.value:.6g}" in " ".join(command)
+
+
+def test_what_a_framework_reads_as_python_is_quoted() -> None:
+    checkout = Checkout(Path("copy"), read_profile(PROFILES / "fastergs.toml"), Path("my scene"), iterations=1000)
+    values = dict(word.split("=", 1) for word in checkout.commands(Path("3dgs/seed-0/output"), 1.0)[-1] if "=" in word)
+    assert ast.literal_eval(values["DATASET.PATH"]) == "my scene"
+    assert ast.literal_eval(values["TRAINING.MODEL_NAME"]) == "3dgs-seed-0"
+    assert {type(ast.literal_eval(value)) for value in values.values()} == {str, int, bool, type(None)}
+
+
+def test_a_profile_is_found_by_what_a_checkout_has(tmp_path: Path) -> None:
+    for name in ("train.py", "render.py", "arguments/__init__.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    with pytest.raises(LegsError, match="none fit"):
+        find_profile(tmp_path)
+    (tmp_path / "arguments/__init__.py").write_text("self.densify_grad_threshold = 0.0002")
+    assert find_profile(tmp_path).name == "3dgs"
+    (tmp_path / "arguments/__init__.py").write_text("self.densify_grad_threshold, self.grad_abs_thresh = 1, 2")
+    assert find_profile(tmp_path).name == "fastgs"
+    assert find_profile(tmp_path, "3dgs").name == "3dgs"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("name = 3", "name is not what it should be"),
+        ('extends = "4dgs"', "no built-in profile '4dgs'"),
+        ('extends = "3dgs"\nrender_all = "x"', "unknown setting 'render_all'"),
+        ('name = "a"', "missing"),
+        ('extends = "3dgs"\ntrain = "train.py"', "train is not what it should be"),
+        ('extends = "3dgs"\nrenders = { train = "a" }', "renders must have train and test"),
+        ('extends = "3dgs"\nthreshold = [{ words = "--x", value = 1.0 }]', "a threshold has words with"),
+        ("name = ", "cannot be read"),
+    ],
+)
+def test_a_wrong_profile_is_explained(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "own.toml").write_text(text)
+    with pytest.raises(LegsError, match=says):
+        find_profile(tmp_path, str(tmp_path / "own.toml"))
+
+
+def test_thresholds_that_the_user_gives_are_those_that_are_scaled() -> None:
+    checkout = Checkout(
+        Path("copy"), read_profile(PROFILES / "fastgs.toml"), Path("a"), extra=["--grad_abs_thresh", "0.0008"]
+    )
+    assert checkout.thresholds() == [0.0002, 0.0008]
+    words = checkout.commands(Path("out/3dgs/seed-0/output"), 0.5)[-1]
+    last = {flag: words[len(words) - words[::-1].index(flag)] for flag in ("--grad_thresh", "--grad_abs_thresh")}
+    assert last == {"--grad_thresh": "0.0001", "--grad_abs_thresh": "0.0004"}
+
+
+def test_words_that_no_one_fills_in() -> None:
+    with pytest.raises(LegsError, match=r"{scenes} is not known here"):
+        fill("train.py -s {scenes}", {"scene": "a"})
+
+
+# A comparison
+
+
+@pytest.fixture(scope="module")
+def compared(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory):
+    """Two seeds of a comparison: its folder, and the command that made it."""
+    folder = tmp_path_factory.mktemp("upstream")
+    profile = write_miniature(folder / "miniature", tiny_scene)
+    words = ["compare", str(tiny_scene), "--upstream", str(folder / "miniature"), "--profile", str(profile)]
+    words += ["--arms", "legs", "legs:scale", "3dgs@legs", "--seeds", "2", "-r", "24", "--iterations", "30"]
+    words += ["-m", str(folder / "out")]
+    assert main(words) == 0
+    return folder, words
+
+
+def rows(folder: Path):
+    found = [json.loads(path.read_text()) for path in (folder / "out").glob("*/seed-*/row.json")]
+    return {(row["arm"], row["seed"]): row for row in found}
+
+
+@pytest.mark.slow
+def test_every_arm_is_trained_by_the_codebases_own_script(compared) -> None:
+    folder, _ = compared
+    found = rows(folder)
+    assert set(found) == {(arm, seed) for arm in ("3dgs", "legs", "legs:scale", "3dgs@legs") for seed in (0, 1)}
+    proof = json.loads((folder / "out" / "comparison.json").read_text())["baseline"]
+    assert proof == {"weighted_calls": 0, "plain_calls": 30}
+    for seed in (0, 1):
+        metrics = {arm: row["metrics"] for (arm, of), row in found.items() if of == seed}
+        assert metrics["legs"]["weighted_calls"] == metrics["legs:scale"]["weighted_calls"] == 30
+        assert metrics["3dgs@legs"]["weighted_calls"] == 0
+        assert metrics["legs"]["gaussians"] > 1.2 * metrics["3dgs"]["gaussians"]
+        assert metrics["3dgs@legs"]["gaussians"] == pytest.approx(metrics["legs"]["gaussians"], rel=0.01)
+        assert metrics["legs:scale"]["mean_weight"] == pytest.approx(metrics["legs"]["mean_weight"])
+        assert found["3dgs@legs", seed]["upstream"]["threshold_factor"] < 1
+    assert found["3dgs", 0]["metrics"]["train"] != found["3dgs", 1]["metrics"]["train"]  # the script's seed is always 0
+
+
+@pytest.mark.slow
+def test_scores_are_those_of_the_pictures_it_wrote(compared) -> None:
+    from skimage.io import imread
+    from skimage.metrics import peak_signal_noise_ratio
+
+    folder, _ = compared
+    where = folder / "out" / "legs" / "seed-0" / "output" / "test" / "ours_30"
+    expected = peak_signal_noise_ratio(imread(where / "gt/00000.png"), imread(where / "renders/00000.png"))
+    scores = rows(folder)["legs", 0]["metrics"]["views"]["test"]
+    assert scores["00000.png"]["psnr"] == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_done_rows_stay_and_others_are_added(compared, capsys: pytest.CaptureFixture) -> None:
+    folder, words = compared
+    kept = {path: path.stat().st_mtime_ns for path in (folder / "out").glob("*/seed-*/row.json")}
+    shutil.rmtree(folder / "out" / "legs" / "seed-1")
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "legs, seed 1" in printed and "legs, seed 0" not in printed and "3dgs@legs − legs" in printed
+    changed = {path.parent.parent.name for path, time in kept.items() if path.stat().st_mtime_ns != time}
+    assert changed == {"legs"}
+    assert main([*words, "--iterations", "31"]) == 2
+    assert "begun with another" in capsys.readouterr().err
+    assert main(["report", str(folder / "out")]) == 0
+
+
+@pytest.mark.slow
+def test_what_cannot_be_compared_is_refused(compared, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder, words = compared
+    new = [*words, "-m", str(tmp_path / "new")]
+    for change, says in (
+        (["--arms", "legs:shuffled"], "needs the package's own trainer"),
+        (["--gaussians", "100"], "has no words for gaussians"),
+        (["--profile", "3dgs-mcmc"], "give it with --gaussians"),
+        (["--profile", "3dgs-mcmc", "--gaussians", "1"], "give more with --gaussians, not 1"),
+        (["--densify_grad_threshold", "1"], "by --extra"),
+        (["--upstream", str(tmp_path / "nowhere")], "there is no folder"),
+    ):
+        assert main([*new, *change]) == 2
+        assert says in capsys.readouterr().err
+        shutil.rmtree(tmp_path / "new", ignore_errors=True)
+    patched = tmp_path / "patched"
+    shutil.copytree(folder / "miniature", patched)
+    (patched / "train.py").write_text("import legs_loss\n")
+    assert main([*new, "--upstream", str(patched)]) == 2
+    assert "is patched already" in capsys.readouterr().err
+    broken = tmp_path / "broken"
+    shutil.copytree(folder / "miniature", broken)
+    (broken / "train.py").write_text((broken / "train.py").read_text().replace("points = 100", "points = 1 / 0"))
+    assert main([*words, "-m", str(tmp_path / "other"), "--upstream", str(broken)]) == 2
+    assert "ZeroDivisionError" in capsys.readouterr().err
+    assert main(["compare", "--cpu"]) == 2
+    assert "--cpu is for --upstream" in capsys.readouterr().err

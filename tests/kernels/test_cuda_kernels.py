@@ -1,0 +1,394 @@
+"""The CUDA kernels' own source, behind their own Python layer, against torch in float64.
+
+On the CPU, compiled with g++; with LEGS_TEST_DEVICE=cuda on a GPU, compiled by NVRTC.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from legs_loss import (
+    LegsError,
+    WeightSpec,
+    configure,
+    l1_loss,
+    legs_loss,
+    register_curve,
+    ssim,
+    weight_map,
+    weighted_l1,
+)
+from legs_loss.kernels import backends
+from legs_loss.kernels.contract import Weights
+from legs_loss.kernels.cuda.launch import STENCILS
+from legs_loss.kernels.trial import difference_from_torch
+from legs_loss.response import response
+from legs_loss.runtime import state
+from legs_loss.spec import PRESETS
+from tests.cuda_emulation import COMPILER
+from tests.kernels.on_device import DEVICE, MISSING, new_backend, new_driver
+from tests.kernels.support import compare, images, used
+from tests.support import legs_environment
+
+pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
+
+LEGS = PRESETS["legs"]
+SHAPES = [(3, 1, 1), (1, 5, 7), (3, 44, 45), (2, 3, 30, 47), (4, 90, 3), (3, 137, 251), (6, 300, 109), (2, 1, 8, 300)]
+
+
+@pytest.fixture(scope="module")
+def backend():
+    return new_backend()
+
+
+@pytest.fixture
+def chosen(monkeypatch):
+    """Make the backend under test the one for images on the device, and return it and its driver."""
+    driver = new_driver()
+    found = backends.Finding(new_backend(driver), True, "")
+    monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("no module", DEVICE.type)})
+    monkeypatch.setattr(backends, "_findings", {f"cuda {DEVICE.type}": found})
+    monkeypatch.delenv("LEGS_BACKEND", raising=False)
+    return found.backend, driver
+
+
+@pytest.fixture(autouse=True)
+def on_device():
+    """Make new tensors on the device."""
+    if DEVICE.type == "cpu":
+        yield
+        return
+    with DEVICE:
+        yield
+
+
+@pytest.fixture(autouse=True)
+def poisoned():
+    """Fill what torch allocates with NaN: what is read before it is written, or never written, shows."""
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def by_signature(backend):
+    """Return the loss as tests of other backends call it: with a map, a spec or None for the weight."""
+
+    def loss(prediction, target, weight=None, lambda_dssim=0.2):
+        weights = Weights(spec=weight) if isinstance(weight, WeightSpec) else Weights(map=weight)
+        return backend.loss(prediction, target, weights, lambda_dssim)
+
+    return loss
+
+
+def compare_l1(backend, prediction, target, weights, **reference):
+    loss = backend.weighted_l1(prediction, target, weights)
+    (gradient,) = torch.autograd.grad(loss, prediction)
+    exact = prediction.detach().double().requires_grad_()
+    if weights.spec is not None:
+        reference["weight"] = weight_map(target.double(), weights.spec)
+    expected = weighted_l1(exact, target.double(), **reference)
+    (exact_gradient,) = torch.autograd.grad(expected, exact)
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-5, abs=1e-7)
+    assert float((gradient.double() - exact_gradient).norm() / exact_gradient.norm()) < 2e-4
+
+
+class TestLoss:
+    @pytest.mark.parametrize("weight", ["none", "map", "spec"])
+    @pytest.mark.parametrize("shape", SHAPES)
+    def test_value_and_gradient_equal_the_reference(self, backend, shape, weight):
+        prediction, target = images(shape)
+        weights = {"none": None, "map": weight_map(target), "spec": LEGS}
+        compare(by_signature(backend), prediction, target, weights[weight])
+
+    @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
+    @pytest.mark.parametrize("operator", STENCILS)
+    def test_every_operator_and_norm(self, backend, operator, p):
+        compare(by_signature(backend), *images((3, 31, 45)), WeightSpec(operator=operator, p=p))
+
+    @pytest.mark.parametrize("curve", ["C1", "C2", "C3", "C4", "C5"])
+    def test_every_curve(self, backend, curve):
+        compare(by_signature(backend), *images((2, 3, 31, 145)), WeightSpec(curve=curve, beta=3.0))
+
+    @settings(max_examples=25, deadline=None)
+    @given(st.integers(1, 300), st.integers(1, 300), st.integers(1, 4), st.floats(0.05, 1), st.integers(1, 200))
+    def test_any_size_share_and_number_of_multiprocessors(self, height, width, channels, share, multiprocessors):
+        prediction, target = images((channels, height, width))
+        backend = new_backend(new_driver(multiprocessors))
+        compare(by_signature(backend), prediction, target, weight_map(target), share)
+
+    @pytest.mark.parametrize("dtypes", [(torch.float16,) * 2, (torch.bfloat16,) * 2, (torch.float16, torch.float32)])
+    def test_half_precision_is_computed_in_float32(self, backend, dtypes):
+        prediction, target = images((3, 40, 130))
+        prediction, target = prediction.detach().to(dtypes[0]).requires_grad_(), target.to(dtypes[1])
+        for weights in (Weights(spec=LEGS), Weights(map=torch.rand(1, 40, 130))):
+            loss = backend.loss(prediction, target, weights, 0.2)
+            # As a gradient scaler does it: unscaled, a step would be below float16's smallest number.
+            (gradient,) = torch.autograd.grad(1024.0 * loss, prediction)
+            exact = prediction.detach().double().requires_grad_()
+            expected = legs_loss(exact, target.double(), weight=None if weights.map is None else weights.map.double())
+            (exact_gradient,) = torch.autograd.grad(1024.0 * expected, exact)
+            assert loss.dtype == torch.float32 and gradient.dtype == dtypes[0]
+            assert loss.item() == pytest.approx(expected.item(), rel=2e-5)
+            error = (gradient.double() - exact_gradient).abs().max()
+            assert float(error) <= torch.finfo(dtypes[0]).eps * float(exact_gradient.abs().max())
+
+    def test_a_flat_target_has_weight_one(self, backend):
+        target, prediction = torch.full((3, 33, 147), 0.7), torch.rand(3, 33, 147)
+        for operator in STENCILS:
+            spec = WeightSpec(operator=operator, eps=1e-30)
+            weighted = backend.loss(prediction, target, Weights(spec=spec), 0.2)
+            assert torch.equal(weighted, backend.loss(prediction, target, Weights(), 0.2))
+
+    @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
+    @pytest.mark.parametrize("operator", STENCILS)
+    def test_a_nan_in_the_target_is_never_hidden(self, backend, operator, p):
+        prediction, target = images((2, 3, 20, 30))
+        target[1, 1, 3, 29] = float("nan")
+        spec = WeightSpec(operator=operator, p=p)
+        found = backend.response_range(target, spec)
+        assert torch.isfinite(found[0]).all() and torch.isnan(found[1]).all()
+        loss = backend.weighted_l1(prediction, target, Weights(spec=spec))
+        loss.backward()
+        assert torch.isnan(loss) and torch.isfinite(prediction.grad[0]).all()
+        assert torch.isnan(backend.loss(prediction, target, Weights(spec=spec), 0.2))
+
+    def test_it_repeats_bit_for_bit_in_any_order_of_the_threads(self):
+        prediction, target = images((2, 3, 61, 133))
+        results = []
+        for backwards in (False, False, True):
+            driver = new_driver()
+            driver.backwards = backwards
+            backend = new_backend(driver)
+            for weights in (Weights(spec=LEGS), Weights(spec=WeightSpec(operator="sobel", p=float("inf")))):
+                for loss in (
+                    backend.loss(prediction, target, weights, 0.2),
+                    backend.weighted_l1(prediction, target, weights),
+                    backend.ssim(prediction, target),
+                ):
+                    results.append((loss, *torch.autograd.grad(loss, prediction)))
+        third = len(results) // 3
+        for first, second, third_ in zip(results[:third], results[third : 2 * third], results[2 * third :]):
+            assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(first, second, third_))
+
+    def test_a_range_that_is_kept_gives_the_same_bits(self, backend):
+        prediction, target = images((2, 3, 40, 50))
+        kept = torch.cat([backend.response_range(view, LEGS) for view in target])
+        for operation in (backend.weighted_l1, lambda *args: backend.loss(*args, 0.2)):
+            made = operation(prediction, target, Weights(spec=LEGS))
+            assert torch.equal(made, operation(prediction, target, Weights(spec=LEGS, range=kept)))
+
+    def test_a_range_for_other_images_is_refused(self, backend):
+        with pytest.raises(ValueError, match=r"a range \[1, 2\] does not fit images \[2, 3, 8, 8\]"):
+            backend.weighted_l1(*images((2, 3, 8, 8)), Weights(spec=LEGS, range=torch.zeros(1, 2)))
+
+
+class TestRange:
+    @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
+    @pytest.mark.parametrize("operator", STENCILS)
+    def test_it_is_the_responses(self, backend, operator, p):
+        for shape in ((3, 1, 1), (2, 3, 1, 40), (3, 5, 2), (2, 4, 33, 90), (3, 200, 210)):
+            target = torch.rand(shape)
+            found = backend.response_range(target, WeightSpec(operator=operator, p=p))
+            exact = response(target.double(), operator, p).reshape(found.shape[0], -1)
+            low, high = exact.min(1).values, exact.max(1).values
+            torch.testing.assert_close(found.double(), torch.stack([low, high - low], 1), rtol=1e-6, atol=1e-6)
+
+
+class TestWeightedL1:
+    @pytest.mark.parametrize("shape", SHAPES)
+    def test_value_and_gradient_equal_the_reference(self, backend, shape):
+        prediction, target = images(shape)
+        weight = weight_map(target)
+        compare_l1(backend, prediction, target, Weights())
+        compare_l1(backend, prediction, target, Weights(map=weight), weight=weight)
+        compare_l1(backend, prediction, target, Weights(spec=LEGS))
+
+    @pytest.mark.parametrize("renormalise", [False, True])
+    def test_masks(self, backend, renormalise):
+        prediction, target = images((2, 3, 40, 50))
+        for mask in (torch.rand(40, 50) > 0.4, torch.rand(2, 1, 40, 50), torch.zeros(1, 40, 50)):
+            weights = Weights(spec=LEGS, mask=mask, renormalise=renormalise)
+            loss = backend.weighted_l1(prediction, target, weights)
+            expected = weighted_l1(prediction, target, weight_map(target), mask, renormalise)
+            assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+            gradients = [torch.autograd.grad(value, prediction)[0] for value in (loss, expected)]
+            torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-9)
+
+    def test_where_both_are_equal_the_gradient_is_zero(self, backend):
+        target = torch.rand(3, 20, 20)
+        prediction = target.clone().requires_grad_()
+        loss = backend.weighted_l1(prediction, target, Weights(spec=LEGS))
+        loss.backward()
+        assert loss.item() == 0.0 and not prediction.grad.any()
+
+
+class TestSsim:
+    @pytest.mark.parametrize("shape", SHAPES)
+    def test_value_and_gradient_equal_the_reference(self, backend, shape):
+        prediction, target = images(shape)
+        found = backend.ssim(prediction, target)
+        exact = prediction.detach().double().requires_grad_()
+        expected = ssim(exact, target.double())
+        (gradient,), (reference,) = torch.autograd.grad(found, prediction), torch.autograd.grad(expected, exact)
+        assert found.item() == pytest.approx(expected.item(), rel=1e-5)
+        assert float((gradient.double() - reference).norm() / reference.norm()) < 2e-5
+
+    def test_equal_images_have_one(self, backend):
+        image = torch.rand(3, 20, 300)
+        assert backend.ssim(image, image).item() == pytest.approx(1.0, abs=1e-6)
+
+
+class TestAutograd:
+    def test_channels_last_and_pieces_of_images_are_read_where_they_are(self, backend):
+        # Around the pieces is NaN: a pixel too far would show.
+        for make in (
+            lambda: torch.rand(2, 40, 150, 3).movedim(-1, 1),
+            lambda: torch.full((2, 5, 60, 170), float("nan"))[:, 1:4, 7:47, 9:159].copy_(torch.rand(2, 3, 40, 150)),
+            lambda: torch.rand(1, 3, 40, 150).expand(2, 3, 40, 150),
+        ):
+            prediction, target = make().requires_grad_(), make()
+            compare(by_signature(backend), prediction, target, LEGS)
+            compare_l1(backend, prediction, target, Weights(spec=LEGS))
+
+    def test_what_arrives_in_backward_is_a_factor(self, backend):
+        prediction, target = images((3, 20, 30))
+        for factor in (1.0, 3.0, 0.0):
+            loss = backend.loss(prediction, target, Weights(spec=LEGS), 0.2)
+            (once,) = torch.autograd.grad(loss, prediction, retain_graph=True)
+            once = once.clone()
+            (scaled,) = torch.autograd.grad(factor * loss, prediction)
+            assert torch.equal(scaled, factor * once)
+
+    def test_without_a_gradient_it_is_the_same_number(self, backend):
+        prediction, target = images((3, 40, 300))
+        for operation in (
+            lambda: backend.loss(prediction, target, Weights(spec=LEGS), 0.2),
+            lambda: backend.weighted_l1(prediction, target, Weights(spec=LEGS)),
+            lambda: backend.ssim(prediction, target),
+        ):
+            with torch.no_grad():
+                plain = operation()
+            assert not plain.requires_grad
+            assert plain.item() == pytest.approx(operation().item(), rel=1e-6)
+
+    def test_second_derivatives_are_refused(self, backend):
+        prediction, target = images((3, 8, 8))
+        (gradient,) = torch.autograd.grad(backend.ssim(prediction, target), prediction, create_graph=True)
+        with pytest.raises(RuntimeError):
+            gradient.sum().backward()
+
+
+class TestSelection:
+    def test_its_trial_agrees_with_torch(self, backend):
+        assert difference_from_torch(backend, DEVICE) is None
+
+    @pytest.mark.parametrize("channels_last", [False, True])
+    def test_the_front_ends_mean_the_same_as_torch(self, chosen, channels_last):
+        prediction, target = images((2, 3, 24, 31))
+        mask, weight = torch.rand(24, 31) > 0.4, 1.0 + torch.rand(2, 24, 31)
+        if channels_last:
+            prediction, target = prediction.detach().movedim(1, -1).requires_grad_(), target.movedim(1, -1)
+        for options in ({}, {"mask": mask}, {"mask": mask, "renormalise": True}, {"weight": weight, "mask": mask}):
+            loss = legs_loss(prediction, target, channels_last=channels_last, **options)
+            assert used(loss) == "fused"
+            expected = legs_loss(prediction.double(), target.double(), channels_last=channels_last, **options)
+            assert loss.item() == pytest.approx(expected.item(), rel=2e-5)
+            gradients = [torch.autograd.grad(value, prediction)[0] for value in (loss, expected)]
+            torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-8)
+        weights = Weights(spec=LEGS, range=backends.fused_range(target, LEGS, channels_last))
+        found = backends.fused_l1(prediction, target, weights, channels_last)
+        expected = weighted_l1(prediction, target, weight_map(target, LEGS, channels_last), channels_last=channels_last)
+        assert found.item() == pytest.approx(expected.item(), rel=1e-5)
+        found = backends.fused_ssim(prediction, target, "zeros", channels_last)
+        with torch.no_grad():  # then it is torch's
+            expected = ssim(prediction, target, "zeros", channels_last)
+        assert found.item() == pytest.approx(expected.item(), rel=1e-5)
+
+    @pytest.mark.parametrize("channels_last", [False, True])
+    def test_the_drop_ins_are_fused(self, chosen, channels_last):
+        state.reset()
+        configure("legs")
+        driver = chosen[1]
+        prediction, target = images((2, 3, 24, 31))
+        if channels_last:
+            prediction, target = prediction.detach().movedim(1, -1).requires_grad_(), target.movedim(1, -1)
+        weight = weight_map(target, LEGS, channels_last)
+        loss = l1_loss(prediction, target, channels_last=channels_last)
+        expected = weighted_l1(prediction, target, weight, channels_last=channels_last)
+        assert used(loss) == "fused" and "legs_range" in dict(driver.launches)
+        assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+        gradients = [torch.autograd.grad(value, prediction)[0] for value in (loss, expected)]
+        torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-8)
+        assert used(ssim(prediction, target, channels_last=channels_last)) == "fused"
+        state.reset()
+
+    @pytest.mark.parametrize(
+        "changes", [{"percentile": 90.0}, {"normalise": "mean"}, {"scale": 0.6}, {"curve": "test-cube"}]
+    )
+    def test_specs_that_it_does_not_know_get_torchs_map(self, chosen, changes):
+        if "curve" in changes:
+            with contextlib.suppress(LegsError):  # registered by an earlier run of this test
+                register_curve("test-cube", lambda x: x * x * x)
+        _, driver = chosen
+        prediction, target = images((3, 31, 25))
+        spec = replace(LEGS, **changes)
+        assert backends.fused_range(target, spec) is None
+        loss = legs_loss(prediction, target, spec)
+        assert used(loss) == "fused" and "legs_range" not in dict(driver.launches)
+        assert loss.item() == pytest.approx(legs_loss(prediction.double(), target.double(), spec).item(), rel=2e-5)
+
+    def test_what_it_does_not_take_is_torchs(self, chosen):
+        prediction, target = images((3, 20, 30))
+        assert used(legs_loss(prediction.double(), target.double())) == "torch"
+        assert used(legs_loss(prediction, target, padding="reflect")) == "torch"
+        assert used(legs_loss(prediction, target.clone().requires_grad_())) == "torch"
+        assert backends.fused_ssim(prediction, target, "valid") is None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(DEVICE.type != "cpu", reason="the sanitizers are g++'s")
+def test_no_access_is_out_of_bounds(tmp_path):
+    """Run every kernel with the address and undefined behaviour sanitizers, which end the process at a fault."""
+    found = subprocess.run([str(COMPILER), "-print-file-name=libasan.so"], capture_output=True, text=True)
+    library = found.stdout.strip()
+    if "/" not in library:
+        pytest.skip("g++ has no address sanitizer here")
+    code = (
+        "import torch\n"
+        "from legs_loss import WeightSpec\n"
+        "from legs_loss.kernels.contract import Weights\n"
+        "from legs_loss.kernels.cuda.cache import BinaryCache\n"
+        "from legs_loss.kernels.cuda.modules import Modules\n"
+        "from legs_loss.kernels.cuda.backend import CudaBackend\n"
+        "from tests.cuda_emulation import EmulatedDriver, Gpp\n"
+        "from pathlib import Path\n"
+        "flags = ['-fsanitize=address,undefined', '-fno-sanitize-recover=all', '-O1']\n"
+        f"modules = Modules(EmulatedDriver(), Gpp(flags), BinaryCache(Path({str(tmp_path)!r})))\n"
+        "backend = CudaBackend(lambda device: modules)\n"
+        "for shape in ((3, 1, 1), (1, 2, 7), (2, 3, 37, 113), (3, 130, 5)):\n"
+        "    for dtype in (torch.float32, torch.float16):\n"
+        "        x, y = torch.rand(shape).to(dtype).requires_grad_(), torch.rand(shape).to(dtype)\n"
+        "        mask = torch.rand(shape[-2:])\n"
+        "        for spec in (WeightSpec(curve='C5'), WeightSpec(operator='scharr', p=float('inf'))):\n"
+        "            weights = Weights(spec=spec, mask=mask)\n"
+        "            backend.loss(x, y, weights, 0.2).backward()\n"
+        "            backend.weighted_l1(x, y, weights).backward()\n"
+        "        backend.ssim(x, y).backward()\n"
+        "        with torch.no_grad():\n"
+        "            backend.loss(x, y, Weights(map=mask), 0.2)\n"
+        "            backend.ssim(x, y)\n"
+        "print('done')\n"
+    )
+    environment = {**legs_environment(), "LD_PRELOAD": library, "ASAN_OPTIONS": "detect_leaks=0"}
+    environment["PYTHONPATH"] += ":" + str(Path(__file__).resolve().parents[2])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.stdout == "done\n", done.stderr[-3000:]

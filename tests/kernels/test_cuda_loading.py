@@ -1,0 +1,579 @@
+"""Finding, compiling, keeping and loading the CUDA kernels, with stand-ins for the libraries; what a capture allows."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from legs_loss import LegsError, configure, l1_loss, legs_loss, ssim
+from legs_loss.kernels import backends
+from legs_loss.kernels.contract import NotNow, Weights
+from legs_loss.kernels.cuda import cache as cache_module
+from legs_loss.kernels.cuda import driver as driver_module
+from legs_loss.kernels.cuda import nvrtc
+from legs_loss.kernels.cuda.backend import CudaBackend
+from legs_loss.kernels.cuda.cache import BinaryCache, cache_folder
+from legs_loss.kernels.cuda.driver import CudaDriver, DriverError
+from legs_loss.kernels.cuda.launch import Layout, Task, chunks_of, strip_of
+from legs_loss.kernels.cuda.modules import PLAIN, Modules, Variant
+from legs_loss.kernels.cuda.nvrtc import Compiled, Compiler, CompilerError, NotFound, candidates, find_compiler
+from legs_loss.kernels.cuda.operations import Shares, fused_loss
+from legs_loss.runtime import counts, sources, state
+from legs_loss.runtime.memo import _OVERHEAD
+from legs_loss.spec import PRESETS
+from tests.kernels.support import images, used
+
+LEGS = PRESETS["legs"]
+
+
+class FakeCompiler:
+    """Compiles to the options that it was given."""
+
+    version = "12.9"
+
+    def __init__(self):
+        self.calls = []
+
+    def target(self, architecture):
+        return f"sm_{architecture}"
+
+    def compile(self, source, options, target):
+        self.calls.append((tuple(options), target))
+        return Compiled(" ".join([target, *options]).encode(), "")
+
+
+class FakeDriver:
+    """Loads anything, launches nothing, and notes it."""
+
+    architecture, multiprocessors = 90, 132
+
+    def __init__(self):
+        self.loads, self.launches, self.captures = [], [], False
+
+    def load(self, binary):
+        self.loads.append(binary)
+        return binary
+
+    def function(self, module, name):
+        return name
+
+    def launch(self, function, blocks, threads, task):
+        self.launches.append(function)
+
+    def capturing(self):
+        return self.captures
+
+
+@pytest.fixture
+def parts(tmp_path):
+    driver, compiler = FakeDriver(), FakeCompiler()
+    return driver, compiler, Modules(driver, compiler, BinaryCache(tmp_path / "kernels"))
+
+
+class TestCache:
+    def test_what_is_kept_is_found_again(self, tmp_path):
+        cache = BinaryCache(tmp_path / "a" / "b")
+        assert cache.get(b"key") is None
+        cache.put(b"key", b"binary")
+        assert cache.get(b"key") == b"binary" and cache.get(b"other") is None
+        assert len(list(cache.folder.iterdir())) == 1  # no temporary file is left
+
+    @pytest.mark.parametrize(
+        "damage", [lambda c: c[:-1], lambda c: b"", lambda c: c[:40] + b"x" + c[41:], lambda c: b"x" * 9]
+    )
+    def test_a_damaged_file_is_compiled_again(self, tmp_path, damage):
+        for _ in range(2):
+            compiler = FakeCompiler()
+            modules = Modules(FakeDriver(), compiler, BinaryCache(tmp_path))
+            modules.function("legs_scale", PLAIN)
+            assert len(compiler.calls) == 1
+            (file,) = tmp_path.iterdir()
+            file.write_bytes(damage(file.read_bytes()))
+
+    def test_a_file_under_another_key_is_not_taken(self, tmp_path):
+        cache = BinaryCache(tmp_path)
+        cache.put(b"one", b"binary")
+        (file,) = tmp_path.iterdir()
+        cache.put(b"two", b"other")
+        (second,) = set(tmp_path.iterdir()) - {file}
+        os.replace(str(file), str(second))
+        assert cache.get(b"two") is None
+
+    def test_a_folder_that_cannot_be_made_is_no_error(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        cache = BinaryCache(tmp_path / "file" / "kernels")
+        cache.put(b"key", b"binary")
+        assert cache.get(b"key") is None
+
+    def test_where_it_lies(self, tmp_path):
+        assert cache_folder({"XDG_CACHE_HOME": str(tmp_path)}, "linux") == tmp_path / "legs-loss" / "kernels"
+        assert cache_folder({"XDG_CACHE_HOME": "relative"}, "linux") == Path.home() / ".cache" / "legs-loss" / "kernels"
+        assert cache_folder({"LOCALAPPDATA": str(tmp_path)}, "win32") == tmp_path / "legs-loss" / "kernels"
+
+    def test_a_user_without_a_home_compiles_each_time(self, monkeypatch):
+        def homeless():
+            raise RuntimeError("Could not determine home directory.")
+
+        monkeypatch.setattr(Path, "home", homeless)
+        assert cache_folder({}, "linux") is None
+        compiler = FakeCompiler()
+        for _ in range(2):
+            Modules(FakeDriver(), compiler, BinaryCache(None)).function("legs_scale", PLAIN)
+        assert len(compiler.calls) == 2
+
+    def test_two_processes_compile_at_once(self, tmp_path):
+        """Each writes a file of its own and puts it in place in one step: whoever comes second finds a whole one."""
+        writers = [BinaryCache(tmp_path) for _ in range(2)]
+        first, second = tempfile.mkstemp, []
+
+        def meanwhile(**options):
+            if not second:
+                second.append(True)
+                writers[1].put(b"key", b"binary")
+            return first(**options)
+
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(cache_module.tempfile, "mkstemp", meanwhile)
+            writers[0].put(b"key", b"binary")
+        assert writers[0].get(b"key") == b"binary" and len(list(tmp_path.iterdir())) == 1
+
+
+class TestModules:
+    def test_a_variant_is_compiled_and_loaded_once(self, parts, tmp_path):
+        driver, compiler, modules = parts
+        for _ in range(2):
+            for name in ("legs_scale", "legs_finish"):
+                modules.function(name, PLAIN)
+        assert len(compiler.calls) == len(driver.loads) == 1
+        assert compiler.calls[0][1] == "sm_90" and "-DVALUE=0" in compiler.calls[0][0]
+        modules.function("legs_range", Variant(1, 3, 2))
+        assert {"-DVALUE=1", "-DSTENCIL=3", "-DNORM=2"} <= set(compiler.calls[1][0])
+
+    def test_another_process_takes_it_from_the_disk(self, parts, tmp_path):
+        parts[2].function("legs_scale", PLAIN)
+        compiler, driver = FakeCompiler(), FakeDriver()
+        Modules(driver, compiler, BinaryCache(tmp_path / "kernels")).function("legs_scale", PLAIN)
+        assert not compiler.calls and driver.loads == parts[0].loads
+
+    @pytest.mark.parametrize("change", ["compiler", "gpu", "source"])
+    def test_another_compiler_gpu_or_source_is_compiled_for(self, parts, tmp_path, monkeypatch, change):
+        parts[2].function("legs_scale", PLAIN)
+        compiler, driver = FakeCompiler(), FakeDriver()
+        if change == "compiler":
+            compiler.version = "13.0"
+        elif change == "gpu":
+            driver.architecture = 86
+        else:
+            monkeypatch.setattr("legs_loss.kernels.cuda.modules.source", lambda: b"other")
+        Modules(driver, compiler, BinaryCache(tmp_path / "kernels")).function("legs_scale", PLAIN)
+        assert len(compiler.calls) == 1
+
+    def test_nothing_is_loaded_during_a_capture(self, parts):
+        driver, compiler, modules = parts
+        modules.function("legs_scale", PLAIN)
+        driver.captures = True
+        modules.function("legs_scale", PLAIN)
+        with pytest.raises(NotNow):
+            modules.function("legs_scale", Variant(1))
+        assert len(compiler.calls) == 1
+
+
+class TestFindingNvrtc:
+    def files(self, root, *names):
+        for name in names:
+            path = root / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(b"")
+
+    def found(self, root, major, platform="linux"):
+        folders = [root / "torch" / "lib", root]
+        return [path.relative_to(root).as_posix() for path in candidates(folders, major, platform)]
+
+    def test_torch_with_cuda_11_brings_it_in_its_own_folder(self, tmp_path):
+        self.files(tmp_path, "torch/lib/libnvrtc-1ea278b5.so.11.2", "torch/lib/libnvrtc-builtins.so.11.3")
+        assert self.found(tmp_path, "11") == ["torch/lib/libnvrtc-1ea278b5.so.11.2"]
+
+    def test_torch_with_cuda_12_and_13_requires_packages_named_nvidia(self, tmp_path):
+        twelve, thirteen = "nvidia/cuda_nvrtc/lib/libnvrtc.so.12", "nvidia/cu13/lib/libnvrtc.so.13"
+        self.files(tmp_path, twelve, thirteen, "nvidia/cuda_nvrtc/lib/libnvrtc.alt.so.12")
+        self.files(tmp_path, "nvidia/cuda_nvrtc/lib/libnvrtc-builtins.so.12.9", "nvidia/cublas/lib/libcublas.so.12")
+        assert self.found(tmp_path, "12") == [twelve]
+        assert self.found(tmp_path, "13") == [thirteen]
+
+    def test_windows(self, tmp_path):
+        self.files(tmp_path, "torch/lib/nvrtc64_120_0.dll", "torch/lib/nvrtc64_120_0.alt.dll")
+        self.files(tmp_path, "torch/lib/nvrtc64_112_0.dll", "torch/lib/nvrtc-builtins64_121.dll")
+        assert self.found(tmp_path, "12", "win32") == ["torch/lib/nvrtc64_120_0.dll"]
+        assert self.found(tmp_path, "11", "win32") == ["torch/lib/nvrtc64_112_0.dll"]
+        self.files(tmp_path, "nvidia/cu13/bin/x86_64/nvrtc64_130_0.dll", "nvidia/cuda_nvrtc/bin/nvrtc64_120_0.dll")
+        assert self.found(tmp_path, "13", "win32") == ["nvidia/cu13/bin/x86_64/nvrtc64_130_0.dll"]
+        assert self.found(tmp_path, "12", "win32")[1:] == ["nvidia/cuda_nvrtc/bin/nvrtc64_120_0.dll"]
+
+    @pytest.mark.parametrize(
+        ("platform", "names"),
+        [
+            ("linux", ["libnvrtc.so.11.2", "libnvrtc.so.12", "libnvrtc.so.13"]),
+            ("win32", ["nvrtc64_112_0.dll", "nvrtc64_120_0.dll", "nvrtc64_130_0.dll"]),
+        ],
+    )
+    def test_the_name_that_the_system_looks_for(self, platform, names):
+        assert [nvrtc._plain_name(major, platform) for major in ("11", "12", "13")] == names
+
+    def test_nothing_there(self, tmp_path, monkeypatch):
+        def refuse(name):
+            raise OSError(f"{name}: cannot open shared object file")
+
+        monkeypatch.setattr(nvrtc.ctypes, "CDLL", refuse)
+        with pytest.raises(NotFound, match=r"no NVRTC of CUDA 12.4 was found: libnvrtc.so.12: cannot open"):
+            find_compiler([tmp_path], "12.4")
+
+    def test_its_builtins_are_loaded_first(self, tmp_path, monkeypatch):
+        self.files(tmp_path, "lib/libnvrtc.so.12", "lib/libnvrtc-builtins.so.12.9")
+        loaded = []
+        monkeypatch.setattr(nvrtc.ctypes, "CDLL", lambda name: loaded.append(Path(name).name) or FakeNvrtc())
+        assert find_compiler([tmp_path / "lib"], "12.9").version == "12.9"
+        assert loaded == ["libnvrtc-builtins.so.12.9", "libnvrtc.so.12"]
+
+
+class FakeNvrtc:
+    """The library, for GPUs 75 to 90; a source that says "bad" does not compile."""
+
+    def __init__(self):
+        self.nvrtcGetErrorString = lambda code: b"NVRTC_ERROR_COMPILATION"  # a function, so that restype can be set
+        self.destroyed = 0
+
+    def nvrtcVersion(self, major, minor):
+        major._obj.value, minor._obj.value = 12, 9
+        return 0
+
+    def nvrtcGetNumSupportedArchs(self, count):
+        count._obj.value = 3
+        return 0
+
+    def nvrtcGetSupportedArchs(self, numbers):
+        numbers[:] = [75, 80, 90]
+        return 0
+
+    def nvrtcCreateProgram(self, program, source, *rest):
+        self.source = source
+        return 0
+
+    def nvrtcCompileProgram(self, program, count, options):
+        self.options = [option.decode() for option in options]
+        return 6 if b"bad" in self.source else 0
+
+    def nvrtcDestroyProgram(self, program):
+        self.destroyed += 1
+        return 0
+
+    def __getattr__(self, name):
+        text = {"ProgramLog": b"note\nlegs.cu(3): error: bad\n\0", "CUBIN": b"\x7fELF", "PTX": b".version"}
+        what = name[len("nvrtcGet") :]
+        if what.endswith("Size"):
+            return lambda program, size: setattr(size._obj, "value", len(text[what[:-4]])) or 0
+        return lambda program, buffer: setattr(buffer, "raw", text[what]) or 0
+
+
+class TestCompiler:
+    def test_machine_code_for_a_known_gpu_and_ptx_for_a_newer_one(self):
+        library = FakeNvrtc()
+        compiler = Compiler(library)
+        assert compiler.target(80) == "sm_80" and compiler.target(86) == "compute_80"
+        assert compiler.target(120) == "compute_90"
+        assert compiler.compile(b"good", ["-DVALUE=0"], "sm_80").binary == b"\x7fELF"
+        assert library.options == ["--gpu-architecture=sm_80", "-DVALUE=0"]
+        assert compiler.compile(b"good", [], "compute_90").binary == b".version"
+        with pytest.raises(CompilerError, match=r"NVRTC 12.9 does not compile for sm_50"):
+            compiler.target(50)
+
+    def test_an_error_is_the_logs_first(self):
+        library = FakeNvrtc()
+        with pytest.raises(CompilerError, match=r"legs.cu\(3\): error: bad"):
+            Compiler(library).compile(b"bad", [], "sm_80")
+        assert library.destroyed == 1
+
+
+class FakeCuda:
+    """The driver's library: notes calls, and fails where it is told to."""
+
+    def __init__(self, fails=None):
+        self.calls, self.fails, self.context = [], fails, None
+
+    def __getattr__(self, name):
+        def call(*arguments):
+            self.calls.append(name)
+            if name == self.fails:
+                return 209
+            if name == "cuDevicePrimaryCtxRetain":
+                arguments[0]._obj.value = 77
+            if name == "cuCtxGetCurrent":
+                arguments[0]._obj.value = self.context
+            if name == "cuCtxSetCurrent":
+                self.context = arguments[0].value
+            if name == "cuGetErrorString":
+                arguments[1]._obj.value = b"no kernel image is available"
+            if name == "cuLaunchKernel":
+                self.grid = [argument.value for argument in arguments[1:8]]
+                self.stream = arguments[8].value
+                self.task = ctypes.cast(arguments[9][0], ctypes.POINTER(Task)).contents.strip
+                self.launched_in = self.context
+            return 0
+
+        return call
+
+
+@pytest.fixture
+def cuda(monkeypatch):
+    """torch.cuda as it is with a GPU, as far as the driver asks."""
+    properties = SimpleNamespace(major=8, minor=6, multi_processor_count=84)
+    stand_in = SimpleNamespace(
+        current_device=lambda: 0,
+        get_device_properties=lambda index: properties,
+        current_stream=lambda device: SimpleNamespace(cuda_stream=0x1234),
+        is_current_stream_capturing=lambda: False,
+    )
+    monkeypatch.setattr(
+        driver_module, "torch", SimpleNamespace(cuda=stand_in, device=torch.device, empty=lambda *args, device: None)
+    )
+
+
+class TestDriver:
+    def test_a_launch_is_on_torchs_stream_and_in_torchs_context(self, cuda):
+        library = FakeCuda()
+        driver = CudaDriver(torch.device("cuda"), library)
+        assert (driver.architecture, driver.multiprocessors) == (86, 84)
+        driver.launch(ctypes.c_void_p(5), 1000, 128, Task(strip=48))
+        assert library.grid == [1000, 1, 1, 128, 1, 1, 0]
+        assert (library.stream, library.task, library.launched_in) == (0x1234, 48, 77)
+        assert library.context is None  # the thread has again what it had
+
+    def test_a_thread_that_has_the_context_keeps_it(self, cuda):
+        library = FakeCuda()
+        driver = CudaDriver(torch.device("cuda"), library)
+        library.context = 77
+        driver.load(b"binary")
+        assert "cuCtxSetCurrent" not in library.calls
+
+    def test_a_failure_is_named(self, cuda):
+        driver = CudaDriver(torch.device("cuda"), FakeCuda("cuModuleLoadData"))
+        with pytest.raises(DriverError, match=r"cuModuleLoadData failed: no kernel image is available \(209\)"):
+            driver.load(b"binary")
+
+
+class TestLaunch:
+    def test_every_row_is_done_by_one_block(self):
+        for shape in ((1, 3, 1080, 1920), (1, 3, 533, 800), (2, 1, 7, 5), (1, 3, 2160, 3840)):
+            for multiprocessors in (1, 30, 132):
+                for wanted, core in ((True, 108), (False, 118)):
+                    strip, blocks = strip_of(torch.empty(shape, device="meta"), multiprocessors, wanted)
+                    assert strip % 4 == 0
+                    assert blocks == shape[0] * shape[1] * -(-shape[2] // strip) * -(-shape[3] // core)
+
+    def test_a_photograph_fills_a_large_gpu(self):
+        _, blocks = strip_of(torch.empty(1, 3, 1080, 1920, device="meta"), 132, True)
+        assert 0.8 * 528 <= blocks <= 1056
+        assert 132 <= chunks_of(torch.empty(1, 3, 1080, 1920, device="meta"), 132) <= 16 * 132
+
+    def test_strides_beyond_31_bits_between_views_are_fine(self):
+        task, layout = Task(), Layout(2**40, 2**33, 3840, 1)
+        task.of_target = layout
+        assert (task.of_target.view, task.of_target.channel) == (2**40, 2**33)
+
+    def test_a_gradient_of_overlapping_windows_is_addressable(self, parts, monkeypatch):
+        """As dense as memory is it would have rows of 2^24 values, and the last of them beyond 31 bits."""
+        tasks = []
+        monkeypatch.setattr(parts[0], "launch", lambda function, blocks, threads, task: tasks.append((function, task)))
+        windows = torch.empty(1 << 17, device="meta").as_strided((1, 65536, 256, 256), (0, 1, 2, 512))
+        fused_loss(
+            parts[2], windows.requires_grad_(), torch.empty(windows.shape, device="meta"), Weights(), Shares(0, 1)
+        )
+        layout = dict(tasks)["legs_ssim_gradient"].of_gradient
+        assert 255 * (layout.row + layout.column) < 2**31
+
+
+class Watched(TorchDispatchMode):
+    """Note each operation that reads a value, or copies between devices."""
+
+    def __init__(self):
+        super().__init__()
+        self.waits, self.seen = [], 0
+
+    def __torch_dispatch__(self, function, types, arguments=(), kwargs=None):
+        name = str(function)
+        self.seen += 1
+        if any(word in name for word in ("_local_scalar_dense", "item", "is_nonzero", "equal.default", "nonzero")):
+            self.waits.append(name)
+        if "_to_copy" in name and (kwargs or {}).get("device") is not None:
+            self.waits.append(name)
+        return function(*arguments, **(kwargs or {}))
+
+
+@pytest.fixture
+def on_meta(monkeypatch, parts):
+    """The backend for tensors on torch's meta device, which have no values that could be read."""
+    monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("no module", "meta")})
+    monkeypatch.setattr(
+        backends, "_findings", {"cuda meta": backends.Finding(CudaBackend(lambda _: parts[2]), True, "")}
+    )
+    monkeypatch.delenv("LEGS_BACKEND", raising=False)
+    return parts[0]
+
+
+class TestNothingWaits:
+    @pytest.mark.parametrize("kind", ["spec", "map", "mask", "half", "five channels, last", "kept range", "l1", "ssim"])
+    def test_no_operation_reads_a_value(self, on_meta, kind):
+        shape = (2, 40, 50, 5) if kind.startswith("five") else (2, 3, 40, 50)
+        prediction, target = (torch.empty(shape, device="meta") for _ in range(2))
+        if kind == "half":
+            prediction, target = prediction.half(), target.half()
+        prediction.requires_grad_()
+        one = torch.empty(40, 50, device="meta")
+        with Watched() as watched:
+            if kind == "l1":
+                loss = backends.fused_l1(prediction, target, Weights(spec=LEGS))
+            elif kind == "ssim":
+                loss = backends.fused_ssim(prediction, target)
+            elif kind == "kept range":
+                found = backends.fused_range(target, LEGS)
+                loss = backends.fused_l1(prediction, target, Weights(spec=LEGS, range=found))
+            else:
+                options = {
+                    "map": {"weight": one},
+                    "mask": {"mask": one, "renormalise": True},
+                    "five channels, last": {"channels_last": True},
+                }
+                loss = legs_loss(prediction, target, **options.get(kind, {}))
+            loss.backward()
+        assert used(loss) == "fused" and on_meta.launches[-1] == "legs_scale"
+        assert prediction.grad.shape == shape and prediction.grad.dtype == prediction.dtype
+        assert watched.seen > 0 and not watched.waits
+
+    def test_a_patched_scripts_step_launches_six_kernels_and_remembers_its_view(self, on_meta):
+        prediction, target = (torch.empty(3, 40, 50, device="meta") for _ in range(2))
+        prediction.requires_grad_()
+        configure("legs")
+        for step in range(2):
+            with Watched() as watched:
+                loss, similarity = l1_loss(prediction, target, view="a"), ssim(prediction, target)
+                (0.8 * loss + 0.2 * (1.0 - similarity)).backward()
+            assert used(loss) == used(similarity) == "fused" and not watched.waits
+            found = ["legs_range", "legs_range_finish"] if step == 0 else []
+            sums = ["legs_l1_gradient", "legs_finish", "legs_ssim_gradient", "legs_finish"]
+            assert on_meta.launches == [*found, *sums, "legs_scale", "legs_scale"]
+            on_meta.launches.clear()
+
+    def test_the_watch_sees_what_waits(self):
+        with Watched() as watched:
+            bool(torch.ones(1).sum() > 0)
+            torch.ones(1).to("meta")
+        assert len(watched.waits) == 2
+
+    def test_launches_of_a_step(self, on_meta):
+        prediction, target = (torch.empty(3, 1080, 1920, device="meta") for _ in range(2))
+        loss = legs_loss(prediction.requires_grad_(), target)
+        assert on_meta.launches == ["legs_range", "legs_range_finish", "legs_loss_gradient", "legs_finish"]
+        loss.backward()
+        assert on_meta.launches[4:] == ["legs_scale"]
+
+
+class TestDropIn:
+    """`l1_loss` and `ssim`, what a patched script calls."""
+
+    @pytest.fixture(autouse=True)
+    def fresh(self):
+        state.reset()
+        configure("legs")
+        yield
+        state.reset()
+
+    def test_a_step_waits_for_nothing_and_remembers_two_numbers_a_view(self, on_meta):
+        stored = [torch.empty(4, 40, 50, device="meta") for _ in range(2)]
+        prediction = torch.empty(3, 40, 50, device="meta", requires_grad=True)
+        with Watched() as watched:
+            for step in range(4):
+                target = stored[step % 2][:3]  # a new view of the same memory at each step
+                loss = 0.8 * l1_loss(prediction, target, view="a") + 0.2 * (1.0 - ssim(prediction, target))
+                loss.backward()
+        assert used(loss) == "fused" and watched.seen > 0 and not watched.waits
+        assert on_meta.launches.count("legs_range") == 2
+        assert (counts().computed, counts().remembered) == (2, 2)
+        assert state.current_run().source.memo.bytes == 2 * (_OVERHEAD + 8)
+
+    def test_a_capture_makes_the_range_part_of_the_graph(self, on_meta, monkeypatch):
+        target = torch.empty(3, 40, 50, device="meta")
+        prediction = torch.empty(3, 40, 50, device="meta", requires_grad=True)
+        l1_loss(prediction, target)
+        monkeypatch.setattr(sources, "is_capturing", lambda device: True)
+        for _ in range(2):
+            assert used(l1_loss(prediction, target)) == "fused"
+        assert on_meta.launches.count("legs_range") == 3
+        assert (counts().computed, counts().remembered) == (3, 0)
+
+
+class TestCapture:
+    def test_a_kernel_that_is_not_loaded_is_torchs_while_a_capture_lasts(self, monkeypatch, tmp_path):
+        driver = FakeDriver()
+        backend = CudaBackend(lambda _: Modules(driver, FakeCompiler(), BinaryCache(tmp_path)))
+        monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("no module", "cpu")})
+        monkeypatch.setattr(backends, "_findings", {"cuda cpu": backends.Finding(backend, True, "")})
+        prediction, target = images((3, 20, 30))
+        driver.captures = True
+        assert used(legs_loss(prediction, target)) == "torch" and not driver.launches
+        driver.captures = False
+        assert used(legs_loss(prediction, target)) == "fused"
+        driver.captures = True
+        loss = legs_loss(prediction, target)
+        loss.backward()
+        assert used(loss) == "fused" and driver.launches[-1] == "legs_scale"
+
+    def test_the_trial_does_not_run_in_a_capture(self, monkeypatch):
+        monkeypatch.setattr(backends, "_findings", {})
+        monkeypatch.setattr(backends, "is_capturing", lambda device: True)
+        monkeypatch.setattr(backends, "_try", lambda *_: pytest.fail("a trial waits for the device"))
+        assert used(legs_loss(*images((3, 20, 30)))) == "torch"
+        assert not backends._findings
+
+
+class TestFailures:
+    @pytest.mark.parametrize(
+        ("error", "said"),
+        [
+            (NotFound("no NVRTC of CUDA 12.4 was found"), "NotFound: no NVRTC of CUDA 12.4 was found"),
+            (OSError("libcuda.so.1: cannot open"), "OSError: libcuda.so.1: cannot open"),
+            (DriverError("cuModuleLoadData failed"), "DriverError: cuModuleLoadData failed"),
+        ],
+    )
+    def test_what_cannot_load_is_said_once_and_torch_computes(self, monkeypatch, capfd, error, said):
+        def broken(_):
+            raise error
+
+        module = SimpleNamespace(BACKEND=CudaBackend(broken))
+        monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("broken", "cpu")})
+        monkeypatch.setattr(backends, "_findings", {})
+        monkeypatch.setattr(backends.importlib, "import_module", lambda name: module)
+        monkeypatch.setattr(backends, "_missing", lambda name: None)
+        for _ in range(2):
+            assert used(legs_loss(*images((3, 20, 30)))) == "torch"
+        assert capfd.readouterr().err == f"legs-loss: cuda is not used, torch is: {said}\n"
+
+    def test_a_torch_without_cuda_is_no_failure(self, monkeypatch, capfd):
+        monkeypatch.setattr(backends, "_findings", {})
+        monkeypatch.setattr(torch.version, "cuda", None)
+        found = backends.finding("cuda", torch.device("cuda"))
+        assert found == backends.Finding(None, False, "this torch is built without CUDA")
+        assert capfd.readouterr().err == ""
+
+    def test_images_that_do_not_fit_their_map_are_still_an_error(self, on_meta):
+        with pytest.raises(LegsError, match="weight"):
+            legs_loss(*(torch.empty(3, 8, 8, device="meta") for _ in range(2)), weight=torch.empty(4, 4, device="meta"))
+
+    def test_shares(self, parts):
+        assert fused_loss(parts[2], *(torch.empty(3, 8, 8, device="meta"),) * 2, Weights(), Shares(0.0, 1.0)).dim() == 0
+        assert parts[0].launches == ["legs_ssim_value", "legs_finish"]

@@ -1,0 +1,79 @@
+"""The codebases under tests/patching, as folders; and what their comments say must become of each line."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+from tests.support import ROOT, legs_environment
+
+CASES = ROOT / "tests" / "patching"
+NAMES = sorted(path.stem for path in CASES.glob("*.txt") if path.stem != "common")
+_MARK = re.compile(r"^\s*# (weighted|plain|fused|left|error): (.*)$")
+
+
+def with_ssim(name):
+    """Return whether a case is of legs-patch --ssim."""
+    return name.startswith("ssim")
+
+
+def files(name):
+    """Return the files of a case by path, with what most codebases share."""
+    found = {}
+    for part in ("common", name):
+        for section in re.split(r"^=== ", (CASES / f"{part}.txt").read_text(encoding="utf-8"), flags=re.M)[1:]:
+            path, _, text = section.partition("\n")
+            found[path.strip()] = text
+    return found
+
+
+def expected(texts):
+    """Return {(path, line): (verdict, detail)} from the comments."""
+    marks = {}
+    for path, text in texts.items():
+        for number, line in enumerate(text.splitlines(), 1):
+            match = _MARK.match(line)
+            if match:
+                marks[path, number + 1] = match.group(1), match.group(2)
+    return marks
+
+
+def checkout(folder, texts, git=False):
+    """Write a codebase to a folder, on request as a git checkout, and return the folder."""
+    for path, text in texts.items():
+        target = folder / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8"))
+    if git:
+        run_git(folder, "init", "-q")
+        run_git(folder, "add", ".")
+        run_git(folder, "commit", "-q", "-m", "start")
+    return folder
+
+
+def run_git(folder, *arguments):
+    """Run git there, whatever this machine's own settings say."""
+    environment = dict(os.environ, GIT_CONFIG_GLOBAL=os.devnull, GIT_CONFIG_SYSTEM=os.devnull)
+    for who in ("AUTHOR", "COMMITTER"):
+        environment[f"GIT_{who}_NAME"] = environment[f"GIT_{who}_EMAIL"] = "test"
+    return subprocess.run(
+        ["git", "-C", str(folder), *arguments], check=True, env=environment, stdout=subprocess.PIPE, text=True
+    ).stdout
+
+
+def snapshot(folder):
+    """Return every file's bytes, .git excepted."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and ".git" not in path.parts and "__pycache__" not in path.parts
+    }
+
+
+def legs_patch(*arguments, **options):
+    """Run ``legs-patch`` as a real subprocess and return the completed process, with text output."""
+    command = [sys.executable, "-m", "legs_adapters.cli", *map(str, arguments)]
+    options = {"env": legs_environment(), "timeout": 300, **options}
+    return subprocess.run(command, capture_output=True, text=True, **options)

@@ -1,0 +1,176 @@
+"""Each rule leaves its first example, by a line that decides, and not its second; the documents follow the rules."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from textwrap import indent
+
+import pytest
+from legs_adapters.plan import plan
+from legs_adapters.rules.document import describe, explain, table
+from legs_adapters.rules.order import RULES
+from legs_adapters.rules.rule import Rule
+
+from legs_loss import LegsError
+from tests.patcher.support import checkout, files, legs_patch
+
+IMPORTS = """\
+import torch
+import torch.nn.functional as F
+from gaussian_renderer import render
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from utils.loss_utils import l1_loss, ssim
+
+
+"""
+STEP = """\
+def training(cameras, gaussians, initial_scaling):
+    for camera in cameras:
+        package = render(camera, gaussians, None, None)
+        image, gt = package["render"], camera.original_image
+{}
+        loss.backward()
+        gaussians.optimizer.step()
+        gaussians.optimizer.zero_grad()
+"""
+
+
+def planned(folder, example, ssim=False):
+    """Return the plan of a codebase whose train.py is an example, and the example's first and last line in it."""
+    text = example if re.match("(import|from) ", example) else IMPORTS + example
+    if not re.search("^(import|from|def|class) ", example, re.M):
+        text = IMPORTS + STEP.format(indent(example, 8 * " "))
+    text += "\n"
+    first = text[: text.index(example.splitlines()[0])].count("\n") + 1
+    other = IMPORTS + STEP.format("        loss = l1_loss(image, gt)")  # so that no other term has to be the loss
+    texts = dict(files("ssim" if ssim else "inria"), **{"train.py": text, "other.py": other})
+    return plan(checkout(folder, texts), ssim=ssim), first, first + example.count("\n")
+
+
+@pytest.mark.parametrize("rule", RULES.values(), ids=lambda rule: rule.id)
+def test_a_rule_leaves_its_example_and_names_the_line_that_decided(rule, tmp_path):
+    found, first, last = planned(tmp_path, describe(rule).left, rule.id.startswith("ssim-"))
+    left = [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert rule.id in [entry.evidence.rule for entry in left]
+    for entry in left:
+        assert entry.reason == RULES[entry.evidence.rule].reason
+        if entry.evidence.rule == rule.id:
+            lines = entry.evidence.lines
+            assert lines
+            for line in lines:
+                assert line.path == "train.py"
+                assert first <= line.line <= last or line.text.startswith("def training(")
+                assert (tmp_path / line.path).read_text().splitlines()[line.line - 1].strip() == line.text
+
+
+@pytest.mark.parametrize("rule", RULES.values(), ids=lambda rule: rule.id)
+def test_the_other_example_of_a_rule_is_weighted(rule, tmp_path):
+    found, first, last = planned(tmp_path, describe(rule).weighted, rule.id.startswith("ssim-"))
+    lines = [site.line for site in found.findings.sites if site.path == "train.py"]
+    assert lines
+    assert first <= min(lines) <= max(lines) <= last
+    assert not [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert not found.findings.problems
+
+
+def test_every_rule_in_the_causes_has_a_place_in_the_order():
+    def leaves(kind):
+        return [leaf for each in kind.__subclasses__() for leaf in (leaves(each) or [each])]
+
+    assert {type(rule) for rule in RULES.values()} == {kind for kind in leaves(Rule) if kind.id}
+    assert len(RULES) == len({type(rule) for rule in RULES.values()})
+
+
+def test_the_report_names_the_rule_and_the_line_that_decided(tmp_path):
+    root = checkout(tmp_path, files("inria"))
+    shown = legs_patch("--check", root).stdout
+    assert "train.py:32            skipped (evaluation)  rule evaluation, line 29: with torch.no_grad():\n" in shown
+    left = json.loads(legs_patch("--check", "--json", root).stdout)["left"]
+    assert left[0]["rule"] == left[0]["reason"] == "evaluation"
+    assert left[0]["because"] == [{"file": "train.py", "line": 29, "code": "with torch.no_grad():"}]
+
+
+def test_the_condition_that_decides_is_the_one_around_the_term(tmp_path):
+    example = (
+        "def step(gaussians, camera, tracking):\n"
+        "    if tracking:\n"
+        "        print('tracking')\n"
+        "    image = render(camera, gaussians, None, None)['render']\n"
+        "    if tracking and camera.skipped:\n"
+        "        return\n"
+        "    elif tracking:\n"
+        "        l1_loss(image, camera.original_image).backward()\n"
+        "        gaussians.optimizer.step()\n"
+    )
+    found, first, _ = planned(tmp_path, example)
+    [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert left.evidence.rule == "tracking"
+    assert [(line.line - first, line.text) for line in left.because] == [(6, "elif tracking:")]
+
+
+def test_the_def_that_decides_is_found_below_its_decorators_and_namesakes(tmp_path):
+    example = (
+        "def evaluate(gaussians, camera):\n"
+        "    return None\n\n\n"
+        "@torch.jit.ignore\n"
+        "async  def evaluate(\n"
+        "    gaussians,  # def evaluate(\n"
+        "    camera,\n"
+        "):\n"
+        "    image = render(camera, gaussians, None, None)['render']\n"
+        "    return l1_loss(image, camera.original_image)\n"
+    )
+    found, first, _ = planned(tmp_path, example)
+    [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert left.evidence.rule == "evaluation"
+    assert [(line.line - first, line.text) for line in left.because] == [(5, "async  def evaluate(")]
+
+
+def test_a_term_outside_of_functions_is_decided_by_its_own_line(tmp_path):
+    example = "import torch\nfrom utils.loss_utils import l1_loss\n\nprint(l1_loss(image, gt_image))\n"
+    found, _, _ = planned(tmp_path, example)
+    [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert left.evidence.rule == "untrained"
+    assert [line.line for line in left.because] == [4]
+
+
+def test_a_default_that_decides_is_shown_by_the_def_it_stands_in(tmp_path):
+    example = (
+        "def step(gaussians, camera, predicted, key='rendered_mask'):\n"
+        "    predicted = predicted(camera)\n"
+        "    torch.abs(predicted[key] - camera.targets[key]).mean().backward()\n"
+        "    gaussians.optimizer.step()\n"
+    )
+    found, first, _ = planned(tmp_path, example)
+    [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
+    assert left.evidence.rule == "mask"
+    assert [line.line for line in left.because] == [first]
+
+
+def test_explain_prints_a_rule_or_all_of_a_reason_or_the_list():
+    done = legs_patch("--explain", "huber")
+    assert done.returncode == 0
+    assert "skipped (huber)" in done.stdout
+    assert indent(describe(RULES["huber"]).left, "    ") in done.stdout
+    assert [line.split(":")[0] for line in explain("not torch").splitlines()[:1]] == ["not-torch"]
+    assert explain("regulariser").count("skipped (regulariser)") == 4
+    listing = legs_patch("--explain")
+    assert listing.returncode == 0
+    assert all(f"  {name} " in listing.stdout for name in RULES)
+
+
+def test_explain_of_an_unknown_rule_lists_those_there_are():
+    done = legs_patch("--explain", "dept")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "there is no rule 'dept'; did you mean depth?" in done.stderr
+    assert all(f"  {name} " in done.stderr for name in RULES)
+    with pytest.raises(LegsError, match="there is no rule 'xyzzy'\n"):
+        explain("xyzzy")
+
+
+def test_the_table_of_reasons_in_the_documents_is_current():
+    page = (Path(__file__).parents[2] / "docs" / "patching.md").read_text(encoding="utf-8")
+    assert f"-->\n{table()}<!-- end of the rules -->" in page

@@ -1,0 +1,155 @@
+"""Which L1 terms are chosen, what they become, and why the others are left: scripts in the shapes met in the wild."""
+
+from __future__ import annotations
+
+import pytest
+from legs_adapters.code.sources import decode
+from legs_adapters.plan import plan
+from legs_adapters.terms.functions import L1Functions
+
+from tests.patcher.support import NAMES, checkout, expected, files, legs_patch, with_ssim
+
+
+def changed_lines(found, path):
+    """Return the lines of a file after the patch, without the import: numbered as before."""
+    lines = decode(path, found.after[path]).text.splitlines()
+    return [line for line in lines if not line.startswith("import legs_loss")]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_term_gets_the_verdict_that_its_comment_asks_for(name, tmp_path):
+    texts = files(name)
+    found = plan(checkout(tmp_path, texts), ssim=with_ssim(name))
+    verdicts = {}
+    for site in found.findings.sites:
+        becomes = "weighted" if site.form.weighs else "fused"
+        verdicts[site.path, site.line] = becomes, changed_lines(found, site.path)[site.line - 1].strip()
+    for kept in found.findings.kept:
+        verdicts[kept.path, kept.line] = "plain", changed_lines(found, kept.path)[kept.line - 1].strip()
+    for entry in found.findings.left:
+        verdicts.setdefault((entry.path, entry.line), ("left", entry.reason))
+    for entry in found.findings.problems:
+        verdicts[entry.path, entry.line] = "error", entry.reason
+    wanted = expected(texts)
+    assert {where: verdict for where, (verdict, _) in verdicts.items()} == {
+        where: verdict for where, (verdict, _) in wanted.items()
+    }
+    for where, (verdict, detail) in wanted.items():
+        if verdict == "error":
+            assert detail in verdicts[where][1]
+        else:
+            assert verdicts[where][1] == detail
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_patched_files_compile_and_a_second_patch_finds_nothing(name, tmp_path):
+    found = plan(checkout(tmp_path, files(name)), ssim=with_ssim(name))
+    for path, data in found.after.items():
+        compile(data, path, "exec")
+        (tmp_path / path).write_bytes(data)
+    assert plan(tmp_path, ssim=with_ssim(name)).after == {}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_place_every_line_keeps_its_number(name, tmp_path):
+    root = checkout(tmp_path, files(name))
+    ssim = with_ssim(name)
+    here, on_disk = plan(root, in_place=True, ssim=ssim), plan(root, ssim=ssim)
+    assert sorted(here.after) == sorted(on_disk.after)
+    for path, data in here.after.items():
+        before = (root / path).read_bytes()
+        if name != "taken":  # nothing to put the import on: its own line
+            assert data.count(b"\n") == before.count(b"\n")
+        edits = [edit for edit in here.edits[path] if b"import legs_loss" not in edit.after]
+        assert edits == [edit for edit in on_disk.edits[path] if b"import legs_loss" not in edit.after]
+
+
+def test_a_site_chosen_by_hand_is_the_only_one(tmp_path):
+    root = checkout(tmp_path, files("traps"))
+    lines = files("traps")["train.py"].splitlines()
+    line = lines.index("        Ll1 = l1_loss(rendered, target_image)") + 1
+    found = plan(root, by_hand=[("train.py", line)])
+    assert [(site.path, site.line) for site in found.findings.sites] == [("train.py", line)]
+
+
+def test_a_vendored_network_that_is_not_about_splats_is_left(tmp_path):
+    texts = files("inria")
+    texts["depth_network/train.py"] = (
+        "import torch\n\n\n"
+        "def step(network, batch):\n"
+        "    predicted_img = network(batch['input'])\n"
+        "    img = batch['image']\n"
+        "    loss = torch.nn.functional.l1_loss(predicted_img, img)\n"
+        "    loss.backward()\n"
+    )
+    found = plan(checkout(tmp_path, texts))
+    assert [site.path for site in found.findings.sites] == ["train.py"]
+    assert ("depth_network/train.py", "other") in [(entry.path, entry.reason) for entry in found.findings.left]
+
+
+def test_a_value_with_very_many_ways_to_come_about_is_followed_once(tmp_path):
+    # Each branch doubles the ways: 2^30 of them, if each were gone for itself.
+    branches = "".join(f"        if opt.stage > {k}:\n            image += opt.noise\n" for k in range(30))
+    texts = files("inria")
+    before, line, after = texts["train.py"].partition("        gt_image = viewpoint_cam.original_image.cuda()\n")
+    texts["train.py"] = before + branches + line + after
+    found = plan(checkout(tmp_path, texts))
+    assert [site.view.text for site in found.findings.sites] == ["viewpoint_cam.image_name"]
+
+
+def test_functions_that_call_each_other_are_each_looked_into_once(tmp_path, monkeypatch):
+    names = [f"l1_of_{k}" for k in range(8)]
+    bodies = {name: "".join(f"    total += {other}(a, b)\n" for other in names if other != name) for name in names}
+    functions = "".join(f"def {name}(a, b, total=0):\n{body}    return total\n\n\n" for name, body in bodies.items())
+    texts = files("inria")
+    texts["utils/loss_utils.py"] += f"\n\n{functions}def mean_of(a, b):\n    return l1_loss(a, b) + l1_of_0(a, b)\n"
+    texts["train.py"] = texts["train.py"].replace("l1_loss", "mean_of")
+    looked_into = []
+    meets = L1Functions._meet_in_differences
+    monkeypatch.setattr(L1Functions, "_meet_in_differences", lambda *args: looked_into.append(args[1]) or meets(*args))
+    plan(checkout(tmp_path, texts))
+    assert len(looked_into) == len(set(looked_into)) >= len(names)
+
+
+def test_a_script_that_trains_without_a_site_is_named_beside_the_sites_of_others(tmp_path):
+    distils = (
+        "from gaussian_renderer import render\nfrom utils.loss_utils import l1_loss\n\n\n"
+        "def refine(scene, student, teacher):\n    for cam in scene:\n"
+        '        image, target = render(cam, student, 0, 0)["render"], render(cam, teacher, 0, 0)["render"]\n'
+        "        loss = l1_loss(image, target)\n        loss.backward()\n"
+    )
+    texts = files("inria")
+    texts["refine.py"] = distils
+    texts["train.py"] += distils.replace("def refine", "def refine_too")
+    found = plan(checkout(tmp_path, texts))
+    assert {site.path for site in found.findings.sites} == {"train.py"}
+    assert [(doubt.path, doubt.line) for doubt in found.findings.doubts] == [("refine.py", 8)]
+    done = legs_patch("--diff", tmp_path)
+    assert done.returncode == 0
+    assert "warning: a possible loss was not weighted: refine.py:8" in done.stderr
+
+
+def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path):
+    texts = {
+        "losses.py": (
+            "from torch import nn\n\n\n"
+            "class MaskedL1(nn.Module):\n    def __init__(self):\n        super().__init__()\n"
+            '        self.l1_loss = nn.L1Loss(reduction="none")\n\n    def forward(self, pred, target, mask):\n'
+            "        return self.l1_loss(pred, target) * mask + self.ssim(pred, target)\n"
+        ),
+        "train.py": (
+            "from gaussian_renderer import render\nfrom losses import MaskedL1\n\n\ndef training(scene, gaussians):\n"
+            "    pictures, depths = MaskedL1(), MaskedL1()\n    for cam in scene:\n"
+            "        package = render(cam, gaussians, None, None)\n"
+            '        loss = pictures(package["render"], cam.original_image, cam.valid).mean()\n'
+            '        loss += depths(package["depth"], cam.depth, cam.valid).mean()\n        loss.backward()\n'
+        ),
+    }
+    (problem,) = plan(checkout(tmp_path, texts)).findings.problems
+    assert problem.advice == "legs_loss.l1_loss(pred, target, own=self.l1_loss), in a copy of MaskedL1 for train.py:9"
+
+
+def test_the_advice_for_a_difference_weights_it_where_its_absolute_value_is_taken(tmp_path):
+    weighted_before, taken = plan(checkout(tmp_path, files("signed_differences"))).findings.problems
+    assert weighted_before.advice == "torch.abs(legs_loss.weight_map(gt_image) * value).mean()"
+    assert taken.advice == "robust(legs_loss.weight_map(gt_image * cam.seen) * residual, cam.scale)"

@@ -1,0 +1,91 @@
+"""Each kind of photometric term: the example in its docstring is planned, and gives what the docstring says."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import re
+
+import pytest
+
+pytest.importorskip("libcst")
+
+from legs_adapters.plan import plan
+from legs_adapters.terms import kinds
+from legs_adapters.terms.form import Form
+
+from tests.patcher.support import checkout, files
+
+MODULES = [importlib.import_module(f"{kinds.__name__}.{info.name}") for info in pkgutil.iter_modules(kinds.__path__)]
+KINDS = sorted(
+    {c for m in MODULES for c in vars(m).values() if inspect.isclass(c) and issubclass(c, Form) and c is not Form},
+    key=lambda kind: kind.__name__,
+)
+
+SCRIPT = """import torch
+import torch.nn.functional as F
+from gaussian_renderer import render
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from utils.loss_utils import l1_loss, ssim
+
+
+def relative(image, gt):
+    return (image - gt) / (gt + 0.01)
+
+
+def robust(residual, c):
+    return (residual.abs() / c).mean()
+
+
+def combined(image, gt, functions):
+    return functions[0](image, gt)
+
+
+def training(dataset, pipe, background):
+    gaussians = GaussianModel(3)
+    scene = Scene(dataset, gaussians)
+    for cam in scene.getTrainCameras():
+        image = render(cam, gaussians, pipe, background)["render"]
+        gt_image = cam.original_image.cuda()
+        {step}
+        loss.backward()
+        gaussians.optimizer.step()
+"""
+
+
+def example(kind):
+    """Return the lines of a kind's example by their labels."""
+    return dict(re.findall(r"^ *(before|after|advice): (.+)$", inspect.getdoc(kind), re.M))
+
+
+def step(code):
+    return code.replace("; ", "\n        ")
+
+
+def planned(tmp_path, code, ssim=False):
+    shared = {path: text for path, text in files("ssim" if ssim else "common").items() if path != "train.py"}
+    return plan(checkout(tmp_path, {**shared, "train.py": SCRIPT.replace("{step}", step(code))}), ssim=ssim)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_the_example_gives_what_the_docstring_says(tmp_path, kind):
+    said = example(kind)
+    found = planned(tmp_path, said["before"], ssim=not kind.weighs)
+    if "after" in said:
+        assert step(said["after"]) in found.after["train.py"].decode()
+    else:
+        assert [problem.advice for problem in found.findings.problems] == [said["advice"]]
+
+
+def test_every_kind_is_found_by_itself():
+    assert {kind.__name__ for kind in KINDS} >= {
+        "Absolute",
+        "Called",
+        "Named",
+        "PassedByName",
+        "Reread",
+        "Structural",
+        "Wrapped",
+    }

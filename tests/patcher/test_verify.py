@@ -1,0 +1,95 @@
+"""legs-patch --verify on a training codebase in the shape of the public ones."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from legs_adapters.verify import Run, Verdict
+
+from tests.patcher.support import checkout, legs_patch, snapshot
+from tests.shims.test_run import texts
+
+pytest.importorskip("numba")
+pytest.importorskip("scipy")
+
+
+def verify(root, *arguments):
+    return legs_patch("--verify", "--json", "--iterations", "6", root, *arguments, timeout=900)
+
+
+def verdict(done):
+    """What was printed after the patch's own report."""
+    return json.loads(done.stdout[done.stdout.rindex('{"holds"') :])
+
+
+@pytest.mark.slow
+class TestVerify:
+    def test_a_patch_that_took(self, tmp_path):
+        root = checkout(tmp_path / "miniature", texts())
+        unpatched = snapshot(root)
+        done = verify(root)
+        assert done.returncode == 0, done.stdout + done.stderr
+        found = verdict(done)
+        assert all(found["holds"].values())
+        runs = found["runs"]
+        assert runs["unpatched"]["losses"] == runs["LEGS_OFF"]["losses"] != runs["patched"]["losses"]
+        assert len(runs["patched"]["losses"]) == 6
+        patched = runs["patched"]
+        # The script's own log of the L1 under no_grad is a plain mean.
+        assert (patched["weighted"], patched["weighted_without_gradient"]) == (6, 0)
+        assert patched["stored"] == 6
+        assert patched["computed"] == 0
+        assert all(0 < seconds < 600 for seconds in patched["seconds"])
+        # The folder is as the patch alone leaves it.
+        after = snapshot(root)
+        assert {name for name in after if after[name] != unpatched.get(name)} == {
+            "train.py", "legs.toml", ".legs-patch.json",
+        }  # fmt: skip
+        again = verify(root)  # patched before
+        assert again.returncode == 0, again.stdout + again.stderr
+        assert legs_patch("--undo", root).returncode == 0
+        assert snapshot(root) == unpatched
+
+    def test_one_that_changes_nothing_is_found_out(self, tmp_path):
+        root = checkout(tmp_path / "miniature", texts())
+        done = verify(root, "--preset", "3dgs")
+        assert done.returncode == 1
+        failed = {claim for claim, held in verdict(done)["holds"].items() if not held}
+        assert failed == {"with LEGS every loss is another", "every step was weighted"}
+
+    def test_a_script_that_cannot_run_is_shown(self, tmp_path):
+        found = texts()
+        found["train.py"] = found["train.py"].replace("    safe_state()\n", "    safe_state()\n    1 / 0\n")
+        done = legs_patch("--verify", checkout(tmp_path / "miniature", found), timeout=900)
+        assert done.returncode == 1
+        assert "FAILS      all three trained" in done.stdout
+        assert "ZeroDivisionError" in done.stdout
+
+
+class TestReport:
+    def test_both_steps_times_are_compared(self):
+        plain = Run(0, ["0x1p+0"] * 4, [0.05, 0.04, 0.01], 0, 0, 4, 0, 0, 0, "")
+        patched = plain._replace(seconds=[0.05, 0.06, 0.9])
+        found = Verdict({"unpatched": plain, "patched": patched, "LEGS_OFF": plain}, {}).text()
+        assert "unpatched  4 steps, 40 ms a step" in found
+        assert "step       patched takes 1.50 times the unpatched one's time (medians)" in found
+
+    def test_a_run_without_steps_is_not_compared(self):
+        ended = Run(1, [], [], 0, 0, 0, 0, 0, 0, "error")
+        found = Verdict({"unpatched": ended, "patched": ended, "LEGS_OFF": ended}, {}).text()
+        assert "no step, exit code 1" in found and "times the" not in found
+
+
+class TestUsage:
+    def test_no_such_script(self, tmp_path):
+        root = checkout(tmp_path / "miniature", texts())
+        done = verify(root, "--script", "nowhere.py")
+        assert done.returncode == 2
+        assert "there is no nowhere.py" in done.stderr
+
+    def test_an_unknown_place_in_the_arguments(self, tmp_path):
+        root = checkout(tmp_path / "miniature", texts())
+        done = verify(root, "--arguments", "-s {secen}")
+        assert done.returncode == 2
+        assert "only {scene}, {output}, {iterations}, {port}" in done.stderr

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 
 import pytest
@@ -11,17 +9,7 @@ import torch
 import torch.nn.functional as F
 
 from legs_loss import LegsError, configure, l1_loss, unweighted, weight_map
-from legs_loss.runtime import active, counts, state
-
-
-@pytest.fixture(autouse=True)
-def fresh(monkeypatch, tmp_path):
-    """Each test is a run of its own, started in an empty folder."""
-    for name in [name for name in os.environ if name.startswith("LEGS_")]:
-        monkeypatch.delenv(name)
-    state.reset()
-    monkeypatch.setattr(sys, "argv", ["train.py"])
-    monkeypatch.chdir(tmp_path)
+from legs_loss.runtime import active, counts
 
 
 def pair(*shape):

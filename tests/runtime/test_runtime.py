@@ -1,4 +1,4 @@
-"""The drop-in l1_loss: when it weights, where the weight comes from, and that it never uses another target's."""
+"""The drop-in l1_loss: when it weights, what it remembers, its variables."""
 
 from __future__ import annotations
 
@@ -7,40 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from legs_loss import LegsError, WeightSpec, configure, l1_loss, weight_map
-from legs_loss.kernels.backends import is_capturing
-from legs_loss.precompute import precompute
-from legs_loss.runtime import counts, memo, sources, state
-from legs_loss.scenes import read_scene
-from legs_loss.weights import error_weight_map
+from legs_loss.runtime import counts, memo, state
+from tests.runtime.support import pair, plain, weighted
 from tests.support import legs_environment
-
-
-@pytest.fixture(autouse=True)
-def fresh(monkeypatch, tmp_path):
-    """Each test is a run of its own, started in an empty folder."""
-    for name in [name for name in os.environ if name.startswith("LEGS_")]:
-        monkeypatch.delenv(name)
-    state.reset()
-    monkeypatch.setattr(sys, "argv", ["train.py"])
-    monkeypatch.chdir(tmp_path)
-
-
-def pair(*shape):
-    return torch.rand(shape, requires_grad=True), torch.rand(shape)
-
-
-def plain(prediction, target):
-    return torch.abs(prediction - target).mean()
-
-
-def weighted(prediction, target, spec="legs"):
-    return (weight_map(target, spec) * torch.abs(prediction - target)).mean()
 
 
 class TestWhenItWeights:
@@ -193,95 +166,6 @@ class TestMemo:
         assert counts().remembered > 50
 
 
-@pytest.fixture
-def scene(tmp_path):
-    """Three photographs in a folder, with their stored maps."""
-    folder = tmp_path / "scene" / "images"
-    folder.mkdir(parents=True)
-    generator = np.random.default_rng(0)
-    for name in ("a.png", "b.png", "c.png"):
-        Image.fromarray(generator.integers(0, 256, (9, 8, 3), dtype=np.uint8)).save(folder / name)
-    precompute(read_scene(folder.parent))
-    return folder.parent
-
-
-def photograph(scene, name):
-    return torch.from_numpy(np.array(Image.open(scene / "images" / name))).float().div(255).movedim(-1, 0)
-
-
-class TestStore:
-    def test_a_stored_map_is_used_for_its_own_image(self, scene):
-        configure("legs", store=scene / "legs_weights")
-        prediction, target = torch.rand(3, 9, 8, requires_grad=True), photograph(scene, "a.png")
-        for _ in range(3):
-            loss = l1_loss(prediction, target, view="a")
-            torch.testing.assert_close(loss, weighted(prediction, target), rtol=1e-3, atol=0)
-        assert (counts().stored, counts().computed, counts().remembered) == (1, 0, 2)
-
-    def test_the_scene_after_minus_s_is_found_by_itself(self, scene, monkeypatch):
-        monkeypatch.setattr(sys, "argv", ["train.py", "-s", str(scene)])
-        l1_loss(torch.rand(3, 9, 8, requires_grad=True), photograph(scene, "b.png"), view="images/b.png")
-        assert counts().stored == 1
-
-    def test_on_the_cpu_it_is_found_without_a_name_or_under_another(self, scene, capsys):
-        configure("legs", store=scene / "legs_weights")
-        for name, view in (("a", None), ("b", "a"), ("c", "nowhere")):
-            l1_loss(torch.rand(3, 9, 8, requires_grad=True), photograph(scene, name + ".png"), view=view)
-        assert (counts().stored, counts().computed) == (3, 0)
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1 and f"maps from {scene / 'legs_weights'}" in lines[0]
-
-    def test_the_first_line_says_what_was_used(self, scene, capsys):
-        configure("legs", store=scene / "legs_weights")
-        l1_loss(torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8))
-        assert "weights computed from the training images" in capsys.readouterr().err
-        configure("legs", store=scene / "legs_weights")
-        state.reset_counts()
-        batch = torch.stack([photograph(scene, "a.png"), torch.rand(3, 9, 8)])
-        l1_loss(torch.rand(2, 3, 9, 8, requires_grad=True), batch)
-        assert "but for 1 image(s), whose weight is computed" in capsys.readouterr().err
-
-    def test_it_is_not_used_for_another_image_under_its_name(self, scene, capsys):
-        configure("legs", store=scene / "legs_weights")
-        prediction = torch.rand(3, 9, 8, requires_grad=True)
-        for shift in (1, 2):
-            target = torch.roll(photograph(scene, "a.png"), shift, dims=2)
-            torch.testing.assert_close(l1_loss(prediction, target, view="a"), weighted(prediction, target))
-        assert (counts().stored, counts().computed) == (0, 2)
-        assert capsys.readouterr().err.count("is not the one that the stored map was made from") == 1
-
-    def test_nor_for_another_size_or_finer_values_or_an_unknown_view(self, scene, capsys):
-        configure("legs", store=scene / "legs_weights")
-        target = photograph(scene, "a.png")
-        l1_loss(torch.rand(3, 9, 8, requires_grad=True), target + 0.3 / 255)  # the same to 8 bits
-        l1_loss(torch.rand(3, 8, 8, requires_grad=True), target[:, :8], view="a")
-        l1_loss(torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8), view="z")
-        assert (counts().stored, counts().computed) == (0, 3)
-        assert "no map of view 'a' at 8x8" in capsys.readouterr().err
-
-    def test_nor_for_another_operator(self, scene):
-        configure("eggs", store=scene / "legs_weights")
-        prediction, target = torch.rand(3, 9, 8, requires_grad=True), photograph(scene, "a.png")
-        torch.testing.assert_close(l1_loss(prediction, target, view="a"), weighted(prediction, target, "eggs"))
-        assert counts().stored == 0
-
-    def test_a_damaged_store_is_said_once_and_computed(self, scene, capsys):
-        for path in (scene / "legs_weights").glob("*.npy"):
-            path.write_bytes(path.read_bytes()[:-1] + b"\xff")
-        configure("legs", store=scene / "legs_weights")
-        prediction = torch.rand(3, 9, 8, requires_grad=True)
-        for name in ("a", "b", "c"):
-            target = photograph(scene, name + ".png")
-            torch.testing.assert_close(l1_loss(prediction, target, view=name), weighted(prediction, target))
-        assert capsys.readouterr().err.count("its checksum differs") == 1
-
-    def test_a_missing_store_is_said_and_computed(self, tmp_path, capsys):
-        configure("legs", store=tmp_path / "nowhere")
-        l1_loss(torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8), view="a")
-        assert counts().computed == 1
-        assert "is no store of weight maps" in capsys.readouterr().err
-
-
 def test_the_one_line_import_costs_nothing_but_torch():
     script = (
         "import sys, torch; before = set(sys.modules); from legs_loss import l1_loss; "
@@ -314,100 +198,6 @@ def test_its_graph_is_whole_from_the_first_call(monkeypatch):
     torch.testing.assert_close(compiled(prediction, target), weighted(prediction, target, "legs-l"))
     with torch.no_grad():
         assert torch.equal(compiled(prediction, target), plain(prediction, target))
-
-
-class TestBackends:
-    @pytest.fixture(autouse=True)
-    def needs_numba(self):
-        pytest.importorskip("numba")
-        if sys.version_info < (3, 8):
-            pytest.skip("numba is not used on Python 3.7")
-
-    def test_the_mean_is_one_fused_pass(self):
-        prediction, target = pair(3, 30, 40)
-        mask = torch.rand(30, 40)
-        for options, expected in (({}, weighted(prediction, target)), ({"mask": mask}, None)):
-            loss = l1_loss(prediction, target, **options)
-            assert type(loss.grad_fn).__name__ == "_FusedLossBackward"
-            if expected is None:
-                expected = (mask * weight_map(target) * torch.abs(prediction - target)).mean()
-            torch.testing.assert_close(loss, expected)
-            gradients = [torch.autograd.grad(one, prediction)[0] for one in (loss, expected)]
-            torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-9)
-        assert state.current_run().source.memo.bytes == 0
-
-    @pytest.mark.parametrize("options", [{"reduction": "none"}, {"own": plain}])
-    def test_what_needs_the_map_gets_it(self, options):
-        prediction, target = pair(3, 30, 40)
-        loss = l1_loss(prediction, target, **options)
-        torch.testing.assert_close(loss.mean(), weighted(prediction, target))
-        l1_loss(prediction, target)
-        assert (counts().computed, counts().remembered) == (2, 0)
-
-    @pytest.mark.parametrize("spec", [WeightSpec(curve="C5"), WeightSpec(percentile=90.0), WeightSpec(error=0.5)])
-    def test_specs_that_need_a_map(self, spec):
-        configure(spec)
-        prediction, target = pair(3, 30, 40)
-        expected = error_weight_map(prediction, target, spec) if spec.error else weight_map(target, spec)
-        for _ in range(2):
-            loss = l1_loss(prediction, target)
-            torch.testing.assert_close(loss, (expected * torch.abs(prediction - target)).mean())
-        assert (counts().computed, counts().remembered) == (1, 1)
-
-
-class TestCapture:
-    """While a CUDA graph is captured nothing is remembered: replays have other pixels in the same memory."""
-
-    def test_each_call_computes_its_own_weight(self, monkeypatch, scene):
-        monkeypatch.setenv("LEGS_BACKEND", "torch")
-        configure("legs", store=scene / "legs_weights")
-        run = state.current_run()
-        monkeypatch.setattr(sources, "is_capturing", lambda device: True)
-        prediction, target = torch.rand(3, 9, 8, requires_grad=True), photograph(scene, "a.png")
-        for _ in range(2):
-            torch.testing.assert_close(l1_loss(prediction, target, view="a"), weighted(prediction, target))
-            target.copy_(torch.rand(3, 9, 8))  # as a replay would find it
-        assert (counts().computed, counts().stored, counts().remembered) == (2, 0, 0)
-        assert len(run.source.memo) == 0
-
-    def test_only_a_cuda_device_is_asked(self, monkeypatch):
-        monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)
-        assert is_capturing(torch.device("cuda"))
-        assert not is_capturing(torch.device("cpu"))
-        monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: False)
-        assert not is_capturing(torch.device("cuda"))
-
-
-class TestOtherDevices:
-    """On the meta device reading a value is an error, so what works there never waits for a device."""
-
-    @pytest.mark.parametrize("spec", ["legs", "eggs", WeightSpec(normalise="mean"), WeightSpec(percentile=99.0)])
-    def test_a_step_reads_nothing_from_the_device(self, spec):
-        if not isinstance(spec, str) and spec.percentile < 100 and not hasattr(torch, "compile"):
-            pytest.skip("torch 1 has no kthvalue on this device")
-        configure(spec)
-        prediction = torch.empty(3, 16, 16, device="meta", requires_grad=True)
-        target = torch.empty(4, 16, 16, device="meta")[:3]
-        for _ in range(2):
-            loss = l1_loss(prediction, target, view="a", mask=torch.empty(16, 16, device="meta"))
-            loss.backward()
-        assert loss.device.type == "meta"
-        with pytest.raises((RuntimeError, NotImplementedError)):
-            loss.item()
-
-    def test_a_target_that_stays_is_computed_once(self):
-        stored = torch.empty(4, 16, 16, device="meta")
-        prediction = torch.empty(3, 16, 16, device="meta", requires_grad=True)
-        for _ in range(3):
-            l1_loss(prediction, stored[:3])
-        assert (counts().computed, counts().remembered) == (1, 2)
-        stored.add_(1)
-        l1_loss(prediction, stored[:3])
-        assert counts().computed == 2
-
-    def test_devices_that_differ_are_named(self):
-        with pytest.raises(LegsError, match="prediction is on cpu and target on meta"):
-            l1_loss(torch.rand(3, 4, 4, requires_grad=True), torch.empty(3, 4, 4, device="meta"))
 
 
 class TestScripts:

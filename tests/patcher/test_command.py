@@ -1,0 +1,273 @@
+"""The command legs-patch: options, exit codes, reports; and the pre-commit hook."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+
+import pytest
+from legs_adapters.cli import main
+
+from tests.patcher.support import PATCHED, SITE, checkout, files, legs_patch, snapshot
+from tests.support import ROOT
+
+
+@pytest.fixture
+def run(capsys):
+    """Run legs-patch in this process: (exit code, stdout, stderr). Starting one costs seconds, most of them torch's."""
+
+    def call(*arguments):
+        code = main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        return subprocess.CompletedProcess(arguments, code, out, err)
+
+    return call
+
+
+class TestCommandLine:
+    def test_patch_check_diff_undo(self, tmp_path):
+        root = checkout(tmp_path, files("inria"), git=True)
+        before = snapshot(root)
+        diff = legs_patch("--diff", root)
+        assert diff.returncode == 0
+        assert "-" + SITE in diff.stdout
+        assert "+" + PATCHED in diff.stdout
+        assert "+import legs_loss\n" in diff.stdout
+        assert "\033[" not in diff.stdout
+        assert legs_patch("--check", root).returncode == 1
+        assert snapshot(root) == before
+
+        done = legs_patch(root, "--preset", "legs-l", "--beta", "4")
+        assert done.returncode == 0, done.stderr
+        assert (
+            "patched               view=viewpoint_cam.image_name: viewpoint_cam.original_image, untouched\n"
+            in done.stdout
+        )
+        assert "legs-patch --undo" in done.stdout
+        assert 'preset = "legs-l"' in (root / "legs.toml").read_text()
+        assert "\nbeta = 4.0" in (root / "legs.toml").read_text()
+
+        again = legs_patch(root)
+        assert (again.returncode, legs_patch("--check", root).returncode) == (0, 0)
+        assert "nothing to do" in again.stdout
+
+        undone = legs_patch("--undo", root)
+        assert undone.returncode == 0
+        assert "restored train.py" in undone.stdout
+        assert snapshot(root) == before
+
+    def test_the_settings_reach_the_run(self, tmp_path, run):
+        root = checkout(tmp_path, files("inria"))
+        done = run(root, "--curve", "C5", "--operator", "sobel", "--beta", "2.5", "--store", root / "maps")
+        assert done.returncode == 0, done.stderr
+        from legs_loss.config import find_config
+
+        config = find_config(root / "train.py", environ={}, argv=[])
+        assert (config.spec.curve, config.spec.operator, config.spec.beta) == ("C5", "sobel", 2.5)
+        assert config.store == root / "maps"
+        assert find_config(root / "train.py", environ={"LEGS_BETA": "7"}, argv=[]).spec.beta == 7.0
+
+    def test_a_dirty_tree_is_refused_and_a_dry_run_is_not(self, tmp_path, run):
+        root = checkout(tmp_path, files("inria"), git=True)
+        (root / "scene" / "cameras.py").write_text("# mine\n" + files("inria")["scene/cameras.py"])
+        before = snapshot(root)
+        refused = run(root)
+        assert refused.returncode == 2
+        assert "uncommitted changes (scene/cameras.py)" in refused.stderr
+        assert snapshot(root) == before
+        assert run("--diff", root).returncode == 0
+        assert run("--force", root).returncode == 0
+
+    def test_what_cannot_be_decided_stops_it_unless_partial(self, tmp_path, run):
+        root = checkout(tmp_path, files("undecided"))
+        before = snapshot(root)
+        refused = run(root)
+        assert refused.returncode == 2
+        assert "train.py:11: cannot tell which of image_a and image_b" in refused.stderr
+        assert "loss = loss + l1_loss(image_a, image_b)" in refused.stderr
+        assert "write there: legs_loss.l1_loss(image_a, image_b)" in refused.stderr
+        assert snapshot(root) == before
+        assert run("--diff", "--partial", root).returncode == 1
+        partial = run("--partial", root)
+        assert partial.returncode == 1
+        assert "legs_loss.l1_loss(image, cam.original_image, view=cam.image_name)" in (root / "train.py").read_text()
+        assert "l1_loss(image_a, image_b)" in (root / "train.py").read_text()
+
+    def test_partial_does_not_call_a_tree_patched_of_which_nothing_could_be_decided(self, tmp_path, run):
+        texts = files("kernel")
+        root = checkout(tmp_path, texts)
+        before = snapshot(root)
+        partial = run("--partial", root)
+        assert partial.returncode == 1
+        assert "nothing could be decided" in partial.stdout
+        assert "legs-patch: error: " in partial.stderr
+        assert snapshot(root) == before
+
+    def test_json(self, tmp_path, run):
+        root = checkout(tmp_path, files("channels_last"))
+        done = run("--json", "--check", root)
+        content = json.loads(done.stdout)
+        assert done.returncode == 1
+        found = [(s["line"], s["channels_last"]) for s in content["sites"] if s["file"] == "simple_trainer.py"]
+        assert found[:4] == [(16, True), (19, True), (25, True), (39, True)]
+        assert content["left"][0]["reason"] == "definition" or content["left"][0]["reason"] == "depth"
+        assert "simple_trainer.py" in content["would_change"]
+        assert content["wrote"] == []
+
+    def test_calls_that_stay_plain_are_reported_and_undone(self, tmp_path, run):
+        root = checkout(tmp_path, files("bodies_of_two"))
+        before = snapshot(root)
+        content = json.loads(run("--json", root).stdout)
+        assert [(plain["file"], plain["line"], plain["reason"]) for plain in content["plain"]] == [
+            ("blurry.py", 14, "distillation"),
+            ("avatar.py", 15, "distillation"),
+            ("train.py", 15, "distillation"),
+            ("train.py", 17, "distillation"),
+            ("train.py", 23, "depth"),
+            ("slam.py", 7, "tracking"),
+        ]
+        assert content["plain"][0]["weighted_at"] == "blurry.py:8"
+        assert "slam.py" in content["wrote"]
+        again = run(root)
+        assert "nothing to do: it is patched" in again.stdout
+        assert "slam.py:8                already patched\n" in again.stdout
+        assert run("--undo", root).returncode == 0
+        assert snapshot(root) == before
+
+    def test_calls_of_a_body_chosen_by_hand_stay_plain_too(self, tmp_path, run):
+        root = checkout(tmp_path, files("bodies_of_two"))
+        done = run("--site", "utils/photometric.py:17", root)
+        assert done.returncode == 0, done.stderr
+        assert "legs_loss.unweighted(rgb_loss)(" in (root / "slam.py").read_text()
+        assert "import legs_loss" not in (root / "train.py").read_text()
+
+    @pytest.mark.parametrize(
+        ("line", "arguments"),
+        [
+            (b"    return rgb_loss(a, b)\n", ["--exclude", "old"]),
+            (b"    print 'of old', rgb_loss(a, b)\n", []),
+            (b"    return rgb_loss(a, b)  # \xe9\n", []),
+        ],
+        ids=["excluded", "Python 2", "not UTF-8"],
+    )
+    def test_a_call_in_a_file_that_is_not_read_is_an_error(self, line, arguments, tmp_path, run):
+        texts = files("bodies_of_two")
+        texts["old/slam.py"] = b"from utils.photometric import rgb_loss\n\n\ndef old(a, b):\n" + line
+        root = checkout(tmp_path, texts)
+        before = snapshot(root)
+        done = run(*arguments, root)
+        assert done.returncode == 2
+        assert "rgb_loss also serves tracking at slam.py:7; what it serves at old/slam.py cannot be told" in done.stderr
+        assert snapshot(root) == before
+
+    def test_a_site_by_hand(self, tmp_path, run):
+        root = checkout(tmp_path, files("inria"))
+        done = run("--site", "train.py:44", root)
+        assert done.returncode == 0, done.stderr
+        assert "l1_test += legs_loss.l1_loss(image, gt_image" in (root / "train.py").read_text()
+        missing = run("--site", "train.py:3", root)
+        assert missing.returncode == 2
+        assert "there is no L1 term at train.py:3" in missing.stderr
+
+    def test_a_function_that_is_settled_at_run_time_is_weighted_by_hand(self, tmp_path, run):
+        root = checkout(tmp_path, files("settled_at_run_time"))
+        before = snapshot(root)
+        line = (
+            files("settled_at_run_time")["train.py"].splitlines().index("        loss1 = loss_func(image, gt_image)")
+            + 1
+        )
+        done = run("--site", f"train.py:{line}", root)
+        assert done.returncode == 0, done.stderr
+        text = (root / "train.py").read_text()
+        assert "loss1 = legs_loss.l1_loss(image, gt_image, view=cam.image_name, own=loss_func)\n" in text
+        assert text.count("own=") == 1
+        assert run("--undo", root).returncode == 0
+        assert snapshot(root) == before
+
+    def test_folders_that_are_not_entered_are_named_where_nothing_was_found(self, tmp_path, run):
+        vendored = {f"third_party/gaussian-splatting/{path}": text for path, text in files("inria").items()}
+        mentions = {path: "from losses import l1_loss\n" for path in ("extern/a/x.py", "tests/x.py", "venv/x.py")}
+        others = {"third_party/simple-knn/setup.py": "", "extern/deeper/third_party/b/x.py": "F.l1_loss\n"}
+        root = checkout(tmp_path, {"run.py": "import os\n", **vendored})
+        (root / "third_party" / "gaussian-splatting" / ".git").write_text("gitdir: elsewhere\n")
+        found = run(root)
+        assert (found.returncode, found.stderr.count("\n")) == (2, 1)
+        named = "third_party/gaussian-splatting (a checkout of its own)"
+        assert found.stderr.endswith(f"; not looked into: {named}: run legs-patch on that folder\n")
+        assert "not looked into" not in run(root, "--exclude", "third_party").stderr
+        checkout(root, {**mentions, **others})
+        assert run(root).stderr.endswith(
+            f"; not looked into: {named}, extern/a (other people's code), "
+            "extern/deeper/third_party/b (other people's code) and 1 more: run legs-patch on the one that trains\n"
+        )
+        assert run(root / "third_party" / "gaussian-splatting").returncode == 0
+
+    @pytest.mark.parametrize(
+        ("path", "message"),
+        [
+            (
+                "third_party/gs/train.py",
+                "third_party/gs is not looked into (a submodule): run legs-patch on that folder",
+            ),
+            (
+                "third_party/train.py",
+                "third_party is not looked into (other people's code): run legs-patch on that folder",
+            ),
+            ("a/extern/b/c/train.py", "a/extern/b is not looked into (other people's code): run legs-patch"),
+            ("my_env/train.py", "my_env is not looked into (a virtual environment)\n"),
+            ("old/train.py", "--exclude leaves it out"),
+            ("test_train.py", "tests are not looked into"),
+            ("train.sh", "it is no .py file"),
+            ("broken.py", "does not parse (line 1)"),
+        ],
+    )
+    def test_a_site_that_is_not_looked_into_is_said_to_be(self, path, message, tmp_path, run):
+        root = checkout(tmp_path, {"my_env/pyvenv.cfg": "", path: "l1_loss(image, gt_image) loss.backward()\n"})
+        (root / ".gitmodules").write_text('[submodule "gs"]\n\tpath = third_party/gs\n')
+        refused = run(root, "--site", f"{path}:1", "--exclude", "old")
+        assert refused.returncode == 2
+        assert f"legs-patch: error: {path}:1: {message}" in refused.stderr
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["nowhere"], "nowhere does not exist"),
+            (["empty", "--beta", "-1"], "beta"),
+            (["empty", "--curve", "C9"], "C9"),
+            (["empty", "--preset", "best"], "no preset is named 'best'"),
+            (["empty"], "no photometric L1 term was found"),
+            (["empty", "--undo"], "nothing to take back"),
+            (["empty", "--site", "train.py"], "--site wants FILE:LINE"),
+        ],
+    )
+    def test_bad_usage_is_one_line(self, arguments, message, tmp_path, run, monkeypatch):
+        (tmp_path / "empty").mkdir()
+        monkeypatch.chdir(tmp_path)
+        done = run(*arguments)
+        assert done.returncode == 2
+        assert done.stderr.startswith("legs-patch: error: ")
+        assert message in done.stderr
+        assert done.stderr.count("\n") == 1
+
+    def test_a_legs_toml_of_the_user_s_stays(self, tmp_path, run):
+        root = checkout(tmp_path, {**files("inria"), "legs.toml": "beta = 3.0\n"})
+        assert run(root).returncode == 0
+        assert (root / "legs.toml").read_text() == "beta = 3.0\n"
+        refused = run(root, "--beta", "5")
+        assert refused.returncode == 2
+        assert "legs.toml is there already" in refused.stderr
+        assert run("--undo", root).returncode == 0
+        assert (root / "legs.toml").read_text() == "beta = 3.0\n"
+
+
+def test_the_pre_commit_hook_fails_until_the_checkout_is_patched(tmp_path):
+    hook = dict(re.findall(r"^[- ] (\w+): (.*)$", (ROOT / ".pre-commit-hooks.yaml").read_text(encoding="utf-8"), re.M))
+    assert hook["id"] == "legs-patch-check" and hook["pass_filenames"] == "false"
+    program, *arguments = hook["entry"].split()
+    assert program == "legs-patch"
+    root = checkout(tmp_path / "fork", files("inria"), git=True)
+    assert legs_patch(*arguments, cwd=str(root)).returncode == 1
+    assert legs_patch(".", cwd=str(root)).returncode == 0
+    done = legs_patch(*arguments, cwd=str(root))
+    assert done.returncode == 0, done.stdout + done.stderr

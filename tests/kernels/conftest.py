@@ -1,0 +1,15 @@
+"""What the tests of the CUDA kernels' loading share."""
+
+from __future__ import annotations
+
+import pytest
+
+from legs_loss.kernels.cuda.cache import BinaryCache
+from legs_loss.kernels.cuda.modules import Modules
+from tests.kernels.parts import FakeCompiler, FakeDriver
+
+
+@pytest.fixture
+def parts(tmp_path):
+    driver, compiler = FakeDriver(), FakeCompiler()
+    return driver, compiler, Modules(driver, compiler, BinaryCache(tmp_path / "kernels"))

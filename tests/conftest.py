@@ -1,4 +1,4 @@
-"""What every test file shares: the real capture, where it is present, and a fixed seed."""
+"""Fixtures of all tests: the real capture, where it is present, and a fixed seed."""
 
 from __future__ import annotations
 

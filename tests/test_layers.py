@@ -36,7 +36,7 @@ def from_package(folder: Path, package: str) -> List[Tuple[str, str, str]]:
 
 
 def is_public(module: str, name: str) -> bool:
-    """Whether a name is published: in ``__all__`` of legs_loss, of a module in it, or of a folder below."""
+    """Return whether a name is published: in ``__all__`` of legs_loss, of a module in it, or of a folder below."""
     found = importlib.import_module(module)
     home = module.count(".") < 2 or hasattr(found, "__path__")
     return home and (not name or name in found.__all__)

@@ -1,4 +1,4 @@
-"""What a package index and a packager get: metadata, the source distribution, types."""
+"""The package as an index and a packager get it: metadata, the source distribution, types."""
 
 from __future__ import annotations
 

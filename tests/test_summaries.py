@@ -11,6 +11,7 @@ from tests.support import ROOT
 QUESTIONS = {"How", "What", "When", "Where", "Whether", "Which", "Who", "Why"}
 ARTICLES = {"A", "An", "Each", "The", "This"}
 FILES = sorted((ROOT / "legs_loss").rglob("*.py"))
+ADAPTERS = sorted((ROOT / "adapters").rglob("*.py"))
 
 
 def summaries(path):
@@ -26,3 +27,8 @@ def summaries(path):
 def test_a_summary_begins_with_a_verb_or_a_noun(path):
     wrong = [(line, word) for line, word, does in summaries(path) if word in QUESTIONS | (ARTICLES if does else set())]
     assert wrong == []
+
+
+@pytest.mark.parametrize("path", ADAPTERS, ids=lambda path: path.relative_to(ROOT / "adapters").as_posix())
+def test_a_summary_asks_no_question(path):
+    assert [(line, word) for line, word, _ in summaries(path) if word in QUESTIONS] == []

@@ -1,4 +1,4 @@
-"""What was edited, so that it can be taken back: the exact bytes from before, and what they became.
+"""The record of a patch, by which it is taken back: the exact bytes from before, and the edits.
 
 The journal is one file in the root of the checkout. A checkout may come from a stranger, and its journal with it: it
 names only what legs-patch ever writes, and it is sealed (:mod:`legs_adapters.checkout.seal`).
@@ -110,7 +110,7 @@ class Journal:
 
     @property
     def name(self) -> str:
-        """What this very journal is called when someone else's is to be trusted: the start of its checksum."""
+        """The name by which ``--trust`` accepts this journal: the start of its checksum."""
         return digest(self.data or b"")[:16]
 
 

@@ -16,7 +16,7 @@ __all__ = ["Undone", "undo", "undo_edits"]
 
 
 class Undone(NamedTuple):
-    """What an undo did, or would do.
+    """The changes that an undo made, or would make.
 
     Attributes:
         restored: the files that are as before the patch.

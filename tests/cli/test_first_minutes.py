@@ -1,4 +1,4 @@
-"""What a new user meets in the first ten minutes: typos, wrong folders, a store elsewhere. Each gets a clear answer."""
+"""The first ten minutes of a new user: typos, wrong folders, a store elsewhere. Each gets a clear answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the channels of an image are, by each sign in the code around it."""
+"""The axis of an image's channels, by each sign in the code around it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of the CUDA kernels' loading share."""
+"""Fixtures of the tests of the CUDA kernels' loading."""
 
 from __future__ import annotations
 

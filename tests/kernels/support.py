@@ -1,4 +1,4 @@
-"""What the tests of the fused losses share: images, the comparison with the reference, and who computed a loss."""
+"""Images for the tests of the fused losses, the comparison with the reference, and which backend computed a loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a training step asks of the CUDA backend: it never waits for the device; captures; failures."""
+"""A training step on the CUDA backend: no wait for the device, graph captures, failures."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ B = (2.0, 2.0, 1.0, 4.0, math.nan, math.nan, 0.0, math.inf)
 
 
 def by_lanes(operation, *rows):
-    """What an operation makes of rows of eight float32."""
+    """Apply an operation to rows of eight float32."""
     import numba
 
     from legs_loss.kernels.simd import load, store

@@ -1,4 +1,4 @@
-"""What legs-patch writes and takes back, byte for byte, whatever a file's formatting."""
+"""legs-patch writes and takes back the same bytes, whatever a file's formatting."""
 
 from __future__ import annotations
 

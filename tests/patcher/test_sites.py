@@ -1,4 +1,4 @@
-"""Which L1 terms are chosen, what they become, and why the others are left: scripts in the shapes met in the wild."""
+"""The L1 terms that are patched, and the reasons of those that are skipped, in scripts shaped as real ones."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ def verify(root, *arguments):
 
 
 def verdict(done):
-    """What was printed after the patch's own report."""
+    """Return the output after the patch's own report."""
     return json.loads(done.stdout[done.stdout.rindex('{"holds"') :])
 
 

@@ -1,4 +1,4 @@
-"""What the tests of the trainer share: the embedded scene as it reads it, and one thread."""
+"""Fixtures of the tests of the trainer: the embedded scene, and one thread."""
 
 from __future__ import annotations
 

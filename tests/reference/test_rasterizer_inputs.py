@@ -1,4 +1,4 @@
-"""What the rasterizers take and refuse: strides, dtypes, options, cameras; and a machine without numba or a cache."""
+"""Inputs of the rasterizers, accepted and refused: strides, dtypes, options, cameras; no numba, no cache."""
 
 from __future__ import annotations
 

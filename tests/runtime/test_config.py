@@ -1,4 +1,4 @@
-"""Where a run's settings come from, and which win."""
+"""The sources of a run's settings, and their order."""
 
 from __future__ import annotations
 

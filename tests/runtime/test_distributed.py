@@ -202,7 +202,7 @@ def run(codebase, kind, script, processes, *arguments, torchrun=True):
 
 @pytest.fixture(scope="module")
 def alone(codebase):
-    """What one process trains with both ranks' views in each step."""
+    """Train in one process with both ranks' views in each step."""
     images, (counts,), _ = run(codebase, "plain", "train.py", 1, "--views", "2")
     assert (counts["weighted"], counts["stored"], counts["computed"]) == (8, 4, 0)
     return images[0]

@@ -1,4 +1,4 @@
-"""What the lines that legs-patch writes ask of l1_loss: unreduced maps, the codebase's own L1, both layouts."""
+"""l1_loss as the lines that legs-patch writes call it: unreduced maps, the codebase's own L1, both layouts."""
 
 from __future__ import annotations
 

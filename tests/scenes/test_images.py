@@ -19,7 +19,7 @@ from tests.support import photograph, save
 
 
 def upstream_size(width, height, resolution):
-    """What 3DGS's loader computes, step by step in its order of operations (resolution_scale is 1.0)."""
+    """Compute the size that 3DGS's loader gives, in its order of operations (resolution_scale is 1.0)."""
     if resolution in [1, 2, 4, 8]:
         return round(width / (1.0 * resolution)), round(height / (1.0 * resolution))
     if resolution == -1:
@@ -31,7 +31,7 @@ def upstream_size(width, height, resolution):
 
 
 def upstream_tensor(image, size):
-    """What 3DGS makes of an opened image: [C, H, W] in [0, 1], the colour channels of it."""
+    """Turn an opened image into 3DGS's tensor: [C, H, W] in [0, 1], the colour channels of it."""
     pixels = torch.from_numpy(np.array(image.resize(size))) / 255.0
     return (pixels if pixels.dim() == 3 else pixels[..., None]).permute(2, 0, 1)[:3]
 

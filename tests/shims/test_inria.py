@@ -22,7 +22,7 @@ from tests.shims.support import BACKGROUND, HEIGHT, WIDTH, Dense, camera, close,
 
 
 def compact_box(mult):
-    """Which tiles FastGS draws in: those that hold a point of the ellipse at ``mult`` times the squared distance."""
+    """Find the tiles that FastGS draws in: those with a point of the ellipse at ``mult`` times the squared distance."""
 
     def inside(centres, conics, opacities, tiles):
         found = torch.zeros(len(centres), tiles[1], tiles[0], dtype=torch.bool)

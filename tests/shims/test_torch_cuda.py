@@ -1,4 +1,4 @@
-"""What a script asks of CUDA is answered by the CPU: each point of the redirection by itself."""
+"""torch.cuda answered by the CPU: each point of the redirection by itself."""
 
 from __future__ import annotations
 
@@ -197,11 +197,11 @@ class TestWhereAModeWouldNotReach:
 
 
 class Anything:
-    """What checkpoints of the time held beside tensors."""
+    """An object as old checkpoints hold it beside tensors."""
 
 
 class RunsCode:
-    """What unpickles by running something."""
+    """An object that runs something when it is unpickled."""
 
     def __init__(self, path):
         self.path = path

@@ -119,7 +119,7 @@ def _has_root(path: str) -> bool:
 
 
 def _is_dot_git(part: str) -> bool:
-    """Whether some file system takes a name for ``.git``.
+    """Return whether some file system takes a name for ``.git``.
 
     They do without regard to case, with dots or spaces behind it, by its short name or as one of its streams (NTFS),
     and with letters in it that nobody sees (HFS+).

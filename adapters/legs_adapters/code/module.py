@@ -143,7 +143,7 @@ class Function:
 
     @property
     def runs_by_instance(self) -> bool:
-        """Whether calling an instance of its class runs it."""
+        """Return whether calling an instance of its class runs it."""
         return self.name in CALLED
 
     @property

@@ -68,7 +68,7 @@ class Analysis:
 
     @property
     def ssims(self) -> SsimCalls:
-        """What the calls of SSIM functions compute."""
+        """The SSIM functions of the program, by evaluation."""
         if self._ssims is None:
             from legs_adapters.terms.structural.calls import SsimCalls  # NumPy is not needed without --ssim
 

@@ -1,4 +1,4 @@
-"""What an evaluation meets: the library that stands for what a checkout imports, and the ways in which it can end."""
+"""A stand-in for a checkout's imports while a function is evaluated, and the ways in which that can end."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Raised(Exception):
 
 
 class Library:
-    """What stands for the libraries that a checkout imports, and for the values that they make."""
+    """A stand-in for the libraries that a checkout imports, and for the values that they make."""
 
     def external(self, name: str) -> Any:
         """Return a function or a constant of a library, or a builtin, by its dotted name."""

@@ -1,1 +1,1 @@
-"""What the shims of Inria's family of rasterizers share."""
+"""The parts that the shims of Inria's family of rasterizers share."""

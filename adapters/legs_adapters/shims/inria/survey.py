@@ -1,4 +1,4 @@
-"""What a codebase expects of its rasterizer, read from its source: modules, settings, and what results are called.
+"""Read from a codebase's source which rasterizer it expects: modules, settings, names of results.
 
 Forks of 3D Gaussian Splatting each have a rasterizer of their own, under Inria's name or another, with more settings
 and more results. Their calls say which.
@@ -28,7 +28,7 @@ class Call(NamedTuple):
 
 
 class Interface:
-    """What the code expects of one module.
+    """The interface that the code expects of one module.
 
     Attributes:
         fields: the settings' names, in the order of their first use.
@@ -40,7 +40,7 @@ class Interface:
         self.calls: List[Call] = []
 
     def is_like(self, fields: Sequence[str], results: int) -> bool:
-        """Whether the code uses no other settings than these, and unpacks so many results wherever it draws."""
+        """Return whether the code uses no other settings than these, and unpacks so many results wherever it draws."""
         known = all(field in fields for field in self.fields)
         return known and all(call.results is None or len(call.results) == results for call in self.calls)
 
@@ -69,7 +69,7 @@ def survey(root: Path) -> Dict[str, Interface]:
 
 
 def _is_of(root: Path, module: str) -> bool:
-    """Whether a module is the codebase's own Python, which needs no stand-in."""
+    """Return whether a module is the codebase's own Python, which needs no stand-in."""
     place = root.joinpath(*module.split("."))
     file = place.with_suffix(".py") if place.with_suffix(".py").is_file() else place / "__init__.py"
     try:

@@ -59,7 +59,7 @@ class _Settings(NamedTuple):
 
 
 class _Forward(NamedTuple):
-    """What the backward pass needs; it hangs on the first of forward's buffers and goes when that goes."""
+    """The inputs of the backward pass; kept by the first of forward's buffers, and freed with it."""
 
     drawn: Drawn  # its image with the graph to `tensors`
     tensors: Tensors  # activated, and scaled by `size`

@@ -100,7 +100,7 @@ FORMATS = ("JPEG", "PNG", "GIF", "WEBP")  # what torchvision decodes
 
 
 class ImageReadMode(enum.Enum):
-    """Which channels are wanted of a picture."""
+    """The channels that are wanted of a picture."""
 
     UNCHANGED = None
     GRAY = "L"

@@ -1,1 +1,1 @@
-"""Which functions of a checkout are 3DGS's SSIM: their value, worked out on small images, says so."""
+"""Find the functions of a checkout that are 3DGS's SSIM, by their values on small images."""

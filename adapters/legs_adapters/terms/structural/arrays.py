@@ -1,4 +1,4 @@
-"""What torch's operations make of small arrays, as far as an SSIM takes them; a value is numpy's, in double precision.
+"""Torch's operations on small arrays, as far as an SSIM takes them, by numpy in double precision.
 
 Of an image only what is rational in its pixels is answered: sums, products, quotients, blurs, means. A function of
 these that agrees with another one at random images is that function. What looks at an image's values (``clamp``,

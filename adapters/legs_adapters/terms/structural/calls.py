@@ -19,7 +19,7 @@ _MISSING = object()
 
 
 class Proof(NamedTuple):
-    """What a call computes.
+    """The value of a call.
 
     Attributes:
         lack: why it is not 3DGS's SSIM, or not provably: "library" (the function is not of this checkout), "settings"

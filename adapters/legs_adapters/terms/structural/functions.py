@@ -21,7 +21,7 @@ _SAME = 1e-9  # of two values in double precision
 
 
 class Answer(NamedTuple):
-    """What a function is.
+    """The kind of SSIM that a function is.
 
     Attributes:
         is_ssim: whether it is 3DGS's SSIM for these arguments; None where that cannot be told.

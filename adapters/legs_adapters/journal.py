@@ -14,8 +14,9 @@ import zlib
 from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 
-from legs_adapters.checkout.replace import LARGEST, check_name, read_file
+from legs_adapters.checkout.replace import LARGEST, read_file
 from legs_adapters.checkout.seal import is_sealed, seal
+from legs_adapters.code.folders import check_name
 from legs_adapters.settings import SETTINGS_FILE
 from legs_loss import LegsError
 
@@ -23,12 +24,13 @@ __all__ = ["JOURNAL", "Journal", "Layer", "digest"]
 
 JOURNAL = ".legs-patch.json"
 _VERSION = 1
+_MOST = 1000  # patches of one file: nobody patches that often
 _NOTE = "What legs-patch changed here, and the bytes from before. legs-patch --undo needs it; do not edit it."
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class Layer(NamedTuple):
-    """One patch of one file: its bytes before, what was put where, and the checksum of what they became."""
+    """One patch of one file: its bytes before, what was put where, in order, and the checksum of what they became."""
 
     original: bytes
     edits: Tuple[Tuple[int, int, str], ...]
@@ -36,10 +38,11 @@ class Layer(NamedTuple):
 
     def patched(self) -> bytes:
         """Return the bytes that the patch wrote."""
-        data = self.original
-        for start, end, text in sorted(self.edits, reverse=True):
-            data = data[:start] + text.encode("utf-8") + data[end:]
-        return data
+        parts, at = [], 0
+        for start, end, text in self.edits:
+            parts += [self.original[at:start], text.encode("utf-8")]
+            at = end
+        return b"".join([*parts, self.original[at:]])
 
 
 class Journal:
@@ -131,6 +134,8 @@ def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
         if not name.endswith(".py"):
             raise LegsError(f"{name!r} is no Python file, and nothing else is patched")
         files[name] = []
+        if len(layers) > _MOST:
+            raise ValueError(f"{name} was patched {len(layers)} times")
         for layer in layers:
             files[name].append(_read_layer(layer, room))
             room -= len(files[name][-1].original)
@@ -139,12 +144,14 @@ def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
 
 def _read_layer(content: Dict[str, Any], room: int) -> Layer:
     original = _unpack(content["original"], room)
-    edits = []
-    for start, end, text in content["edits"]:
-        if type(start) is not int or type(end) is not int or not 0 <= start <= end <= len(original):
+    edits: List[Tuple[int, int, str]] = []
+    at = 0
+    for start, end, text in sorted(content["edits"]):
+        if type(start) is not int or type(end) is not int or not at <= start <= end <= len(original):
             raise ValueError(f"an edit of bytes {start!r} to {end!r} of {len(original)}")
         text.encode("utf-8")
         edits.append((start, end, text))
+        at = end
     return Layer(original, tuple(edits), _checksum(content["after"]))
 
 

@@ -119,7 +119,7 @@ def write(plan: Plan, force: bool = False) -> List[str]:
         changes: Dict[str, Tuple[Optional[bytes], Optional[bytes]]] = {}
         for path, data in plan.after.items():
             source = plan.findings.program.sources[path]
-            edits = tuple((edit.start, edit.end, edit.after.decode("utf-8")) for edit in plan.edits[path])
+            edits = tuple((edit.start, edit.end, edit.after.decode("utf-8")) for edit in sorted(plan.edits[path]))
             journal.files.setdefault(path, []).append(Layer(source.data, edits, digest(data)))
             changes[path] = (source.data, data)
         settings = _settings_change(plan, journal)

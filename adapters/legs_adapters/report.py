@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 
+from legs_adapters.checkout.comparing import unified_diff
 from legs_adapters.code.syntax import one_line
 from legs_adapters.plan import Plan
 from legs_adapters.settings import SETTINGS_FILE
@@ -32,11 +32,16 @@ def as_table(plan: Plan) -> str:
     rows += [(entry.path, entry.line, "ERROR", entry.reason) for entry in found.problems]
     rows.sort()
     table = [(f"{path}:{line}", what, why) for path, line, what, why in rows]
-    table += [(entry.path, "not read", entry.reason) for entry in found.unreadable]
+    table += [(_in_one_line(entry.path), "not read", entry.reason) for entry in found.unreadable]
     if not table:
         return ""
     wide, wider = (max(len(row[column]) for row in table) for column in (0, 1))
     return "".join(f"{where:<{wide}}  {what:<{wider}}  {why}".rstrip() + "\n" for where, what, why in table)
+
+
+def _in_one_line(path: str) -> str:
+    """Return a name without line ends, which could pass for lines of the report."""
+    return path.replace("\n", "\\n").replace("\r", "\\r")
 
 
 def _decided(left: Left) -> str:
@@ -122,13 +127,8 @@ def changes_as_diff(changes: Mapping[str, Tuple[Optional[bytes], Optional[bytes]
 
 
 def _unified(path: str, before: Optional[bytes], after: Optional[bytes]) -> List[str]:
-    lines = difflib.unified_diff(
-        _lines(before),
-        _lines(after),
-        "/dev/null" if before is None else f"a/{path}",
-        "/dev/null" if after is None else f"b/{path}",
-        lineterm="\n",
-    )
+    names = "/dev/null" if before is None else f"a/{path}", "/dev/null" if after is None else f"b/{path}"
+    lines = unified_diff(_lines(before), _lines(after), names)
     shown = []
     for line in lines:
         shown.append(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n")

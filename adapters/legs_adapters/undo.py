@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
+from legs_adapters.checkout.comparing import matching_lines
 from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
 from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL, Journal, digest
@@ -78,7 +78,10 @@ def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
                 data, missing = undo_edits(layer.original, layer.patched(), data)
                 lost.extend(missing)
         if lost:
-            done.kept.append((name, "these lines were changed since and stay: " + "; ".join(sorted(set(lost)))))
+            shown = sorted(set(lost))
+            more = f" and {len(shown) - 20} more" if len(shown) > 20 else ""
+            listed = "; ".join(line[:200] for line in shown[:20])
+            done.kept.append((name, f"these lines were changed since and stay: {listed}{more}"))
         if data != current:
             changes[name] = (current, data)
             done.restored.append(name)
@@ -123,12 +126,12 @@ def undo_edits(original: bytes, patched: bytes, current: bytes) -> Tuple[bytes, 
     """
     before, after, lines = (data.splitlines(keepends=True) for data in (original, patched, current))
     lost: List[str] = []
-    hunks = difflib.SequenceMatcher(None, before, after, autojunk=False).get_opcodes()
-    kept = difflib.SequenceMatcher(None, after, lines, autojunk=False).get_matching_blocks()
-    where = {block.a + i: block.b + i for block in kept for i in range(block.size)}
+    where = {a + i: b + i for a, b, size in matching_lines(after, lines) for i in range(size)}
     changes: List[Tuple[int, int, Sequence[bytes]]] = []
-    for tag, i1, i2, j1, j2 in hunks:
-        if tag == "equal":
+    ended = 0, 0
+    for i2, j2, size in [*matching_lines(before, after), (len(before), len(after), 0)]:
+        (i1, j1), ended = ended, (i2 + size, j2 + size)
+        if (i1, j1) == (i2, j2):
             continue
         places = [where[j] for j in range(j1, j2) if j in where]
         if j1 == j2 or len(places) < j2 - j1 or places[-1] - places[0] >= j2 - j1:

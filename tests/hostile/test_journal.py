@@ -7,8 +7,10 @@ import hashlib
 import io
 import json
 import os
+import random
 import re
 import shutil
+import signal
 import subprocess
 import zlib
 from contextlib import redirect_stderr, redirect_stdout
@@ -18,7 +20,7 @@ from legs_adapters.checkout.seal import seal
 from legs_adapters.cli import main
 from legs_adapters.journal import JOURNAL
 
-from tests.patcher.support import checkout, files, legs_patch, run_git, snapshot
+from tests.patcher.support import checkout, files, legs_patch, snapshot
 from tests.support import legs_environment
 
 COMMAND = 'touch "$LEGS_ATTACK"; false'
@@ -291,6 +293,8 @@ DAMAGED = {
     "edits of halves": layers({"edits": [[0, 1, "\ud800"]]}),
     "edits of floats": layers({"edits": [[0.0, 1, ""]]}),
     "edits of numbers": layers({"edits": [[0, 1, 7]]}),
+    "edits over one another": layers({"edits": [[0, 1, ""], [0, 1, ""]]}),
+    "60,000 patches of a file": layers(*[{}] * 60_000),
     "no checksum": layers({"after": "z"}),
     "huge numbers": '{"version": ' + "9" * 5000 + "}",
 }
@@ -330,72 +334,37 @@ def test_a_journal_that_is_no_file(what, attack):
     assert state(root) == before
 
 
-CONFIG = """
-[core]
-    fsmonitor = "COMMAND"
-    hooksPath = .hooks
-    pager = "COMMAND"
-    sshCommand = "COMMAND"
-    repositoryformatversion = 1
-[extensions]
-    partialClone = origin
-[remote "origin"]
-    url = ext::sh -c COMMAND
-    promisor = true
-[protocol "ext"]
-    allow = always
-[filter "plain"]
-    clean = "COMMAND"
-    process = "COMMAND"
-    required = true
-[filter "a=b"]
-    clean = "COMMAND"
-[diff "plain"]
-    textconv = "COMMAND"
-    command = "COMMAND"
-[diff]
-    external = "COMMAND"
-"""
+def shuffled(count, kinds):
+    """Return so many lines in no order, of so many kinds."""
+    order = random.Random(count)
+    return b"".join(b"%d\n" % (order.randrange(kinds) if kinds else number) for number in range(count))
 
 
-@pytest.mark.parametrize("attributes", ["*.py filter=plain diff=plain\n", "*.py filter=a=b\n", ""])
-@pytest.mark.parametrize("where", ["of its own", "as a file", "bare", "above"])
-def test_git_runs_nothing_of_the_checkout_s(where, attributes, attack):
-    """An archive, unlike a clone, brings a ``.git`` of its own; and a clone may have a bare repository in a folder."""
+LABORIOUS = {
+    "a million edits": (b"x" * (1 << 20), [[i, i, "y"] for i in range(1 << 20)], b"z\n"),
+    "lines of ninety kinds": (shuffled(200_000, 90), [[0, 0, shuffled(200_001, 90).decode()]], shuffled(200_002, 90)),
+    "lines of one kind": (b"\n" * 500_000 + b"a\n" + b"\n" * 500_000, [[9, 9, "b"]], b"c\n" + b"\n" * 900_000 + b"d\n"),
+    "lines in another order": (shuffled(200_000, 1 << 30), [[0, 9, ""]], shuffled(200_000, 0)),
+}
+
+
+@pytest.mark.skipif(not hasattr(signal, "alarm"), reason="needs a clock that ends it")
+@pytest.mark.parametrize("what", LABORIOUS, ids=lambda what: what.replace(" ", "_"))
+def test_a_journal_that_would_take_days(what, attack):
+    """Looking at what a stranger's journal would do is what the refusal advises: it ends, whatever is in it."""
     folder, ran = attack
-    root = checkout(folder / "theirs", {**files("inria"), ".gitattributes": attributes}, git=True)
-    config = CONFIG.replace("COMMAND", f"touch {ran}")
-    for hook in ("post-index-change", "post-checkout", "fsmonitor-watchman"):
-        checkout(root, {f".hooks/{hook}": f"#!/bin/sh\ntouch {ran}\n", f".git/hooks/{hook}": "#!/bin/sh\nfalse\n"})
-        (root / ".hooks" / hook).chmod(0o755)
-    run_git(root, "rm", "-q", "--cached", "utils/loss_utils.py")
-    for path in root.rglob("*.py"):
-        path.write_text(path.read_text() + "\n")  # what is not as the index has it is put through the filters
-    (root / ".git" / "config").write_text(config)
-    target = root
-    if where == "as a file":
-        (root / ".git").rename(folder / "gitdir")
-        (root / ".git").write_text(f"gitdir: {folder / 'gitdir'}\n")
-    elif where == "bare":
-        for path in (root / ".git").iterdir():
-            path.rename(root / path.name)
-        (root / ".git").rmdir()
-        (root / "config").write_text(config.replace("[core]", "[core]\n    bare = false\n    worktree = .\n"))
-    elif where == "above":
-        target = root / "utils"
-        (root / "train.py").rename(target / "train.py")
-    run(target, ran=ran)
-    run("--force", target, ran=ran)
-    run("--undo", target, ran=ran)
-    assert not ran.exists()
-    if where == "of its own" and "plain" in attributes:  # the premise, or this proves nothing
-        subprocess.run(["git", "-C", str(root), "status"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        assert ran.exists()
-        ran.unlink()
-
-
-def test_git_of_the_checkout_s_own_is_not_run(attack):
-    folder, ran = attack
-    root = checkout(folder / "theirs", {**files("inria"), "git": f"#!/bin/sh\ntouch {ran}\n"})
-    (root / "git").chmod(0o755)
-    assert run(root, ran=ran, PATH=os.pathsep.join([str(root), os.environ["PATH"]])).returncode == 0
+    original, edits, current = LABORIOUS[what]
+    content = layers({"original": pack(original), "edits": edits}).replace('"a.py"', '"train.py"')
+    root = checkout(folder / "theirs", {"train.py": current, JOURNAL: content})
+    before = state(root)
+    signal.alarm(300)
+    try:
+        done = run("--undo", "--diff", "--force", root, ran=ran)
+        assert done.returncode == 0, done.stderr
+        assert "these lines were changed since and stay" in done.stderr
+        name = digest((root / JOURNAL).read_bytes())[:16]
+        assert state(root) == before
+        assert run("--undo", "--force", "--trust", name, root, ran=ran).returncode == 0
+        assert (root / "train.py").read_bytes() == current
+    finally:
+        signal.alarm(0)

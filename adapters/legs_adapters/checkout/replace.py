@@ -7,14 +7,14 @@ import os
 import shutil
 import stat
 import tempfile
-import unicodedata
 from pathlib import Path
 from typing import Dict, Iterator, List, Mapping, Optional, Tuple
 
+from legs_adapters.code.folders import check_name
 from legs_loss import LegsError
 from legs_loss.system import FileLock, HeldError, held_back, read_regular
 
-__all__ = ["LARGEST", "Changes", "check_name", "locked", "read_file", "replace_files"]
+__all__ = ["LARGEST", "Changes", "locked", "read_file", "replace_files"]
 
 # By relative path, in order: the bytes expected there now (None: no file), and the bytes to put there (None: remove).
 Changes = Mapping[str, Tuple[Optional[bytes], Optional[bytes]]]
@@ -99,33 +99,6 @@ def read_file(root: Path, path: str) -> Optional[bytes]:
         return None
     except OSError as error:
         raise LegsError(f"{full} cannot be read: {error.strerror}; nothing was changed") from None
-
-
-def check_name(path: str) -> None:
-    """Check that a relative path is written the one way that it can be, and stays out of every ``.git``.
-
-    Raises:
-        LegsError: it is not, or does not.
-    """
-    parts = path.split("/")
-    if any(part in ("", ".", "..") or "\0" in part for part in parts) or "\\" in path or _has_root(path):
-        raise LegsError(f"{path!r} is no path of a file in the checkout")
-    if any(_is_dot_git(part) for part in parts):
-        raise LegsError(f"{path!r} is in .git, where legs-patch changes nothing")
-
-
-def _has_root(path: str) -> bool:
-    return os.path.isabs(path) or bool(os.path.splitdrive(path)[0])
-
-
-def _is_dot_git(part: str) -> bool:
-    """Return whether some file system takes a name for ``.git``.
-
-    They do without regard to case, with dots or spaces behind it, by its short name or as one of its streams (NTFS),
-    and with letters in it that nobody sees (HFS+).
-    """
-    seen = "".join(letter for letter in part if unicodedata.category(letter) != "Cf")
-    return seen.split(":")[0].rstrip(". ").casefold() in (".git", "git~1")
 
 
 def _stage(staging: Path, target: Path, data: bytes) -> str:

@@ -8,7 +8,7 @@ from typing import Callable, Dict, Iterable, List, Mapping, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.module import Function, Module, parse
+from legs_adapters.code.module import Function, Module, parse, said
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import dotted
 
@@ -32,7 +32,9 @@ class Checkout:
         self._unreadable: Dict[str, Unreadable] = {}
         self._modules: Dict[str, Optional[Module]] = {}
         self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
+        self._by_word: Optional[Dict[str, List[str]]] = None  # as ``said`` has them
         self._defined: Dict[str, List[str]] = {}
+        self._by_import: Dict[Tuple[str, str, int], Optional[Module]] = {}
         self._together: Dict[str, Set[str]] = {}
         self._ending: Dict[str, List[str]] = {}  # by the last name of what is imported of them
         for source in self.sources.values():
@@ -68,19 +70,15 @@ class Checkout:
 
     def mentioning(self, name: str, called: bool = False) -> List[Function]:
         """Return the functions and top levels whose text mentions a name, or calls it."""
-        pattern = re.compile(r"\b" + re.escape(name) + (r"\s*\(" if called else r"\b"))
-
-        def says(text: str) -> bool:
-            return name in text and pattern.search(text) is not None
-
+        if self._by_word is None:
+            self._by_word = {}
+            for path, source in self.sources.items():
+                for word in said(source.text):
+                    self._by_word.setdefault(word, []).append(path)
         if (name, called) not in self._mentions:
-            modules = [
-                self.module(path)
-                for path, source in self.sources.items()
-                if name in source.text and (path in self._modules or says(source.text))
-            ]
+            modules = [self.module(path) for path in self._by_word.get(f"{name}(" if called else name, ())]
             self._mentions[name, called] = [
-                function for module in modules if module is not None for function in module.mentioning(name, says)
+                function for module in modules if module is not None for function in module.mentioning(name, called)
             ]
         return self._mentions[name, called]
 
@@ -134,6 +132,12 @@ class Checkout:
 
     def find_module(self, module: Module, name: str, level: int) -> Optional[Module]:
         """Return the checkout's module of this name, as seen from another; None where it is not the checkout's."""
+        asked = (module.path, name, level)
+        if asked not in self._by_import:
+            self._by_import[asked] = self._find_module(module, name, level)
+        return self._by_import[asked]
+
+    def _find_module(self, module: Module, name: str, level: int) -> Optional[Module]:
         here = PurePosixPath(module.path).parent
         inner = name.replace(".", "/")
         if level:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import fnmatch
 import os
 import re
+import unicodedata
 from pathlib import Path
 from typing import Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
+from legs_loss import LegsError
 from legs_loss.system import read_regular
 
 __all__ = [
@@ -16,6 +18,7 @@ __all__ = [
     "TESTS",
     "VENDORED",
     "Skipped",
+    "check_name",
     "folders_of",
     "foreign_folder",
     "own_and_excluded",
@@ -129,6 +132,8 @@ def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[s
     name = os.path.basename(path)
     if name in _FOREIGN:
         return _FOREIGN[name]
+    if _is_dot_git(name):
+        return _FOREIGN[".git"]
     if os.path.exists(os.path.join(full, "pyvenv.cfg")):
         return "a virtual environment"
     return _CHECKOUT if os.path.lexists(os.path.join(full, ".git")) else None
@@ -151,3 +156,27 @@ def _submodules(root: Path) -> List[str]:
     except OSError:
         return []
     return [match.strip().rstrip("/") for match in re.findall(r"^\s*path\s*=\s*(.+)$", text, re.M)]
+
+
+def check_name(path: str) -> None:
+    """Check that a relative path is written the one way that it can be, and stays out of every ``.git``.
+
+    Raises:
+        LegsError: it is not, or does not.
+    """
+    parts = path.split("/")
+    odd = any(part in ("", ".", "..") for part in parts) or any(letter in path for letter in "\0\n\r\\")
+    if odd or os.path.isabs(path) or os.path.splitdrive(path)[0]:
+        raise LegsError(f"{path!r} is no path of a file in the checkout")
+    if any(_is_dot_git(part) for part in parts):
+        raise LegsError(f"{path!r} is in .git, where legs-patch changes nothing")
+
+
+def _is_dot_git(part: str) -> bool:
+    """Return whether some file system takes a name for ``.git``.
+
+    They do without regard to case, with dots or spaces behind it, by its short name or as one of its streams (NTFS),
+    and with letters in it that nobody sees (HFS+).
+    """
+    seen = "".join(letter for letter in part if unicodedata.category(letter) != "Cf")
+    return seen.split(":")[0].rstrip(". ").casefold() in (".git", "git~1")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Callable, Dict, Iterator, List, Optional, Sequence, Tuple
+from typing import Callable, Dict, Iterator, List, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
@@ -14,14 +14,14 @@ from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import arguments, dotted
 
-__all__ = ["CALLED", "Class", "Function", "Module", "parse"]
+__all__ = ["CALLED", "Class", "Function", "Module", "parse", "said"]
 
 CALLED = ("forward", "__call__")  # what calling an instance runs: a torch module's own, and Python's
 
 _PRINT_STATEMENT = re.compile(
     r"^\s*(print\s+[\"'\w]|exec\s+[\"']|raise\s+\w+\s*,)|^\s*except\s+[\w.]+\s*,\s*\w+\s*:", re.M
 )
-_WORD = re.compile(r"\w+")
+_SAID = re.compile(r"(\w+)(?:\s*(\())?")  # a word, and whether it is called
 _DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
@@ -221,7 +221,8 @@ class Module:
         self.classes: List[Class] = []
         self.by_node: Dict[int, Function | Class] = {}
         self.top = Function(self, self.outline.tree)
-        self._by_word: Optional[Dict[str, List[Function]]] = None
+        self._by_word: Optional[Dict[str, List[Function]]] = None  # as ``said`` has them
+        self._says: Dict[str, bool] = {}
         self._cuts: Iterator[Optional[Cut]] = iter(cuts)
         self._functions = self.collect(self.outline.tree.body, self.top)
         self._cuts = iter(())
@@ -248,6 +249,12 @@ class Module:
                 functions += self.collect(node.body.body, parent, found)
         return functions
 
+    def says(self, piece: str) -> bool:
+        """Return whether a piece of text is in the file: of each of its functions it may be asked."""
+        if piece not in self._says:
+            self._says[piece] = piece in self.text
+        return self._says[piece]
+
     def functions(self, says: Callable[[str], object]) -> Iterator[Function]:
         """Yield the functions whose text says so, methods and nested functions too, in source order."""
         return _chosen(self._functions, says)
@@ -264,14 +271,24 @@ class Module:
         """Yield the top level and the functions whose text says so."""
         return _chosen([self.top, *self._functions], says)
 
-    def mentioning(self, name: str, says: Callable[[str], object]) -> Iterator[Function]:
-        """Yield those of the scopes whose text has a word, by an index: every function's name may be asked for."""
+    def mentioning(self, name: str, called: bool = False) -> Iterator[Function]:
+        """Yield those of the scopes whose text has a word, or calls it, by an index: any function may be asked for."""
         if self._by_word is None:
             self._by_word = {}
             for scope in (self.top, *self._functions):
-                for word in set(_WORD.findall(scope.text)):
+                for word in said(scope.text):
                     self._by_word.setdefault(word, []).append(scope)
-        return _chosen(self._by_word.get(name, ()), says)
+        for scope in self._by_word.get(f"{name}(" if called else name, ()):
+            yield scope
+            if scope.inner:
+                pattern = re.compile(rf"\b{re.escape(name)}" + (r"\s*\(" if called else r"\b"))
+                yield from _chosen(scope.inner, pattern.search, scope.text)
+
+
+def said(text: str) -> Set[str]:
+    """Return the words of a text, and with a bracket behind them those that it calls."""
+    found = set(_SAID.findall(text))
+    return {word for word, _ in found} | {f"{word}(" for word, bracket in found if bracket}
 
 
 def _chosen(

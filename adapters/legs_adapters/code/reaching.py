@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Dict, FrozenSet, List, Optional, Sequence, Set, Tuple
 
 import libcst as cst
@@ -13,6 +14,8 @@ import libcst as cst
 from legs_adapters.code.syntax import walk_expressions
 
 __all__ = ["Definition", "Env", "Reaching", "join"]
+
+_PART = re.compile(r"[.\[]")
 
 
 class Definition:
@@ -77,6 +80,7 @@ class Reaching:
         self._reaching: Dict[int, Set[Definition]] = {}
         self._names: Dict[int, List[Env]] = {}
         self._made: Dict[Tuple[int, str, str], Definition] = {}
+        self._holders: Set[str] = set()  # places of which a part is defined: ``x`` and ``x.y`` of ``x.y['z']``
 
     @property
     def every_definition(self) -> List[Definition]:
@@ -117,13 +121,14 @@ class Reaching:
             self._made[known] = Definition(place, kind, node, value, index, key)
             self._made[known].order = len(self._made)
             self.definitions.setdefault(place, []).append(self._made[known])
+            self._holders.update(place[: found.start()] for found in _PART.finditer(place))
         return self._made[known]
 
-    @staticmethod
-    def _bind(env: Env, definition: Definition) -> None:
+    def _bind(self, env: Env, definition: Definition) -> None:
         place = definition.place
-        for other in [other for other in env if other.startswith((place + ".", place + "["))]:
-            del env[other]
+        if place in self._holders:  # a top level may bind thousands of names: few of them have parts
+            for other in [other for other in env if other.startswith((place + ".", place + "["))]:
+                del env[other]
         env[place] = frozenset([definition])
 
     @staticmethod

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Sequence
 
-from legs_adapters.code.folders import own_and_excluded
+from legs_adapters.code.folders import check_name, own_and_excluded
 from legs_adapters.code.limits import LARGEST, too_deep
 from legs_loss import LegsError
 from legs_loss.system import read_regular
@@ -95,9 +95,12 @@ def read_files(root: Path, exclude: Sequence[str]) -> Files:
 
 
 def read_source(root: Path, path: str) -> Source | Unreadable:
-    """Read one file; what cannot be read as UTF-8 is returned with its reason."""
+    """Read one file; what cannot be read as UTF-8, or has a name that is never written, is returned with its reason."""
     try:
+        check_name(path)
         data = read_regular(root / path, LARGEST)
+    except LegsError:
+        return Unreadable(path, "a file of this name is not written: rename it")
     except OSError as error:
         large = error.errno == errno.EFBIG
         return Unreadable(path, f"larger than {LARGEST >> 20} MiB" if large else f"cannot be read: {error.strerror}")

@@ -17,7 +17,7 @@ _PATCHED = (f"{PACKAGE}.l1_loss", f"{PACKAGE}.unweighted")
 
 def patched_nodes(program: Program, function: Function, names: Sequence[str] = _PATCHED) -> List[cst.CSTNode]:
     """Return what refers to legs_loss's own in a function, by these names: what is called, and what names are given."""
-    if PACKAGE not in function.module.text:
+    if not function.module.says(PACKAGE):
         return []
     nodes: List[cst.CSTNode] = [call.func for call in function.flow.calls]
     named = [d.value for d in function.flow.every_definition if d.kind == "assign"]

@@ -77,12 +77,13 @@ class Entry:
         return self.view, self.height, self.width, self.operator, self.p, self.eps, self.smooth
 
 
+_STRONGEST = 1e6  # response: images are in [0, 1]; weights of larger ones would overflow
 _LEVELS = ("low", "span", "percentile", "median", "strong")
 _ADDED = {"smooth": 0.0, **dict.fromkeys(_LEVELS)}  # by version 2, and what they are where they are not written
 
 
 def _is_level(value: Any) -> bool:
-    return value is None or (type(value) is float and 0 <= value < math.inf)
+    return value is None or (type(value) is float and 0 <= value <= _STRONGEST)
 
 
 # What a field may be. Type by type: JSON's true is an int, and 1.0 == 1.

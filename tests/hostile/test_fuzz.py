@@ -37,8 +37,9 @@ def test_what_breaks_a_promise_is_found(tmp_path, monkeypatch):
     good = tmp_path / "good"
     good.mkdir()
     make(good)
+    watch = fuzz.Watch(tmp_path / "work")
     for read, said in ((traceback, "KeyError"), (writes_outside, "outside"), (fuzz.read_settings, "")):
         monkeypatch.setitem(fuzz.READERS, "settings", (make, ["legs.toml"], read))
         (tmp_path / "work").mkdir(exist_ok=True)
-        wrong = fuzz.run_case("settings", good, tmp_path / "work", fuzz.random.Random(1))
+        wrong = fuzz.run_case("settings", good, tmp_path / "work", fuzz.random.Random(1), watch)
         assert (said in wrong) and bool(wrong) == bool(said)

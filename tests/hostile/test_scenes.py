@@ -141,3 +141,10 @@ def test_a_checkpoint_in_good_form(changes, line, tmp_path):
     write_checkpoint(path, *state(**changes))
     with pytest.raises(LegsError, match=line):
         read_state(path)
+
+
+def test_a_compressed_checkpoint_is_none(tmp_path):
+    """A few kilobytes could become gigabytes; ours are never compressed."""
+    np.savez_compressed(str(tmp_path / "c.npz"), **{**state()[0], "more": np.zeros(1 << 20)})
+    with pytest.raises(LegsError, match=r"is damaged \(compressed"):
+        read_state(tmp_path / "c.npz")

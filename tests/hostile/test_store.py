@@ -65,6 +65,7 @@ MAPS = {
     "of objects": npy(np.array([{}])),
     "of gigabytes": header(b"{'descr': '<f2', 'fortran_order': False, 'shape': (1099511627776, 4194304)}\n") + b"00",
     "deep": header(b"(" * 60_000),
+    "an open bracket": header(b"{'descr': '<f2', 'fortran_order': False, 'shape': (9, 12\n"),
     "not python": header(b"\xff" * 100),
     "empty": b"",
     "a zip": b"PK\x03\x04" + b"\0" * 40,
@@ -113,6 +114,23 @@ def test_legs_info_says_so(scene):
     assert "Traceback" not in done.stderr
 
 
+def test_a_map_of_terabytes_is_not_read(scene, capsys):
+    """Its entry says so, too: memory for it would end the training, or the machine."""
+    store = scene / "legs_weights"
+    entries = read_manifest(store)
+    entries[0] = replace(entries[0], bytes=1 << 40)
+    try:
+        with open(str(store / entries[0].file), "wb") as file:
+            file.truncate(1 << 40)
+    except OSError:
+        pytest.skip("a file system without sparse files")
+    (store / MANIFEST).write_bytes(manifest_bytes(entries))
+    stored, computed = train(scene)
+    assert stored == computed
+    assert "no file of its kind has more" in capsys.readouterr().err
+    assert len(WeightStore(store).check().damaged) == 1
+
+
 MANIFESTS = {
     "empty": b"",
     "deep": b"[" * 200_000,
@@ -140,6 +158,10 @@ FIELDS = [
     ("p", -2.0),
     ("sha256", "Z" * 64),
     ("background", "red"),
+    ("low", 1e300),
+    ("span", float("inf")),
+    ("median", -1.0),
+    ("strong", 1e7),
 ]
 
 

@@ -29,6 +29,8 @@ def read_checkpoint(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:
     """
     try:
         with open_regular(path) as raw, np.load(raw, allow_pickle=False) as file:
+            if any(member.compress_type for member in file.zip.infolist()):
+                raise ValueError("compressed, which none is: it could be of any size")
             arrays = {name: file[name] for name in file.files}
         facts = json.loads(arrays.pop("__facts__").tobytes().decode())
     except FileNotFoundError:

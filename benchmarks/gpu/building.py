@@ -56,7 +56,8 @@ def fastgs_modules(options: Options, record: Record) -> None:
     need([copy / "train.py", copy / "render.py"], packages)
     built = []
     for module in modules:
-        _build(module, options.site)
+        if not any((options.site / path.name).is_dir() for path in module.iterdir() if path.is_dir()):
+            _build(module, options.site)  # fused-ssim may have been built before
         built.append(module.name)
         record(built=built)
 

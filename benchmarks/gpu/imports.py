@@ -1,4 +1,4 @@
-"""What a training script imports and this Python lacks: found before minutes go into building its modules."""
+"""Find what a training script imports and this Python lacks, before minutes go into building its modules."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from benchmarks.gpu.options import Skipped
 
 __all__ = ["missing", "need"]
 
+OURS = ("libcst",)  # what `legs run` itself needs
+
 
 def need(scripts: Sequence[Path], built: Iterable[str] = ()) -> None:
-    """Check that all of a codebase's scripts can be imported; arguments as for :func:`missing`.
+    """Check that `legs run` can run a codebase's scripts; arguments as for :func:`missing`.
 
     Raises:
         Skipped: they cannot; the message names the packages.
     """
     lacking = sorted({name for script in scripts for name in missing(script, built)})
+    lacking += [name for name in OURS if importlib.util.find_spec(name) is None]
     if lacking:
         raise Skipped(f"{scripts[0].name} needs what is not installed: {', '.join(lacking)}")
 

@@ -21,8 +21,9 @@ _CHANGED = (
     "(said once; see docs/precompute.md)"
 )
 _RENEWED = (
-    "view {view!r}: its training image is a new tensor at each step, which on a GPU cannot be proven to be the stored "
-    "map's without waiting for the device, so its weight is computed (said once; see docs/precompute.md)"
+    "view {view!r}: its training image is another tensor than before, or on another stream; on a GPU it cannot be "
+    "proven to be the stored map's without waiting for the device, so its weight is computed (said once; see "
+    "docs/precompute.md)"
 )
 
 

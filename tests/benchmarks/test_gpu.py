@@ -21,7 +21,7 @@ pytest.importorskip("libcst")
 
 from benchmarks import loss
 from benchmarks.gpu import aims, building, imports, measured
-from benchmarks.gpu.options import ROOT, Skipped
+from benchmarks.gpu.options import ROOT, Options, Skipped
 from benchmarks.gpu.stages import STAGES
 from tests.cuda_emulation import COMPILER
 from tests.experiments.miniature import RENDER, RENDERER, TRAIN
@@ -156,6 +156,23 @@ def test_what_a_script_lacks_is_known_before_anything_is_built(tmp_path: Path) -
     with pytest.raises(Skipped, match=r"^train.py needs what is not installed: no_such_package$"):
         imports.need([tmp_path / "train.py"], built={"rasterizer_module"})
     imports.need([tmp_path / "utils.py"])
+
+
+def test_a_module_that_is_built_already_is_not_built_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """fused-ssim is, by a stage of its own."""
+    for name in ("FastGS/train.py", "FastGS/render.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("import fused_ssim_of_a_test, rasterizer_of_a_test\n")
+    for module in ("fused_ssim_of_a_test", "rasterizer_of_a_test"):
+        (tmp_path / "FastGS" / "submodules" / module / module).mkdir(parents=True)
+        (tmp_path / "FastGS" / "submodules" / module / "setup.py").write_text("")
+    built: list[str] = []
+    monkeypatch.setattr(building, "torch", SimpleNamespace(version=SimpleNamespace(cuda="13.0")))
+    monkeypatch.setattr(building, "_build", lambda source, site: built.append(source.name))
+    options = Options(False, (), 1, str(tmp_path), str(tmp_path), None, None, None, 1, None)
+    (options.site / "fused_ssim_of_a_test").mkdir(parents=True)
+    building.fastgs_modules(options, lambda **found: None)
+    assert built == ["rasterizer_of_a_test"]
 
 
 def test_a_gpus_time_begins_when_all_steps_are_launched(monkeypatch: pytest.MonkeyPatch) -> None:

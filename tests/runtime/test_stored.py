@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from legs_loss import configure, l1_loss
+from legs_loss import store as store_module
 from legs_loss.kernels.backends import is_capturing
 from legs_loss.precompute import precompute
 from legs_loss.runtime import counts, sources, state
@@ -82,6 +83,19 @@ class TestStore:
         l1_loss(torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8), view="z")
         assert (counts().stored, counts().computed) == (0, 3)
         assert "no map of view 'a' at 8x8" in capsys.readouterr().err
+
+    def test_on_a_device_it_is_for_a_tensor_that_stays(self, scene, capsys, monkeypatch):
+        """To know a new one again would wait for the device at each step: it is said, and its weight is computed."""
+        configure("legs", store=scene / "legs_weights")
+        image, compared = photograph(scene, "a.png"), []
+        proven = store_module.fingerprint(image)
+        monkeypatch.setattr(store_module, "fingerprint", lambda target: compared.append(target) or proven)
+        prediction, kept = torch.rand(3, 9, 8, device="meta", requires_grad=True), image.to("meta")
+        for target in (kept, kept, image.to("meta"), image.to("meta")):
+            l1_loss(prediction, target, view="a")
+        assert (counts().stored, counts().remembered, counts().computed) == (1, 1, 2)
+        assert len(compared) == 1
+        assert capsys.readouterr().err.count("view 'a': its training image is another tensor than before") == 1
 
     def test_nor_for_another_operator(self, scene):
         configure("eggs", store=scene / "legs_weights")

@@ -36,10 +36,13 @@ DEVICE unsigned as_bits(float value) { return __float_as_uint(value); }
 #endif
 
 #define ROWS 4             // rows a step of the streaming pass
+// Rows that the vertical blurs of a step unroll: of the moments, of the slopes. More of them spill a few bytes.
 #if defined(__CUDACC_VER_MAJOR__) && __CUDACC_VER_MAJOR__ < 12
-#define ROWS_AT_ONCE 1  // of the vertical blur; more of them spill a few bytes with the compilers of CUDA 11
+#define MOMENT_ROWS 2
+#define SLOPE_ROWS 1
 #else
-#define ROWS_AT_ONCE ROWS
+#define MOMENT_ROWS ROWS
+#define SLOPE_ROWS 2
 #endif
 #define REACH 5            // of SSIM's window
 #define PITCH (THREADS + 16)  // a row with its margins: 5 zeros before it, 11 after it
@@ -471,7 +474,7 @@ DEVICE void stream(const Task& k) {
             const int column = left + t;
             const bool inside = column >= 0 && column < k.width;
             const bool mine = t >= halo && t < halo + core && column < k.width;
-#pragma unroll ROWS_AT_ONCE
+#pragma unroll MOMENT_ROWS
             for (int r = 0; r < ROWS; ++r) {
                 const float* from = blurred + r * THREADS + t;
                 const float m1 = push(lane.moments[0], from[0]), m2 = push(lane.moments[1], from[ROWS * THREADS]);
@@ -523,7 +526,7 @@ DEVICE void stream(const Task& k) {
                         raw[r * PITCH + REACH + t] = weight_at(k, weights, row, column);
                 }
             }
-#pragma unroll 2  // four rows at a time spill a few bytes on some GPUs
+#pragma unroll SLOPE_ROWS
             for (int r = 0; r < ROWS; ++r) {
                 const float* from = blurred + r * THREADS + t;
                 const float s1 = push(lane.slopes[0], from[0]), s2 = push(lane.slopes[1], from[ROWS * THREADS]);

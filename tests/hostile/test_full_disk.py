@@ -144,17 +144,23 @@ def test_train(disk, tiny_scene, capsys):
     assert len(read_ply(out / "point_cloud" / "iteration_8" / "point_cloud.ply")) > 0
 
 
+def in_this_process(arms, processes, on_progress, on_done=lambda name, metrics: None):
+    """Train arms one after another, in place of a process for each."""
+    from legs_loss.reference.training.side_by_side import train_arm
+
+    found = {}
+    for arm in arms:
+        found[arm.name] = train_arm(arm, lambda progress: None)
+        on_done(arm.name, found[arm.name])
+    return found
+
+
 @pytest.mark.slow
 def test_compare_and_report(disk, tiny_scene, capsys, monkeypatch):
     pytest.importorskip("jinja2")
     from legs_loss.experiments import running
-    from legs_loss.reference.training.side_by_side import train_arm
 
-    def train(arms, processes, on_progress, on_done=None):
-        for arm in arms:
-            on_done(arm.name, train_arm(arm, lambda progress: None))
-
-    monkeypatch.setattr(running, "train_side_by_side", train)
+    monkeypatch.setattr(running, "train_side_by_side", in_this_process)
     subprocess.run(["mount", "-o", "remount,size=8m", str(disk.path)], check=True)
     out = disk.path / "out"
     compare = ["compare", str(tiny_scene), "--out", str(out), "--iterations", "6", "-r", "2", "--seeds", "1"]
@@ -170,6 +176,31 @@ def test_compare_and_report(disk, tiny_scene, capsys, monkeypatch):
         one_error(capsys, main(["report", str(out)]))
         assert disk.state() == before
         assert main(compare) == 0, "there is nothing to train"
+
+
+@pytest.mark.slow
+def test_demo(disk, tiny_scene, capsys, monkeypatch):
+    """One error wherever its room ends; what an earlier demo left stays whole."""
+    pytest.importorskip("matplotlib")
+    from legs_loss.reference.training import side_by_side
+
+    monkeypatch.setattr(side_by_side, "train_side_by_side", in_this_process)
+    subprocess.run(["mount", "-o", "remount,size=8m", str(disk.path)], check=True)
+    out = disk.path / "demo"
+    demo = ["demo", str(tiny_scene), "--out", str(out), "--iterations", "6", "-r", "2", "--processes", "1"]
+    for room in (0, 40_960, 200_000):
+        with disk.full(room):
+            one_error(capsys, main(demo))
+        assert not list(out.rglob("*.part"))
+    assert main(demo) == 0
+    capsys.readouterr()
+    before = disk.state()
+    assert "demo/results.json" in before
+    with disk.full(8192):
+        one_error(capsys, main(demo))
+        after = disk.state()
+    assert all(after[name] for name in before), "half a file"
+    assert main(demo) == 0
 
 
 def test_show(disk, tiny_scene, capsys):

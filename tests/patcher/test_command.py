@@ -80,7 +80,7 @@ class TestCommandLine:
         assert run("--force", root).returncode == 0
 
     def test_what_cannot_be_decided_stops_it_unless_partial(self, tmp_path, run):
-        root = checkout(tmp_path, files("undecided"))
+        root = checkout(tmp_path, files("unknown_image_pair_error"))
         before = snapshot(root)
         refused = run(root)
         assert refused.returncode == 2
@@ -95,7 +95,7 @@ class TestCommandLine:
         assert "l1_loss(image_a, image_b)" in (root / "train.py").read_text()
 
     def test_partial_does_not_call_a_tree_patched_of_which_nothing_could_be_decided(self, tmp_path, run):
-        texts = files("kernel")
+        texts = files("fused_l1_ssim_kernel_error")
         root = checkout(tmp_path, texts)
         before = snapshot(root)
         partial = run("--partial", root)
@@ -105,7 +105,7 @@ class TestCommandLine:
         assert snapshot(root) == before
 
     def test_json(self, tmp_path, run):
-        root = checkout(tmp_path, files("channels_last"))
+        root = checkout(tmp_path, files("channels_last_weighted"))
         done = run("--json", "--check", root)
         content = json.loads(done.stdout)
         assert done.returncode == 1
@@ -116,7 +116,7 @@ class TestCommandLine:
         assert content["wrote"] == []
 
     def test_calls_that_stay_plain_are_reported_and_undone(self, tmp_path, run):
-        root = checkout(tmp_path, files("bodies_of_two"))
+        root = checkout(tmp_path, files("shared_loss_function_unweighted_call"))
         before = snapshot(root)
         content = json.loads(run("--json", root).stdout)
         assert [(plain["file"], plain["line"], plain["reason"]) for plain in content["plain"]] == [
@@ -136,7 +136,7 @@ class TestCommandLine:
         assert snapshot(root) == before
 
     def test_calls_of_a_body_chosen_by_hand_stay_plain_too(self, tmp_path, run):
-        root = checkout(tmp_path, files("bodies_of_two"))
+        root = checkout(tmp_path, files("shared_loss_function_unweighted_call"))
         done = run("--site", "utils/photometric.py:17", root)
         assert done.returncode == 0, done.stderr
         assert "legs_loss.unweighted(rgb_loss)(" in (root / "slam.py").read_text()
@@ -152,7 +152,7 @@ class TestCommandLine:
         ids=["excluded", "Python 2", "not UTF-8"],
     )
     def test_a_call_in_a_file_that_is_not_read_is_an_error(self, line, arguments, tmp_path, run):
-        texts = files("bodies_of_two")
+        texts = files("shared_loss_function_unweighted_call")
         texts["old/slam.py"] = b"from utils.photometric import rgb_loss\n\n\ndef old(a, b):\n" + line
         root = checkout(tmp_path, texts)
         before = snapshot(root)
@@ -171,12 +171,10 @@ class TestCommandLine:
         assert "there is no L1 term at train.py:3" in missing.stderr
 
     def test_a_function_that_is_settled_at_run_time_is_weighted_by_hand(self, tmp_path, run):
-        root = checkout(tmp_path, files("settled_at_run_time"))
+        texts = files("loss_from_eval_or_getattr_error")
+        root = checkout(tmp_path, texts)
         before = snapshot(root)
-        line = (
-            files("settled_at_run_time")["train.py"].splitlines().index("        loss1 = loss_func(image, gt_image)")
-            + 1
-        )
+        line = texts["train.py"].splitlines().index("        loss1 = loss_func(image, gt_image)") + 1
         done = run("--site", f"train.py:{line}", root)
         assert done.returncode == 0, done.stderr
         text = (root / "train.py").read_text()

@@ -26,7 +26,7 @@ def patched(root, **options):
 
 class TestWriting:
     def test_a_second_run_changes_nothing(self, tmp_path):
-        root = patched(checkout(tmp_path, files("appearance")))
+        root = patched(checkout(tmp_path, files("decoupled_appearance_weighted")))
         before = snapshot(root)
         assert write(plan(root)) == []
         assert snapshot(root) == before
@@ -43,7 +43,7 @@ class TestWriting:
         assert snapshot(root) == before
 
     def test_all_or_nothing_across_files(self, tmp_path, monkeypatch):
-        root = checkout(tmp_path, files("gui"))
+        root = checkout(tmp_path, files("gui_train_step_weighted"))
         before = snapshot(root)
         replace, calls = os.replace, []
 
@@ -59,7 +59,7 @@ class TestWriting:
         assert snapshot(root) == before
 
     def test_a_file_that_changed_meanwhile_stops_it(self, tmp_path):
-        root = checkout(tmp_path, files("gui"))
+        root = checkout(tmp_path, files("gui_train_step_weighted"))
         found = plan(root)
         (root / "train_gui.py").write_text("# mine\n")
         before = snapshot(root)
@@ -68,7 +68,7 @@ class TestWriting:
         assert snapshot(root) == before
 
     def test_an_interrupted_write_can_be_taken_back(self, tmp_path, monkeypatch):
-        root = checkout(tmp_path, files("gui"))
+        root = checkout(tmp_path, files("gui_train_step_weighted"))
         before = snapshot(root)
         replace, calls = os.replace, []
 
@@ -201,7 +201,7 @@ class TestWhereItLooks:
     @pytest.mark.skipif(sys.platform == "win32", reason="links want a privilege there")
     def test_links_are_not_followed(self, tmp_path):
         outside = checkout(tmp_path / "outside", files("inria"))
-        root = checkout(tmp_path / "repo", {**files("gui")})
+        root = checkout(tmp_path / "repo", {**files("gui_train_step_weighted")})
         (root / "linked").symlink_to(outside, target_is_directory=True)
         (root / "linked.py").symlink_to(outside / "train.py")
         before = snapshot(outside)

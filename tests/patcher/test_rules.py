@@ -46,7 +46,7 @@ def planned(folder, example, ssim=False):
     text += "\n"
     first = text[: text.index(example.splitlines()[0])].count("\n") + 1
     other = IMPORTS + STEP.format("        loss = l1_loss(image, gt)")  # so that no other term has to be the loss
-    texts = dict(files("ssim" if ssim else "inria"), **{"train.py": text, "other.py": other})
+    texts = dict(files("ssim_beside_l1_fused" if ssim else "inria"), **{"train.py": text, "other.py": other})
     return plan(checkout(folder, texts), ssim=ssim), first, first + example.count("\n")
 
 

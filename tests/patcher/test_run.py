@@ -38,7 +38,7 @@ def result(done):
 @pytest.fixture(scope="module")
 def runs(scene, tmp_path_factory):
     """The runs that the tests compare: each is a training of its own process."""
-    root = checkout(tmp_path_factory.mktemp("checkout"), files("trainable"))
+    root = checkout(tmp_path_factory.mktemp("checkout"), files("runnable_train_script_weighted"))
     train = ("train.py", "-s", scene)
     found = {"unpatched": result(python(*train, cwd=root))}
     before = snapshot(root)
@@ -75,7 +75,7 @@ class TestTraining:
 
     @pytest.mark.slow
     def test_so_is_beta_0_and_off_in_memory(self, runs, scene, tmp_path):
-        root = checkout(tmp_path, files("trainable"))
+        root = checkout(tmp_path, files("runnable_train_script_weighted"))
         train = ("-m", "legs_loss", "run", "train.py", "-s", scene)
         for variables in ({"LEGS_BETA": "0"}, {"LEGS_OFF": "1"}, {"LEGS_PRESET": "3dgs"}):
             assert result(python(*train, cwd=root, **variables))["losses"] == runs["unpatched"]["losses"]
@@ -83,7 +83,7 @@ class TestTraining:
     @pytest.mark.slow
     def test_the_compiled_rasterizer_trains_on_the_whole_scene(self, tmp_path):
         scene = write_embedded_scene(tmp_path / "scene", views=6, width=96, height=72, points=1500, samples=1)
-        root = checkout(tmp_path / "checkout", files("trainable"))
+        root = checkout(tmp_path / "checkout", files("runnable_train_script_weighted"))
         train = ("train.py", "-s", scene, "--backend", "numba", "--iterations", "60", "--points", "1500")
         plain = result(python(*train, cwd=root))["losses"]
         weighted = result(python("-m", "legs_loss", "run", *train, cwd=root))["losses"]
@@ -190,7 +190,7 @@ class TestAsPythonRunsIt:
         assert codes[0] == codes[1] != 0
 
     def test_modules_beside_the_script_are_rewritten_as_they_are_imported(self, tmp_path):
-        texts = files("appearance")
+        texts = files("decoupled_appearance_weighted")
         texts["losses.py"] = texts["train.py"]
         texts["train.py"] = (
             "import inspect, losses\n"
@@ -206,7 +206,7 @@ class TestAsPythonRunsIt:
         assert "losses.py:13 is weighted in this run" in done.stderr
 
     def test_calls_stay_plain_in_memory_too(self, tmp_path):
-        texts = files("bodies_of_two")
+        texts = files("shared_loss_function_unweighted_call")
         texts["run.py"] = "import inspect, slam\nprint(inspect.getsource(slam.tracking), slam.legs_loss.__name__)\n"
         root = checkout(tmp_path, texts)
         before = snapshot(root)

@@ -58,15 +58,15 @@ def test_in_place_every_line_keeps_its_number(name, tmp_path):
     assert sorted(here.after) == sorted(on_disk.after)
     for path, data in here.after.items():
         before = (root / path).read_bytes()
-        if name != "taken":  # nothing to put the import on: its own line
+        if name != "legs_loss_name_taken_weighted":  # nothing to put the import on: its own line
             assert data.count(b"\n") == before.count(b"\n")
         edits = [edit for edit in here.edits[path] if b"import legs_loss" not in edit.after]
         assert edits == [edit for edit in on_disk.edits[path] if b"import legs_loss" not in edit.after]
 
 
 def test_a_site_chosen_by_hand_is_the_only_one(tmp_path):
-    root = checkout(tmp_path, files("traps"))
-    lines = files("traps")["train.py"].splitlines()
+    root = checkout(tmp_path, files("non_photometric_l1_left"))
+    lines = files("non_photometric_l1_left")["train.py"].splitlines()
     line = lines.index("        Ll1 = l1_loss(rendered, target_image)") + 1
     found = plan(root, by_hand=[("train.py", line)])
     assert [(site.path, site.line) for site in found.findings.sites] == [("train.py", line)]
@@ -150,6 +150,6 @@ def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path)
 
 
 def test_the_advice_for_a_difference_weights_it_where_its_absolute_value_is_taken(tmp_path):
-    weighted_before, taken = plan(checkout(tmp_path, files("signed_differences"))).findings.problems
+    weighted_before, taken = plan(checkout(tmp_path, files("difference_from_callee_error"))).findings.problems
     assert weighted_before.advice == "torch.abs(legs_loss.weight_map(gt_image) * value).mean()"
     assert taken.advice == "robust(legs_loss.weight_map(gt_image * cam.seen) * residual, cam.scale)"

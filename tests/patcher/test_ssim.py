@@ -18,7 +18,7 @@ from tests.code.support import function, program
 from tests.patcher.support import checkout, files, legs_patch, snapshot
 from tests.patcher.test_run import python, result
 
-SSIM = files("ssim")["utils/loss_utils.py"]
+SSIM = files("ssim_beside_l1_fused")["utils/loss_utils.py"]
 
 
 def answer(source, name="ssim", *extras, **keywords):
@@ -26,14 +26,14 @@ def answer(source, name="ssim", *extras, **keywords):
     return SsimFunctions(made).answer(function(made, name), extras, keywords)
 
 
-TRAIN = files("trainable")["train.py"].splitlines()
+TRAIN = files("runnable_train_script_weighted")["train.py"].splitlines()
 L1 = TRAIN.index("        Ll1 = l1_loss(image, gt_image)") + 1
 WHERE = SSIM.splitlines().index("def ssim(img1, img2, window_size=11, size_average=True):") + 1
 
 
 def scripts():
     """A script that trains on the CPU, with the SSIM of 3DGS."""
-    return {**files("trainable"), "utils/loss_utils.py": SSIM}
+    return {**files("runnable_train_script_weighted"), "utils/loss_utils.py": SSIM}
 
 
 class TestWhatIsTheSsimOf3dgs:
@@ -92,13 +92,13 @@ class TestWhatIsTheSsimOf3dgs:
 
 class TestPatch:
     def test_without_the_option_no_ssim_is_touched_or_listed(self, tmp_path):
-        found = plan(checkout(tmp_path, files("ssim")))
+        found = plan(checkout(tmp_path, files("ssim_beside_l1_fused")))
         assert not [edit for edits in found.edits.values() for edit in edits if b"ssim" in edit.after]
         assert all(site.form.weighs for site in found.findings.sites)
         assert not [left for left in found.findings.left if left.evidence.rule.startswith("ssim-")]
 
     def test_the_l1_terms_are_what_they_are_without_it(self, tmp_path):
-        root = checkout(tmp_path, files("ssim"))
+        root = checkout(tmp_path, files("ssim_beside_l1_fused"))
         plain, both = plan(root), plan(root, ssim=True)
         assert [site[:4] for site in both.findings.sites if site.form.weighs] == [s[:4] for s in plain.findings.sites]
         assert {left[:4] for left in plain.findings.left} <= {left[:4] for left in both.findings.left}

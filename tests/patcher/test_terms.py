@@ -65,7 +65,8 @@ def step(code):
 
 
 def planned(tmp_path, code, ssim=False):
-    shared = {path: text for path, text in files("ssim" if ssim else "common").items() if path != "train.py"}
+    name = "ssim_beside_l1_fused" if ssim else "common"
+    shared = {path: text for path, text in files(name).items() if path != "train.py"}
     return plan(checkout(tmp_path, {**shared, "train.py": SCRIPT.replace("{step}", step(code))}), ssim=ssim)
 
 

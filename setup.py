@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: the licence for old and new setuptools, and README as a package index shows it.
+"""The metadata beyond pyproject.toml: the licence for old and new setuptools, and README as a package index shows it.
 
 setuptools 77 and later writes the licence as an SPDX expression (PEP 639) and is to refuse every other form; the last
 setuptools of Python 3.7 and 3.8 knows only the older field.

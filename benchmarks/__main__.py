@@ -85,7 +85,7 @@ def merge(old: Dict[str, Any], new: Dict[str, Any]) -> None:
 
 
 def measure(command: List[str]) -> Any:
-    """Run a script; return its JSON, or what it printed where it writes none; None if it fails."""
+    """Run a script; return its JSON, its output where it writes none, or None if it fails."""
     search = os.pathsep.join([str(HERE.parent), str(HERE.parent / "adapters"), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": search}
     if "--threads" in command:

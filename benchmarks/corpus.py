@@ -125,7 +125,7 @@ def _child(folder: str, results: Connection) -> None:
 
 
 def compare(before: Dict[str, Plan], after: Dict[str, Plan], sites: bool = False) -> int:
-    """Print what differs between the plans, checkout by checkout; return how many checkouts differ."""
+    """Print the differences between the plans, checkout by checkout; return how many checkouts differ."""
     different = 0
     for name in sorted(set(before) | set(after)):
         old, new = (
@@ -144,7 +144,7 @@ def compare(before: Dict[str, Plan], after: Dict[str, Plan], sites: bool = False
 
 
 def changes(key: str, old: Any, new: Any) -> None:
-    """Print what of a plan's entry is gone and what is new; of lists, only the elements that differ."""
+    """Print the old and the new value of a plan's entry; of lists, only the elements that differ."""
     if old == new:
         return
     if not (isinstance(old, list) and isinstance(new, list)):
@@ -158,7 +158,7 @@ def changes(key: str, old: Any, new: Any) -> None:
 
 
 def edits(found: Plan) -> Plan:
-    """Return what a plan would edit: call sites with view and layout, the lines of problems, the exit code."""
+    """Return a plan's edits: call sites with view and layout, the lines of problems, the exit code."""
 
     def places(key: str, *names: str) -> List[List[Any]]:
         return sorted(([entry.get(name) for name in names] for entry in found.get(key, [])), key=str)

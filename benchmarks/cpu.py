@@ -1,4 +1,4 @@
-"""What a stand-in costs over the reference rasterizer called directly: same Gaussians, same image, side by side.
+"""The cost of a stand-in over the reference rasterizer called directly: same Gaussians, same image, side by side.
 
     PYTHONPATH=.:adapters python benchmarks/cpu.py --threads 1
 

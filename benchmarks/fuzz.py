@@ -1,4 +1,4 @@
-"""Damage files at random, read them with every reader of the package, and hold it to what it promises.
+"""Damage files at random and read them with every reader of the package, which must keep its promises.
 
     python -m benchmarks.fuzz --minutes 10
     python -m benchmarks.fuzz --cases 10000 --seed 7 --readers store colmap
@@ -185,7 +185,7 @@ def make_patched(folder: Path) -> None:
 
 
 def read_maps(folder: Path) -> None:
-    """Read a store whose manifest says of damaged maps what they are: what a stranger would write."""
+    """Read a store of damaged maps whose manifest agrees with them, as a stranger would write it."""
     entries = read_manifest(folder / "store")
     data = {entry.file: (folder / "store" / entry.file).read_bytes() for entry in entries}
     true = [replace(e, bytes=len(data[e.file]) or 1, sha256=sha256(data[e.file]).hexdigest()) for e in entries]
@@ -220,7 +220,7 @@ def read_points(folder: Path) -> None:
 
 
 def patch(folder: Path) -> None:
-    """Patch and undo: what compiled still compiles, and every byte comes back."""
+    """Patch and undo: a file that compiled still compiles, and every byte comes back."""
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     found = plan(folder)
     for name, after in found.after.items():
@@ -270,7 +270,7 @@ READERS: Dict[str, Reader] = {
 
 
 def void(_: Any) -> None:
-    """Return nothing of what was made."""
+    """Drop the result of a call."""
 
 
 def stop(*_: Any) -> None:
@@ -278,9 +278,9 @@ def stop(*_: Any) -> None:
 
 
 class Watch:
-    """What is written, renamed, deleted or started in a case, outside of its folder; needs Python 3.8.
+    """The files written, renamed or deleted and the processes started outside of a case's folder; needs Python 3.8.
 
-    numba's and Python's own caches, the user's state folder and the null device are no such thing.
+    numba's and Python's own caches, the user's state folder and the null device do not count.
     """
 
     def __init__(self, work: Path) -> None:
@@ -304,7 +304,7 @@ class Watch:
 
 
 def run_case(name: str, good: Path, work: Path, at: random.Random, watch: Watch) -> str:
-    """Return what was wrong with a case, or nothing."""
+    """Return the fault of a case, or nothing."""
     _, patterns, read = READERS[name]
     folder = work / "case"
     if folder.exists():

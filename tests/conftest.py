@@ -32,7 +32,7 @@ FOX = Path(os.environ.get("LEGS_TEST_SCENE", Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="session", autouse=True)
 def state_home(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Keys and the like go to a folder of the tests' own, in what they start too."""
+    """Send the user's state, such as keys, to a folder of the tests' own, in processes that they start too."""
     os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
 
 

@@ -60,5 +60,5 @@ def legs(*arguments, **options):
 
 
 def without_times(metrics):
-    """Return a run's metrics without what differs from run to run."""
+    """Return a run's metrics without those that differ from run to run."""
     return {name: value for name, value in metrics.items() if not name.endswith("seconds")}

@@ -1,4 +1,4 @@
-"""The page of compatibility: it is what corpus.csv says, and other documents name the same figures."""
+"""The page of compatibility: it agrees with corpus.csv, and other documents name the same figures."""
 
 import csv
 import importlib.util

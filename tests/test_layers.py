@@ -26,7 +26,7 @@ def imports(path: Path) -> Iterator[Tuple[int, str, str]]:
 
 
 def from_package(folder: Path, package: str) -> List[Tuple[str, str, str]]:
-    """Place, module and name of what the files in a folder import from a package."""
+    """Return place, module and name of each import from a package in a folder's files."""
     return [
         (f"{path.relative_to(ROOT)}:{line}", module, name)
         for path in sorted(folder.rglob("*.py"))

@@ -21,7 +21,7 @@ setuptools = pytest.importorskip("setuptools", minversion="77")
 
 
 def build(tree: Path, hook: str, out: Path) -> Path:
-    """Run one of setuptools' build hooks in a tree, and return what it wrote."""
+    """Run one of setuptools' build hooks in a tree, and return the file that it wrote."""
     out.mkdir(parents=True, exist_ok=True)
     program = f"from setuptools import build_meta\nprint(build_meta.{hook}({str(out)!r}))"
     done = subprocess.run([sys.executable, "-c", program], cwd=str(tree), capture_output=True, text=True)

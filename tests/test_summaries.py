@@ -1,4 +1,4 @@
-"""The first line of a docstring says what a function does, in the imperative, or what a class is, as a noun."""
+"""The first line of a docstring describes a function in the imperative, a class or a module as a noun."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.support import ROOT
 QUESTIONS = {"How", "What", "When", "Where", "Whether", "Which", "Who", "Why"}
 ARTICLES = {"A", "An", "Each", "The", "This"}
 FILES = sorted((ROOT / "legs_loss").rglob("*.py"))
-ADAPTERS = sorted((ROOT / "adapters").rglob("*.py"))
+OTHERS = sorted(path for folder in ("adapters", "benchmarks", "tests") for path in (ROOT / folder).rglob("*.py"))
 
 
 def summaries(path):
@@ -29,6 +29,6 @@ def test_a_summary_begins_with_a_verb_or_a_noun(path):
     assert wrong == []
 
 
-@pytest.mark.parametrize("path", ADAPTERS, ids=lambda path: path.relative_to(ROOT / "adapters").as_posix())
+@pytest.mark.parametrize("path", OTHERS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_a_summary_asks_no_question(path):
     assert [(line, word) for line, word, _ in summaries(path) if word in QUESTIONS] == []

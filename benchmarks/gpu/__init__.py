@@ -1,4 +1,4 @@
-"""What only a GPU can show, in one command: `python -m benchmarks.gpu --help`.
+"""Every check and measurement that needs a GPU, in one command: `python -m benchmarks.gpu --help`.
 
 stages.py lists the stages in their order; running.py runs each in a process of its own, with a time limit, and keeps
 what it has found; child.py is that process. machine.py, tests.py, times.py, behaviour.py, building.py and training.py

@@ -1,4 +1,4 @@
-"""Everything that needs a GPU, in one command of at most 25 minutes; what it has is kept when it is interrupted.
+"""Everything that needs a GPU, in one command of at most 25 minutes; its results are kept when it is interrupted.
 
     python -m benchmarks.gpu --fastgs FastGS/ --scene fox/             # all of it, on a GPU
     python -m benchmarks.gpu --stages machine tests                    # some of it; the file keeps the rest

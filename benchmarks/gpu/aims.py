@@ -1,4 +1,4 @@
-"""What was aimed at, beside what was measured."""
+"""The aims beside the measurements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the kernels must not disturb: they wait for nothing, and run in graphs, on any stream and under torch.compile.
+"""The kernels' behaviour: they wait for nothing, and run in graphs, on any stream and under torch.compile.
 
 On the CPU the same steps run without the graph or the stream, and a stage says that the rest needs CUDA.
 """

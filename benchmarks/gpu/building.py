@@ -42,7 +42,7 @@ def fused_ssim(options: Options, record: Record) -> None:
 
 
 def fastgs_modules(options: Options, record: Record) -> None:
-    """Build the CUDA modules in a copy of FastGS; without a torch for CUDA, compile what needs no torch."""
+    """Build the CUDA modules in a copy of FastGS; without a torch for CUDA, compile the files that need no torch."""
     copy = copied(options)
     modules = sorted(path.parent for path in (copy / "submodules").glob("*/setup.py"))
     if not modules:

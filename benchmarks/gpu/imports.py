@@ -1,4 +1,4 @@
-"""Find what a training script imports and this Python lacks, before minutes go into building its modules."""
+"""Find the packages that a training script imports and this Python lacks, before its modules are built."""
 
 from __future__ import annotations
 

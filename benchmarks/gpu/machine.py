@@ -12,7 +12,7 @@ __all__ = ["machine"]
 
 
 def machine(options: Options, record: Record) -> None:
-    """Record what the numbers depend on, whether the kernels are used, and how fast a copy is."""
+    """Record the machine and its versions, whether the kernels are used, and how fast a copy is."""
     device = options.device()
     record(**timing.machine(device), emulated=options.emulate)
     for name, command in (

@@ -69,7 +69,7 @@ def steps(stamps: List[float], equal: int) -> Dict[str, Any]:
 
 
 def memory(cpu: bool) -> Dict[str, Any]:
-    """Return the peak of what torch allocated on the GPU, or of the process's memory."""
+    """Return the peak of torch's memory on the GPU, or of the process's memory."""
     if not cpu:
         return {"peak MB": torch.cuda.max_memory_allocated() / 1e6}
     import resource

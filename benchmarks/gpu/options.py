@@ -1,4 +1,4 @@
-"""The options of a run, as every stage gets them, and what a stage can say besides its results."""
+"""The options of a run, as every stage gets them, and the types of its results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Skipped(Exception):
 
 @dataclass(frozen=True)
 class Options:
-    """What the user asked for; paths are absolute strings, so that it can be written as JSON.
+    """The options of a run; paths are absolute strings, so that it can be written as JSON.
 
     Attributes:
         emulate: run on the CPU, the kernels compiled with g++.
@@ -46,7 +46,7 @@ class Options:
 
     @property
     def site(self) -> Path:
-        """Where built modules are installed."""
+        """The folder that built modules are installed in."""
         return Path(self.work) / "site"
 
     def device(self) -> torch.device:

@@ -1,4 +1,4 @@
-"""Run a stage in a process of its own, for a limited time, and keep what it has found until then.
+"""Run a stage in a process of its own, for a limited time, and keep its results until then.
 
 A kernel that writes out of bounds spoils a process's GPU context for good, so no two stages share one. A stage appends
 each result to a file of JSON lines as soon as it has it; whatever ends the stage, these lines are read.
@@ -89,7 +89,7 @@ def _read(lines: Path) -> Dict[str, Any]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End what is left of a process's session."""
+    """End the processes of a session that still run."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         try:
             os.killpg(process.pid, number)

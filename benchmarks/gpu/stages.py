@@ -16,7 +16,7 @@ class Stage(NamedTuple):
     minutes: float
 
     def load(self) -> Any:
-        """Return the function, which takes the options and what records results."""
+        """Return the function, which takes the options and a callback that records results."""
         return getattr(importlib.import_module(f"benchmarks.gpu.{self.module}"), self.function)
 
 

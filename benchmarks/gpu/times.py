@@ -1,4 +1,4 @@
-"""The times of the losses beside what people run today, for each size of image."""
+"""The times of LEGS and of other implementations of the loss, for each size of image."""
 
 from __future__ import annotations
 

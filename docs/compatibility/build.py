@@ -137,7 +137,7 @@ def page():
 
 
 def stale():
-    """Return what is not as the data says: the page, or a sentence of another document."""
+    """Return the texts that disagree with the data: the page, or a sentence of another document."""
     faults = (
         [] if PAGE.read_text(encoding="utf-8") == page() else ["docs/compatibility.md: run docs/compatibility/build.py"]
     )

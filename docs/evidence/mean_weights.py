@@ -1,4 +1,4 @@
-"""Measure what blur and noise do to the mean weight of a photograph, for docs/evidence.md.
+"""Measure the effect of blur and noise on the mean weight of a photograph, for docs/evidence.md.
 
     python docs/evidence/mean_weights.py SCENE docs/evidence/fox_weights.json
 
@@ -28,7 +28,7 @@ RESOLUTION = 2
 
 
 def noise(sigma: float) -> Callable[[Tensor], Tensor]:
-    """Return what adds noise of ``sigma`` of 255 to an image, and rounds it to 8 bits."""
+    """Return a function that adds noise of ``sigma`` of 255 to an image, and rounds it to 8 bits."""
 
     def noisy(image: Tensor) -> Tensor:
         values = image + sigma / 255 * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))

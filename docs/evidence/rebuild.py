@@ -136,7 +136,7 @@ def _rounded(value: Any) -> Any:
 
 
 def main(words: List[str]) -> None:
-    """Take what is asked to be taken, then rebuild."""
+    """Take the files that --take names, then rebuild."""
     while words[:1] == ["--take"]:
         taken: Tuple[str, ...] = tuple(words[1:3])
         take(Path(taken[0]), Path(taken[1]))

@@ -1,4 +1,4 @@
-"""The corpus check: it plans every checkout of a folder, and names what differs from the plans of an earlier run."""
+"""The corpus check: it plans every checkout of a folder, and names the differences from an earlier run's plans."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def run(*arguments: Any, **settings: str) -> Any:
 
 
 def codebase(root: Path, scene: Path) -> Path:
-    """Write a checkout with 3DGS's files and options, and a CUDA module with what CUDA 13 no longer has."""
+    """Write a checkout with 3DGS's files and options, and a CUDA module that uses calls removed in CUDA 13."""
     for name, text in (
         ("train.py", TRAIN.replace("parser.parse_args()", "parser.parse_known_args()[0]")),
         ("render.py", RENDER.replace("parser.parse_args()", "parser.parse_known_args()[0]")

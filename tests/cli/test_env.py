@@ -1,4 +1,4 @@
-"""``legs env`` says what was found, in a machine's every state."""
+"""``legs env`` reports the backends, in every state of a machine."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def scene(tmp_path):
 
 
 def says(capsys, *arguments, main=main):
-    """Run a command in this process; return its exit code and what it wrote to stderr."""
+    """Run a command in this process; return its exit code and its stderr."""
     try:
         code = main([str(argument) for argument in arguments])
     except SystemExit as left:

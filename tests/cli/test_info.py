@@ -1,4 +1,4 @@
-"""``legs info`` says what a store holds and what is wrong with it."""
+"""``legs info`` reports a store's contents and its faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``legs show`` draws what it is given."""
+"""``legs show`` draws the views that it is given."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``legs view`` in a real browser: what is drawn, what a switch changes, and no error."""
+"""``legs view`` in a real browser: the picture, the effect of each switch, and no error."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class TestBrowser:
         return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
     def coloured(self, page):
-        """Where the picture is clearly red, and clearly green; left of the panel."""
+        """Return masks of the clearly red and the clearly green pixels left of the panel."""
         picture = self.shot(page)[:, :600]
         return picture[..., 0] > picture[..., 1] + 80, picture[..., 1] > picture[..., 0] + 80
 
@@ -124,7 +124,7 @@ class TestBrowser:
         return red.mean(), green.mean()
 
     def errors(self, page):
-        """What the page reported; of viser's own splat, a flat square, three.js can compute no bounding sphere."""
+        """Return the page's errors, without that of viser's own flat splat, which has no bounding sphere."""
         return [error for error in page.errors if "Computed radius is NaN" not in error]
 
     def until(self, page, holds):

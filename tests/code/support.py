@@ -1,4 +1,4 @@
-"""Programs of a few lines, and the nodes in them, for tests of what is read in code."""
+"""Programs of a few lines, and the nodes in them, for tests of the code analysis."""
 
 from __future__ import annotations
 
@@ -38,6 +38,6 @@ def call(where, text):
 
 
 def values(definitions):
-    """Return what definitions say that a place holds, as text: the value, or the kind where there is none."""
+    """Return the definitions that reach a place, as text: the value, or the kind where there is none."""
     said = [d.kind if not isinstance(d.value, cst.BaseExpression) else code(d.value) for d in definitions]
     return sorted(said)

@@ -1,4 +1,4 @@
-"""Names and operations: what words say, what torch's operations do, and that each list stands once."""
+"""Names and operations: the meanings of words, the effects of torch's operations, and that each list stands once."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ STEP = "def step():\n    {call}\n"
 
 
 def resolved(files, place="step"):
-    """Return what the last call of a function refers to, each as (kind, name)."""
+    """Return the objects that the last call of a function refers to, each as (kind, name)."""
     made = program(files)
     where = function(made, place)
     found = made.resolve(where, where.flow.calls[-1].func)

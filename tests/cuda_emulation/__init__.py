@@ -105,7 +105,7 @@ _CACHE: Optional[Path] = None
 
 
 def emulated(driver: Optional[EmulatedDriver] = None) -> CudaBackend:
-    """Return the CUDA backend for tensors on the CPU; what was compiled is shared by this process's tests."""
+    """Return the CUDA backend for tensors on the CPU; this process's tests share its compiled kernels."""
     global _CACHE
     if _CACHE is None:
         _CACHE = Path(tempfile.mkdtemp(prefix="legs-emulated-"))

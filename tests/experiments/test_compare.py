@@ -204,7 +204,7 @@ def test_ctrl_c_keeps_the_rows_that_are_done(tiny_scene: Path, tmp_path: Path) -
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 def test_killed_it_goes_on(tiny_scene: Path, tmp_path: Path) -> None:
-    """Killed with no chance to clean up: its trainings end by themselves, in silence, and what is there is used."""
+    """Killed with no chance to clean up: its trainings end by themselves, in silence, and finished ones are used."""
     out = tmp_path / "out"
     arguments = command("compare", tiny_scene, "--out", out, "--iterations", 150, "-r", 1, "--processes", 1)
     arguments += ["--seeds", "1", "--arms", "legs"]

@@ -1,4 +1,4 @@
-"""What may lie in a checkout beside Python: pipes, sockets, devices, links, files of gigabytes, names of any bytes."""
+"""A checkout's files beside Python: pipes, sockets, devices, links, files of gigabytes, names of any bytes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in t
 
 @pytest.fixture
 def stranger(tmp_path, monkeypatch):
-    """A checkout with all of that in it."""
+    """A checkout with all of these files in it."""
     root = checkout(tmp_path / "stranger", files("inria"))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for name in ("pipe.py", "data", ".gitmodules", "arguments/pipe.py"):
@@ -87,7 +87,7 @@ def run_of_none():
 @pytest.mark.parametrize("number", range(3))
 @pytest.mark.parametrize("other", ["--verify", "--undo", "--preset"])
 def test_verify_beside_another(other, number, tmp_path, monkeypatch):
-    """What is compared is a whole patch and a whole original, or it says that there is none any more."""
+    """A whole patch is compared with a whole original, or the message says that there is none any more."""
     from tests.hostile.test_two_at_once import SOURCES, together
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))

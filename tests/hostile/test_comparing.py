@@ -16,7 +16,7 @@ HUNK = re.compile(r"@@ -(\d+)(?:,(\d+))? \+(\d+)(?:,(\d+))? @@\n")
 
 
 def applied(before, diff):
-    """Return what a unified diff makes of a text, as patch(1) would; its numbers must be right."""
+    """Apply a unified diff to a text, as patch(1) would; its numbers must be right."""
     after, at = [], 0
     for line in diff[2:]:
         head = HUNK.fullmatch(line)

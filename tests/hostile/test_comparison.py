@@ -1,4 +1,4 @@
-"""A comparison's folder and a .ply from a stranger: a field, what stands there, and the one line expected."""
+"""A comparison's folder and a .ply from a stranger: a field, its value, and the one line expected."""
 
 from __future__ import annotations
 

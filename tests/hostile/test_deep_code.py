@@ -1,4 +1,4 @@
-"""Code that is deep or large: the plan goes on, and what was not read is reported."""
+"""Code that is deep or large: the plan goes on, and files that were not read are reported."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def beside(folder, others):
 
 
 def test_the_training_is_planned_beside_them(tmp_path):
-    """All of them in one checkout: what is wrong with one costs only that one."""
+    """All of them in one checkout: a fault of one file costs only that file."""
     others = {}
     for number, (name, (text, _)) in enumerate(CASES.items()):
         head = "" if name.startswith("a double") else "from utils.loss_utils import l1_loss\n"
@@ -96,7 +96,7 @@ def test_the_training_is_planned_beside_them(tmp_path):
 
 
 def test_deeper_than_the_stack(tmp_path, monkeypatch):
-    """What the limits let through and the walk cannot follow all the same is one file's matter."""
+    """Code within the limits that the walk still cannot follow costs only its own file."""
     from legs_adapters import plan as module
     from legs_adapters.rules import find
 

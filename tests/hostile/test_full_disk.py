@@ -180,7 +180,7 @@ def test_compare_and_report(disk, tiny_scene, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_demo(disk, tiny_scene, capsys, monkeypatch):
-    """One error wherever its room ends; what an earlier demo left stays whole."""
+    """One error wherever its room ends; an earlier demo's files stay whole."""
     pytest.importorskip("matplotlib")
     from legs_loss.reference.training import side_by_side
 
@@ -240,7 +240,7 @@ def test_gaussians(disk):
 
 
 def test_compiled_kernels(disk, tiny_scene):
-    """What cannot be kept is compiled again next time; nothing ends for it."""
+    """A kernel that cannot be kept is compiled again next time, without an error."""
     cache = BinaryCache(disk.path / "cuda")
     with disk.full():
         cache.put(b"key", b"binary")

@@ -95,7 +95,7 @@ INCLUDE = "[include]\n\tpath = ../evil.cfg\n"
     "what", ["included", "of the worktree", "of a linked worktree", "in a folder of the checkout", "of a submodule"]
 )
 def test_settings_from_elsewhere(what, attack):
-    """Wherever the checkout's settings stand: what they name is not run."""
+    """Wherever the checkout's settings stand, the commands that they name are not run."""
     folder, ran = attack
     root = target = checkout(folder / "theirs", {**files("inria"), ".gitattributes": "*.py filter=plain\n"}, git=True)
     settings = root / ".git" / "config"

@@ -104,7 +104,7 @@ def _in_this_process():
 
 
 def _result(out):
-    """What must be the same, however often it was interrupted: all but times."""
+    """Return the results that must be the same however often it was interrupted: all but times."""
     found = {}
     for path in sorted(out.rglob("*")):
         if path.name == "point_cloud.ply":

@@ -36,7 +36,7 @@ def digest(data):
 
 
 def journal(written, created=()):
-    """Return a journal that would put the second bytes where the first are, and delete what has the bytes created."""
+    """Return a journal that would put the second bytes where the first are, and delete files with the bytes created."""
     return json.dumps(
         {
             "version": 1,
@@ -68,7 +68,7 @@ def attack(tmp_path):
 
 
 def run(*arguments, ran, **environment):
-    """Run ``legs-patch`` in this process: what a command that it starts would do is seen all the same."""
+    """Run ``legs-patch`` in this process; the effects of commands that it starts are seen all the same."""
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
         for name, value in {"LEGS_ATTACK": str(ran), **environment}.items():
@@ -108,7 +108,7 @@ NAMES = {
 
 @pytest.mark.parametrize("what", NAMES, ids=lambda what: what.replace(" ", "_"))
 def test_a_clone_with_a_journal_of_its_own(what, attack):
-    """``legs-patch .; legs-patch --undo .; git status``: what used to run a command of the stranger's."""
+    """``legs-patch .; legs-patch --undo .; git status`` runs no command of the stranger's, as it once did."""
     folder, ran = attack
     root = checkout(folder / "clone", {**files("inria"), "run.sh": "old\n", "sub/.git/config": "[core]\n"}, git=True)
     for link, target in (("g", ".git"), ("config", ".git/config")):
@@ -351,7 +351,7 @@ LABORIOUS = {
 @pytest.mark.skipif(not hasattr(signal, "alarm"), reason="needs a clock that ends it")
 @pytest.mark.parametrize("what", LABORIOUS, ids=lambda what: what.replace(" ", "_"))
 def test_a_journal_that_would_take_days(what, attack):
-    """Looking at what a stranger's journal would do is what the refusal advises: it ends, whatever is in it."""
+    """The refusal advises to look at the effects of a stranger's journal: that ends, whatever is in it."""
     folder, ran = attack
     original, edits, current = LABORIOUS[what]
     content = layers({"original": pack(original), "edits": edits}).replace('"a.py"', '"train.py"')

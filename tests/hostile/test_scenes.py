@@ -1,4 +1,4 @@
-"""Scenes and checkpoints from a stranger: a file, what was done to it, and the one line that is expected."""
+"""Scenes and checkpoints from a stranger: a file, its damage, and the one line that is expected."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HUGE = struct.pack("<Q", 1 << 60)
 
 
 def at(place, data):
-    """Return what writes these bytes over a file's, from this place on."""
+    """Return a function that writes these bytes over a file's, from this place on."""
     return lambda old: old[:place] + data + old[place + len(data) :]
 
 

@@ -137,7 +137,7 @@ def test_what_nobody_may_read():
 
 
 def as_nobody(arguments):
-    """Run ``legs`` in a fork that gives up root; what it needs of the package's files it has imported before."""
+    """Run ``legs`` in a fork that gives up root; the package's modules that it needs are imported before."""
     import legs_loss.cli
     import legs_loss.cli.info
     import legs_loss.cli.precompute

@@ -1,4 +1,4 @@
-"""Two legs-patch at once, Ctrl-C at any line, and what a killed one leaves: real processes, whatever the timing."""
+"""Two legs-patch at once, Ctrl-C at any line, and the remains of a killed one: real processes, whatever the timing."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ OURS = ("legs_adapters/cli.py", "plan.py", "undo.py", "journal.py", "replace.py"
 
 
 def at_line(number, action):
-    """Return a trace function that acts at the n-th line of what writes."""
+    """Return a trace function that acts at the n-th line of the modules that write."""
     lines = [0]
 
     def trace(frame, event, _):
@@ -248,7 +248,7 @@ def test_the_owner_stays(tmp_path):
 
 @pytest.mark.parametrize("writable", [True, False])
 def test_another_user_s_files(writable):
-    """Who may write the folder patches and undoes, the mode stays; who may not gets one line, and nothing changes."""
+    """With write access to the folder, patch and undo keep the mode; without it, one line, and nothing changes."""
     if os.geteuid() != 0:
         pytest.skip("to become another user needs root")
     with tempfile.TemporaryDirectory() as made:  # pytest's own folder is root's alone

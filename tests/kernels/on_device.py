@@ -22,7 +22,7 @@ MISSING: Optional[str] = "needs g++" if DEVICE.type == "cpu" and COMPILER is Non
 
 
 class RecordingDriver(CudaDriver):
-    """A GPU's driver that keeps what was launched, as EmulatedDriver does.
+    """A GPU's driver that keeps a list of its launches, as EmulatedDriver does.
 
     Attributes:
         launches: name and number of blocks.

@@ -73,7 +73,7 @@ def on_device():
 
 @pytest.fixture(autouse=True)
 def poisoned():
-    """Fill what torch allocates with NaN: what is read before it is written, or never written, shows."""
+    """Fill torch's new memory with NaN, which shows values that are read before they are written, or never written."""
     torch.use_deterministic_algorithms(True, warn_only=True)
     yield
     torch.use_deterministic_algorithms(False)

@@ -144,7 +144,7 @@ class TestNothingWaits:
 
 
 class TestDropIn:
-    """`l1_loss` and `ssim`, what a patched script calls."""
+    """`l1_loss` and `ssim`, which a patched script calls."""
 
     @pytest.fixture(autouse=True)
     def fresh(self):

@@ -171,7 +171,7 @@ class TestResponse:
 
 @pytest.fixture
 def chosen(monkeypatch):
-    """Return a function that sets LEGS_BACKEND, and forget what was found out before and after."""
+    """Return a function that sets LEGS_BACKEND; clear the backends' findings before and after."""
     monkeypatch.setattr(backends, "_findings", {})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return lambda name: monkeypatch.setenv("LEGS_BACKEND", name)

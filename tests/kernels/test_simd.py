@@ -1,4 +1,4 @@
-"""Eight numbers at once: what the compiled code relies on that no result of a kernel would tell at once."""
+"""Eight numbers at once: assumptions of the compiled code that no kernel's result would show."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weights normalised over the scene, the preset "legs-robust": what blur, noise and a dead pixel do to them."""
+"""Weights normalised over the scene, the preset "legs-robust": the effects of blur, noise and a dead pixel."""
 
 from __future__ import annotations
 

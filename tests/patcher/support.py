@@ -1,4 +1,4 @@
-"""The codebases under tests/patching, as folders; and what their comments say must become of each line."""
+"""The codebases under tests/patching, as folders, and the verdicts in their comments."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def with_ssim(name):
 
 
 def files(name):
-    """Return the files of a case by path, with what most codebases share."""
+    """Return the files of a case by path, with those of common.txt."""
     found = {}
     for part in ("common", name):
         for section in re.split(r"^=== ", (CASES / f"{part}.txt").read_text(encoding="utf-8"), flags=re.M)[1:]:

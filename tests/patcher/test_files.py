@@ -1,4 +1,4 @@
-"""legs-patch on real folders: all files or none are written, what is undone, where it looks."""
+"""legs-patch on real folders: all files or none are written, undo restores them, and the folders that it reads."""
 
 from __future__ import annotations
 

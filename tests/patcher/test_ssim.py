@@ -1,4 +1,4 @@
-"""legs-patch --ssim: which functions are 3DGS's SSIM, by what they compute; patched, run and taken back."""
+"""legs-patch --ssim: functions are 3DGS's SSIM by the values they compute; patched, run and taken back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each kind of photometric term: the example in its docstring is planned, and gives what the docstring says."""
+"""Each kind of photometric term: the example in its docstring is planned, with the result that the docstring states."""
 
 from __future__ import annotations
 

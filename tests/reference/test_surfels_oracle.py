@@ -1,4 +1,4 @@
-"""The oracle of surfels against geometry and derivatives, and what both rasterizers do at their cuts."""
+"""The oracle of surfels against geometry and derivatives, and both rasterizers at their cuts."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def value_and_slope(inputs, settings, index, pixel, backend, channel=0):
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])
 class TestCuts:
-    """Where the image has an edge or a kink in its parameters, its gradient cannot equal a finite difference."""
+    """Edges and kinks of the image in its parameters, at which its gradient cannot equal a finite difference."""
 
     PIXEL = 26, 36  # next to the disc's centre
 

@@ -1,4 +1,4 @@
-"""The drop-in l1_loss and its backends: what is fused, and what a step asks of a device."""
+"""The drop-in l1_loss and its backends: the fused cases, and a step's demands on a device."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class TestBackends:
 
 
 class TestOtherDevices:
-    """On the meta device reading a value is an error, so what works there never waits for a device."""
+    """On the meta device reading a value is an error, so code that works there never waits for a device."""
 
     @pytest.mark.parametrize("spec", ["legs", "eggs", WeightSpec(normalise="mean"), WeightSpec(percentile=99.0)])
     def test_a_step_reads_nothing_from_the_device(self, spec):

@@ -178,7 +178,7 @@ def free_port():
 
 
 def run(codebase, kind, script, processes, *arguments, torchrun=True):
-    """Run a script; return what each rank reported, and what all of them said on stderr."""
+    """Run a script; return each rank's report, and the stderr of all of them."""
     out = Path(tempfile.mkdtemp(dir=str(codebase)))
     launch = ["-m", "torch.distributed.run", "--nproc_per_node", str(processes), "--master_port", free_port()]
     program = [script] if kind == "patched" else ["-m", "legs_loss", "run", script]

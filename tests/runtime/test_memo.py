@@ -1,4 +1,4 @@
-"""The memo: a map is remembered under what the target is, and never given for another."""
+"""The memo: a map is remembered for its target, and never given for another."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class TestByIdentity:
         assert (make.made, len(memo)) == (2, 0)
 
     def test_each_stream_computes_for_itself(self, by_identity, monkeypatch):
-        """What one stream is still writing, another must not read; nothing tells the second one to wait."""
+        """A map that one stream is still writing must not be read by another, which nothing tells to wait."""
         memo, make, target = WeightMemo(), Maker(), torch.rand(3, 4, 4)
         for stream in (7, 8, 7, 8):
             monkeypatch.setattr(memo_module, "_current_stream", lambda device, stream=stream: stream)

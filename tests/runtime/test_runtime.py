@@ -1,4 +1,4 @@
-"""The drop-in l1_loss: when it weights, what it remembers, its variables."""
+"""The drop-in l1_loss: the calls that it weights, its memory, its variables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes are read as their formats define them; what is damaged is one clear error."""
+"""Scenes are read as their formats define them; damage is one clear error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A store gives back what was put in, notices any damage, and survives writers that die or meet."""
+"""A store gives back the maps that were put in, notices any damage, and survives writers that die or meet."""
 
 from __future__ import annotations
 

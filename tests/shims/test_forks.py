@@ -1,4 +1,4 @@
-"""A fork's rasterizer, made from what its code passes and unpacks."""
+"""A fork's rasterizer, made from the arguments that its code passes and the results that it unpacks."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(scene, tmp_path_factory):
-    """The miniature, trained once with LEGS; its checkout, what it printed, and what it wrote to stderr."""
+    """The miniature, trained once with LEGS; its checkout, its stdout and its stderr."""
     root = checkout(tmp_path_factory.mktemp("miniature"), texts())
     before = snapshot(root)
     done = run(root, "train.py", "-s", scene, "-m", "out", "--checkpoint_iterations", "20")

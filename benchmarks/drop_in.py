@@ -12,18 +12,10 @@ import argparse
 import json
 
 import torch
-from loss import (
-    LAMBDA,
-    LEGS,
-    Contenders,
-    Pairs,
-    in_turns,
-    machine,
-    reference_ssim,
-    set_threads,
-    side_by_side,
-    some_images,
-)
+from losses.contenders import LAMBDA, LEGS, Contenders, reference_ssim
+from losses.images import Pairs, in_turns, some_images
+from losses.machine import machine, set_threads
+from losses.tables import side_by_side
 from torch import Tensor
 
 from legs_loss import configure, l1_loss, ssim, weight_map

@@ -11,8 +11,8 @@ from typing import Any, Callable, Iterator, Sequence, Tuple
 import torch
 from torch import Tensor
 
-from benchmarks import loss as timing
 from benchmarks.gpu.options import Options, Record, Skipped
+from benchmarks.losses.images import images, some_images
 from legs_loss import configure, l1_loss, legs_loss, ssim
 
 __all__ = ["compile", "graph", "stream", "synchronisation"]
@@ -25,7 +25,7 @@ def synchronisation(options: Options, record: Record) -> None:
     """Run steps while torch raises an error for every wait for the device."""
     device = options.device()
     configure("legs")
-    pairs = timing.some_images((400, 300), device)[:3]
+    pairs = some_images((400, 300), device)[:3]
     ones = torch.ones(300, 400, device=device)
     steps = {
         "legs_loss": lambda image, target: legs_loss(image, target),
@@ -47,7 +47,7 @@ def graph(options: Options, record: Record) -> None:
     device = options.device()
     configure("legs")
     for name, loss in (("legs_loss", legs_loss), ("l1_loss", l1_loss)):
-        image, target = timing.images((400, 300), device)
+        image, target = images((400, 300), device)
         step = _step(loss, image, target)
         found, replay = _captured(step, device)
         with torch.no_grad():
@@ -64,7 +64,7 @@ def stream(options: Options, record: Record) -> None:
     device = options.device()
     configure("legs")
     for name, loss in (("legs_loss", legs_loss), ("l1_loss", l1_loss)):
-        step = _step(loss, *timing.images((1297, 840) if device.type == "cuda" else (130, 84), device))
+        step = _step(loss, *images((1297, 840) if device.type == "cuda" else (130, 84), device))
         expected = step()
         with _second_stream(device):
             found = [step() for _ in range(10)]
@@ -79,7 +79,7 @@ def compile(options: Options, record: Record) -> None:
     device = options.device()
     configure("legs")
     for name, loss in (("legs_loss", legs_loss), ("l1_loss", l1_loss)):
-        image, target = timing.images((200, 150), device)
+        image, target = images((200, 150), device)
         expected = _step(loss, image, target)()
         found = _step(torch.compile(loss, fullgraph=True), image, target)()
         apart = [float((a - b).norm() / b.norm()) for a, b in zip(found, expected)]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import subprocess
 
-from benchmarks import loss as timing
 from benchmarks.gpu.options import Options, Record
+from benchmarks.losses import machine as machines
+from benchmarks.losses.timing import copy_bandwidth
 from legs_loss.kernels import backends
 
 __all__ = ["machine"]
@@ -14,7 +15,7 @@ __all__ = ["machine"]
 def machine(options: Options, record: Record) -> None:
     """Record the machine and its versions, whether the kernels are used, and how fast a copy is."""
     device = options.device()
-    record(**timing.machine(device), emulated=options.emulate)
+    record(**machines.machine(device), emulated=options.emulate)
     for name, command in (
         ("driver", ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]),
         ("nvcc", ["nvcc", "--version"]),
@@ -22,7 +23,7 @@ def machine(options: Options, record: Record) -> None:
         record(**{name: _said_by(command)})
     backend = backends.backend_for(device)
     reason = backends.finding("cuda", device).reason
-    record(**{"backend": f"{backend}: {reason}", "GB/s of a copy": timing.copy_bandwidth(device) / 1e9})
+    record(**{"backend": f"{backend}: {reason}", "GB/s of a copy": copy_bandwidth(device) / 1e9})
     if backend != "cuda":
         raise RuntimeError(f"the kernels are not used: {reason}")
 

@@ -7,8 +7,10 @@ from typing import Any, Callable, Dict
 import torch
 from torch import Tensor
 
-from benchmarks import loss as timing
 from benchmarks.gpu.options import Options, Record
+from benchmarks.losses.contenders import losses
+from benchmarks.losses.images import Pairs, in_turns, some_images
+from benchmarks.losses.tables import at_bandwidth, side_by_side
 from legs_loss.kernels import backends
 from legs_loss.kernels.contract import Weights
 from legs_loss.spec import PRESETS
@@ -35,17 +37,17 @@ def times(options: Options, record: Record) -> None:
     for name in options.sizes:
         width, height = (int(side) for side in name.split("x"))
         print(f"\nforward and backward, {name} RGB", flush=True)
-        pairs = timing.some_images((width, height), device)
-        contenders = {**timing.losses(pairs), **_l1_terms(pairs)}
+        pairs = some_images((width, height), device)
+        contenders = {**losses(pairs), **_l1_terms(pairs)}
         contenders = {each: contenders[each] for each in CONTENDERS if each in contenders}
-        table = timing.side_by_side(contenders, options.rounds, LEGS, device)
-        timing.at_bandwidth(table, (width, height), device)
+        table = side_by_side(contenders, options.rounds, LEGS, device)
+        at_bandwidth(table, (width, height), device)
         for missing in (each for each in CONTENDERS if each not in table):
             table[missing] = {"skipped": "needs CUDA" if options.emulate else "fused-ssim is not installed"}
         record(**{name: table})
 
 
-def _l1_terms(pairs: timing.Pairs) -> Dict[str, Callable[[], Any]]:
+def _l1_terms(pairs: Pairs) -> Dict[str, Callable[[], Any]]:
     """Return torch's plain L1, and the weighted one as ``l1_loss`` computes it once it knows a view's range."""
     spec = PRESETS["legs"]
     ranges = [backends.fused_range(target, spec) for _, target in pairs]
@@ -56,6 +58,6 @@ def _l1_terms(pairs: timing.Pairs) -> Dict[str, Callable[[], Any]]:
         return value
 
     return {
-        L1: timing.in_turns(pairs, weighted),
-        "L1 alone (torch)": timing.in_turns(pairs, lambda image, target, _: torch.abs(image - target).mean()),
+        L1: in_turns(pairs, weighted),
+        "L1 alone (torch)": in_turns(pairs, lambda image, target, _: torch.abs(image - target).mean()),
     }

@@ -19,10 +19,10 @@ import torch
 pytest.importorskip("numba")
 pytest.importorskip("libcst")
 
-from benchmarks import loss
 from benchmarks.gpu import aims, building, imports, measured
 from benchmarks.gpu.options import ROOT, Options, Skipped
 from benchmarks.gpu.stages import STAGES
+from benchmarks.losses import timing
 from tests.cuda_emulation import COMPILER
 from tests.experiments.miniature import RENDER, RENDERER, TRAIN
 from tests.support import legs_environment
@@ -192,10 +192,12 @@ def test_a_gpus_time_begins_when_all_steps_are_launched(monkeypatch: pytest.Monk
         def elapsed_time(self, end: Any) -> float:
             return 5.0
 
-    cuda = SimpleNamespace(Event=Event, _sleep=lambda cycles: order.append(f"sleep {cycles / loss.FASTEST_CLOCK:g} s"))
-    monkeypatch.setattr(loss, "torch", SimpleNamespace(cuda=cuda))
-    assert loss.between_events(lambda: order.append("step"), launched=0.001) == 5.0 / 1e3 / loss.STEPS
-    assert order == ["sleep 0.02 s", "event", *["step"] * loss.STEPS, "event", "wait"]
+    cuda = SimpleNamespace(
+        Event=Event, _sleep=lambda cycles: order.append(f"sleep {cycles / timing.FASTEST_CLOCK:g} s")
+    )
+    monkeypatch.setattr(timing, "torch", SimpleNamespace(cuda=cuda))
+    assert timing.between_events(lambda: order.append("step"), launched=0.001) == 5.0 / 1e3 / timing.STEPS
+    assert order == ["sleep 0.02 s", "event", *["step"] * timing.STEPS, "event", "wait"]
 
 
 @pytest.mark.parametrize("module", [aims, measured], ids=lambda module: module.__name__)

@@ -14,7 +14,8 @@ import torch
 
 pytest.importorskip("numba")
 
-from benchmarks import loss
+from benchmarks.losses import timing
+from benchmarks.losses.tables import at_bandwidth
 from tests.support import legs_environment
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -51,10 +52,10 @@ def test_a_missing_gpu_is_said() -> None:
 
 def test_the_bytes_that_must_move(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 10x10 pixels: three values of float32 are read twice and written once; a copy of one byte moves two."""
-    monkeypatch.setattr(loss, "COPIED", 1 << 20)
-    monkeypatch.setattr(loss, "timed", lambda step, device: step() is None or 1e-3)
+    monkeypatch.setattr(timing, "COPIED", 1 << 20)
+    monkeypatch.setattr(timing, "timed", lambda step, device: step() is None or 1e-3)
     table = {name: {"median ms": 1.0} for name in NAMES}
-    loss.at_bandwidth(table, (10, 10), torch.device("cpu"))
+    at_bandwidth(table, (10, 10), torch.device("cpu"))
     assert [row["bytes"] for row in table.values()] == [3 * 16 * 100, (3 * 12 + 4) * 100, 3 * 12 * 100]
     at_that = 1e3 * 4800 / (2 * (1 << 20) / 1e-3)
     assert table[NAMES[0]]["ms at a copy's bandwidth"] == pytest.approx(at_that)

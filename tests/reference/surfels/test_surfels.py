@@ -13,7 +13,7 @@ from legs_adapters.shims.missing import MissingShim
 from legs_loss import LegsError
 from legs_loss.reference.surfels import Surfels, rasterize_surfels
 from legs_loss.reference.surfels import oracle as surfels_oracle
-from tests.reference.surfels import (
+from tests.reference.surfels.support import (
     ALPHA,
     BACKGROUND,
     NAMES,

@@ -1,7 +1,8 @@
 """Run a stage in a process of its own, for a limited time, and keep its results until then.
 
 A kernel that writes out of bounds spoils a process's GPU context for good, so no two stages share one. A stage appends
-each result to a file of JSON lines as soon as it has it; whatever ends the stage, these lines are read.
+each result to a file of JSON lines as soon as it has it; whatever ends the stage, these lines are read. As a command,
+`python -m benchmarks.gpu.running STAGE OPTIONS RECORDS`, it is that process.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Callable, Dict
 
-from benchmarks.gpu.options import ROOT, Options
+from benchmarks.gpu.options import ROOT, Options, Skipped, first_line
+from benchmarks.gpu.stages import STAGES
 
 __all__ = ["environment", "run_stage"]
 
@@ -38,7 +41,7 @@ def run_stage(name: str, options: Options, seconds: float, keep: Callable[[Dict[
     """
     lines = Path(options.work) / f"{name}.jsonl"
     lines.write_text("", encoding="utf-8")
-    command = [sys.executable, "-m", "benchmarks.gpu.child", name, json.dumps(asdict(options)), str(lines)]
+    command = [sys.executable, "-m", "benchmarks.gpu.running", name, json.dumps(asdict(options)), str(lines)]
     began, seen = time.monotonic(), 0
     # A session of its own, so that it is ended with everything that it has started.
     process = subprocess.Popen(command, cwd=str(ROOT), env=environment(options), start_new_session=True)
@@ -100,3 +103,26 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         except subprocess.TimeoutExpired:
             continue
     process.wait()
+
+
+def main(stage: str, options: str, records: str) -> int:
+    """Run a stage in this process; append its results, and how it ended, to a file of JSON lines."""
+    with open(records, "a", encoding="utf-8") as file:
+
+        def record(**found: Any) -> None:
+            file.write(json.dumps(found) + "\n")
+            file.flush()
+
+        try:
+            STAGES[stage].load()(Options(**json.loads(options)), record)
+            record(status="done")
+        except Skipped as reason:
+            record(status="skipped", reason=str(reason))
+        except Exception as error:  # the other stages are worth having
+            traceback.print_exc()
+            record(status="failed", reason=first_line(error))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

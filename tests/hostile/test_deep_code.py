@@ -27,8 +27,8 @@ PARTS = "an expression of more than 2000 parts"
 # What stands in another function of the checkout, and why that file is reported as unread, if it is.
 CASES = {
     "a sum of 400 parts": ("x = " + " + ".join(["l1_loss(a, b)"] * 400), ""),
-    "a sum of 1,000 calls": ("x = " + " + ".join(["l1_loss(a, b)"] * 1000), ""),
-    "a sum of 2,000 names": ("x = " + " + ".join(["l1_loss"] * 2000), ""),
+    "a sum of 1,000 calls": ("x = " + " + ".join(["loss(a, b)"] * 1000), ""),
+    "a sum of 2,000 names": ("x = " + " + ".join(["loss"] * 2000), ""),
     "a string of 400 parts": ("x = " + " ".join(["'l1_loss'"] * 400), ""),
     "400 elif": ("if a == 0:\n    x = 0\n" + "".join(f"elif a == {i}:\n    x = {i}\n" for i in range(1, 400)), ""),
     "1,000 attributes": ("x = a" + ".b" * 1000, ""),
@@ -39,6 +39,9 @@ CASES = {
     "100,000 open ones": ("x = " + "(" * 100_000, "brackets are nested more than 150 deep"),
     "brackets in a string": ("x = '" + ") (" * 400 + "'", ""),
     "5 MB of literal": ("x = [" + "1.25, " * 900_000 + "]", "larger than 1 MiB"),
+    "900 kB of literal": ("x = [" + "1.25, " * 150_000 + "]", "more than 250000 words and signs"),
+    "130,000 statements": ("a\n" * 130_000, "more than 250000 words and signs"),
+    "2,000 terms": ("def f(a, b):\n" + "    x = l1_loss(a, b)\n" * 2000, "words and signs speaks of an L1 2000 times"),
     "a sum of 20,000 parts": ("x = " + " + ".join(["l1_loss(a, b)"] * 20_000), PARTS),
     "a loss of 20,000 parts": ("def f():\n    x = " + " + ".join(["l1_loss(a, b)"] * 20_000), PARTS),
     "20,000 attributes": ("x = a" + ".b" * 20_000, PARTS),
@@ -93,6 +96,58 @@ def test_the_training_is_planned_beside_them(tmp_path):
     for number, (name, (_, why)) in enumerate(CASES.items()):
         found = unread.get(f"other{number}.py", "")
         assert (why in found) if why else not found, (name, found)
+
+
+def test_files_that_are_too_much_together(tmp_path, monkeypatch, capsys):
+    """The largest are left, whatever their names; each is one line of the report."""
+    from legs_adapters.cli import main
+    from legs_adapters.code import checkout as parsed
+    from legs_adapters.code import sources as read
+
+    head = "from utils.loss_utils import l1_loss\n"
+    others = {f"{name}.py": head + "x = 1\n" * size for name, size in (("a", 900), ("z", 800), ("m", 20))}
+    root = beside(tmp_path, others)
+
+    def unread():
+        assert main(["--check", str(root)]) == 1
+        said = capsys.readouterr().out
+        assert "would change: train.py" in said
+        return {line.split()[0]: line.split("not read  ")[1] for line in said.splitlines() if " not read " in line}
+
+    assert not unread()
+    with monkeypatch.context() as patch:
+        patch.setattr(parsed, "TOGETHER", 5000)
+        found = unread()
+    assert sorted(found) == ["a.py"]
+    assert "words and signs together; leave others out by --exclude" in found["a.py"]
+    with monkeypatch.context() as patch:
+        patch.setattr(read, "READ", 5000)
+        assert sorted(unread()) == ["a.py", "z.py"]
+    with monkeypatch.context() as patch:  # what is not read by itself takes nothing of what all may have
+        patch.setattr(parsed, "TOGETHER", 5000)
+        patch.setattr(parsed, "ONE", 3500)
+        assert not unread()
+
+
+def test_terms_that_are_too_many_together(tmp_path, monkeypatch, capsys):
+    from legs_adapters.cli import main
+    from legs_adapters.rules import find
+
+    monkeypatch.setattr(find, "ASKED_TOGETHER", 120_000)
+    terms = "from utils.loss_utils import l1_loss\n\n\ndef f(a, b):\n" + "    x = l1_loss(a, b)\n" * 100
+    root = beside(tmp_path, {"zoo/one.py": terms, "zoo/two.py": terms})
+    assert main(["--check", str(root)]) == 1
+    said = capsys.readouterr().out
+    assert [line.split()[0] for line in said.splitlines() if " not read " in line] == ["zoo/two.py"]
+    assert "too many places speak of an L1 in all files" in said and "would change: train.py" in said
+
+
+@pytest.mark.slow
+def test_many_large_files(tmp_path):
+    """Each is within the limits; all of them are not."""
+    text = "from utils.loss_utils import l1_loss\nx = [" + "1.25, " * 62_000 + "]\n"
+    code, said = check(beside(tmp_path, {f"other{i}.py": text for i in range(12)}))
+    assert (code, said.count(" not read "), "would change: train.py" in said) == (1, 5, True)
 
 
 def test_deeper_than_the_stack(tmp_path, monkeypatch):

@@ -8,12 +8,14 @@ from typing import Callable, Dict, Iterable, List, Mapping, Optional, Set, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.limits import ONE, TOGETHER, largest_over, pieces
 from legs_adapters.code.module import Function, Module, parse, said
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import dotted
 
 __all__ = ["Checkout", "imported_name"]
 
+_WHY_OVER = f"too large: all files have more than {TOGETHER} words and signs together; leave others out by --exclude"
 _DEFINED = re.compile(r"^[ \t]*(?:async[ \t]+)?(?:def|class)[ \t]+(\w+)", re.M)
 
 
@@ -29,9 +31,11 @@ class Checkout:
     def __init__(self, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> None:
         self.unread = unread or {}
         self.sources: Dict[str, Source] = {source.path: source for source in sources}
+        self._over = _over(self.sources)
         self._unreadable: Dict[str, Unreadable] = {}
         self._modules: Dict[str, Optional[Module]] = {}
         self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
+        self._methods: Dict[str, List[Function]] = {}
         self._by_word: Optional[Dict[str, List[str]]] = None  # as ``said`` has them
         self._defined: Dict[str, List[str]] = {}
         self._by_import: Dict[Tuple[str, str, int], Optional[Module]] = {}
@@ -47,7 +51,7 @@ class Checkout:
     def module(self, path: str) -> Optional[Module]:
         """Return a parsed file; None where it does not parse (it is then among ``unreadable``)."""
         if path not in self._modules:
-            parsed = parse(self.sources[path])
+            parsed = Unreadable(path, _WHY_OVER) if path in self._over else parse(self.sources[path])
             if isinstance(parsed, Unreadable):
                 self._unreadable[path] = parsed
             self._modules[path] = parsed if isinstance(parsed, Module) else None
@@ -84,12 +88,16 @@ class Checkout:
 
     def methods_named(self, name: str) -> List[Function]:
         """Return every method of this name in the checkout."""
-        found: List[Function] = []
-        for path in self._defined.get(name, []):
-            module = self.module(path)
-            if module is not None:
-                found.extend(f for f in module.named(name) if f.owner is not None)
-        return found
+        if name not in self._methods:
+            modules = [self.module(path) for path in self._defined.get(name, [])]
+            self._methods[name] = [
+                function
+                for module in modules
+                if module is not None
+                for function in module.named(name)
+                if function.owner is not None
+            ]
+        return self._methods[name]
 
     # -- imports
 
@@ -171,6 +179,14 @@ class Checkout:
         ends = [p for p in known if defines.search(self.sources[p].text)]
         ends = _nearest(module.path, ends)
         return self.module(ends[0]) if len(ends) == 1 else None
+
+
+def _over(sources: Mapping[str, Source]) -> Set[str]:
+    """Return the largest files, which are not parsed even if they are asked for, where all are too much together."""
+    if sum(len(source.text) for source in sources.values()) <= TOGETHER:  # the most pieces that they can have
+        return set()
+    sizes = {path: pieces(source.text) for path, source in sources.items()}
+    return largest_over({path: size for path, size in sizes.items() if size <= ONE}, TOGETHER)
 
 
 def imported_name(node: cst.ImportFrom) -> str:

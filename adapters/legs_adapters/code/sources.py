@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Dict, List, NamedTuple, Sequence
 
 from legs_adapters.code.folders import check_name, own_and_excluded
-from legs_adapters.code.limits import LARGEST, too_deep
+from legs_adapters.code.limits import LARGEST, READ, largest_over, too_deep
 from legs_loss import LegsError
 from legs_loss.system import read_regular
 
 __all__ = ["BOM", "Files", "Source", "Unreadable", "check_root", "decode", "read_files", "read_source"]
 
-_LARGEST_UNREAD = 64 << 20  # bytes; of what is larger it is not asked which names it says
+_UNREAD = 64 << 20  # bytes of all together; of what is over it, it is not asked which names it says
 BOM = b"\xef\xbb\xbf"
 
 _CODING = re.compile(rb"^[ \t\f]*#.*?coding[:=][ \t]*([-\w.]+)")
@@ -85,13 +85,24 @@ def check_root(path: str | os.PathLike[str]) -> Path:
 def read_files(root: Path, exclude: Sequence[str]) -> Files:
     """Read the Python files of a checkout, but for those that are excluded."""
     own, excluded = own_and_excluded(root, exclude)
-    read = [read_source(root, name) for name in own]
+    over = largest_over({path: size for path, size in _sizes(root, own).items() if size <= LARGEST}, READ)
+    why = f"too large: all files have more than {READ >> 20} MiB together; leave others out by --exclude"
+    read = [Unreadable(path, why) if path in over else read_source(root, path) for path in own]
     unreadable = [source for source in read if isinstance(source, Unreadable)]
+    sizes = _sizes(root, [*excluded, *(source.path for source in unreadable)])
     unread: Dict[str, str] = {}
-    for path in sorted([*excluded, *(source.path for source in unreadable)]):
+    for path in sorted(set(sizes) - largest_over(sizes, _UNREAD)):
         with contextlib.suppress(OSError):
-            unread[path] = read_regular(root / path, _LARGEST_UNREAD).decode("utf-8", "replace")
+            unread[path] = read_regular(root / path, sizes[path]).decode("utf-8", "replace")
     return Files([source for source in read if isinstance(source, Source)], unreadable, unread)
+
+
+def _sizes(root: Path, paths: Sequence[str]) -> Dict[str, int]:
+    sizes = {}
+    for path in paths:
+        with contextlib.suppress(OSError):
+            sizes[path] = os.lstat(str(root / path)).st_size
+    return sizes
 
 
 def read_source(root: Path, path: str) -> Source | Unreadable:

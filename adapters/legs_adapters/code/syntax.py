@@ -25,6 +25,7 @@ __all__ = [
     "path_of",
     "root_of",
     "same",
+    "squeezed",
     "strip_parens",
     "walk_all",
     "walk_expressions",
@@ -236,10 +237,11 @@ def _fields(kind: type) -> Tuple[str, ...]:
 
 def same(a: cst.CSTNode, b: cst.CSTNode) -> bool:
     """Return whether two expressions are written alike, brackets and spaces aside."""
-    return _squeeze(a) == _squeeze(b)
+    return squeezed(a) == squeezed(b)
 
 
-def _squeeze(node: cst.CSTNode) -> str:
+def squeezed(node: cst.CSTNode) -> str:
+    """Return what an expression is written as, without brackets around it, spaces and comments."""
     return re.sub(r"\s+|#[^\n]*", "", strip_parens(code(node)))
 
 

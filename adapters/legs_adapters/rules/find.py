@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple, Union
 
+from legs_adapters.code.limits import ASKED, ASKED_TOGETHER, pieces
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.sources import Source
@@ -56,6 +57,7 @@ class _Finder:
         self.doubts = Doubts(analysis, self.verdicts)
         self.found = Findings([], [], [], [], [], [], analysis.program)
         self.doubtful: List[Doubt] = []
+        self.asked = 0  # of all functions that were looked at
 
     def run(self) -> Findings:
         for module in self.analysis.program.matching(_MAY_HAVE_L1):
@@ -83,6 +85,10 @@ class _Finder:
         patched: List[Left] = []
         try:
             for function in module.scopes(lambda text: self.analysis.prospects.of(text) or STRUCTURAL.search(text)):
+                over = self._over_the_limits(function)
+                if over:
+                    self.analysis.program.give_up(module.path, over)
+                    return
                 entries += self._entries(function)
                 nodes = patched_nodes(self.analysis.program, function)
                 patched += [Left.at(function, function.place(node), "patched") for node in nodes]
@@ -102,6 +108,17 @@ class _Finder:
             else:
                 self.found.left.append(entry)
         self.found.patched.extend(sorted(patched, key=lambda entry: entry.line))
+
+    def _over_the_limits(self, function: Function) -> str:
+        """Return why a function is not looked at, or "": what each of its places takes grows with all of it."""
+        if function.parent is not None and function.text is function.parent.text:
+            return ""  # that one was asked
+        places = len(_MAY_HAVE_L1.findall(function.text))
+        asked = places * pieces(function.text)
+        if asked > ASKED:
+            return f"a function of {pieces(function.text)} words and signs speaks of an L1 {places} times"
+        self.asked += asked
+        return "too many places speak of an L1 in all files: leave others out" if self.asked > ASKED_TOGETHER else ""
 
     def _entries(self, function: Function) -> Iterator[_Entry]:
         """Yield what becomes of each L1 in a function, with its place."""

@@ -23,6 +23,7 @@ class Splats:
         self.program = program
         self.training = training
         self._splats: Dict[str, bool] = {}
+        self._rays: Dict[str, bool] = {}
 
     def about(self, function: Function, form: Form) -> bool:
         """Return whether the term of a function is about splats: by its files, or by the rendering itself."""
@@ -52,9 +53,7 @@ class Splats:
         """Return whether a name in the term or a file beside it says so, where the file is not about rays."""
         sides = made_of(function, form)
         names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
-        if RAYS.search(module.text) or "mesh" in words(module.path.rpartition("/")[2]):
-            return False
-        if FIELD.search(module.text):
+        if self._speaks_of_rays(module) or "mesh" in words(module.path.rpartition("/")[2]):
             return False
         rendered = any(word.startswith(("render", "raster")) for word in names)
         folder = module.path.rpartition("/")[0]
@@ -79,6 +78,11 @@ class Splats:
         if path not in self._splats:
             self._splats[path] = DRAWS_SPLATS.search(self.program.sources[path].text) is not None
         return self._splats[path]
+
+    def _speaks_of_rays(self, module: Module) -> bool:
+        if module.path not in self._rays:
+            self._rays[module.path] = bool(RAYS.search(module.text) or FIELD.search(module.text))
+        return self._rays[module.path]
 
 
 def made_of(function: Function, form: Form) -> List[cst.CSTNode]:

@@ -15,6 +15,7 @@ from legs_adapters.code.syntax import (
     dotted,
     path_of,
     same,
+    squeezed,
     walk_expressions,
     words,
 )
@@ -176,16 +177,19 @@ def _votes_of_callers(training: Training, function: Function, name: str, seen: S
 def _votes_of_callees(training: Training, function: Function, images: Tuple[cst.CSTNode, ...]) -> List[Vote]:
     """Pictures that go together into a function of the codebase lie as it takes them, for SSIM as for the L1."""
     votes: List[Vote] = []
+    wanted = {squeezed(image) for image in images}
     for scope in _beside(function):
         for call in scope.flow.calls:
             positional, keywords, starred = arguments(call)
-            given = [_without_batch(value) for value in (*positional, *keywords.values())]
-            if starred or not all(any(same(value, image) for value in given) for image in images):
+            if starred or len(positional) + len(keywords) < len(wanted):
+                continue
+            given = [squeezed(_without_batch(value)) for value in (*positional, *keywords.values())]
+            if not wanted <= set(given):
                 continue
             references = [r for r in training.program.resolve(scope, call.func) if not r.guess]
             for callee in [each for reference in references for each in training.program.run_by(reference)]:
                 for name, value in zip((*callee.parameters[: len(positional)], *keywords), given):
-                    if any(same(value, image) for image in images):
+                    if value in wanted:
                         votes.extend(_of_parameter(callee, name))
     return votes
 

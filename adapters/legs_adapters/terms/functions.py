@@ -36,6 +36,7 @@ class L1Functions:
         self.program = program
         self._prospects = prospects
         self._only: Dict[Function, bool] = {}
+        self._uncalled: Dict[Function, Optional[str]] = {}  # shapes, whatever a call may give
 
     def shape(self, function: Function, call: Optional[cst.Call] = None, depth: int = 0) -> Optional[str]:
         """Say what a function of the checkout makes of its first two arguments.
@@ -47,6 +48,13 @@ class L1Functions:
             "mean" for ``abs(a - b).mean()``, "none" for ``abs(a - b)``, "own" for what else is an L1 and depends on
             nothing but the difference (and on further arguments); None for what is not.
         """
+        if call is None and depth == 0:  # each of a function's terms asks it
+            if function not in self._uncalled:
+                self._uncalled[function] = self._shape(function, None, 0)
+            return self._uncalled[function]
+        return self._shape(function, call, depth)
+
+    def _shape(self, function: Function, call: Optional[cst.Call], depth: int) -> Optional[str]:
         names = function.parameters
         if len(names) < 2 or depth > 4 or not self._prospects.of(function.text):
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import AbstractSet, Iterator, List, Tuple
 
 import libcst as cst
@@ -164,13 +165,14 @@ def _names(term: Term) -> Iterator[Tuple[str, Decider]]:
 def _callers(term: Term, function: Function) -> List[Function]:
     if not function.name or function.name.startswith("__"):
         return []
-    return [
+    callers = (
         caller
         for caller in term.analysis.program.mentioning(function.name, called=True)
         if caller is not function
         and caller.parent is not None
         and any(call_name(call) == function.name for call in caller.flow.calls)
-    ][:8]
+    )
+    return list(islice(callers, 8))
 
 
 def _leaves(function: Function, node: cst.CSTNode) -> List[Decider]:

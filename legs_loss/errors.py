@@ -9,7 +9,10 @@ __all__ = ["LegsError", "did_you_mean"]
 
 
 class LegsError(ValueError):
-    """Bad input: the message says what was wrong, where, and what to do."""
+    """Bad input: the message says what was wrong, where, and what to do; further arguments are lines that it quotes."""
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self.args))
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Optional, Sequence, Tuple
 
 from legs_loss import OPERATORS, LegsError, __version__
 from legs_loss.cli import Parser
-from legs_loss.system import never_fail_to_print, say
+from legs_loss.system import never_fail_to_print, say, say_error
 
 if TYPE_CHECKING:
     from legs_adapters.terms.findings import Problem
@@ -41,7 +41,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
             return _patch(args) or _verify(args)
         return _undo(args) if args.undo else _patch(args)
     except LegsError as error:
-        say(f"legs-patch: error: {error}", sys.stderr)
+        say_error("legs-patch", error)
         return 2
     except KeyboardInterrupt:
         say(f"legs-patch: interrupted; {_so_far(folder, undoing, before)}", sys.stderr)
@@ -87,7 +87,7 @@ class _Explain(argparse.Action):
         from legs_adapters.rules.document import explain, listed
 
         rule = given[1]
-        say(explain(rule) if isinstance(rule, str) else listed(), end="")
+        say(explain(rule) if isinstance(rule, str) else listed(), end="", lines=True)
         parser.exit()
 
 
@@ -173,9 +173,9 @@ def _patch(args: argparse.Namespace) -> int:
     found = found._replace(settings=settings)
     if problems and not args.partial:
         if args.json:
-            say(as_json(found, []), end="")
+            say(as_json(found, []), end="", lines=True)
         else:
-            say(as_table(found), end="")
+            say(as_table(found), end="", lines=True)
         _left_to_the_user(problems)
         say(
             "legs-patch: nothing was changed (--partial patches the rest, --exclude leaves files out)",
@@ -183,7 +183,7 @@ def _patch(args: argparse.Namespace) -> int:
         )
         return 2
     if nothing and not found.findings.patched and not problems:
-        say(as_json(found, []) if args.json else as_table(found), end="")
+        say(as_json(found, []) if args.json else as_table(found), end="", lines=True)
         raise LegsError(
             f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
             + _not_looked_into(root, args.exclude)
@@ -194,19 +194,21 @@ def _patch(args: argparse.Namespace) -> int:
         print(as_json(found, []) if args.json else as_diff(found, _colour()), end="")
         return _left_to_the_user(problems)
     if args.check:
-        say(as_json(found, []) if args.json else as_table(found), end="")
+        say(as_json(found, []) if args.json else as_table(found), end="", lines=True)
         if not args.json:
             say("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
         return _left_to_the_user(problems) or (1 if found.after else 0)
     wrote = write(found, args.force) if changes else []
     if args.json:
-        say(as_json(found, wrote), end="")
+        say(as_json(found, wrote), end="", lines=True)
     else:
-        say(as_table(found), end="")
+        say(as_table(found), end="", lines=True)
         if wrote:
-            say(f"\nwrote {', '.join(wrote)}; take it back with: legs-patch --undo {shlex.quote(args.folder)}")
+            say("")
+            say(f"wrote {', '.join(wrote)}; take it back with: legs-patch --undo {shlex.quote(args.folder)}")
         else:
-            say(f"\nnothing to do: {'it is patched' if found.findings.patched else 'nothing could be decided'}")
+            say("")
+            say(f"nothing to do: {'it is patched' if found.findings.patched else 'nothing could be decided'}")
     return _left_to_the_user(problems)
 
 
@@ -232,7 +234,7 @@ def _verify(args: argparse.Namespace) -> int:
     if args.json:
         say(json.dumps({"holds": verdict.claims, "runs": {name: run._asdict() for name, run in verdict.runs.items()}}))
     else:
-        say("\n" + verdict.text(), end="")
+        say("\n" + verdict.text(), end="", lines=True)
     return 0 if verdict.holds else 1
 
 
@@ -244,7 +246,7 @@ def _undo(args: argparse.Namespace) -> int:
 
     done = undo(args.folder, args.force, args.trust, look=args.diff)
     if args.json:
-        say(json.dumps({"restored": done.restored, "removed": done.removed, "kept": done.kept}, indent=2))
+        say(json.dumps({"restored": done.restored, "removed": done.removed, "kept": done.kept}, indent=2), lines=True)
         return 0
     if args.diff:
         print(changes_as_diff(done.changes, _colour()), end="")
@@ -269,25 +271,20 @@ def _journal(folder: str) -> bytes:
 def _left_to_the_user(problems: Sequence[Problem]) -> int:
     """Say on stderr what to write by hand; return the exit code of that."""
     for problem in problems:
-        say(
-            f"legs-patch: error: {problem.path}:{problem.line}: {problem.reason}\n"
-            f"    {problem.text}\n"
-            f"  if this is the loss between rendering and photograph, write there: {problem.advice}\n"
-            f"  (rendering first), and import legs_loss at the top",
-            stream=sys.stderr,
-        )
+        say(f"legs-patch: error: {problem.path}:{problem.line}: {problem.reason}", sys.stderr)
+        say(f"    {problem.text}", sys.stderr)
+        say(f"  if this is the loss between rendering and photograph, write there: {problem.advice}", sys.stderr)
+        say("  (rendering first), and import legs_loss at the top", sys.stderr)
     return 1 if problems else 0
 
 
 def _left_in_doubt(doubts: Sequence[Problem]) -> None:
     """Say on stderr which lines were left although a file trains that nothing else of was weighted."""
     for doubt in doubts:
-        say(
-            f"legs-patch: warning: a possible loss was not weighted: {doubt.path}:{doubt.line}: {doubt.reason}\n"
-            f"    {doubt.text}\n"
-            f"  if it is the loss between rendering and photograph, write there: {doubt.advice}",
-            stream=sys.stderr,
-        )
+        where = f"{doubt.path}:{doubt.line}"
+        say(f"legs-patch: warning: a possible loss was not weighted: {where}: {doubt.reason}", sys.stderr)
+        say(f"    {doubt.text}", sys.stderr)
+        say(f"  if it is the loss between rendering and photograph, write there: {doubt.advice}", sys.stderr)
 
 
 def _site(root: Path, text: str) -> Tuple[str, int]:

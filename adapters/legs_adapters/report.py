@@ -31,17 +31,12 @@ def as_table(plan: Plan) -> str:
     rows += [(entry.path, entry.line, f"skipped ({entry.reason})", _decided(entry)) for entry in found.left]
     rows += [(entry.path, entry.line, "ERROR", entry.reason) for entry in found.problems]
     rows.sort()
-    table = [(f"{path}:{line}", what, why) for path, line, what, why in rows]
-    table += [(_in_one_line(entry.path), "not read", entry.reason) for entry in found.unreadable]
+    table = [(printable(f"{path}:{line}"), what, printable(why)) for path, line, what, why in rows]
+    table += [(printable(entry.path), "not read", printable(entry.reason)) for entry in found.unreadable]
     if not table:
         return ""
     wide, wider = (max(len(row[column]) for row in table) for column in (0, 1))
     return "".join(f"{where:<{wide}}  {what:<{wider}}  {why}".rstrip() + "\n" for where, what, why in table)
-
-
-def _in_one_line(path: str) -> str:
-    """Return a name without line ends, which could pass for lines of the report."""
-    return path.replace("\n", "\\n").replace("\r", "\\r")
 
 
 def _decided(left: Left) -> str:
@@ -122,7 +117,11 @@ def as_diff(plan: Plan, colour: bool) -> str:
 
 def changes_as_diff(changes: Mapping[str, Tuple[Optional[bytes], Optional[bytes]]], colour: bool) -> str:
     """Return a unified diff of files' bytes before and after; None is no file."""
-    parts = [printable(line) for path, (before, after) in changes.items() for line in _unified(path, before, after)]
+    parts = [
+        printable(line, lines=True)
+        for path, (before, after) in changes.items()
+        for line in _unified(path, before, after)
+    ]
     return "".join(_coloured(line) if colour else line for line in parts)
 
 

@@ -22,7 +22,7 @@ from legs_adapters.plan import plan
 from legs_adapters.rewritten import Loader, install, main_module
 from legs_loss import LegsError
 from legs_loss.config import find_config
-from legs_loss.system import is_first_process
+from legs_loss.system import is_first_process, say
 
 __all__ = ["checkout_of", "execute", "run_script"]
 
@@ -82,7 +82,7 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
 def _say(message: str) -> None:
     """Print a line on stderr, in the first of the processes that torchrun starts."""
     if is_first_process():
-        print(f"legs-loss: {message}", file=sys.stderr, flush=True)
+        say(f"legs-loss: {message}", sys.stderr)
 
 
 def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[Path] = None) -> int:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Dict, List
 
 from legs_loss import LegsError
+from legs_loss.system import say_error
 
 __all__ = ["watch"]
 
@@ -110,5 +111,5 @@ if __name__ == "__main__":
     try:
         sys.exit(_main(*sys.argv[1:]))
     except LegsError as error:
-        print(f"legs: error: {error}", file=sys.stderr)
+        say_error("legs", error)
         sys.exit(2)

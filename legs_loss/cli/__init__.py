@@ -14,7 +14,7 @@ from typing import Any, Callable, Dict, Optional, Sequence
 from legs_loss._version import __version__
 from legs_loss.cli.parser import Parser
 from legs_loss.errors import LegsError
-from legs_loss.system import never_fail_to_print, plugins, say
+from legs_loss.system import never_fail_to_print, plugins, say, say_error
 
 __all__ = ["Parser", "main"]
 
@@ -30,7 +30,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     try:
         return args.run(args)
     except LegsError as error:
-        say(f"legs: error: {error}", sys.stderr)
+        say_error("legs", error)
         return 2
     except KeyboardInterrupt:
         say("legs: interrupted", sys.stderr)

@@ -149,8 +149,8 @@ def _say_scores(out: Path, study: Study, seeds: Sequence[int]) -> None:
     from legs_loss.experiments.tables import study_text
     from legs_loss.reference.training.metrics import left_out
 
-    say(study_text([row for row in read_rows(out)[1] if row["seed"] in seeds], study))
-    say(f"\n{READING}")
+    say(study_text([row for row in read_rows(out)[1] if row["seed"] in seeds], study), lines=True)
+    say(f"\n{READING}", lines=True)
     if left_out():
         say(left_out())
     say(f"Rows: {out}; as a page: legs report {out}")
@@ -213,7 +213,7 @@ def _again(args: argparse.Namespace) -> int:
     row = read_row(args.again)
     with progress_bar(row["config"]["iterations"], row["arm"]) as show:
         now = train_again(args.again, None if args.scene is None else Path(args.scene), show)
-    say(again_text(row, now))
+    say(again_text(row, now), lines=True)
     return 0
 
 

@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     metrics = {arm.name: metrics[arm.name] for arm in arms}
     view, sheet = _save_pictures(scene, arms, metrics, out / "pictures")
     write_whole(out / "results.json", (json.dumps(metrics, indent=2) + "\n").encode())
-    say(table(metrics))
+    say(table(metrics), lines=True)
     say(conclusion(metrics))
     say(
         f"Pictures of the held-out view {view}: {sheet.parent}{os.sep}METHOD-rendering.png, -error.png, -weight.png; "

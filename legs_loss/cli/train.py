@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
 
-from legs_loss.system import say
+from legs_loss.system import printable, say
 
 if TYPE_CHECKING:
     from legs_loss.reference.training.trainer import Progress, TrainConfig
@@ -141,7 +141,7 @@ def progress_bar(iterations: int, name: str, position: int = 0) -> Iterator[Call
     """Show a bar with loss, PSNR and Gaussians; yields what ``train`` takes as ``on_progress``."""
     from tqdm import tqdm
 
-    with tqdm(total=iterations, desc=name, position=position, leave=position == 0, mininterval=0.5) as bar:
+    with tqdm(total=iterations, desc=printable(name), position=position, leave=position == 0, mininterval=0.5) as bar:
 
         def show(progress: Progress) -> None:
             if bar.n == 0 and progress.iteration > 10:  # resumed: these iterations did not take this run's time

@@ -13,4 +13,4 @@ def label(name: str) -> str:
     >>> print(label("a$b\x07.png"))
     a\$b\x07.png
     """
-    return printable(name).replace("$", r"\$")
+    return printable(name, lines=True).replace("$", r"\$")

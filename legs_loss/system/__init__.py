@@ -11,7 +11,7 @@ from legs_loss.system.files import open_regular, read_regular, write_whole
 from legs_loss.system.locks import FileLock, HeldError, is_held
 from legs_loss.system.plugins import plugins
 from legs_loss.system.processors import cores
-from legs_loss.system.terminal import never_fail_to_print, printable, say
+from legs_loss.system.terminal import never_fail_to_print, printable, say, say_error
 
 __all__ = [
     "FileLock",
@@ -28,5 +28,6 @@ __all__ = [
     "printable",
     "read_regular",
     "say",
+    "say_error",
     "write_whole",
 ]

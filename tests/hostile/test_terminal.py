@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 
 import pytest
 
+from legs_loss import LegsError
 from legs_loss.store import WeightStore
+from legs_loss.system import say_error
 from tests.patcher.support import checkout, files
-from tests.support import legs_command, legs_environment, photograph, save
+from tests.support import colmap_scene, legs_command, legs_environment, photograph, save
 
 
 def legs_patch(*arguments, encoding):
@@ -72,6 +75,53 @@ class TestLegs:
         self.legs("report", scene, code=2)
         self.legs("view", tmp_path / "nowhere\x1b[2J", code=2)
         self.legs("compare", scene, "--out", tmp_path / "rows", code=2)
+
+    @pytest.fixture
+    def lines(self, tmp_path):
+        """A scene whose photographs have names that would be lines of a report, or colours."""
+        root = tmp_path / "scene"
+        for name in self.LINES:
+            save(root / "images" / name, photograph(24, 16))
+        (root / "images" / "br\nok\x1b[31m.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+        return root
+
+    LINES = ("a\nlegs: error: b.png", "\x1b[31mred.png")
+
+    def test_a_line_end_in_a_name_ends_no_line(self, lines, tmp_path):
+        colmap = colmap_scene(tmp_path / "colmap", self.LINES)
+        (colmap / "images" / self.LINES[0]).write_bytes(b"\x89PNG\r\n\x1a\n")
+        store = lines / "legs_weights"
+        done = self.run("precompute", lines, code=1)
+        assert b"legs: skipped images/br\\nok\\x1b[31m.png: " in done.stderr
+        for path in store.glob("*.npy"):
+            path.write_bytes(b"")
+        said = self.run("info", lines, code=1).stdout
+        assert b"    images/a\\nlegs: error: b.png 24x16 laplacian" in said and b"images/\\x1b[31mred.png" in said
+        for arguments in (
+            ["show", lines],
+            ["show", lines, "--views", "nothing"],
+            ["train", lines, "--out", tmp_path / "run"],
+            ["train", colmap, "--out", tmp_path / "run"],
+            ["compare", lines, "--out", tmp_path / "rows"],
+            ["compare", colmap, "--out", tmp_path / "rows"],
+            ["info", tmp_path / "no\nlegs: error: b"],
+            ["report", tmp_path / "no\nlegs: error: b"],
+            ["view", tmp_path / "no\nlegs: error: b"],
+        ):
+            assert b"\\n" in self.run(*arguments, code=2).stderr, arguments
+
+    def run(self, *arguments, code):
+        done = subprocess.run(legs_command(*arguments), capture_output=True, env=legs_environment(), timeout=300)
+        assert done.returncode == code, done.stderr
+        printed = done.stdout + done.stderr
+        assert b"\x1b[31m" not in printed and b"Traceback" not in printed
+        assert b"\nlegs: error: b" not in printed
+        return done
+
+    def test_what_an_error_quotes_has_lines(self, capsys):
+        say_error("legs", LegsError("the script\nof x\x1b[2J failed", "its\nlast\x1b[2J lines"))
+        assert capsys.readouterr().err == "legs: error: the script\\nof x\\x1b[2J failed\nits\nlast\\x1b[2J lines\n"
+        assert pickle.loads(pickle.dumps(LegsError("a", "b"))).args == ("a", "b")
 
     def test_a_picture_that_is_written_is_named(self, scene, tmp_path):
         pytest.importorskip("matplotlib")

@@ -39,7 +39,7 @@ def explain(name: str) -> str:
     if not rules:
         near = difflib.get_close_matches(name.lower(), [*RULES, *(rule.reason for rule in RULES.values())], 1)
         guess = f"; did you mean {near[0]}?" if near else ""
-        raise LegsError(f"there is no rule {name!r}{guess}\n{listed()}".rstrip())
+        raise LegsError(f"there is no rule {name!r}{guess}", listed().rstrip())
     return "\n".join(_explained(rule) for rule in rules)
 
 

@@ -184,7 +184,7 @@ def _once(
                 stdin=subprocess.DEVNULL,
             ).returncode  # fmt: skip
         if code != 0 or not part.is_file():
-            raise LegsError(f"the codebase's script ended with exit code {code}:\n{_tail(log)}\nall of it: {log}")
+            raise LegsError(f"the codebase's script ended with exit code {code}; its log: {log}", _tail(log))
     report = dict(json.loads(part.read_text(encoding="utf-8")), commands=[list(map(str, words)) for words in commands])
     part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     os.replace(str(part), str(done))

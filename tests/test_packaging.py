@@ -121,20 +121,23 @@ def test_the_changelog_has_this_version():
 
 
 @pytest.mark.slow
-def test_every_type_of_the_public_face_is_known(tmp_path):
+@pytest.mark.parametrize("package", ["legs_loss", "legs_adapters"])
+def test_every_type_of_the_public_face_is_known(package, tmp_path):
     pytest.importorskip("pyright")
     # pyright reads packages as they are installed, and an editable install is none: so a venv with links.
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
     site = next((tmp_path / "venv").glob("lib/python*/site-packages"))
     (site / "legs_loss").symlink_to(ROOT / "legs_loss")
+    (site / "legs_adapters").symlink_to(ROOT / "adapters" / "legs_adapters")
     (site / "others.pth").write_text("".join(f"{path}\n" for path in sys.path if path.endswith("site-packages")))
     environment = dict(os.environ, PATH=f"{tmp_path / 'venv' / 'bin'}{os.pathsep}{os.environ['PATH']}")
-    command = [sys.executable, "-m", "pyright", "--verifytypes", "legs_loss", "--ignoreexternal", "--outputjson"]
+    command = [sys.executable, "-m", "pyright", "--verifytypes", package, "--ignoreexternal", "--outputjson"]
     done = subprocess.run(command, cwd=str(tmp_path), env=environment, capture_output=True, text=True)
     if not done.stdout.startswith("{"):
         pytest.skip(f"pyright did not run: {done.stderr[-300:]}")
     found = json.loads(done.stdout)["typeCompleteness"]
     public = [one for one in found["symbols"] if one["isExported"]]
     assert len(public) > 500
-    assert not [one["name"] for one in public if not one["isTypeKnown"] or one["isTypeAmbiguous"]]
-    assert found["completenessScore"] == 1.0
+    unknown = [one["name"] for one in public if not one["isTypeKnown"] or one["isTypeAmbiguous"]]
+    # This one's base class is NerfBaselines', which is not installed here.
+    assert set(unknown) <= {"legs_adapters.upstreams.nerfbaselines.SplatfactoLegs"}

@@ -103,13 +103,12 @@ def _main(report: str, limit: str, root: str, script: str, *arguments: str) -> i
             return execute(script, arguments, {}, Path(root))
         except _Enough:
             return 0
+        except LegsError as error:
+            say_error("legs", error)
+            return 2
         finally:
             Path(report).write_text(json.dumps(seen.report()))
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(_main(*sys.argv[1:]))
-    except LegsError as error:
-        say_error("legs", error)
-        sys.exit(2)
+    sys.exit(_main(*sys.argv[1:]))

@@ -29,7 +29,7 @@ class Checkout:
     """
 
     def __init__(self, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> None:
-        self.unread = unread or {}
+        self.unread: Mapping[str, str] = unread or {}
         self.sources: Dict[str, Source] = {source.path: source for source in sources}
         self._over = _over(self.sources)
         self._unreadable: Dict[str, Unreadable] = {}

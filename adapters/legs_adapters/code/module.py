@@ -49,14 +49,14 @@ class Function:
         self.node = node
         self.parent = parent
         self.owner = owner
-        self.name = node.name.value if isinstance(node, cst.FunctionDef) else ""
+        self.name: str = node.name.value if isinstance(node, cst.FunctionDef) else ""
         self._cut = cut
         self._part: Optional[Part] = None
         self._body: Optional[cst.BaseSuite | cst.Module] = None
         self._inner: List[Function] = []
         self._flow: Optional[Flow] = None
         if cut is not None:
-            self.text = module.lines.data[cut.start : cut.end].decode("utf-8")
+            self.text: str = module.lines.data[cut.start : cut.end].decode("utf-8")
         else:
             self.text = parent.text if parent is not None and parent.parent is not None else module.outline_text
 
@@ -170,7 +170,7 @@ class Class:
         self.module = module
         self.node = node
         self.parent = parent
-        self.name = node.name.value
+        self.name: str = node.name.value
         self.methods: Dict[str, Function] = {}
         self.fields: Dict[str, cst.BaseExpression] = dict(_fields(node))
 
@@ -214,13 +214,14 @@ class Module:
     def __init__(self, path: str, text: str) -> None:
         self.path = path
         self.text = text
-        self.lines = Lines(text.encode("utf-8"))
-        self.outline, cuts = outline_part(self.lines)
-        self.outline_text = self.outline.text.decode("utf-8")
+        self.lines: Lines = Lines(text.encode("utf-8"))
+        outline, cuts = outline_part(self.lines)
+        self.outline: Part = outline
+        self.outline_text: str = self.outline.text.decode("utf-8")
         self.failure: Optional[Unreadable] = None
         self.classes: List[Class] = []
         self.by_node: Dict[int, Function | Class] = {}
-        self.top = Function(self, self.outline.tree)
+        self.top: Function = Function(self, self.outline.tree)
         self._by_word: Optional[Dict[str, List[Function]]] = None  # as ``said`` has them
         self._says: Dict[str, bool] = {}
         self._cuts: Iterator[Optional[Cut]] = iter(cuts)

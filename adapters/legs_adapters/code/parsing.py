@@ -85,7 +85,7 @@ class Part:
     """
 
     def __init__(self, lines: Lines, text: bytes, shifts: Sequence[Tuple[int, int]]) -> None:
-        self.tree = cst.parse_module(text.decode("utf-8"))
+        self.tree: cst.Module = cst.parse_module(text.decode("utf-8"))
         self.text = text
         self._lines = lines
         self._shifts = shifts

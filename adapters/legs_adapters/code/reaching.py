@@ -44,13 +44,13 @@ class Definition:
         index: Optional[int] = None,
         key: object = None,
     ) -> None:
-        self.place = place
-        self.kind = kind
-        self.node = node
-        self.value = value
-        self.index = index
-        self.key = key
-        self.order = 0
+        self.place: str = place
+        self.kind: str = kind
+        self.node: cst.CSTNode = node
+        self.value: Optional[cst.CSTNode] = value
+        self.index: Optional[int] = index
+        self.key: object = key
+        self.order: int = 0
 
 
 Env = Dict[str, FrozenSet[Definition]]

@@ -32,7 +32,7 @@ class Views:
     """Verdicts for one program."""
 
     def __init__(self, program: Program) -> None:
-        self.names = Names(program)
+        self.names: Names = Names(program)
 
     def of(self, function: Function, target: cst.CSTNode, site: cst.CSTNode) -> View:
         """Return the verdict for the target of one site."""

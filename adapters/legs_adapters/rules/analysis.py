@@ -44,13 +44,13 @@ class Analysis:
     def __init__(self, program: Program, speaks: Optional[Pattern[str]] = None) -> None:
         self.program = program
         texts = [source.text for source in program.sources.values()]
-        self.prospects = Prospects(texts, speaks) if speaks is not None else Prospects(texts)
-        self.training = Training(self.program, self.prospects.of)
-        self.meanings = Meanings(self.program, self.training)
-        self.views = Views(self.program)
-        self.forms = Forms(L1Functions(self.program, self.prospects))
-        self.purposes = Purposes(self.program, self.training)
-        self.splats = Splats(self.program, self.training)
+        self.prospects: Prospects = Prospects(texts, speaks) if speaks is not None else Prospects(texts)
+        self.training: Training = Training(self.program, self.prospects.of)
+        self.meanings: Meanings = Meanings(self.program, self.training)
+        self.views: Views = Views(self.program)
+        self.forms: Forms = Forms(L1Functions(self.program, self.prospects))
+        self.purposes: Purposes = Purposes(self.program, self.training)
+        self.splats: Splats = Splats(self.program, self.training)
         self._callbacks: Optional[Callbacks] = None
         self._ssims: Optional[SsimCalls] = None
 

@@ -72,8 +72,8 @@ class Term(Asked):
     def __init__(self, analysis: Analysis, function: Function, form: Form, pair: Optional[Pair] = None) -> None:
         super().__init__(analysis, function, form.call)
         self.form = form
-        self.here = [(function, form.node)]
-        self.pair = pair or pair_of(analysis.meanings, function, form)
+        self.here: List[Decider] = [(function, form.node)]
+        self.pair: Pair = pair or pair_of(analysis.meanings, function, form)
 
     @property
     def sides(self) -> Sequence[cst.BaseExpression]:

@@ -34,7 +34,7 @@ class Verdicts:
 
     def __init__(self, analysis: Analysis) -> None:
         self.analysis = analysis
-        self.uses = Uses(analysis)
+        self.uses: Uses = Uses(analysis)
 
     def of(self, function: Function, form: Form, place: Place, by_hand: bool) -> Site | Left | Problem:
         """Return what becomes of a form; ``by_hand`` where a person says that it is the loss."""

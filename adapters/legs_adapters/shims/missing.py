@@ -88,15 +88,16 @@ class Absent:
             raise AttributeError(name)
         return self._refuse()
 
-    __getitem__ = __iter__ = __len__ = __float__ = __add__ = __radd__ = __mul__ = __rmul__ = __sub__ = _refuse
-    __rsub__ = __truediv__ = __rtruediv__ = __gt__ = __lt__ = __ge__ = __le__ = __invert__ = __neg__ = _refuse
-    __torch_function__ = classmethod(lambda cls, *args, **kwargs: cls._refuse_any(args))
-
     @classmethod
-    def _refuse_any(cls, args: Any) -> Any:
+    def __torch_function__(cls, *args: Any, **kwargs: Any) -> Any:
         for value in _flat(args):
             if isinstance(value, cls):
                 value._refuse()
+
+
+_USES = "getitem iter len float add radd mul rmul sub rsub truediv rtruediv gt lt ge le invert neg"
+for _use in _USES.split():
+    setattr(Absent, f"__{_use}__", Absent._refuse)
 
 
 def _flat(values: Any) -> List[Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional, Tuple
+from typing import Dict, List, Optional, Set, Tuple
 
 import libcst as cst
 
@@ -26,8 +26,8 @@ __all__ = [
 
 # The axis of the channels, counted from the last: [C, H, W] and [H, W, C].
 FIRST, LAST = -3, -1
-TO_LAST = {(1, 2, 0), (0, 2, 3, 1)}
-TO_FIRST = {(2, 0, 1), (0, 3, 1, 2)}
+TO_LAST: Set[Tuple[int, ...]] = {(1, 2, 0), (0, 2, 3, 1)}
+TO_FIRST: Set[Tuple[int, ...]] = {(2, 0, 1), (0, 3, 1, 2)}
 
 
 def permutation(node: cst.Call) -> Optional[Tuple[int, ...]]:

@@ -7,7 +7,7 @@ from typing import NamedTuple, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.module import Function
+from legs_adapters.code.module import Function, Module
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import code
 
@@ -33,8 +33,8 @@ class Text:
     def __init__(self, source: Source, function: Function) -> None:
         self.source = source
         self.function = function
-        self.module = function.module
-        self.bytes = self.module.lines.data
+        self.module: Module = function.module
+        self.bytes: bytes = self.module.lines.data
         self._shift = len(source.bom)
 
     def span(self, node: cst.CSTNode, brackets: bool = False) -> Tuple[int, int]:

@@ -20,14 +20,14 @@ from legs_loss.reference.rasterizer import Drawn
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
 
-GaussianRasterizationSettings = settings_type(__name__, (*SETTINGS, "pixel_weights"))
+GaussianRasterizationSettings: Any = settings_type(__name__, (*SETTINGS, "pixel_weights"))
 
 
 class GaussianRasterizer(Rasterizer):
     """Draws Gaussians from the view of its settings."""
 
     module = "diff_gaussian_rasterization"
-    inputs = (*Gaussians._fields[:3], "dc", *Gaussians._fields[3:])
+    inputs: Tuple[str, ...] = (*Gaussians._fields[:3], "dc", *Gaussians._fields[3:])
 
     def results(self, drawn: Drawn, given: Dict[str, Any]) -> Tuple[Any, ...]:
         """Return image, radii; counts, lists, listsRender, listsDistance; centres, depths, radii; and four sums.

@@ -8,6 +8,7 @@ rasterizers of their own: where the codebase expects another interface, it gets 
 from __future__ import annotations
 
 import types
+from typing import Any
 
 from legs_adapters.shims.inria import forks, taming
 from legs_adapters.shims.inria.rasterizer import Rasterizer
@@ -18,7 +19,7 @@ from legs_adapters.shims.missing import complete
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "module"]
 
-GaussianRasterizationSettings = settings_type(__name__)
+GaussianRasterizationSettings: Any = settings_type(__name__)
 
 
 class GaussianRasterizer(Rasterizer):

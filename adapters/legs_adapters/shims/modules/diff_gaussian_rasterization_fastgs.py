@@ -21,7 +21,7 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussia
 
 EVERYWHERE = 1e6  # standard deviations: no square cuts a splat off
 
-GaussianRasterizationSettings = settings_type(
+GaussianRasterizationSettings: Any = settings_type(
     __name__, (*SETTINGS[:10], "mult", *SETTINGS[10:], "get_flag", "metric_map")
 )
 
@@ -29,7 +29,7 @@ GaussianRasterizationSettings = settings_type(
 class GaussianRasterizer(Rasterizer):
     """Draws Gaussians from the view of its settings, each in the tiles of its compact box."""
 
-    inputs = (*Gaussians._fields[:3], "dc", *Gaussians._fields[3:])
+    inputs: Tuple[str, ...] = (*Gaussians._fields[:3], "dc", *Gaussians._fields[3:])
 
     def lens(self) -> Lens:
         """Return a footprint that no square cuts off."""

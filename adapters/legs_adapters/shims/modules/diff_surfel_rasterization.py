@@ -12,7 +12,7 @@ from legs_loss.reference.surfels import Surfels, SurfelView, rasterize_surfels
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
-GaussianRasterizationSettings = settings_type(__name__)
+GaussianRasterizationSettings: Any = settings_type(__name__)
 
 
 class GaussianRasterizer(RasterizerBase):

@@ -153,7 +153,8 @@ class Resize:
     """`resize` as a transform."""
 
     def __init__(self, size: Union[int, Sequence[int]], interpolation: Any = None, *_: Any, **__: Any) -> None:
-        self.size, self.interpolation = size, interpolation
+        self.size: Union[int, Sequence[int]] = size
+        self.interpolation: Any = interpolation
 
     def __call__(self, img: Any) -> Any:
         return resize(img, self.size, self.interpolation)
@@ -163,7 +164,7 @@ class Compose:
     """Transforms one after the other."""
 
     def __init__(self, transforms: Sequence[Any]) -> None:
-        self.transforms = list(transforms)
+        self.transforms: List[Any] = list(transforms)
 
     def __call__(self, img: Any) -> Any:
         for transform in self.transforms:

@@ -40,7 +40,7 @@ class Stream:
     """``torch.cuda.Stream``: the only one, with no work pending."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.device = torch.device("cpu")
+        self.device: torch.device = torch.device("cpu")
         self.cuda_stream = self.stream_id = 0
 
     def record_event(self, event: Optional[Event] = None) -> Event:

@@ -24,7 +24,7 @@ class Tensor:
     """An array, and whether an image is in it, whose gradient goes through it."""
 
     def __init__(self, values: Any, of_image: bool) -> None:
-        self.values = np.asarray(values, dtype=np.float64)
+        self.values: np.ndarray = np.asarray(values, dtype=np.float64)
         self.of_image = of_image
 
 
@@ -55,7 +55,7 @@ class Torch(Library):
     def __init__(self, cuda: bool) -> None:
         self._cuda = cuda
         self._blurs = 0
-        self.depends_on_device = False
+        self.depends_on_device: bool = False
 
     def external(self, name: str) -> Any:
         """Return a function or a constant of torch, math or Python."""

@@ -44,7 +44,7 @@ class SsimCalls:
 
     def __init__(self, program: Program) -> None:
         self.program = program
-        self.functions = SsimFunctions(program)
+        self.functions: SsimFunctions = SsimFunctions(program)
 
     def proof(self, function: Function, form: Form) -> Proof:
         """Return what a call in a function computes, with what shows it."""

@@ -157,13 +157,11 @@ def _say_scores(out: Path, study: Study, seeds: Sequence[int]) -> None:
 
 
 def _upstream(args: argparse.Namespace, study: Study) -> int:
-    import shlex
-
     from legs_loss.errors import LegsError
     from legs_loss.experiments.arms import needed, parse_arms
     from legs_loss.experiments.running import BASELINE
     from legs_loss.experiments.upstream.comparison import UpstreamComparison
-    from legs_loss.experiments.upstream.profile import find_profile
+    from legs_loss.experiments.upstream.profile import find_profile, split
 
     if args.scene is None:
         raise LegsError("give the scene that --upstream is to be trained on")
@@ -181,7 +179,7 @@ def _upstream(args: argparse.Namespace, study: Study) -> int:
         resolution=args.resolution,
         iterations=args.iterations,
         gaussians=args.gaussians,
-        extra=shlex.split(args.extra),
+        extra=split(args.extra),
         cpu=args.cpu,
     )
     arms = needed(parse_arms([BASELINE, *study.arms]))

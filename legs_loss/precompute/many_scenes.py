@@ -14,11 +14,13 @@ from legs_loss.errors import LegsError
 from legs_loss.precompute import Report, precompute
 from legs_loss.scenes import read_scene
 from legs_loss.spec import Spec
+from legs_loss.system import read_regular
 from legs_loss.system.executors import Listener
 
 __all__ = ["SceneDone", "SceneTask", "find_scenes", "precompute_scene", "stores_of"]
 
 _TELL_SECONDS = 0.25
+_LARGEST = 64 << 20  # bytes of a list
 
 
 class SceneTask(NamedTuple):
@@ -48,11 +50,18 @@ def find_scenes(given: Sequence[str]) -> List[Path]:
     Raises:
         LegsError: a pattern or a file means no scene, or a scene is not there.
     """
+    return list(dict.fromkeys(_find(given, ())))
+
+
+def _find(given: Sequence[str], lists: Sequence[Path]) -> List[Path]:
+    """Return the scenes that are named; ``lists`` are the files in which these names stand."""
     found: List[Path] = []
     for one in given:
         path = Path(one)
         if path.suffix == ".txt" and path.is_file():
-            found += _listed(path)
+            if path.resolve() in lists:
+                raise LegsError(f"{path} is in a list that it names itself")
+            found += _find(_listed(path), [*lists, path.resolve()])
         elif path.exists() or not glob.has_magic(one):
             found.append(path)
         else:
@@ -60,18 +69,20 @@ def find_scenes(given: Sequence[str]) -> List[Path]:
             if not matches:
                 raise LegsError(f"no folder fits {one}")
             found += matches
-    return list(dict.fromkeys(found))
+    return found
 
 
-def _listed(path: Path) -> List[Path]:
+def _listed(path: Path) -> List[str]:
     try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
+        lines = [line.strip() for line in read_regular(path, _LARGEST).decode("utf-8-sig").splitlines()]
+    except OSError as error:
+        raise LegsError(f"cannot read {path}: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
         raise LegsError(f"cannot read {path}: {error}") from None
     scenes = [str(path.parent / line) for line in lines if line and not line.startswith("#")]
     if not scenes:
         raise LegsError(f"{path} names no scene: it should have a folder a line")
-    return find_scenes(scenes)
+    return scenes
 
 
 def stores_of(scenes: Sequence[Path], out: Optional[str]) -> List[Path]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Callable, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
+from legs_loss.scenes.images import open_image
 
 __all__ = ["PHOTOGRAPHS", "Reconstructed", "reconstruct"]
 
@@ -115,16 +116,11 @@ def _photographs(folder: Path) -> List[str]:
 
 def _one_camera(folder: Path, names: Sequence[str]) -> bool:
     """Return whether all photographs have one size, and one focal length as far as they tell it."""
-    from PIL import Image
-
     kinds = set()
     for name in names:
-        try:
-            with Image.open(str(folder / name)) as photograph:
-                exif = photograph.getexif()
-                kinds.add((photograph.size, exif.get_ifd(0x8769).get(0x920A) if exif else None))
-        except (OSError, SyntaxError, ValueError) as error:
-            raise LegsError(f"{folder / name} cannot be read: {error}") from None
+        with open_image(folder / name) as photograph:
+            exif = photograph.getexif()
+            kinds.add((photograph.size, exif.get_ifd(0x8769).get(0x920A) if exif else None))
     return len(kinds) == 1
 
 

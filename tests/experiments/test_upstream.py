@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import json
+import os
+import re
 import shutil
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import pytest
 from legs_loss import LegsError
 from legs_loss.cli import main
 from legs_loss.experiments.upstream.profile import PROFILES, fill, find_profile, read_profile
-from legs_loss.experiments.upstream.training import Checkout
+from legs_loss.experiments.upstream.training import Checkout, copy_checkout
 from tests.experiments.miniature import write_miniature
 
 pytest.importorskip("libcst")
@@ -66,6 +68,8 @@ def test_a_profile_is_found_by_what_a_checkout_has(tmp_path: Path) -> None:
         ('extends = "3dgs"\nrenders = { train = "a" }', "renders must have train and test"),
         ('extends = "3dgs"\nthreshold = [{ words = "--x", value = 1.0 }]', "a threshold has words with"),
         ("name = ", "cannot be read"),
+        ("name = " + "[" * 100_000, "cannot be read"),
+        ("name = " + "9" * 5_000, "cannot be read|name is not what it should be"),
     ],
 )
 def test_a_wrong_profile_is_explained(tmp_path: Path, text: str, says: str) -> None:
@@ -87,6 +91,26 @@ def test_thresholds_that_the_user_gives_are_those_that_are_scaled() -> None:
 def test_words_that_no_one_fills_in() -> None:
     with pytest.raises(LegsError, match=r"{scenes} is not known here"):
         fill("train.py -s {scenes}", {"scene": "a"})
+
+
+@pytest.mark.parametrize(
+    "words", ["train.py {}", "train.py {scene", "train.py '", "{scene.x}", "{scene[0]}", "{scene:d}"]
+)
+def test_words_that_cannot_be_filled_in(words: str) -> None:
+    with pytest.raises(LegsError, match=re.escape(repr(words))):
+        fill(words, {"scene": Path("a")})
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in this file system")
+def test_a_checkout_is_copied_without_what_is_no_file(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    (root / "folder.py").mkdir(parents=True)
+    (root / "train.py").write_text("import torch\n")
+    (root / "lost").symlink_to("nowhere")
+    for name in ("pipe", "pipe.py"):
+        os.mkfifo(str(root / name))
+    copy_checkout(root, tmp_path / "copy")
+    assert sorted(os.listdir(str(tmp_path / "copy"))) == [".git", "folder.py", "lost", "train.py"]
 
 
 # A comparison

@@ -49,6 +49,23 @@ class TestWhichScenes:
         with pytest.raises(LegsError, match="no folder fits"):
             find_scenes([str(tmp_path / "x*")])
 
+    def test_lists_in_lists(self, scenes, tmp_path):
+        for name, line in (
+            ("all", "some.txt\nscenes/scene2\nsome.txt"),
+            ("some", "scenes/scene0"),
+            ("self", "self.txt"),
+        ):
+            (tmp_path / f"{name}.txt").write_text(line + "\n")
+        (tmp_path / "one.txt").write_text("other.txt\n")
+        (tmp_path / "other.txt").write_text("scenes/scene0\none.txt\n")
+        (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe")
+        assert find_scenes([str(tmp_path / "all.txt")]) == [scenes[0], scenes[2]]
+        for name in ("self", "one", "other"):
+            with pytest.raises(LegsError, match="is in a list that it names itself"):
+                find_scenes([str(tmp_path / f"{name}.txt")])
+        with pytest.raises(LegsError, match=r"cannot read .*bytes\.txt"):
+            find_scenes([str(tmp_path / "bytes.txt")])
+
     def test_stores_in_another_folder(self, scenes, tmp_path):
         assert stores_of(scenes[:1], "maps") == [Path("maps")]
         assert stores_of(scenes, "maps") == [Path("maps/scene0"), Path("maps/scene1"), Path("maps/scene2")]

@@ -58,7 +58,7 @@ def test_errors_say_what_to_do_and_leave_nothing(tmp_path, capsys):
         Image.fromarray(rng.integers(0, 255, (64, 64, 3), dtype=np.uint8)).save(photos / f"{i}.png")
     assert "no scene can be made" in error_of(capsys, photos, out, "--threads", 1)
     (photos / "3.png").write_bytes(b"not a photograph")
-    assert "3.png cannot be read" in error_of(capsys, photos, out)
+    assert "3.png: not an image" in error_of(capsys, photos, out)
     assert "--overlap must be" in error_of(capsys, photos, out, "--overlap", 0)
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
     out.mkdir()

@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
+from legs_loss.system import read_regular
 
-__all__ = ["PROFILES", "Profile", "Threshold", "find_profile", "read_profile"]
+__all__ = ["PROFILES", "Profile", "Threshold", "fill", "find_profile", "read_profile", "split"]
 
 PROFILES = Path(__file__).with_name("profiles")
+_LARGEST = 1 << 20  # bytes of a profile
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,23 @@ def fill(words: str, places: Mapping[str, Any]) -> List[str]:
     unknown = sorted(set(re.findall(r"{(\w+)", words)) - set(places))
     if unknown:
         raise LegsError(f"{words!r}: {{{unknown[0]}}} is not known here; there are {', '.join(sorted(places))}")
-    return [word.format(**places) for word in shlex.split(words)]
+    parts = split(words)
+    try:
+        return [word.format(**places) for word in parts]
+    except (ValueError, LookupError, AttributeError, TypeError) as error:
+        raise LegsError(f"{words!r} cannot be filled in: {error}") from None
+
+
+def split(words: str) -> List[str]:
+    """Return words as a shell would part them.
+
+    Raises:
+        LegsError: a quotation has no end.
+    """
+    try:
+        return shlex.split(words)
+    except ValueError as error:
+        raise LegsError(f"{words!r}: {error}") from None
 
 
 def _has_default(field: Any) -> bool:
@@ -180,6 +198,8 @@ def _read(path: Path) -> Dict[str, Any]:
     else:
         import tomli as tomllib
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        return tomllib.loads(read_regular(path, _LARGEST).decode("utf-8"))
+    except OSError as error:
+        raise LegsError(f"{path} cannot be read: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:  # all that a parser of TOML says, and of numbers and texts in it
         raise LegsError(f"{path} cannot be read: {error}") from None

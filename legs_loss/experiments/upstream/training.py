@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import stat
 import subprocess
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Sequence
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Set
 
 import numpy as np
 import torch
@@ -20,11 +21,13 @@ from legs_loss.reference.training.densify import Schedule
 from legs_loss.reference.training.metrics import mean_scores, score
 from legs_loss.scenes import open_image
 from legs_loss.spec import WeightSpec
+from legs_loss.system import read_regular
 
 __all__ = ["Checkout", "copy_checkout", "gaussians_in", "read_picture", "train_and_score"]
 
 # What a copy of a checkout can do without.
 UNNEEDED = (".git", "__pycache__", "node_modules", "output", "outputs")
+_LARGEST = 256 << 20  # bytes of a step's report
 
 
 @dataclass(frozen=True)
@@ -95,14 +98,25 @@ def copy_checkout(root: Path, copy: Path) -> None:
     """
     if not root.is_dir():
         raise LegsError(f"there is no folder {root}: give a checkout of the codebase")
-    patched = next((path for path in sorted(root.rglob("*.py")) if b"import legs_loss" in path.read_bytes()), None)
+    patched = next((path for path in sorted(root.rglob("*.py")) if _is_patched(path)), None)
     if patched is not None or (root / ".legs-patch.json").exists():
         raise LegsError(f"{patched or root} is patched already, so there is no baseline: legs-patch {root} --undo")
     part = copy.with_name(copy.name + ".part")
     shutil.rmtree(str(part), ignore_errors=True)
-    shutil.copytree(str(root), str(part), symlinks=True, ignore=shutil.ignore_patterns(*UNNEEDED))
+    shutil.copytree(str(root), str(part), symlinks=True, ignore=_unneeded)
     (part / ".git").mkdir()  # it ends here: what lies above is not looked at
     os.replace(str(part), str(copy))
+
+
+def _is_patched(path: Path) -> bool:
+    return path.is_file() and b"import legs_loss" in path.read_bytes()
+
+
+def _unneeded(folder: str, names: List[str]) -> Set[str]:
+    """Return what is not copied of a folder: what tools wrote, and pipes, sockets and devices."""
+    kinds = {name: stat.S_IFMT(os.lstat(os.path.join(folder, name)).st_mode) for name in names}
+    odd = {name for name, kind in kinds.items() if kind not in (stat.S_IFREG, stat.S_IFDIR, stat.S_IFLNK)}
+    return odd | set(shutil.ignore_patterns(*UNNEEDED)(folder, names))
 
 
 def train_and_score(checkout: Checkout, spec: WeightSpec, seed: int, folder: Path, factor: float) -> Dict[str, Any]:
@@ -166,10 +180,11 @@ def _once(
     done = folder / f"{step}.json"
     if done.is_file():
         try:
-            kept = json.loads(done.read_text(encoding="utf-8"))
-        except ValueError:
+            kept = json.loads(read_regular(done, _LARGEST).decode("utf-8"))
+            known = kept.get("commands")
+        except (OSError, ValueError, AttributeError, RecursionError):
             raise LegsError(f"{done}: this file is damaged: delete it and run the comparison again") from None
-        if kept.get("commands") != [list(map(str, words)) for words in commands]:
+        if known != [list(map(str, words)) for words in commands]:
             raise LegsError(f"{done}: this was done by other commands: choose another folder (--out)")
         return kept
     part = folder / f"{step}.json.part"

@@ -9,7 +9,7 @@ from typing import Callable, Dict, Iterator, List, Optional, Sequence, Set, Tupl
 
 import libcst as cst
 
-from legs_adapters.code.reaching import Env, Reaching, join
+from legs_adapters.code.reaching import Definition, Env, Reaching, join
 from legs_adapters.code.syntax import call_name, children, constant, dotted, path_of
 
 __all__ = ["Flow"]
@@ -50,7 +50,7 @@ class Flow(Reaching):
         env: Env = {}
         if parameters is not None:
             for param in _parameters(parameters):
-                self._bind(env, self._define(param.name.value, "parameter", param, param.default))
+                self._bind(env, Definition(param.name.value, "parameter", param, param.default))
         self._block(_statements(body), env)
 
     # -- definitions
@@ -82,7 +82,7 @@ class Flow(Reaching):
         place = path_of(target)
         if place is not None:
             unpacked = kind in ("element", "part")
-            self._bind(env, self._define(place, kind, target if unpacked else node, value, index))
+            self._bind(env, Definition(place, kind, target if unpacked else node, value, index))
         if isinstance(target, (cst.Attribute, cst.Subscript)):
             self._visit(target.value, env)
             if isinstance(target, cst.Subscript):
@@ -98,7 +98,7 @@ class Flow(Reaching):
                     key = "." + target.attr.value
                 elif len(target.slice) == 1 and isinstance(target.slice[0].slice, cst.Index):
                     key = constant(target.slice[0].slice.value)
-                self._add(env, self._define(whole, "store", target, value, None, key))
+                self._add(env, Definition(whole, "store", target, value, None, key))
 
     # -- statements
 
@@ -161,10 +161,10 @@ class Flow(Reaching):
                 self._visit(decorator.decorator, env)
             if self._around:
                 self.contexts[id(node)] = self._around
-            self._bind(env, self._define(node.name.value, "function", node))
+            self._bind(env, Definition(node.name.value, "function", node))
             return env
         if isinstance(node, cst.ClassDef):
-            self._bind(env, self._define(node.name.value, "class", node))
+            self._bind(env, Definition(node.name.value, "class", node))
             return env
         if type(node).__name__ == "Match":
             self._visit(node.subject, env)  # type: ignore[attr-defined]
@@ -188,11 +188,11 @@ class Flow(Reaching):
             self._visit(node.value, env)
             place = path_of(node.target)
             if place is not None:
-                self._bind(env, self._define(place, "augment", node, node.value))
+                self._bind(env, Definition(place, "augment", node, node.value))
             if isinstance(node.target, (cst.Attribute, cst.Subscript)):
                 whole = path_of(node.target.value)
                 if whole is not None:
-                    self._add(env, self._define(whole, "store", node, node.value))
+                    self._add(env, Definition(whole, "store", node, node.value))
         elif isinstance(node, cst.Expr):
             self._visit(node.value, env)
             self._mutation(node.value, env)
@@ -248,9 +248,9 @@ class Flow(Reaching):
         if whole is None:
             return
         if name in _MUTATORS:
-            self._add(env, self._define(whole, "mutate", node, node))
+            self._add(env, Definition(whole, "mutate", node, node))
         elif name.endswith("_") and not name.endswith("__"):
-            self._add(env, self._define(whole, "inplace", node, node))
+            self._add(env, Definition(whole, "inplace", node, node))
 
     def _import(self, node: cst.Import | cst.ImportFrom, env: Env) -> None:
         if self._is_first(node):
@@ -263,7 +263,7 @@ class Flow(Reaching):
             else:
                 name = (dotted(alias.name) or "").split(".")[0]
             if name:
-                self._bind(env, self._define(name, "import", alias, node))
+                self._bind(env, Definition(name, "import", alias, node))
 
     # -- expressions
 
@@ -333,7 +333,7 @@ class Flow(Reaching):
     def _lambda(self, node: cst.Lambda, env: Env) -> None:
         inner = dict(env)
         for param in _parameters(node.params):
-            self._bind(inner, self._define(param.name.value, "parameter", param, param.default))
+            self._bind(inner, Definition(param.name.value, "parameter", param, param.default))
         self._visit(node.body, inner)
 
     def _comprehension(self, node: cst.BaseSimpleComp | cst.DictComp, env: Env) -> None:

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Dict, FrozenSet, List, Optional, Sequence, Set, Tuple
 
 import libcst as cst
@@ -18,6 +19,7 @@ __all__ = ["Definition", "Env", "Reaching", "join"]
 _PART = re.compile(r"[.\[]")
 
 
+@dataclass(eq=False)
 class Definition:
     """One way in which a place got its value.
 
@@ -33,24 +35,13 @@ class Definition:
         order: which definition of its function it is, in the order of the source.
     """
 
-    __slots__ = ("index", "key", "kind", "node", "order", "place", "value")
-
-    def __init__(
-        self,
-        place: str,
-        kind: str,
-        node: cst.CSTNode,
-        value: Optional[cst.CSTNode] = None,
-        index: Optional[int] = None,
-        key: object = None,
-    ) -> None:
-        self.place: str = place
-        self.kind: str = kind
-        self.node: cst.CSTNode = node
-        self.value: Optional[cst.CSTNode] = value
-        self.index: Optional[int] = index
-        self.key: object = key
-        self.order: int = 0
+    place: str
+    kind: str
+    node: cst.CSTNode
+    value: Optional[cst.CSTNode] = None
+    index: Optional[int] = None
+    key: object = None
+    order: int = 0
 
 
 Env = Dict[str, FrozenSet[Definition]]
@@ -107,32 +98,25 @@ class Reaching:
             found |= env.get(place, frozenset())
         return frozenset(found)
 
-    def _define(
-        self,
-        place: str,
-        kind: str,
-        node: cst.CSTNode,
-        value: Optional[cst.CSTNode] = None,
-        index: Optional[int] = None,
-        key: object = None,
-    ) -> Definition:
-        known = (id(node), place, kind)
-        if known not in self._made:
-            self._made[known] = Definition(place, kind, node, value, index, key)
-            self._made[known].order = len(self._made)
-            self.definitions.setdefault(place, []).append(self._made[known])
-            self._holders.update(place[: found.start()] for found in _PART.finditer(place))
-        return self._made[known]
+    def _known(self, made: Definition) -> Definition:
+        """Return the definition that a statement was recorded as when it was met first; a loop is walked twice."""
+        known = self._made.setdefault((id(made.node), made.place, made.kind), made)
+        if known is made:
+            made.order = len(self._made)
+            self.definitions.setdefault(made.place, []).append(made)
+            self._holders.update(made.place[: found.start()] for found in _PART.finditer(made.place))
+        return known
 
     def _bind(self, env: Env, definition: Definition) -> None:
+        definition = self._known(definition)
         place = definition.place
         if place in self._holders:  # a top level may bind thousands of names: few of them have parts
             for other in [other for other in env if other.startswith((place + ".", place + "["))]:
                 del env[other]
         env[place] = frozenset([definition])
 
-    @staticmethod
-    def _add(env: Env, definition: Definition) -> None:
+    def _add(self, env: Env, definition: Definition) -> None:
+        definition = self._known(definition)
         env[definition.place] = env.get(definition.place, frozenset()) | {definition}
 
     def unchanged(self, *nodes: cst.CSTNode) -> bool:

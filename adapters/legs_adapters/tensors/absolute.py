@@ -12,11 +12,11 @@ __all__ = ["AbsoluteValue", "abs_argument", "absolute_value", "is_abs", "is_diff
 
 
 class AbsoluteValue(NamedTuple):
-    """An absolute value, with or without its mean: the call that takes it, and what of."""
+    """An absolute value: the call that takes it, what of, and "mean" where the mean is taken of it, else "none"."""
 
     call: cst.Call
     argument: cst.BaseExpression
-    mean: bool
+    makes: str
 
 
 def absolute_value(node: cst.Call) -> Optional[AbsoluteValue]:
@@ -24,7 +24,7 @@ def absolute_value(node: cst.Call) -> Optional[AbsoluteValue]:
     inner = mean_of(node)
     call = node if inner is None else inner
     argument = abs_argument(call)
-    return None if argument is None else AbsoluteValue(call, argument, inner is not None)
+    return None if argument is None else AbsoluteValue(call, argument, "none" if inner is None else "mean")
 
 
 def is_difference(node: cst.CSTNode) -> bool:

@@ -32,6 +32,8 @@ class Form:
         extras: the call's further arguments.
         difference: the ``a - b``, for a form that is an absolute value.
         selection: for a difference with a name of its own, the index that it is taken with, ``[mask]``; empty without.
+        makes: what becomes of the differences: "mean", "none" (the map), or "own", anything else that is an L1; see
+            `L1Functions.shape`.
         order: of the kinds that recognise one call, the least is taken.
         is_named: whether the difference has a name of its own, so that there is no one expression to replace.
         weighs: whether the edit weights the term.
@@ -46,6 +48,7 @@ class Form:
     extras: Tuple[cst.Arg, ...] = ()
     difference: Optional[cst.BinaryOperation] = None
     selection: str = ""
+    makes: str = "own"
 
     order: ClassVar[int] = 0
     is_named: ClassVar[bool] = False
@@ -60,12 +63,12 @@ class Form:
     @property
     def is_map(self) -> bool:
         """Return whether the term is an unreduced error map."""
-        return False
+        return self.makes == "none"
 
     @property
     def is_mean(self) -> bool:
         """Return whether the term is the plain mean."""
-        return False
+        return self.makes == "mean"
 
     @property
     def takes_index(self) -> bool:

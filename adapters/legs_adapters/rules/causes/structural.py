@@ -80,10 +80,6 @@ class Value(_Lacking):
     """With `--ssim`: the function computes something else: another window, padding or constant, no mean over all.
 
     left:
-        import torch
-        import torch.nn.functional as F
-        from gaussian_renderer import render
-
         def ssim_of_patches(image, gt):
             return (image * gt).mean()
 
@@ -103,9 +99,6 @@ class Unproven(_Lacking):
     """With `--ssim`: what the function computes, or which function it is, cannot be told from the source.
 
     left:
-        import torch
-        from gaussian_renderer import render
-
         def ssim_clamped(image, gt):
             return (image.clamp(0, 1) * gt).mean()
 

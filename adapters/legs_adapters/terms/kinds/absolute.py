@@ -25,12 +25,7 @@ class Absolute(Form):
     Example:
         before: loss = torch.abs(image - gt_image).mean()
         after: loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name)
-
-    Attributes:
-        mean: whether its mean is taken.
     """
-
-    mean: bool = False
 
     order = 10
 
@@ -44,17 +39,7 @@ class Absolute(Form):
         assert isinstance(difference, cst.BinaryOperation)
         if _is_number(difference.left) or _is_number(difference.right):
             return None
-        return cls(call, found.call, difference.left, difference.right, difference=difference, mean=found.mean)
-
-    @property
-    def is_map(self) -> bool:
-        """Return whether no mean is taken."""
-        return not self.mean
-
-    @property
-    def is_mean(self) -> bool:
-        """Return whether the mean is taken."""
-        return self.mean
+        return cls(call, found.call, difference.left, difference.right, difference=difference, makes=found.makes)
 
     @property
     def takes_index(self) -> bool:
@@ -72,7 +57,7 @@ class Absolute(Form):
         )
         middle = residue(text.between(left[1], right[0]))
         settings = writing.settings(as_map=bool(writing.selection) or self.is_map)
-        tail = writing.selection + (".mean()" if writing.selection and self.mean else "")
+        tail = writing.selection + (".mean()" if writing.selection and self.is_mean else "")
         before, after = residue(text.between(start, left[0])), residue(text.between(right[1], end))
         return [
             text.replace(start, left[0], f"{writing.package}.l1_loss({before}"),

@@ -26,18 +26,13 @@ class PassedByName(Form):
     Example:
         before: loss = combined(image, gt_image, [l1_loss])
         after: [lambda input, target: legs_loss.l1_loss(input, target, own=l1_loss)]
-
-    Attributes:
-        mean: whether the function is known to return the plain mean; else it is kept as ``own=``.
     """
 
-    mean: bool = False
-
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
-        """Write the weighted function in the name's place."""
+        """Write the weighted function in the name's place; what is not the plain mean is kept as ``own=``."""
         assert self.callee is not None
         function = f"{writing.package}.l1_loss"
-        if not self.mean:
+        if not self.is_mean:
             function = f"lambda input, target: {function}(input, target, own={code(self.callee)})"
         return [text.replace(*text.span(self.node, True), function)]
 
@@ -111,7 +106,7 @@ class Callbacks:
                 near = [(c, call) for c, call in unknown if c.module is holder.module] or unknown
                 caller, call = near[0]
                 sides = call.args[0].value, call.args[1].value
-                self._add(holder, Callback(PassedByName(value, call, *sides, value, mean=shape == "mean"), caller))
+                self._add(holder, Callback(PassedByName(value, call, *sides, value, makes=shape), caller))
 
     def _add_listed(self, function: Function) -> None:
         """Add the functions of a list, ``on_crops(image, gt, [l1, other])``, which ``losses[i](image, gt)`` calls."""

@@ -30,12 +30,7 @@ class Called(Form):
     Example:
         before: loss = l1_loss(image, gt_image)
         after: loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name)
-
-    Attributes:
-        makes: "mean", "none" (the map), or "own", which is whatever the function makes of it; see `L1Functions.shape`.
     """
-
-    makes: str = "own"
 
     order = 50
 
@@ -78,28 +73,15 @@ class Called(Form):
         return cls(call, call, first, second, call.func, tuple(extras), makes=makes)
 
     @property
-    def is_map(self) -> bool:
-        """Return whether the function returns the map."""
-        return self.makes == "none"
-
-    @property
-    def is_mean(self) -> bool:
-        """Return whether the function returns the mean."""
-        return self.makes == "mean"
-
-    @property
     def takes_index(self) -> bool:
         """Return whether nothing but a mean is taken after the pixel by pixel difference."""
-        return self.makes != "own" or (self._is_torchs() and not self.extras)
-
-    def _is_torchs(self) -> bool:
-        return self.callee is not None and re.search(r"(^|\.)(F|functional)\.l1_loss$", code(self.callee)) is not None
+        assert self.callee is not None
+        torchs = re.search(r"(^|\.)(F|functional)\.l1_loss$", code(self.callee))
+        return self.makes != "own" or (torchs is not None and not self.extras)
 
     def _own(self, writing: Writing) -> str:
         assert self.callee is not None
-        if self.makes != "own" or (self._is_torchs() and not self.extras):
-            return ""
-        return writing.own(self.callee, self.extras)
+        return "" if self.takes_index else writing.own(self.callee, self.extras)
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the function, order the two images, and put the settings in the further arguments' place."""

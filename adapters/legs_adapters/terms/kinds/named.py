@@ -25,12 +25,7 @@ class Named(Form):
     Example:
         before: diff = image - gt_image; loss = diff.abs().mean()
         after: diff = image - gt_image; loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name)
-
-    Attributes:
-        mean: whether the mean is taken.
     """
-
-    mean: bool = False
 
     order = 30
     is_named: ClassVar[bool] = True
@@ -49,28 +44,19 @@ class Named(Form):
         if not isinstance(value, cst.BinaryOperation) or not is_difference(value):
             return None
         sides = value.left, value.right
-        return cls(call, found.call, *sides, difference=value, selection=selection, mean=found.mean)
+        return cls(call, found.call, *sides, difference=value, selection=selection, makes=found.makes)
 
     @classmethod
     def of(cls, form: Form, first: cst.BaseExpression, second: cst.BaseExpression, index: str) -> Named:
         """Return a form of masked images as one of whole images, the error map of which is indexed."""
-        return cls(form.node, form.call, first, second, form.callee, selection=index, mean=not form.is_map)
-
-    @property
-    def is_map(self) -> bool:
-        """Return whether no mean is taken."""
-        return not self.mean
-
-    @property
-    def is_mean(self) -> bool:
-        """Return whether the mean is taken."""
-        return self.mean
+        makes = "none" if form.is_map else "mean"
+        return cls(form.node, form.call, first, second, form.callee, selection=index, makes=makes)
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the whole term; the name and its difference stay for whoever else reads them."""
         carried = writing.selection[: len(writing.selection) - len(self.selection)]
         first, second = (on_one_line(text.argument(side, carried)) for side in (self.first, self.second))
-        tail = writing.selection + (".mean()" if writing.selection and self.mean else "")
+        tail = writing.selection + (".mean()" if writing.selection and self.is_mean else "")
         call = writing.call(
             *writing.ordered(first, second), bool(writing.selection) or self.is_map, residue=residue(text.of(self.node))
         )

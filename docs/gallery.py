@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from legs_loss import WeightSpec, response, weight_map
-from legs_loss.operators import operator_names
+from legs_loss.operators import OPERATORS
 from legs_loss.reference.embedded import write_embedded_scene
 from legs_loss.response import normalise_response
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
@@ -41,7 +41,7 @@ def main() -> None:
         view = read_scene(write_embedded_scene(Path(folder) / "scene", views=9, width=320, height=240)).views[4]
         image = image_tensor(load_training_image(view))
     photograph = ("photograph", image, "", 1.0)
-    strengths = [(name, normalise_response(response(image, name))) for name in operator_names()]
+    strengths = [(name, normalise_response(response(image, name))) for name in OPERATORS]
     most = float(torch.quantile(strengths[0][1], 0.99))
     sheet("operators", 3, [photograph, *((name, strength, "magma", most) for name, strength in strengths)])
     curves = [

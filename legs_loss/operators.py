@@ -9,7 +9,7 @@ from typing import Dict, NamedTuple, Tuple
 
 from legs_loss.errors import LegsError, did_you_mean
 
-__all__ = ["NORMS", "OPERATORS", "Operator", "Stencil", "check_operator", "operator_names"]
+__all__ = ["NORMS", "OPERATORS", "Operator", "Stencil", "check_operator"]
 
 # Rows of weights, an odd number of rows and as many columns. A stencil is even (it equals its own mirror images, as a
 # second derivative does) or odd in one direction (a first derivative). Its centre is minus the sum of all others, so
@@ -73,11 +73,6 @@ OPERATORS: Dict[str, Operator] = _by_name(
 )
 
 NORMS = (1.0, 2.0, float("inf"))
-
-
-def operator_names() -> Tuple[str, ...]:
-    """Return the names that ``operator`` may take."""
-    return tuple(OPERATORS)
 
 
 def check_operator(operator: str, p: float) -> None:

@@ -60,7 +60,6 @@ def plan(
     path: str | os.PathLike[str],
     exclude: Sequence[str] = (),
     by_hand: Sequence[Tuple[str, int]] = (),
-    settings: Optional[str] = None,
     in_place: bool = False,
     ssim: bool = False,
 ) -> Plan:
@@ -70,7 +69,6 @@ def plan(
         path: the checkout.
         exclude: globs of what is not to be looked at.
         by_hand: (relative path, line) of the sites; the others are not sites then.
-        settings: the text of legs.toml.
         in_place: keep every line's number (for running in memory).
         ssim: rewrite the SSIM terms, too.
 
@@ -100,7 +98,7 @@ def plan(
         kept = [call for call in findings.kept if call.path == name]
         edits[name] = rewrite(source, module, sites, kept, in_place)
         after[name] = apply_edits(source.data, edits[name])
-    return Plan(root, findings, edits, after, settings)
+    return Plan(root, findings, edits, after)
 
 
 def write(plan: Plan, force: bool = False) -> List[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from typing import Any, Iterator, List, NoReturn, Optional, Sequence
+from typing import Any, Iterator, NoReturn, Optional, Sequence
 
 from legs_loss.errors import did_you_mean
 from legs_loss.system import printable
@@ -33,7 +33,8 @@ class Parser(argparse.ArgumentParser):
         if choice:
             message += did_you_mean(choice.group(1), re.findall(r"[\w.+-]+", choice.group(2)))
         elif unknown:
-            message += did_you_mean(unknown.group(1), self._options())
+            known = [option for action in self._actions for option in action.option_strings]
+            message += did_you_mean(unknown.group(1), known)
         super().error(printable(message))
 
     def offer_completion(self) -> None:
@@ -44,9 +45,6 @@ class Parser(argparse.ArgumentParser):
             choices=("bash", "zsh", "tcsh"),
             help="print the completion script of a shell, for its start-up file; needs shtab",
         )
-
-    def _options(self) -> List[str]:
-        return [option for action in self._actions for option in action.option_strings]
 
     def _command(self, parsed: argparse.Namespace) -> argparse.ArgumentParser:
         for action in self._actions:

@@ -58,13 +58,13 @@ class Gaussians:
         return cls(means, log_scales[:, None].repeat(1, 3), quaternions, logits, sh)
 
 
-def _mean_square_distance(points: Tensor, neighbours: int = 3, block: int = 1024) -> Tensor:
-    """Return [N]: to each point's nearest neighbours, itself left out; block by block, so that memory stays bounded."""
-    neighbours = min(neighbours, len(points) - 1)
+def _mean_square_distance(points: Tensor) -> Tensor:
+    """Return [N]: to each point's three nearest neighbours; block by block, so that memory stays bounded."""
+    neighbours = min(3, len(points) - 1)
     if neighbours < 1:
         return torch.ones(len(points))
     result = []
-    for rows in points.split(block):
+    for rows in points.split(1024):
         squares = torch.cdist(rows, points, compute_mode="donot_use_mm_for_euclid_dist").square()
         nearest = squares.topk(neighbours + 1, largest=False).values  # the first is the point itself
         result.append(nearest[:, 1:].mean(1))

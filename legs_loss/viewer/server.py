@@ -55,7 +55,7 @@ class _Methods:
         self.server, self.loaded = server, loaded
         names = list(loaded)
         self.handles = {
-            name: server.scene.add_gaussian_splats(f"/methods/{name}", **one.as_arguments(), visible=name == names[0])
+            name: server.scene.add_gaussian_splats(f"/methods/{name}", **one._asdict(), visible=name == names[0])
             for name, one in loaded.items()
         }
         self.shown: Dict[str, Any] = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,16 +14,12 @@ __all__ = ["Splats", "left_of", "splats"]
 
 
 class Splats(NamedTuple):
-    """centers [N, 3], covariances [N, 3, 3], rgbs [N, 3] and opacities [N, 1] in [0, 1], all float32."""
+    """Arguments of viser, float32: centers [N, 3], covariances [N, 3, 3], rgbs [N, 3], opacities [N, 1] in [0, 1]."""
 
     centers: np.ndarray
     covariances: np.ndarray
     rgbs: np.ndarray
     opacities: np.ndarray
-
-    def as_arguments(self) -> Dict[str, Any]:
-        """Return them by the names of viser's arguments."""
-        return self._asdict()
 
 
 def splats(gaussians: Gaussians) -> Splats:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from legs_loss import LegsError, LEGSLoss, WeightSpec, legs_loss, weight_map
 from legs_loss.kernels import backends
-from legs_loss.operators import OPERATORS, Operator, operator_names
+from legs_loss.operators import OPERATORS, Operator
 from legs_loss.precompute import normalised_map
 from legs_loss.response import response
 from legs_loss.scenes.images import image_tensor
@@ -30,7 +30,7 @@ from legs_loss.kernels.numba_loss import fused_loss
 from legs_loss.kernels.numba_passes import extremes, map_of_responses, photograph_response
 from legs_loss.kernels.numba_response import supports_response
 
-COMPILED = [name for name in operator_names() if supports_response(WeightSpec(operator=name))]
+COMPILED = [name for name in OPERATORS if supports_response(WeightSpec(operator=name))]
 
 SHAPES = [(3, 1, 1), (1, 5, 7), (3, 40, 300), (2, 3, 30, 17), (3, 150, 530), (4, 11, 257), (2, 1, 8, 9), (3, 129, 8)]
 

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from legs_loss.errors import LegsError
-from legs_loss.operators import operator_names
+from legs_loss.operators import OPERATORS
 from legs_loss.precompute import normalised_map, precompute
 from legs_loss.precompute.photograph import compiled_anew
 from legs_loss.response import normalise_response, response
@@ -34,7 +34,7 @@ def stored(store, view="0001", width=40, height=30, preset="legs"):
 
 
 class TestMap:
-    @pytest.mark.parametrize("operator", operator_names())
+    @pytest.mark.parametrize("operator", OPERATORS)
     @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
     def test_strips_give_the_response_of_the_whole(self, operator, p, monkeypatch):
         spec = WeightSpec(operator=operator, p=p)

@@ -51,7 +51,8 @@ class Views:
         unstored = self.names.unstored(image.attr.value)
         if unstored is not None:
             return View(None, unstored)
-        if not self._still(function, holder, target, site):
+        then = function.flow.reaching(holder)
+        if not then or function.flow.names_at(site, holder.value) != then:
             return View(None, f"{holder.value} may be another view by then")
         doubt = self.names.doubt(function, holder, image.attr.value, site)
         if doubt is not None:
@@ -123,12 +124,6 @@ class Views:
         if definition.kind in ("augment", "inplace", "store", "mutate"):
             return f"changed in place: {brief(definition.node)}"
         return f"{definition.place} comes out of a batch"
-
-    def _still(self, function: Function, holder: cst.Name, target: cst.CSTNode, site: cst.CSTNode) -> bool:
-        """Return whether the camera's name at the loss can only be the camera that the target was taken from."""
-        then = function.flow.reaching(holder)
-        now = function.flow.names_at(site, holder.value)
-        return bool(then) and now == then
 
 
 def _unit_range(node: cst.Call, skip: int) -> bool:

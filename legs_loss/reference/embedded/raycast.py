@@ -276,7 +276,7 @@ def render(
     origin = -rotation.T @ translation
     xs = ((np.arange(width * samples) + 0.5) / samples - width / 2.0) / focal
     ys = ((np.arange(height * samples) + 0.5) / samples - height / 2.0) / focal
-    rectangles = [_screen_rectangle(s.hull() @ rotation.T + translation, xs, ys, focal, samples) for s in surfaces]
+    rectangles = [_screen_rectangle(s.hull() @ rotation.T + translation, xs, ys) for s in surfaces]
     picture = np.empty((height, width, 3), np.float32)
     depth = np.empty((height, width), np.float32)
     strip = max(1, 48 // samples)  # so many rows of pixels at a time stay in the cache
@@ -291,9 +291,7 @@ def render(
     return np.clip(picture, 0, 1), depth
 
 
-def _screen_rectangle(
-    hull: np.ndarray, xs: np.ndarray, ys: np.ndarray, focal: float, samples: int
-) -> Tuple[int, int, int, int]:
+def _screen_rectangle(hull: np.ndarray, xs: np.ndarray, ys: np.ndarray) -> Tuple[int, int, int, int]:
     """Return rows and columns of rays that may meet a surface whose hull, in camera axes, is given."""
     if hull[:, 2].max() < NEAR:
         return 0, 0, 0, 0

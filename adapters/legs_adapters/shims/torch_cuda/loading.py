@@ -54,7 +54,7 @@ class LoadsSafely:
         by_name = "weights_only" in kwargs or "pickle_module" in kwargs or bool(args)
         if by_name or not self._can_be_safe:
             return self._load(f, "cpu", *args, **kwargs)
-        if _is_set(ASKED_FOR):
+        if os.environ.get(ASKED_FOR, "0").lower() in ("1", "y", "yes", "true"):
             return self._load(f, "cpu", weights_only=False, **kwargs)
         start = f.tell() if hasattr(f, "tell") else None
         try:
@@ -82,10 +82,6 @@ def _path(f: Any) -> Any:
     """The real path of what is saved to or loaded from; None of what is no file on disk."""
     name = f if isinstance(f, (str, os.PathLike)) else getattr(f, "name", None)
     return os.path.realpath(os.fspath(name)) if isinstance(name, (str, os.PathLike)) else None
-
-
-def _is_set(variable: str) -> bool:
-    return os.environ.get(variable, "0").lower() in ("1", "y", "yes", "true")
 
 
 def _plain_numbers() -> ContextManager[Any]:

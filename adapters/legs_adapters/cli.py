@@ -1,7 +1,7 @@
-"""Give a 3D Gaussian Splatting codebase the LEGS loss, or take it back.
+"""Add the LEGS loss to a 3D Gaussian Splatting codebase, or remove it.
 
 Finds the photometric L1 term of every training step in FOLDER and rewrites it to call legs_loss.l1_loss; evaluation,
-scoring and every other L1 stay as they are. Writes legs.toml beside it, and remembers how to undo all of it.
+scoring and every other L1 are not changed. Writes legs.toml to FOLDER, and a journal for --undo.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 EXIT_CODES = (
-    "exit codes: 0 done, or nothing to do; 1 --check: something would change, or --partial: a term was left to you, "
-    "or --verify: something did not hold; "
+    "exit codes: 0 done, or nothing to do; 1 --check: something would change, or --partial: a term needs a manual "
+    "edit, or --verify: a check failed; "
     "2 nothing was changed: bad usage, a term that cannot be decided, no term found, uncommitted changes; "
     "130 interrupted"
 )
@@ -62,26 +62,26 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 
 
 def _so_far(folder: str, undoing: bool, before: bytes) -> str:
-    """Say what was done by now. It is written with the journal, all of it or nothing: the journal knows."""
+    """Return what was done so far, from the journal: a command writes all files and the journal, or nothing."""
     if _journal(folder) == before:
         return "nothing was changed"
     if undoing:
-        return "by then the patch was taken back"
-    return f"by then it was patched; take it back with: legs-patch --undo {folder}"
+        return "the patch was already undone"
+    return f"the patch was already written; undo it with: legs-patch --undo {folder}"
 
 
 def _arguments(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     parser = _parser()
     args = parser.parse_args(argv)
     if args.undo and (args.check or args.verify):
-        parser.error("--undo goes with --diff, --force and --trust only")
+        parser.error("--undo can be combined with --diff, --force and --trust only")
     if args.trust is not None and not args.undo:
-        parser.error("--trust goes with --undo")
+        parser.error("--trust requires --undo")
     return args
 
 
 class _Explain(argparse.Action):
-    """Print what a rule does, or without a name the list of rules, and exit; no FOLDER is needed."""
+    """Print the explanation of a rule, or without a name the list of rules, and exit; FOLDER is not required."""
 
     def __call__(self, parser: argparse.ArgumentParser, *given: object) -> None:
         from legs_adapters.rules.document import explain, listed
@@ -102,22 +102,22 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument(
         "--verify",
         action="store_true",
-        help="patch, then prove on the CPU that it took: train copies with and without it for a few dozen steps, and "
+        help="patch, then verify it on the CPU: train copies with and without the patch for a few dozen steps, and "
         "compare",
     )
     parser.add_argument(
-        "--undo", action="store_true", help="take the patch back, byte for byte; with --diff: show what that would do"
+        "--undo", action="store_true", help="undo the patch, byte for byte; with --diff: show what would change"
     )
     parser.add_argument(
         "--trust",
         metavar="NAME",
-        help="with --undo: follow a journal that was not written by you on this machine; the refusal says its name",
+        help="with --undo: accept a journal that you did not write on this machine; the error message gives its NAME",
     )
     parser.add_argument(
         "--force",
         action="store_true",
-        help="patch although git has uncommitted changes; with --undo: put the patch's own lines back in files that "
-        "were edited since, and leave the edits",
+        help="patch despite uncommitted changes in git; with --undo: restore the patched lines of files that were "
+        "edited since, and keep the edits",
     )
     parser.add_argument(
         "--ssim",
@@ -125,29 +125,29 @@ def _parser() -> argparse.ArgumentParser:
         help="also rewrite the training step's SSIM to legs_loss.ssim, which is faster, where the checkout's own is "
         "provably the SSIM of 3DGS",
     )
-    parser.add_argument("--partial", action="store_true", help="patch what can be decided although something cannot")
+    parser.add_argument("--partial", action="store_true", help="patch the terms that can be decided, and no others")
     parser.add_argument(
         "--site", action="append", default=[], metavar="FILE:LINE", help="patch this term, and no other; repeatable"
     )
     parser.add_argument(
-        "--exclude", action="append", default=[], metavar="GLOB", help="files or folders not to look at; repeatable"
+        "--exclude", action="append", default=[], metavar="GLOB", help="files or folders to ignore; repeatable"
     )
     parser.add_argument("--json", action="store_true", help="report as JSON")
     parser.add_argument(
-        "--explain", action=_Explain, nargs="?", metavar="RULE", help="say why a rule skips a term, with examples; exit"
+        "--explain", action=_Explain, nargs="?", metavar="RULE", help="explain a rule, or list the rules, and exit"
     )
     proof = parser.add_argument_group("with --verify")
-    proof.add_argument("--script", metavar="FILE", help="the training script; default: where the term is")
+    proof.add_argument("--script", metavar="FILE", help="the training script; default: the file of the term")
     proof.add_argument("--iterations", type=int, default=40, metavar="N", help="steps to compare; default: 40")
     proof.add_argument(
         "--arguments",
         metavar="TEXT",
         help="the script's arguments, with {scene}, {output}, {iterations}, {port} filled in; default: those of "
-        "Inria's train.py that it knows",
+        "Inria's train.py that the script declares",
     )
     settings = parser.add_argument_group("settings, written to legs.toml")
     settings.add_argument("--preset", metavar="NAME", help="3dgs, eggs, legs-l, legs or legs-robust; default: legs")
-    settings.add_argument("--beta", type=float, metavar="X", help="how far the strongest response lifts the weight")
+    settings.add_argument("--beta", type=float, metavar="X", help="weight of the strongest response, minus 1")
     settings.add_argument("--curve", metavar="NAME", help="C1 to C5")
     settings.add_argument("--operator", metavar="NAME", help=f"one of {', '.join(OPERATORS)}")
     settings.add_argument("--store", metavar="DIR", help="weight maps that legs precompute wrote")
@@ -205,7 +205,7 @@ def _patch(args: argparse.Namespace) -> int:
         say(as_table(found), end="", lines=True)
         if wrote:
             say("")
-            say(f"wrote {', '.join(wrote)}; take it back with: legs-patch --undo {shlex.quote(args.folder)}")
+            say(f"wrote {', '.join(wrote)}; undo it with: legs-patch --undo {shlex.quote(args.folder)}")
         else:
             say("")
             say(f"nothing to do: {'it is patched' if found.findings.patched else 'nothing could be decided'}")
@@ -213,7 +213,7 @@ def _patch(args: argparse.Namespace) -> int:
 
 
 def _not_looked_into(root: Path, exclude: Sequence[str]) -> str:
-    """Name the folders that may have the term, and that legs-patch does not enter by itself."""
+    """Name the folders that may have the term and that legs-patch skips by default."""
     from legs_adapters.terms.other_folders import not_entered
 
     folders = not_entered(root, exclude)
@@ -222,7 +222,7 @@ def _not_looked_into(root: Path, exclude: Sequence[str]) -> str:
     shown = ", ".join(f"{folder.path} ({folder.why})" for folder in folders[:3])
     more = f" and {len(folders) - 3} more" if len(folders) > 3 else ""
     which = "that folder" if len(folders) == 1 else "the one that trains"
-    return f"; not looked into: {shown}{more}: run legs-patch on {which}"
+    return f"; not searched: {shown}{more}: run legs-patch on {which}"
 
 
 def _verify(args: argparse.Namespace) -> int:
@@ -260,7 +260,7 @@ def _undo(args: argparse.Namespace) -> int:
 
 
 def _journal(folder: str) -> bytes:
-    """Return bytes that tell one state of a checkout's journal from another; empty where there is none."""
+    """Return bytes that identify the state of a checkout's journal; empty without one."""
     try:
         found = os.lstat(os.path.join(folder, ".legs-patch.json"))
     except (OSError, ValueError):
@@ -269,28 +269,28 @@ def _journal(folder: str) -> bytes:
 
 
 def _left_to_the_user(problems: Sequence[Problem]) -> int:
-    """Say on stderr what to write by hand; return the exit code of that."""
+    """Print the terms that need a manual edit to stderr; return the exit code."""
     for problem in problems:
         say(f"legs-patch: error: {problem.path}:{problem.line}: {problem.reason}", sys.stderr)
         say(f"    {problem.text}", sys.stderr)
-        say(f"  if this is the loss between rendering and photograph, write there: {problem.advice}", sys.stderr)
+        say(f"  if this is the loss between rendering and photograph, edit it by hand: {problem.advice}", sys.stderr)
         say("  (rendering first), and import legs_loss at the top", sys.stderr)
     return 1 if problems else 0
 
 
 def _left_in_doubt(doubts: Sequence[Problem]) -> None:
-    """Say on stderr which lines were left although a file trains that nothing else of was weighted."""
+    """Warn on stderr of skipped terms in training files that have no weighted term."""
     for doubt in doubts:
         where = f"{doubt.path}:{doubt.line}"
         say(f"legs-patch: warning: a possible loss was not weighted: {where}: {doubt.reason}", sys.stderr)
         say(f"    {doubt.text}", sys.stderr)
-        say(f"  if it is the loss between rendering and photograph, write there: {doubt.advice}", sys.stderr)
+        say(f"  if it is the loss between rendering and photograph, edit it by hand: {doubt.advice}", sys.stderr)
 
 
 def _site(root: Path, text: str) -> Tuple[str, int]:
     name, _, line = text.rpartition(":")
     if not name or not line.isdigit():
-        raise LegsError(f"--site wants FILE:LINE, got {text!r}")
+        raise LegsError(f"--site must be FILE:LINE, got {text!r}")
     for base in (root, Path.cwd()):
         full = Path(os.path.abspath(str(base / name)))
         if full.is_file() and root in full.parents:

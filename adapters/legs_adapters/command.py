@@ -1,8 +1,8 @@
-"""Run a training script with the LEGS loss, its files untouched; with --cpu on a machine without a GPU.
+"""Run a training script with the LEGS loss, without changing its files; with --cpu on a machine without a GPU.
 
-As `python SCRIPT ARGUMENTS`, with the photometric L1 term of its training step weighted: the same edits as legs-patch
-makes, in memory. Settings come from legs.toml and LEGS_* variables, as for a patched script. With --cpu, what the
-script asks of CUDA is answered by the CPU, and its rasterizer by a shim: slow, but it trains.
+Runs like `python SCRIPT ARGUMENTS`, with the photometric L1 term of its training step weighted: the edits of legs-patch
+are made in memory. Settings come from legs.toml and LEGS_* variables, as for a patched script. With --cpu, CUDA calls
+run on the CPU and a shim replaces the rasterizer: slow, but it trains.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import argparse
 
 from legs_loss import LegsError
 
-HELP = "run a training script with the LEGS loss, its files untouched"
+HELP = "run a training script with the LEGS loss, without changing its files"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,11 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run it, and return its exit code."""
+    """Run the script and return its exit code."""
     try:
         from legs_adapters.runner import run_script
     except ModuleNotFoundError as error:
         if error.name != "libcst":
             raise
-        raise LegsError("legs run wants LibCST: pip install 'legs-loss[patch]'") from None
+        raise LegsError("legs run needs LibCST: pip install 'legs-loss[patch]'") from None
     return run_script(args.script, args.arguments, args.cpu, args.ssim)

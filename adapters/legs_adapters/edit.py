@@ -1,4 +1,4 @@
-"""The edit: sites in, spans of text out. What is not between a span's ends is not touched, not even a space.
+"""Turn sites into edits of spans of text. Text outside of the spans is not changed, not even a space.
 
     Ll1 = l1_loss(image, gt_image)
     Ll1 = legs_loss.l1_loss(image, gt_image, view=viewpoint_cam.image_name)
@@ -47,11 +47,11 @@ def rewrite(
     Args:
         source, module: the file, and its parsed form.
         sites: its sites.
-        kept: its calls that stay unweighted.
-        in_place: put the import on a line that is there, so that every line keeps its number.
+        kept: its calls that are not weighted.
+        in_place: put the import on an existing line, so that every line keeps its number.
 
     Raises:
-        LegsError: an edit would not parse (a fault of this tool; nothing is written then).
+        LegsError: an edit would not parse (a bug of legs-patch; nothing is written then).
     """
     name, imported = _package_name(module)
     edits = [edit for site in sites for edit in _site_edits(Text(source, site.scope), site, name)]
@@ -87,20 +87,20 @@ def _site_edits(text: Text, site: Site, package: str) -> List[Edit]:
 
 
 def _kept_edits(text: Text, kept: Kept, package: str) -> List[Edit]:
-    """Return the edits of one call that stays unweighted."""
+    """Return the edits of one call that is not weighted."""
     start, end = text.span(kept.call.func, True)
     return [text.replace(start, start, f"{package}.unweighted("), text.replace(end, end, ")")]
 
 
 class _Import:
-    """The import of the package in one file, and its place there."""
+    """The import of the package in one file, and its place."""
 
     def __init__(self, text: Text) -> None:
         self.text = text
         self.body = text.module.outline.tree.body
 
     def edit(self, name: str, in_place: bool) -> Edit:
-        """Return the edit that imports the package under a name; in place, on a line that is there."""
+        """Return the edit that imports the package under a name; ``in_place``: on an existing line."""
         line = f"import {PACKAGE}" + ("" if name == PACKAGE else f" as {name}")
         anchor = self._anchor()
         if anchor is None:
@@ -158,7 +158,7 @@ class _Import:
         return self.text.module.outline.tree.default_newline
 
     def _next_line(self, line: int) -> Tuple[int, str]:
-        """Return where the line after this one begins, and what ends this one; nothing where it is the last."""
+        """Return where the next line begins, and the line end before it; nothing for the last line."""
         at = self.text.module.lines.start(line + 1)
         ending = re.search(rb"(\r\n|\r|\n)?\Z", self.text.bytes[:at])
         assert ending is not None

@@ -1,7 +1,7 @@
-"""The record of a patch, by which it is taken back: the exact bytes from before, and the edits.
+"""The journal of a patch, from which it is undone: the exact bytes from before, and the edits.
 
-The journal is one file in the root of the checkout. A checkout may come from a stranger, and its journal with it: it
-names only what legs-patch ever writes, and it is sealed (:mod:`legs_adapters.checkout.seal`).
+The journal is one file in the root of the checkout. A checkout and its journal may come from somebody else:
+a journal names only files that legs-patch writes, and it is sealed (:mod:`legs_adapters.checkout.seal`).
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ __all__ = ["JOURNAL", "Journal", "Layer", "digest"]
 
 JOURNAL = ".legs-patch.json"
 _VERSION = 1
-_MOST = 1000  # patches of one file: nobody patches that often
+_MOST = 1000  # patches of one file
 _NOTE = "What legs-patch changed here, and the bytes from before. legs-patch --undo needs it; do not edit it."
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class Layer(NamedTuple):
-    """One patch of one file: its bytes before, what was put where, in order, and the checksum of what they became."""
+    """One patch of one file: its bytes before, the edits in order, and the checksum of the bytes after."""
 
     original: bytes
     edits: Tuple[Tuple[int, int, str], ...]
@@ -68,7 +68,7 @@ class Journal:
         """Read a checkout's journal, whoever wrote it; an empty one where there is none.
 
         Raises:
-            LegsError: it is there and is none, or names what legs-patch never writes.
+            LegsError: it cannot be read, or names files that legs-patch never writes.
         """
         data = read_file(root, JOURNAL)
         if data is None:
@@ -77,7 +77,7 @@ class Journal:
         try:
             content = json.loads(data.decode("utf-8"))
             if content["version"] != _VERSION:
-                raise LegsError(f"{path} was written by another version of legs-patch: undo with that one")
+                raise LegsError(f"{path} was written by another version of legs-patch: undo with that version")
             claimed = content.pop("seal", None)
             ours = is_sealed(_canonical(content), claimed, root)
             files, created = _read_files(content["files"]), _read_created(content["created"])
@@ -132,7 +132,7 @@ def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
     for name, layers in content.items():
         check_name(name)
         if not name.endswith(".py"):
-            raise LegsError(f"{name!r} is no Python file, and nothing else is patched")
+            raise LegsError(f"{name!r} is not a Python file, and legs-patch patches no others")
         files[name] = []
         if len(layers) > _MOST:
             raise ValueError(f"{name} was patched {len(layers)} times")
@@ -158,13 +158,13 @@ def _read_layer(content: Dict[str, Any], room: int) -> Layer:
 def _read_created(content: Dict[str, Any]) -> Dict[str, str]:
     for name in content:
         if name != SETTINGS_FILE:
-            raise LegsError(f"{name!r} is not {SETTINGS_FILE}, and nothing else is created")
+            raise LegsError(f"{name!r} is not {SETTINGS_FILE}, and legs-patch creates no other file")
     return {name: _checksum(value) for name, value in content.items()}
 
 
 def _checksum(value: Any) -> str:
     if not isinstance(value, str) or not _DIGEST.fullmatch(value):
-        raise ValueError("a checksum that is none")
+        raise ValueError("an invalid checksum")
     return value
 
 
@@ -173,11 +173,11 @@ def _pack(data: bytes) -> str:
 
 
 def _unpack(text: str, room: int) -> bytes:
-    """Decompress a file; what a few kilobytes may become is bounded."""
+    """Decompress a file, up to a size limit."""
     stream = zlib.decompressobj()
     data = stream.decompress(base64.b64decode(text, validate=True), max(room, 0) + 1)
     if len(data) > room:
         raise ValueError(f"its files are larger than {LARGEST >> 20} MiB")
     if not stream.eof:
-        raise ValueError("a file is cut short")
+        raise ValueError("a file is truncated")
     return data

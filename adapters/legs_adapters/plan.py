@@ -1,4 +1,4 @@
-"""Plan a patch of a checkout, and carry it out: everything is worked out before anything is written."""
+"""Plan a patch of a checkout, and write it: everything is computed before anything is written."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["Plan", "plan", "write"]
 
 
 class Plan(NamedTuple):
-    """A patch that has been worked out, and not been written.
+    """A patch that was computed and not yet written.
 
     Attributes:
         root: the checkout.
@@ -42,7 +42,7 @@ class Plan(NamedTuple):
 
 @contextlib.contextmanager
 def _deep_recursion() -> Iterator[None]:
-    """Let expressions of some thousand parts be walked; say which error it is where one is longer still."""
+    """Raise the recursion limit for expressions of some thousand parts; report longer ones as a LegsError."""
     before = sys.getrecursionlimit()
     # Before Python 3.11 a Python call takes some of the process's stack.
     sys.setrecursionlimit(max(before, 20_000 if sys.version_info >= (3, 11) else 6_000))
@@ -50,7 +50,7 @@ def _deep_recursion() -> Iterator[None]:
         yield
     except RecursionError:
         raise LegsError(
-            "an expression of thousands of parts is nested too deeply: leave its file out by --exclude"
+            "an expression of thousands of parts is nested too deeply: skip its file with --exclude"
         ) from None
     finally:
         sys.setrecursionlimit(before)
@@ -63,11 +63,11 @@ def plan(
     in_place: bool = False,
     ssim: bool = False,
 ) -> Plan:
-    """Work out what a patch would do, and write nothing.
+    """Compute a patch, and write nothing.
 
     Args:
         path: the checkout.
-        exclude: globs of what is not to be looked at.
+        exclude: globs of files and folders to ignore.
         by_hand: (relative path, line) of the sites; the others are not sites then.
         in_place: keep every line's number (for running in memory).
         ssim: rewrite the SSIM terms, too.
@@ -102,7 +102,7 @@ def plan(
 
 
 def write(plan: Plan, force: bool = False) -> List[str]:
-    """Carry out a plan; return the paths that were written.
+    """Write a plan; return the paths that were written.
 
     Raises:
         LegsError: the git tree has changes that are not the patch's own, and not ``force``; another user patched this
@@ -128,12 +128,12 @@ def write(plan: Plan, force: bool = False) -> List[str]:
         if not journal.ours:
             raise LegsError(
                 f"{root / JOURNAL} is not yours: this checkout was patched by someone else, or on another machine; "
-                f"nothing was changed. Take that patch back first: legs-patch --undo {root} says how"
+                f"nothing was changed. Undo that patch first: see legs-patch --undo {root}"
             )
         if dirty:
             shown = ", ".join(dirty[:5]) + (f" and {len(dirty) - 5} more" if len(dirty) > 5 else "")
-            raise LegsError(f"the git tree has uncommitted changes ({shown}): commit them, or give --force")
-        # The journal goes first: whatever happens after it, --undo knows what to look for.
+            raise LegsError(f"the git tree has uncommitted changes ({shown}): commit them, or use --force")
+        # The journal is written first, so that --undo works whatever happens next.
         replace_files(root, {JOURNAL: (journal.data, journal.dump(root)), **changes})
     return list(changes)
 
@@ -155,6 +155,6 @@ def _settings_change(plan: Plan, journal: Journal) -> Optional[Tuple[Optional[by
     if current == data:
         return None
     if current is not None and not journal.wrote(SETTINGS_FILE, current):
-        raise LegsError(f"{SETTINGS_FILE} is there already, and not as legs-patch wrote it: change the settings in it")
+        raise LegsError(f"{SETTINGS_FILE} exists and is not as legs-patch wrote it: change the settings in it")
     journal.created[SETTINGS_FILE] = digest(data)
     return current, data

@@ -19,7 +19,7 @@ _RED, _GREEN, _CYAN, _BOLD, _PLAIN = "\033[31m", "\033[32m", "\033[36m", "\033[1
 
 
 def as_table(plan: Plan) -> str:
-    """Return one line for every L1 term: where it is, what is done with it, and why."""
+    """Return one line for every L1 term: its place, the verdict, and the reason."""
     rows: List[Tuple[str, int, str, str]] = []
     found = plan.findings
     for site in found.sites:
@@ -40,7 +40,7 @@ def as_table(plan: Plan) -> str:
 
 
 def _decided(left: Left) -> str:
-    """Return the rule that left a term, and the first line that decided."""
+    """Return the rule that skips a term, and the first deciding line."""
     if left.evidence is None:
         return ""
     path, line, text = left.because[0]

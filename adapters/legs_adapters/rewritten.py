@@ -16,7 +16,7 @@ __all__ = ["Finder", "Loader", "install", "main_module"]
 
 
 def install(sources: Dict[str, bytes]) -> None:
-    """Import these sources, by real path, in place of what is on disk.
+    """Import these sources, by real path, in place of the files on disk.
 
     A process that is spawned (`torch.multiprocessing.spawn`, DataLoader workers) starts as a new Python, which imports
     the script again: it installs the same sources before.
@@ -52,7 +52,7 @@ class _Inherited:
 
 
 class Loader(importlib.machinery.SourceFileLoader):
-    """Loads a file's rewritten source in place of what is on disk; no bytecode cache is read or written."""
+    """Load a file's rewritten source in place of the file; no bytecode cache is read or written."""
 
     def __init__(self, name: str, path: str, data: Optional[bytes]) -> None:
         super().__init__(name, path)
@@ -79,7 +79,7 @@ class Loader(importlib.machinery.SourceFileLoader):
 
 
 class Finder:
-    """Finds modules as Python does, and swaps the loader of those that were rewritten."""
+    """Find modules as Python does, and replace the loader of rewritten ones."""
 
     def __init__(self, sources: Dict[str, bytes]) -> None:
         self._sources = sources

@@ -28,9 +28,9 @@ __all__ = ["checkout_of", "execute", "run_script"]
 
 
 def checkout_of(script: Path) -> Path:
-    """Return the folder that is looked at for a script: its git checkout's root, or its own folder.
+    """Return the folder that is searched for a script: its git checkout's root, or its own folder.
 
-    In a checkout that has others' code, under third_party say, that is the root of theirs for a script of theirs.
+    For a script of vendored code, under third_party for example, it is the root of that code.
     """
     folder = script.resolve().parent
     for candidate in (folder, *folder.parents):
@@ -48,7 +48,7 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
     Args:
         script: the script.
         arguments: its arguments.
-        cpu: run it without a GPU: what it asks of CUDA is answered by the CPU, and its rasterizer by a shim.
+        cpu: run it without a GPU: CUDA calls run on the CPU, and a shim replaces its rasterizer.
         ssim: let legs_loss.ssim compute the training step's SSIM where that is 3DGS's.
 
     Returns:
@@ -56,17 +56,17 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
 
     Raises:
         LegsError: there is no such script; or a setting is wrong; or its codebase has a term that cannot be decided,
-            or, unless ``cpu``, none; or, with ``cpu``, the script wants something of CUDA that has no shim.
+            or, unless ``cpu``, none; or, with ``cpu``, the script uses a CUDA feature that has no shim.
     """
     path = Path(script)
     if not path.is_file():
         raise LegsError(f"{script} is not a file: give the training script")
-    find_config(path, argv=[])  # a mistake in the settings is told now, not at the first training step
+    find_config(path, argv=[])  # report wrong settings now, not at the first training step
     root = check_root(checkout_of(path))
     found = plan(root, in_place=True, ssim=ssim)
     if found.findings.problems:
         problem = found.findings.problems[0]
-        raise LegsError(f"{problem.path}:{problem.line}: {problem.reason}; write there by hand: {problem.advice}")
+        raise LegsError(f"{problem.path}:{problem.line}: {problem.reason}; edit it by hand: {problem.advice}")
     if not found.after and not found.findings.patched:
         if not cpu:
             raise LegsError(f"no photometric L1 term was found in {root}")
@@ -75,7 +75,7 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
     for site in found.findings.sites:
         _say(f"{site.path}:{site.line} {site.form.done} in this run")
     for kept in found.findings.kept:
-        _say(f"{kept.path}:{kept.line} stays plain in this run")
+        _say(f"{kept.path}:{kept.line} is not weighted in this run")
     return execute(str(script), arguments, sources, root if cpu else None)
 
 
@@ -92,7 +92,7 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
         name: the script, as it would be given to python.
         arguments: its arguments.
         sources: by real path, what to run in place of what is on disk.
-        cpu_root: the codebase, if what it asks of CUDA is to be answered by the CPU.
+        cpu_root: the codebase, if its CUDA calls are to run on the CPU.
 
     Returns:
         The exit code, where the script does not leave by ``sys.exit``.
@@ -137,7 +137,7 @@ def _as_python_names(script: str) -> str:
 
 
 def _show(error: BaseException) -> None:
-    """Print a traceback that begins where the script does, without our own frame."""
+    """Print a traceback that begins at the script, without this module's frame."""
     traceback = error.__traceback__
     if traceback is not None and traceback.tb_next is not None:
         traceback = traceback.tb_next

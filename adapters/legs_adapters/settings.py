@@ -50,7 +50,7 @@ def settings_text(
         "# LEGS_OFF=1 turns the loss back into the codebase's own.",
         "",
         line("preset", name, True, f"one of {', '.join(PRESETS)}"),
-        line("beta", spec.beta, beta is not None, "how far the strongest response lifts the weight; 0 is the plain L1"),
+        line("beta", spec.beta, beta is not None, "weight of the strongest response, minus 1; 0 is the plain L1"),
         line("curve", spec.curve, curve is not None, "C1 (linear) to C5"),
         line("operator", spec.operator, operator is not None, f"one of {', '.join(OPERATORS)}"),
         line(

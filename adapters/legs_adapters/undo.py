@@ -1,4 +1,4 @@
-"""Taking the patches of a checkout back: from the journal, what each file was."""
+"""Undo the patches of a checkout, from its journal."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ class Undone(NamedTuple):
 
 
 def undo(path: str | os.PathLike[str], force: bool = False, trust: Optional[str] = None, look: bool = False) -> Undone:
-    """Take every patch of a checkout back.
+    """Undo every patch of a checkout.
 
     Args:
         path: the checkout.
         force: in files that were edited since, put the patch's own lines back and leave the edits.
-        trust: the name of a journal that this user did not write, and that is to be followed all the same.
-        look: change nothing, and return what would be done; then any journal will do.
+        trust: the name of a journal that this user did not write, to accept it.
+        look: change nothing, and return what would be done; any journal is accepted then.
 
     Raises:
-        LegsError: nothing was patched; a stranger wrote the journal; or a file was edited since, and not ``force``.
+        LegsError: nothing was patched; another user wrote the journal; or a file was edited since, and not ``force``.
             Nothing is changed then.
     """
     root = check_root(path)
     with locked(root, f"legs-patch --undo {path}"):
         journal = Journal.read(root)
         if journal.data is None:
-            raise LegsError(f"{root}: there is nothing to take back: no {JOURNAL}")
+            raise LegsError(f"{root}: nothing to undo: there is no {JOURNAL}")
         if not (journal.ours or look or trust == journal.name):
             raise LegsError(_not_ours(root, journal, path))
         done = _work_out(root, journal, force)
@@ -64,7 +64,7 @@ def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
     for name, layers in journal.files.items():
         current = read_file(root, name)
         if current is None:
-            done.kept.append((name, "it is gone"))
+            done.kept.append((name, "the file is gone"))
             continue
         data = current
         lost: List[str] = []
@@ -81,14 +81,14 @@ def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
             shown = sorted(set(lost))
             more = f" and {len(shown) - 20} more" if len(shown) > 20 else ""
             listed = "; ".join(line[:200] for line in shown[:20])
-            done.kept.append((name, f"these lines were changed since and stay: {listed}{more}"))
+            done.kept.append((name, f"these lines were edited since and are kept: {listed}{more}"))
         if data != current:
             changes[name] = (current, data)
             done.restored.append(name)
     if edited and not force:
         raise LegsError(
-            f"{', '.join(sorted(set(edited)))}: edited since it was patched; --undo --force puts the patch's own lines "
-            "back and leaves the edits"
+            f"{', '.join(sorted(set(edited)))}: edited since it was patched; --undo --force restores the patched lines "
+            "and keeps the edits"
         )
     for name, wrote in journal.created.items():
         current = read_file(root, name)
@@ -98,7 +98,7 @@ def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
             changes[name] = (current, None)
             done.removed.append(name)
         else:
-            done.kept.append((name, "it was edited since: yours now"))
+            done.kept.append((name, "it was edited since"))
     return done
 
 
@@ -106,15 +106,14 @@ def _not_ours(root: Path, journal: Journal, path: object) -> str:
     names = [*journal.files, *journal.created]
     shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
     return (
-        f"{root / JOURNAL} was not written by your legs-patch on this machine (or by one before it had seals, or its "
-        f"key is gone): nothing was changed. It is about {shown}, which git can restore. To follow it all the same, "
-        f"look at what it would do with `legs-patch --undo --diff {path}`, and name it: "
-        f"`legs-patch --undo --trust {journal.name} {path}`"
+        f"{root / JOURNAL} was not written by your legs-patch on this machine (or by a version without seals, or its "
+        f"key is gone): nothing was changed. It covers {shown}, which git can restore. To use it anyway, check its "
+        f"changes with `legs-patch --undo --diff {path}`, then run `legs-patch --undo --trust {journal.name} {path}`"
     )
 
 
 def undo_edits(original: bytes, patched: bytes, current: bytes) -> Tuple[bytes, List[str]]:
-    """Put a patch's own lines back in a file that was edited since.
+    """Restore the patched lines of a file that was edited since.
 
     Args:
         original, patched: the file before and after the patch.

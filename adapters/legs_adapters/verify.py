@@ -1,4 +1,4 @@
-"""Prove on the CPU that a patch took: train the patched and the unpatched script, and compare what they did.
+"""Verify a patch on the CPU: train the patched and the unpatched script, and compare the runs.
 
 Three runs of copies of the checkout, on the embedded scene, from the same seed: unpatched, patched, and patched with
 LEGS_OFF=1; of a patch with --ssim also a fourth, patched with beta 0, where nothing but the SSIM differs. Each is a
@@ -32,8 +32,8 @@ ITERATIONS = 40
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 96, 64, 800  # of the embedded scene
 SECONDS = 1800  # that a run may take
 FIRST_STEP, LATER_STEPS = 1e-5, 1e-3  # relative differences of losses that rounding explains
-# What a script that takes arguments in the way of Inria's is given, where its source has these words. (Inria's options
-# are made of attributes' names, but for those that its train.py adds itself.)
+# The arguments of a script like Inria's, where its source has these words. (Inria's options are named after attributes,
+# except those that train.py adds itself.)
 ARGUMENTS = (
     ("source_path", "-s {scene}"),
     ("model_path", "-m {output}"),
@@ -98,8 +98,7 @@ class Verdict(NamedTuple):
         if patched.ssims:
             lines.append(f"{'ssim':<10} {patched.ssims} calls in training")
         lines.append(
-            f"{'maps':<10} {patched.stored} from the store, {patched.computed} computed; {patched.remembered} times "
-            "one of these again"
+            f"{'maps':<10} {patched.stored} from the store, {patched.computed} computed; {patched.remembered} reused"
         )
         lines += [f"{'holds' if held else 'FAILS':<10} {claim}" for claim, held in self.claims.items()]
         for name, run in self.runs.items():
@@ -121,10 +120,10 @@ def verify(
         script: the training script in it; default: the file of its one weighted term, or its train.py.
         arguments: the script's arguments, with {scene}, {output}, {iterations} and {port} filled in; default: those of
             Inria's train.py that its source knows.
-        iterations: how many steps are looked at; a script that goes on is ended then.
+        iterations: how many steps are compared; the script is ended then.
 
     Raises:
-        LegsError: the folder is not patched; or which script trains cannot be told.
+        LegsError: the folder is not patched; or the training script is ambiguous.
     """
     from legs_loss.precompute import precompute
     from legs_loss.reference.embedded import write_embedded_scene
@@ -200,7 +199,7 @@ def _script(root: Path) -> str:
         return trains[0]
     if "train.py" in trains or (not trains and (root / "train.py").is_file()):
         return "train.py"
-    raise LegsError(f"which script trains? Name it with --script; weighted are {', '.join(files) or 'none'}")
+    raise LegsError(f"cannot tell which script trains: use --script; weighted files: {', '.join(files) or 'none'}")
 
 
 def _arguments(script: Path, given: Optional[str], iterations: int, **places: Path) -> List[str]:
@@ -224,7 +223,7 @@ def _arguments(script: Path, given: Optional[str], iterations: int, **places: Pa
 
 
 def _unneeded(folder: str, names: List[str]) -> List[str]:
-    """Return what a copy can do without: histories, caches, and anything large."""
+    """Return what is not copied: histories, caches, and anything large."""
     left = {".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs"} & set(names)
     for name in names:
         path = os.path.join(folder, name)

@@ -1,4 +1,4 @@
-"""Run a training script watched: every backward pass from one number, and every call of ``legs_loss.l1_loss``.
+"""Run a training script and record every backward pass of a scalar, and every call of ``legs_loss.l1_loss``.
 
 The process that ``legs-patch --verify`` starts for each of its runs.
 """
@@ -19,11 +19,11 @@ __all__ = ["watch"]
 
 
 class _Enough(SystemExit):
-    """As many steps as were asked for; the runner lets it pass, as it does a script's own exit."""
+    """Ends the script after the requested steps; the runner lets it pass, like the script's own exit."""
 
 
 class watch:
-    """Watch this process train: every backward pass from one number, and every call of the two losses."""
+    """Record the training of this process: every backward pass of a scalar, and every call of the two losses."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
@@ -71,7 +71,7 @@ class watch:
         legs_loss.l1_loss, legs_loss.ssim = self._l1_loss, self._ssim
 
     def report(self) -> Dict[str, Any]:
-        """Return all fields of a `Run` that the process itself knows."""
+        """Return the fields of a `Run` that were recorded in this process."""
         from legs_loss.runtime import counts
 
         found = counts()
@@ -89,7 +89,7 @@ class watch:
 
 
 def _main(report: str, limit: str, root: str, script: str, *arguments: str) -> int:
-    """Run a script, watched; what was seen goes to a file, whatever happens."""
+    """Run a script and write the record to a file, also after an error."""
     import numpy as np
     import torch
 

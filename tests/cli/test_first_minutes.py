@@ -181,7 +181,7 @@ class TestCommandsToCopy:
 
         with redirect_stdout(StringIO()) as output:
             assert patch([str(checkout)]) == 0
-        command = output.getvalue().split("take it back with: ")[1].strip()
+        command = output.getvalue().split("undo it with: ")[1].strip()
         assert command == f"legs-patch --undo '{checkout}'"
         assert patch(shlex.split(command)[1:]) == 0
         assert (checkout / "train.py").read_text() == before

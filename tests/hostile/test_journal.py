@@ -169,7 +169,7 @@ class TestSomeoneElses:
         refused = run("--undo", root, ran=ran)
         assert refused.returncode == 2
         assert "was not written by your legs-patch on this machine" in refused.stderr
-        assert "It is about train.py, legs.toml, which git can restore" in refused.stderr
+        assert "It covers train.py, legs.toml, which git can restore" in refused.stderr
         line = (
             files("inria")["train.py"]
             .splitlines()
@@ -286,7 +286,7 @@ DAMAGED = {
     "a layer is a number": '{"version": 1, "files": {"a.py": [3]}, "created": {}}',
     "no base64": layers({"original": "%"}),
     "not compressed": layers({"original": "AAAA"}),
-    "cut short": layers({"original": pack(b"hello" * 100)[:12]}),
+    "truncated": layers({"original": pack(b"hello" * 100)[:12]}),
     "gigabytes": layers({"original": pack(bytes(200 << 20))}),
     "gigabytes in pieces": layers(*[{"original": pack(bytes(30 << 20))}] * 9),
     "edits outside": layers({"edits": [[0, 9, ""]]}),
@@ -361,7 +361,7 @@ def test_a_journal_that_would_take_days(what, attack):
     try:
         done = run("--undo", "--diff", "--force", root, ran=ran)
         assert done.returncode == 0, done.stderr
-        assert "these lines were changed since and stay" in done.stderr
+        assert "these lines were edited since and are kept" in done.stderr
         name = digest((root / JOURNAL).read_bytes())[:16]
         assert state(root) == before
         assert run("--undo", "--force", "--trust", name, root, ran=ran).returncode == 0

@@ -81,7 +81,7 @@ class TestPairs:
         write(plan(root))
         results = together(["--undo", root], ["--undo", root])
         assert sorted(code for code, _ in results) == [0, 2]
-        assert any("there is nothing to take back" in said for code, said in results if code == 2)
+        assert any("nothing to undo" in said for code, said in results if code == 2)
         assert snapshot(root) == {name: text.encode() for name, text in SOURCES.items()}
 
     def test_two_patches_of_different_files(self, number, tmp_path):
@@ -96,7 +96,7 @@ class TestPairs:
         root = checkout(tmp_path, SOURCES)
         results = together([root], [root])
         for code, said in results:
-            assert code == 0 or "changed while legs-patch was at work: nothing was written; run it again" in said
+            assert code == 0 or "changed while legs-patch was running: nothing was written; run it again" in said
         assert 0 in [code for code, _ in results]
         undo(root)
         assert snapshot(root) == {name: text.encode() for name, text in SOURCES.items()}
@@ -129,7 +129,7 @@ def test_who_holds_the_lock_is_said(tmp_path, monkeypatch, capsys):
     before = snapshot(root)
     assert main(["--undo", str(root)]) == 2
     said = capsys.readouterr().err
-    assert f"another legs-patch is at work in {root}: process {child} (legs-patch --undo here); nothing was" in said
+    assert f"another legs-patch is running in {root}: process {child} (legs-patch --undo here); nothing was" in said
     assert snapshot(root) == before
     os.write(done[1], b".")
     os.waitpid(child, 0)

@@ -86,7 +86,7 @@ class TestCommandLine:
         assert refused.returncode == 2
         assert "train.py:11: cannot tell which of image_a and image_b" in refused.stderr
         assert "loss = loss + l1_loss(image_a, image_b)" in refused.stderr
-        assert "write there: legs_loss.l1_loss(image_a, image_b)" in refused.stderr
+        assert "edit it by hand: legs_loss.l1_loss(image_a, image_b)" in refused.stderr
         assert snapshot(root) == before
         assert run("--diff", "--partial", root).returncode == 1
         partial = run("--partial", root)
@@ -158,7 +158,10 @@ class TestCommandLine:
         before = snapshot(root)
         done = run(*arguments, root)
         assert done.returncode == 2
-        assert "rgb_loss also serves tracking at slam.py:7; what it serves at old/slam.py cannot be told" in done.stderr
+        assert (
+            "rgb_loss is also called for tracking at slam.py:7; the purpose of the call at old/slam.py is unknown"
+            in done.stderr
+        )
         assert snapshot(root) == before
 
     def test_a_site_by_hand(self, tmp_path, run):
@@ -191,13 +194,13 @@ class TestCommandLine:
         (root / "third_party" / "gaussian-splatting" / ".git").write_text("gitdir: elsewhere\n")
         found = run(root)
         assert (found.returncode, found.stderr.count("\n")) == (2, 1)
-        named = "third_party/gaussian-splatting (a checkout of its own)"
-        assert found.stderr.endswith(f"; not looked into: {named}: run legs-patch on that folder\n")
-        assert "not looked into" not in run(root, "--exclude", "third_party").stderr
+        named = "third_party/gaussian-splatting (a nested checkout)"
+        assert found.stderr.endswith(f"; not searched: {named}: run legs-patch on that folder\n")
+        assert "not searched" not in run(root, "--exclude", "third_party").stderr
         checkout(root, {**mentions, **others})
         assert run(root).stderr.endswith(
-            f"; not looked into: {named}, extern/a (other people's code), "
-            "extern/deeper/third_party/b (other people's code) and 1 more: run legs-patch on the one that trains\n"
+            f"; not searched: {named}, extern/a (third-party code), "
+            "extern/deeper/third_party/b (third-party code) and 1 more: run legs-patch on the one that trains\n"
         )
         assert run(root / "third_party" / "gaussian-splatting").returncode == 0
 
@@ -206,17 +209,17 @@ class TestCommandLine:
         [
             (
                 "third_party/gs/train.py",
-                "third_party/gs is not looked into (a submodule): run legs-patch on that folder",
+                "third_party/gs is not searched (a submodule): run legs-patch on that folder",
             ),
             (
                 "third_party/train.py",
-                "third_party is not looked into (other people's code): run legs-patch on that folder",
+                "third_party is not searched (third-party code): run legs-patch on that folder",
             ),
-            ("a/extern/b/c/train.py", "a/extern/b is not looked into (other people's code): run legs-patch"),
-            ("my_env/train.py", "my_env is not looked into (a virtual environment)\n"),
-            ("old/train.py", "--exclude leaves it out"),
-            ("test_train.py", "tests are not looked into"),
-            ("train.sh", "it is no .py file"),
+            ("a/extern/b/c/train.py", "a/extern/b is not searched (third-party code): run legs-patch"),
+            ("my_env/train.py", "my_env is not searched (a virtual environment)\n"),
+            ("old/train.py", "excluded by --exclude"),
+            ("test_train.py", "tests are not searched"),
+            ("train.sh", "it is not a .py file"),
             ("broken.py", "does not parse (line 1)"),
         ],
     )
@@ -235,8 +238,8 @@ class TestCommandLine:
             (["empty", "--curve", "C9"], "C9"),
             (["empty", "--preset", "best"], "no preset is named 'best'"),
             (["empty"], "no photometric L1 term was found"),
-            (["empty", "--undo"], "nothing to take back"),
-            (["empty", "--site", "train.py"], "--site wants FILE:LINE"),
+            (["empty", "--undo"], "nothing to undo"),
+            (["empty", "--site", "train.py"], "--site must be FILE:LINE"),
         ],
     )
     def test_bad_usage_is_one_line(self, arguments, message, tmp_path, run, monkeypatch):
@@ -254,7 +257,7 @@ class TestCommandLine:
         assert (root / "legs.toml").read_text() == "beta = 3.0\n"
         refused = run(root, "--beta", "5")
         assert refused.returncode == 2
-        assert "legs.toml is there already" in refused.stderr
+        assert "legs.toml exists and is not as legs-patch wrote it" in refused.stderr
         assert run("--undo", root).returncode == 0
         assert (root / "legs.toml").read_text() == "beta = 3.0\n"
 

@@ -213,7 +213,7 @@ class TestAsPythonRunsIt:
         done = python("-m", "legs_loss", "run", "run.py", cwd=root)
         assert done.returncode == 0, done.stderr
         assert "loss = legs_loss.unweighted(rgb_loss)(render(" in done.stdout
-        assert "slam.py:7 stays plain in this run" in done.stderr
+        assert "slam.py:7 is not weighted in this run" in done.stderr
         assert snapshot(root) == before
 
     @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Comparing the lines of two texts in bounded time: a stranger's files can make any comparison take days."""
+"""Compare the lines of two texts in bounded time: some files make a plain diff take days."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _Line = TypeVar("_Line", str, bytes)
 def matching_lines(before: Sequence[_Line], after: Sequence[_Line]) -> List[Tuple[int, int, int]]:
     """Return the blocks of lines that two texts share, in order: where in each, and how many lines.
 
-    What is between the first and the last difference counts as different all through where it is too long or too
-    repetitive to be compared.
+    Everything between the first and the last difference counts as different where it is too long or too repetitive
+    to be compared.
     """
     head, tail = _ends(before, after)
     middles = before[head : len(before) - tail], after[head : len(after) - tail]
@@ -32,7 +32,7 @@ def matching_lines(before: Sequence[_Line], after: Sequence[_Line]) -> List[Tupl
 
 
 def unified_diff(before: Sequence[str], after: Sequence[str], names: Tuple[str, str]) -> List[str]:
-    """Return the lines of a unified diff of two texts; one hunk of all that is between where that is too much work."""
+    """Return the lines of a unified diff of two texts; a single hunk where comparing would take too long."""
     head, tail = _ends(before, after)
     start = max(head - _CONTEXT, 0)
     gone, come = (lines[start : len(lines) - max(tail - _CONTEXT, 0)] for lines in (before, after))
@@ -45,7 +45,7 @@ def unified_diff(before: Sequence[str], after: Sequence[str], names: Tuple[str, 
 
 
 def _shifted(line: str, by: int) -> str:
-    """Return a line of a diff; the numbers in the head of a hunk are of lines that stand further down."""
+    """Return a line of a diff, with the line numbers of a hunk's header shifted."""
     found = _HUNK.fullmatch(line)
     return f"@@ -{int(found[1]) + by}{found[2]} +{int(found[3]) + by}{found[4]}" if found is not None else line
 

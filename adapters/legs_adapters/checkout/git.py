@@ -1,4 +1,4 @@
-"""Asking git which files were changed, without running a program that the checkout names.
+"""Ask git which files were changed, without running programs that the checkout names.
 
 A checkout's ``.git/config`` and ``.gitattributes`` can name programs: filters, hooks, a file system monitor, a
 transport. A clone brings no ``.git/config`` of its own; an archive can, and so can a bare repository inside a clone.
@@ -19,7 +19,7 @@ from legs_loss import LegsError
 
 __all__ = ["changed_files"]
 
-_SECONDS = 60  # for all that git is asked; a pipe in its folder would hold it for ever
+_SECONDS = 60  # for all git commands; a pipe in the checkout would block them for ever
 _OVERRIDES = {
     "core.fsmonitor": "",
     "core.hooksPath": os.devnull,
@@ -43,7 +43,7 @@ def changed_files(root: Path) -> List[str]:
     Empty outside of git, where git is missing, and where git does not trust the checkout's owner.
 
     Raises:
-        LegsError: git does not answer.
+        LegsError: git times out.
     """
     until = time.monotonic() + _SECONDS
     off: Dict[str, str] = {}
@@ -65,7 +65,7 @@ def changed_files(root: Path) -> List[str]:
 
 
 def _own_filters(root: Path, until: float) -> Set[str]:
-    """Name the filters that the checkout's own settings say something of; those of the user, Git LFS say, stay."""
+    """Return the filters that the checkout's own settings configure; the user's own, such as Git LFS, stay."""
     words = ("config", "-z", "--name-only", "--get-regexp", r"^(filter|lfs)\.")
     listed = _git(root, until, {}, "config", "--show-scope", *words[1:])
     if listed is None:  # there is no filter, or git is older than 2.26 and knows no scopes
@@ -82,7 +82,7 @@ def _git(root: Path, until: float, settings: Dict[str, str], *arguments: str) ->
     """Run a git command and return what it printed; None where it failed.
 
     Raises:
-        LegsError: it does not end.
+        LegsError: it times out.
     """
     program = shutil.which("git")
     if program is None or root in Path(os.path.realpath(program)).parents:
@@ -97,8 +97,8 @@ def _git(root: Path, until: float, settings: Dict[str, str], *arguments: str) ->
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise LegsError(
-            f"git did not say in {_SECONDS} seconds which files of {root} were changed; nothing was written: "
-            "--force does not ask it"
+            f"git did not list the changed files of {root} within {_SECONDS} seconds; nothing was written: "
+            "--force skips this check"
         ) from None
     except (OSError, ValueError):
         return None

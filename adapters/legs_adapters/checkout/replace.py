@@ -26,21 +26,21 @@ _WAIT = 30.0  # seconds: a command holds the lock while it writes, and while git
 
 @contextlib.contextmanager
 def locked(root: Path, what: str) -> Iterator[None]:
-    """Let no other legs-patch change a checkout meanwhile; sweep what a killed one left.
+    """Hold the lock of a checkout; delete what a killed legs-patch left.
 
     Args:
         root: the checkout.
-        what: what this process does, for the message that another one gives while it waits in vain.
+        what: the command of this process, for the error message of another one that waits.
 
     Raises:
-        LegsError: another one is at work and does not end; or the folder cannot be written.
+        LegsError: another process holds the lock too long; or the folder cannot be written.
     """
     note = f"process {os.getpid()} ({what})"
     try:
         lock = FileLock(root / _LOCK, wait=_WAIT, note=note, remove=True)
     except HeldError as error:
         who = f": {error}" if str(error) else ""
-        raise LegsError(f"another legs-patch is at work in {root}{who}; nothing was changed: wait for it") from None
+        raise LegsError(f"another legs-patch is running in {root}{who}; nothing was changed: wait for it") from None
     except OSError as error:
         raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
     with lock:
@@ -52,11 +52,11 @@ def replace_files(root: Path, changes: Changes) -> None:
     """Replace files, all of them or none; Ctrl-C is held back from the first one on.
 
     Raises:
-        LegsError: a file is not as expected, or cannot be written; then all are as they were.
+        LegsError: a file is not as expected, or cannot be written; no file is changed then.
     """
     for path, (expected, _) in changes.items():
         if read_file(root, path) != expected:
-            raise LegsError(f"{path} changed while legs-patch was at work: nothing was written; run it again")
+            raise LegsError(f"{path} changed while legs-patch was running: nothing was written; run it again")
     staging = root / _STAGING
     staged: Dict[str, str] = {}
     done: List[str] = []
@@ -92,7 +92,7 @@ def read_file(root: Path, path: str) -> Optional[bytes]:
     check_name(path)
     full = os.path.join(str(root), *path.split("/"))
     if os.path.normcase(os.path.realpath(full)) != os.path.normcase(full):
-        raise LegsError(f"{path} is a link or behind one: legs-patch follows none")
+        raise LegsError(f"{path} is a link or below one: legs-patch does not follow links")
     try:
         return read_regular(full, LARGEST)
     except FileNotFoundError:
@@ -131,8 +131,8 @@ def _restore(root: Path, path: str, data: Optional[bytes]) -> None:
 
 
 def _sweep(root: Path) -> None:
-    """Delete the staging folder, this command's or that of one that was killed."""
+    """Delete the staging folder of this command or of one that was killed."""
     staging = root / _STAGING
     if staging.is_symlink():
-        raise LegsError(f"{staging} is a link: legs-patch follows none; delete it")
+        raise LegsError(f"{staging} is a link, and legs-patch does not follow links: delete it")
     shutil.rmtree(str(staging), ignore_errors=True)

@@ -1,8 +1,8 @@
-"""Sealing a journal, so that one from a stranger is told from one's own.
+"""Seal a journal, to distinguish the user's own journals from those of others.
 
 The seal is an HMAC under a key in the user's state folder (``$XDG_STATE_HOME/legs-loss``, by default
-``~/.local/state/legs-loss``; on Windows ``%LOCALAPPDATA%\\legs-loss``). It is not bound to a path: a checkout that was
-moved is undone as before.
+``~/.local/state/legs-loss``; on Windows ``%LOCALAPPDATA%\\legs-loss``). It is not bound to a path: a checkout can be
+moved and then undone.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def seal(content: bytes, root: Path) -> Optional[str]:
 
     Args:
         content: what is sealed.
-        root: the checkout. A state folder inside of it is not used: its content could be a stranger's.
+        root: the checkout. A state folder inside of it is not used: others may have written it.
     """
     folder = _folder(root)
     key = None if folder is None else _read(folder) or _make(folder)
@@ -68,7 +68,7 @@ def _read(folder: Path) -> Optional[bytes]:
 
 
 def _make(folder: Path) -> Optional[bytes]:
-    """Make the key; of two processes that do so at once, both get the first one's."""
+    """Make the key; concurrent processes all get the first one's."""
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         handle, name = tempfile.mkstemp(dir=str(folder))
@@ -99,7 +99,7 @@ def _publish(name: str, key: str) -> None:
 
 
 def _as_owner_of(parent: Path, *paths: Path) -> None:
-    """Under sudo the home folder is often the user's own: what root makes there must stay readable to the user."""
+    """Give files to the owner of a folder: under sudo, what root creates in a home folder must stay readable."""
     if getattr(os, "geteuid", lambda: -1)() == 0:
         owner = os.stat(str(parent))
         for path in paths:

@@ -1,1 +1,1 @@
-"""Python as data: files, syntax trees, reaching definitions, name resolution, calls. Knows neither torch nor splats."""
+"""Python as data: files, syntax trees, reaching definitions, name resolution, calls. No torch, no splats."""

@@ -1,4 +1,4 @@
-"""The calls of a function in a checkout: those of its name, those that are surely its, or every one there can be."""
+"""The calls of a function in a checkout: those by its name, those that are certain, or all possible ones."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from legs_adapters.code.syntax import attribute_chain, call_name, children, cons
 
 __all__ = ["BY_NAME", "Calls", "callees", "calls_of", "given_to", "handed", "likely_calls", "sure_calls"]
 
-_METHODS = {"staticmethod", "classmethod"}  # decorators that hand a function to nobody
+_METHODS = {"staticmethod", "classmethod"}  # decorators that do not pass the function on
 BY_NAME = {"getattr", "attrgetter", "methodcaller", "eval"}  # what looks a name up at run time
 _NAMESPACES = {"globals", "locals", "vars"}
 
 
 class Calls(NamedTuple):
-    """The calls of a function, each with its caller; and where there may be another, None where there is none."""
+    """The calls of a function, each with its caller; and the place of a further possible call, None without one."""
 
     known: List[Tuple[Function, cst.Call]]
     lost: Optional[str] = None
 
 
 class _Mention(NamedTuple):
-    """A mention of a name: the expression that ends in it, and what is around that, the innermost first."""
+    """A mention of a name: the expression that ends in it, and the nodes around it, the innermost first."""
 
     scope: Function
     node: cst.CSTNode
@@ -35,7 +35,7 @@ class _Mention(NamedTuple):
 
     @property
     def call(self) -> Optional[cst.Call]:
-        """The call of what is named here."""
+        """The call of the mentioned name."""
         outer = self.around[0]
         return outer if isinstance(outer, cst.Call) and outer.func is self.node else None
 
@@ -46,14 +46,14 @@ class _Mention(NamedTuple):
 
 
 def likely_calls(program: Program, function: Function) -> Iterator[Tuple[Function, cst.Call]]:
-    """Yield the calls of a function's name, without those that are surely of another one with it."""
+    """Yield the calls of a function's name, without those that resolve to another function."""
     for caller, call, known in _named(program, function):
         if not known or function in known:
             yield caller, call
 
 
 def sure_calls(program: Program, function: Function) -> Iterator[Tuple[Function, cst.Call]]:
-    """Yield the calls that are surely a function's, as far as its name is called in a dozen functions."""
+    """Yield the calls that resolve to a function, if at most a dozen functions call its name."""
     for caller, call, known in _named(program, function, 12):
         if function in known:
             yield caller, call
@@ -62,7 +62,7 @@ def sure_calls(program: Program, function: Function) -> Iterator[Tuple[Function,
 def _named(
     program: Program, function: Function, most: Optional[int] = None
 ) -> Iterator[Tuple[Function, cst.Call, List[object]]]:
-    """Yield the calls of a function's name elsewhere, each with its caller and with what it surely is of."""
+    """Yield the calls of a function's name elsewhere, each with its caller and the functions it resolves to."""
     for caller in program.mentioning(function.name, called=True)[:most]:
         for call in caller.flow.calls if caller is not function else ():
             if call_name(call) == function.name:
@@ -70,7 +70,7 @@ def _named(
 
 
 def callees(program: Program, function: Function, call: cst.Call) -> List[Function]:
-    """Return the functions of the checkout that a call runs, as far as that is sure; an instance's not."""
+    """Return the functions of the checkout that a call resolves to for certain, without those of instances."""
     found = [ref.target for ref in program.resolve(function, call.func) if ref.kind == "function" and not ref.guess]
     return [target for target in found if isinstance(target, Function)]
 
@@ -78,7 +78,7 @@ def callees(program: Program, function: Function, call: cst.Call) -> List[Functi
 def given_to(
     program: Program, function: Function, parameter: str
 ) -> Iterator[Tuple[Function, Optional[cst.BaseExpression]]]:
-    """Yield what calls of a function's name give for a parameter, None where it is left out, and the callers."""
+    """Yield callers of a function's name, each with its argument for a parameter, None where it is missing."""
     for caller in program.mentioning(function.name, called=True):
         for call in caller.flow.calls if caller is not function else ():
             if call_name(call) == function.name:
@@ -86,7 +86,7 @@ def given_to(
 
 
 def handed(program: Program, function: Function, node: cst.Name) -> List[Reference]:
-    """Return the modules that a parameter is given, ``model`` of ``train_epoch(model, loader)``."""
+    """Return the modules that callers pass for a parameter, ``model`` of ``train_epoch(model, loader)``."""
     kinds = {definition.kind for definition in function.flow.reaching(node)}
     if not function.name or kinds - {"store"} != {"parameter"}:
         return []
@@ -102,9 +102,9 @@ def handed(program: Program, function: Function, node: cst.Name) -> List[Referen
 def calls_of(program: Program, function: Function) -> Calls:
     """Return the calls of a function.
 
-    None is missing where each mention of its name is its definition, an import, or a call that is resolved. A
-    ``forward`` is called by the names that the instances of its class get. What is handed on as a value may be called
-    wherever that goes.
+    No further call is possible where each mention of its name is its definition, an import, or a resolved call. A
+    ``forward`` is called by the names of the instances of its class. A function that is passed as a value may be called
+    anywhere.
     """
     owner = function.owner if function.runs_by_instance else None
     if owner is None and set(function.decorators) - _METHODS:
@@ -130,12 +130,12 @@ def calls_of(program: Program, function: Function) -> Calls:
 
 
 def _refers(program: Program, target: Function | Class, mention: _Mention) -> Optional[bool]:
-    """Return whether a mention is of the function, or of an instance or the class of its own; None where it may be."""
+    """Return whether a mention is of the function, of its class or of an instance; None where it is unknown."""
     node = mention.node
     if isinstance(node, (cst.ImportAlias, cst.SimpleString)):
         return None
     if isinstance(mention.around[0], (cst.AssignTarget, cst.AnnAssign)) and mention.around[0].target is node:
-        return False  # what is put there is named where it is made
+        return False  # what is stored there is mentioned where it is made
     references = program.resolve(mention.scope, node)
     if any(reference.target is target for reference in references):
         return None if any(reference.guess for reference in references) else True
@@ -149,7 +149,7 @@ def _refers(program: Program, target: Function | Class, mention: _Mention) -> Op
 
 
 def _held(program: Program, owner: Class, mention: _Mention) -> List[str]:
-    """Return the names that an instance gets where it is made: ``self.image_loss = ImageLoss().cuda()``."""
+    """Return the names that are assigned an instance: ``self.image_loss = ImageLoss().cuda()``."""
     for outer in mention.around:
         if isinstance(outer, cst.Assign) and any(part is mention.node for part in attribute_chain(outer.value)):
             made = program.resolve(mention.scope, outer.value)
@@ -160,7 +160,7 @@ def _held(program: Program, owner: Class, mention: _Mention) -> List[str]:
 
 
 def _mentions(module: Module, name: str, said: re.Pattern[str]) -> Iterator[_Mention]:
-    """Yield what says a name in a file, where it is neither defined nor imported, nor the name of an argument."""
+    """Yield the mentions of a name in a file, without definitions, imports and keyword arguments."""
     for scope in module.scopes(said.search):
         stack: List[Tuple[cst.CSTNode, Tuple[cst.CSTNode, ...]]] = [(scope.body, ())]
         while stack:
@@ -189,7 +189,7 @@ def _looks_up(node: cst.CSTNode) -> bool:
 
 
 def _is_label(node: cst.CSTNode, child: cst.CSTNode) -> bool:
-    """Return whether a part of a node is no expression of its own, or the body of a function, a scope of its own."""
+    """Return whether a part of a node is not an expression, or is the body of a function."""
     if isinstance(node, cst.FunctionDef):
         return child is node.name or child is node.body
     if isinstance(node, (cst.ClassDef, cst.Param)):

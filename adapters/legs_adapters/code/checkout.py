@@ -1,4 +1,4 @@
-"""The files of a checkout: parsed when they are first asked for, searched by name, linked by their imports."""
+"""The files of a checkout: parsed on first use, searched by name, linked by their imports."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ class Checkout:
 
     Args:
         sources: the readable files.
-        unread: by path, the text of those that are not to be looked at, or cannot be: all that is asked of it is
-            whether it says a name.
+        unread: by path, the text of ignored and unreadable files, which is only searched for names.
     """
 
     def __init__(self, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> None:
@@ -59,12 +58,12 @@ class Checkout:
 
     @property
     def unreadable(self) -> Dict[str, Unreadable]:
-        """Files that turned out not to parse, by path, each with the reason."""
+        """Files that do not parse, by path, each with the reason."""
         failed = {m.path: m.failure for m in self._modules.values() if m is not None and m.failure is not None}
         return {**self._unreadable, **failed}
 
     def give_up(self, path: str, reason: str) -> None:
-        """Count a file as unreadable."""
+        """Record a file as unreadable."""
         self._unreadable[path] = Unreadable(path, reason)
 
     def matching(self, pattern: re.Pattern[str]) -> List[Module]:
@@ -102,13 +101,13 @@ class Checkout:
     # -- imports
 
     def imported_from(self, module: Module, node: cst.ImportFrom) -> Optional[Module]:
-        """Return the checkout's module that ``from ... import`` in another takes from."""
+        """Return the checkout's module that a ``from ... import`` statement names."""
         return self.find_module(module, imported_name(node), len(node.relative))
 
     def together(self, module: Module) -> Set[str]:
-        """Return the paths of the files that run together with another: what is imported by whatever imports it.
+        """Return the paths of the files that run together with another: all imports of the files that import it.
 
-        What functions import, or is loaded by its name, is not seen.
+        Imports inside of functions, and modules that are loaded by name, are not found.
         """
         if module.path not in self._together:
             users = _closure([module], self._users)
@@ -139,7 +138,7 @@ class Checkout:
         return [other for other in found if other is not None]
 
     def find_module(self, module: Module, name: str, level: int) -> Optional[Module]:
-        """Return the checkout's module of this name, as seen from another; None where it is not the checkout's."""
+        """Return the checkout's module of this name, resolved from another; None where it is not the checkout's."""
         asked = (module.path, name, level)
         if asked not in self._by_import:
             self._by_import[asked] = self._find_module(module, name, level)
@@ -162,7 +161,7 @@ class Checkout:
                     return self.module(path)
         if level or not inner:
             return None
-        # Scripts put folders on sys.path: the one file whose path ends so is it, or the one nearest by.
+        # Scripts extend sys.path: use the only file whose path ends so, or the nearest one.
         known = self._ending.get(inner.rpartition("/")[2], []) if "/" in inner else []
         ends = _nearest(module.path, [p for p in known if p.endswith((f"/{inner}.py", f"/{inner}/__init__.py"))])
         return self.module(ends[0]) if len(ends) == 1 else None
@@ -170,7 +169,7 @@ class Checkout:
     def _on_path(self, module: Module, stem: str, name: str) -> Optional[Module]:
         """Find the nearest ``base.py`` that defines a Trainer, for ``from base import Trainer``.
 
-        A script can have put its folder on sys.path. In a checkout that is a package itself, the import may also be
+        A script can add its folder to sys.path. In a checkout that is itself a package, the import may also be
         ``from its_name.base import Trainer``.
         """
         defines = re.compile(rf"^(?:class|def)[ \t]+{re.escape(name)}\b", re.M)
@@ -195,7 +194,7 @@ def imported_name(node: cst.ImportFrom) -> str:
 
 
 def _closure(modules: Iterable[Module], following: Callable[[Module], List[Module]]) -> List[Module]:
-    """Return the modules, and what follows from them, and from that."""
+    """Return the modules and all that are reachable from them."""
     found: Dict[str, Module] = {}
     work = list(modules)
     while work:
@@ -207,7 +206,7 @@ def _closure(modules: Iterable[Module], following: Callable[[Module], List[Modul
 
 
 def _nearest(path: str, others: List[str]) -> List[str]:
-    """Return those that share the most folders with a path."""
+    """Return the paths that share the most folders with a path."""
     here = PurePosixPath(path).parents
     shared = [len(set(here) & set(PurePosixPath(other).parents)) for other in others]
     return [other for other, count in zip(others, shared) if count == max(shared)]

@@ -1,6 +1,6 @@
 """Walk one function body in the order of execution, and record what reaches each use.
 
-Branches are joined, a loop is walked twice, an assignment ends what stood in the name before.
+Branches are joined, a loop is walked twice, an assignment replaces the earlier definitions of a name.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Flow(Reaching):
             elements = target.elements
             parts = value.elements if isinstance(value, (cst.Tuple, cst.List)) and kind == "assign" else None
             plain = not any(isinstance(element, cst.StarredElement) for element in elements)
-            # Of [a, b], c = f() neither a nor b is what f returns first: they are parts of that.
+            # In [a, b], c = f() neither a nor b is the first result of f: they are parts of it.
             inner = "part" if kind == "element" and index is not None and not _counts(value) else "element"
             for i, element in enumerate(elements):
                 if parts is not None and plain and len(parts) == len(elements):
@@ -105,7 +105,7 @@ class Flow(Reaching):
     def _block(self, statements: Sequence[cst.CSTNode], env: Optional[Env]) -> Optional[Env]:
         for statement in statements:
             if env is None:
-                # Not reached (it follows a return or a continue), yet its names are worth knowing.
+                # Unreachable (after a return or a continue), but its names are recorded.
                 self._statement(statement, {})
                 continue
             env = self._statement(statement, env)
@@ -226,7 +226,7 @@ class Flow(Reaching):
             self._visit(node.iter, env)
         entry: Optional[Env] = env
         breaks: List[Env] = []
-        for _ in range(2):  # the second time around, with what the first leaves behind
+        for _ in range(2):  # the second pass starts with the definitions of the first
             self._breaks.append([])
             self._continues.append([])
             around: Env = dict(entry or {})
@@ -268,10 +268,10 @@ class Flow(Reaching):
     # -- expressions
 
     def _visit(self, node: cst.CSTNode, env: Env) -> None:
-        """Note what reaches an expression and the parts of it, in the order in which they are computed."""
+        """Record the definitions that reach an expression and its parts, in the order of evaluation."""
         if self._around:
             self.contexts[id(node)] = self._around
-        visit = self._VISITS.get(type(node))  # by class: to ask isinstance of every node costs half of the walk
+        visit = self._VISITS.get(type(node))  # by class: isinstance on every node takes half of the walk's time
         if visit is not None:
             visit(self, node, env)
         else:
@@ -282,7 +282,7 @@ class Flow(Reaching):
             self._visit(child, env)
 
     def _is_first(self, node: cst.CSTNode) -> bool:
-        """Return whether a node is met for the first time: what a loop holds is walked twice."""
+        """Return whether a node is visited for the first time: the body of a loop is walked twice."""
         first = id(node) not in self._seen
         self._seen.add(id(node))
         return first
@@ -301,7 +301,7 @@ class Flow(Reaching):
         self._parts(node, env)
 
     def _argument(self, node: cst.Arg, env: Env) -> None:
-        self._visit(node.value, env)  # its keyword is no name that is read
+        self._visit(node.value, env)  # the keyword is not a read of a name
 
     def _operation(self, node: cst.BinaryOperation, env: Env) -> None:
         if self._is_first(node):
@@ -367,7 +367,7 @@ def _statements(body: cst.BaseSuite | cst.Module) -> Sequence[cst.CSTNode]:
 
 
 def _counts(value: Optional[cst.CSTNode]) -> bool:
-    """Return whether a loop goes over something in step with something else: ``enumerate(...)``, ``zip(...)``."""
+    """Return whether a loop iterates over several things together: ``enumerate(...)``, ``zip(...)``."""
     return isinstance(value, cst.Call) and call_name(value) in ("enumerate", "zip")
 
 
@@ -380,7 +380,7 @@ def _parameters(parameters: cst.Parameters) -> Iterator[cst.Param]:
 
 
 def _true_names(test: cst.BaseExpression) -> Tuple[str, ...]:
-    """Return the names that are true where a test is: of ``tracking and x > 0``: tracking."""
+    """Return the names that are true where a test is true: for ``tracking and x > 0``: tracking."""
     if isinstance(test, cst.BooleanOperation) and isinstance(test.operator, cst.And):
         return _true_names(test.left) + _true_names(test.right)
     name = dotted(test)
@@ -388,7 +388,7 @@ def _true_names(test: cst.BaseExpression) -> Tuple[str, ...]:
 
 
 def _true_names_else(test: cst.BaseExpression) -> Tuple[str, ...]:
-    """Return the names that are true where a test is not: of ``not tracking``: tracking."""
+    """Return the names that are true where a test is false: for ``not tracking``: tracking."""
     if isinstance(test, cst.UnaryOperation) and isinstance(test.operator, cst.Not):
         return _true_names(test.expression)
     return ()

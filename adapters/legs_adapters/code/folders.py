@@ -26,15 +26,15 @@ __all__ = [
     "why_left_out",
 ]
 
-VENDORED, SUBMODULE = "other people's code", "a submodule"
-TESTS, _CHECKOUT = "a folder of tests", "a checkout of its own"
+VENDORED, SUBMODULE = "third-party code", "a submodule"
+TESTS, _CHECKOUT = "a folder of tests", "a nested checkout"
 _FOREIGN = {
     name: why
     for why, names in (
         (VENDORED, "submodules third_party third-party thirdparty external externals extern SIBR_viewers"),
         (TESTS, "tests test testing"),
         ("installed packages", "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs"),
-        ("what tools wrote", ".git .hg .svn __pycache__ .ipynb_checkpoints build dist .mypy_cache .pytest_cache"),
+        ("tool output", ".git .hg .svn __pycache__ .ipynb_checkpoints build dist .mypy_cache .pytest_cache"),
     )
     for name in names.split()
 }
@@ -44,7 +44,7 @@ _TEST_FILE = re.compile(r"^(test_.*|.*_test|conftest)\.py$")
 
 
 class Skipped(NamedTuple):
-    """A folder that is not looked into, relative to the root, and what it is."""
+    """A folder that is not searched, relative to the root, and the reason."""
 
     path: str
     why: str
@@ -53,7 +53,7 @@ class Skipped(NamedTuple):
 def walk(root: Path, exclude: Sequence[str] = ()) -> Iterator[str]:
     """Yield the paths of the checkout's own Python files, relative, posix separators, a folder's own files first.
 
-    Links are not followed, whether to files or to folders; left out are ``.git``, submodules, virtual environments,
+    Links are not followed, whether to files or to folders; skipped are ``.git``, submodules, virtual environments,
     vendored folders, tests, and what ``exclude`` names: globs on the relative path or, without a slash, on the name of
     the file or of a folder above it.
     """
@@ -68,22 +68,22 @@ def own_and_excluded(root: Path, exclude: Sequence[str]) -> Tuple[List[str], Lis
 
 
 def why_left_out(root: Path, path: str, exclude: Sequence[str] = ()) -> Optional[str]:
-    """Say why a file of the checkout is not one that ``walk`` yields; None where it is."""
+    """Return why ``walk`` skips a file of the checkout; None where it yields it."""
     if _excluded(path, exclude):
-        return "--exclude leaves it out"
+        return "excluded by --exclude"
     foreign = foreign_folder(root, path)
     if foreign is not None:
         instead = ": run legs-patch on that folder" if foreign.why in PATCHABLE else ""
-        return f"{foreign.path} is not looked into ({foreign.why}){instead}"
+        return f"{foreign.path} is not searched ({foreign.why}){instead}"
     if not path.endswith(".py"):
-        return "it is no .py file"
+        return "it is not a .py file"
     if _TEST_FILE.match(os.path.basename(path)):
-        return "tests are not looked into"
+        return "tests are not searched"
     return "links are not followed" if os.path.islink(str(root / path)) else None
 
 
 def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
-    """Return the folder of a file that is not looked into: of third_party the one in it; None where there is none."""
+    """Return the skipped folder that a file is in, below third_party the inner one; None without one."""
     submodules = _submodules(root)
     parts = path.split("/")
     for i in range(1, len(parts)):
@@ -125,7 +125,7 @@ def folders_of(root: Path, exclude: Sequence[str]) -> Iterator[Tuple[List[str], 
 
 
 def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[str]:
-    """Say what a folder is that holds other people's code, or none at all; None for the checkout's own."""
+    """Return why a folder is skipped; None for the checkout's own code."""
     full = str(root / path)
     if path in submodules:
         return SUBMODULE
@@ -159,24 +159,24 @@ def _submodules(root: Path) -> List[str]:
 
 
 def check_name(path: str) -> None:
-    """Check that a relative path is written the one way that it can be, and stays out of every ``.git``.
+    """Check that a relative path is normalised and has no ``.git`` in it.
 
     Raises:
-        LegsError: it is not, or does not.
+        LegsError: it is not, or it has.
     """
     parts = path.split("/")
     odd = any(part in ("", ".", "..") for part in parts) or any(letter in path for letter in "\0\n\r\\")
     if odd or os.path.isabs(path) or os.path.splitdrive(path)[0]:
-        raise LegsError(f"{path!r} is no path of a file in the checkout")
+        raise LegsError(f"{path!r} is not the path of a file in the checkout")
     if any(_is_dot_git(part) for part in parts):
         raise LegsError(f"{path!r} is in .git, where legs-patch changes nothing")
 
 
 def _is_dot_git(part: str) -> bool:
-    """Return whether some file system takes a name for ``.git``.
+    """Return whether some file system resolves a name to ``.git``.
 
-    They do without regard to case, with dots or spaces behind it, by its short name or as one of its streams (NTFS),
-    and with letters in it that nobody sees (HFS+).
+    They ignore case, trailing dots and spaces, resolve short names and streams (NTFS), and ignore invisible letters
+    (HFS+).
     """
     seen = "".join(letter for letter in part if unicodedata.category(letter) != "Cf")
     return seen.split(":")[0].rstrip(". ").casefold() in (".git", "git~1")

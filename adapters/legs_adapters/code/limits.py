@@ -1,10 +1,10 @@
 """Limits of what is planned: a file over them is reported as not read, and the rest of the checkout is planned.
 
-They go by the text alone, before any parser sees it: parsers of deep code may end the process, and the walk of a long
-expression takes time with the square of its parts. So what is read does not depend on the machine or its load.
+They are checked on the text, before it is parsed: deep code may crash a parser, and the walk of a long expression takes
+time quadratic in its parts. So the result does not depend on the machine or its load.
 
-LibCST takes up to 4 KB and 40 microseconds for each word, sign and line end. The most that was met in the 251 checkouts
-at hand: 37,000 of them in a file, 460,000 in a checkout, whose Python files have 2 MiB; and of ``ASKED`` 440,000.
+LibCST takes up to 4 KB and 40 microseconds for each word, sign and line end. The maxima in 251 checkouts: 37,000 of
+them in a file, 460,000 in a checkout, whose Python files have 2 MiB; and of ``ASKED`` 440,000.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def too_deep(data: bytes) -> str:
     for _ in range(DEEPEST):
         inner = brackets.replace(b"()", b"").replace(b"[]", b"").replace(b"{}", b"")
         if len(inner) == len(brackets):
-            # Unpaired ones, in strings say, are shallow unless many open in a row.
+            # Unpaired brackets, in strings for example, are shallow unless many open in a row.
             runs = re.findall(rb"[(\[{]+", brackets)
             return _DEEP if max(map(len, runs), default=0) > DEEPEST else ""
         brackets = inner
@@ -65,12 +65,12 @@ _DEEP = f"brackets are nested more than {DEEPEST} deep"
 
 
 def pieces(text: str) -> int:
-    """Count words, signs and line ends, in strings and comments too: what parsing costs goes by them."""
+    """Count words, signs and line ends, in strings and comments too: they determine the cost of parsing."""
     return len(_PIECE.findall(text))
 
 
 def largest_over(sizes: Mapping[str, int], most: int) -> Set[str]:
-    """Return the files, the largest ones, that have to be left for the others to have at most so much together."""
+    """Return the largest files, without which the others have at most this total size."""
     over: Set[str] = set()
     total = sum(sizes.values())
     for path in sorted(sizes, key=lambda path: (-sizes[path], path)):
@@ -82,7 +82,7 @@ def largest_over(sizes: Mapping[str, int], most: int) -> Set[str]:
 
 
 def over_the_limits(text: str) -> str:
-    """Return why the code of a file is not walked, or "" where all of it is within the limits."""
+    """Return why the code of a file is not analysed, or "" where it is within the limits."""
     if len(text) > ONE and pieces(text) > ONE:
         return f"more than {ONE} words and signs"
     return _blocks(text) or (f"an expression of more than {PARTS} parts" if _longest(text) > PARTS else "")
@@ -91,8 +91,8 @@ def over_the_limits(text: str) -> str:
 def _longest(text: str) -> int:
     """Return an upper bound of the parts that are nested in one another in any expression.
 
-    What stands between commas is not nested in one another, but for the bodies of lambdas; what stands in brackets is
-    nested in what is before them.
+    Parts between commas are not nested in one another, except for lambda bodies; parts in brackets are nested in the
+    expression before them.
     """
     longest, before, here = 0, [], [0, 0]  # of a bracket: since its last comma, its lambdas
     outer = 0
@@ -125,7 +125,7 @@ def _longest(text: str) -> int:
 
 
 def _blocks(text: str) -> str:
-    """Return what of the blocks is over the limits, by the indentation of lines alone."""
+    """Return which limit on blocks is exceeded, from the indentation of lines."""
     columns: List[int] = []  # of the blocks that a line is in
     branches: Dict[int, int] = {}  # `elif` in a row, by column
     functions: List[int] = []  # the columns of `def` that a line is in

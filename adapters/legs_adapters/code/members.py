@@ -15,7 +15,7 @@ from legs_adapters.code.syntax import word_set
 __all__ = ["DEPTH", "Conventions", "Members", "Reference", "unique"]
 
 DEPTH = 12  # how many names are followed, one to the next
-# Methods that are too common to say whose they are.
+# Methods whose names are too common to resolve.
 _COMMON = word_set("__init__ get items keys values copy load save append update close write read format join split pop")
 
 
@@ -32,13 +32,13 @@ class Reference(NamedTuple):
 
 
 class Conventions(NamedTuple):
-    """The ways in which libraries pass objects on, which neither names nor the checkout show.
+    """How libraries pass objects on, which the checkout itself does not show.
 
     Attributes:
         returning_self: methods that return the object itself, ``model.cuda()``.
-        wrapping: functions that return what they are given, wrapped: ``DataParallel(model)``; with a dot where the name
-            alone says too little.
-        common: names of methods that are too common to say whose they are.
+        wrapping: functions that return their argument wrapped: ``DataParallel(model)``; dotted where the name alone is
+            ambiguous.
+        common: names of methods that are too common to resolve.
     """
 
     returning_self: FrozenSet[str] = frozenset()
@@ -51,8 +51,7 @@ class Members(Checkout):
 
     Args:
         sources: the readable files.
-        unread: by path, the text of those that are not to be looked at, or cannot be: all that is asked of it is
-            whether it says a name.
+        unread: by path, the text of ignored and unreadable files, which is only searched for names.
         conventions: of the libraries that it uses.
     """
 
@@ -67,7 +66,7 @@ class Members(Checkout):
         self._common = _COMMON | self._conventions.common
 
     def resolve(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[Reference]:
-        """Return what an expression may refer to; empty where nothing is known."""
+        """Return what an expression may refer to; empty where it is unknown."""
         raise NotImplementedError
 
     def of_definition(self, where: Function, definition: Definition, depth: int = 0) -> List[Reference]:
@@ -107,7 +106,7 @@ class Members(Checkout):
         return False
 
     def bases(self, owner: Class) -> List[Class]:
-        """Return the base classes that stand in the checkout."""
+        """Return the base classes that are defined in the checkout."""
         found = []
         for arg in owner.node.bases:
             for ref in self.resolve(owner.parent, arg.value):
@@ -116,7 +115,7 @@ class Members(Checkout):
         return found
 
     def member(self, owner: Class, name: str, depth: int = 0) -> List[Reference]:
-        """Return what ``instance.name`` may be: a method, or what methods of the class store there."""
+        """Return what ``instance.name`` may be: a method, or a value that methods of the class store."""
         references: List[Reference] = []
         seen: Set[int] = set()
         queue = [owner]
@@ -136,7 +135,7 @@ class Members(Checkout):
         return unique(references)
 
     def run_by(self, reference: Reference) -> List[Function]:
-        """Return the functions that calling a reference runs: itself, or what an instance of a class runs."""
+        """Return the functions that a call of a reference runs: itself, or the ``forward`` of an instance."""
         found = [reference]
         if reference.kind == "instance" and isinstance(reference.target, Class):
             found = [ref for name in CALLED for ref in self.member(reference.target, name)]

@@ -1,4 +1,4 @@
-"""One parsed file: its functions and classes, and where its nodes stand in its bytes."""
+"""One parsed file: its functions and classes, and the byte positions of its nodes."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class Function:
     """A function, a method, or a module's top level.
 
     Attributes:
-        module, name: where it stands.
+        module, name: its file and its name.
         node: its header; its body is ``body``.
-        parent: the function around it; a module's top level for what is defined there; None for the top level itself.
+        parent: the function around it, or the module's top level; None for the top level itself.
         owner: its class, for a method.
-        text: what it is written in: its own body, or (where that is not known by itself) what is around it. What a
-            function says is said there: a cheap question before the dear ones.
+        text: the text that contains it: its own body, or (where that was not cut out) the text around it. It is
+            searched before anything is parsed.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Function:
 
     @property
     def body(self) -> cst.BaseSuite | cst.Module:
-        """Its statements, parsed when they are first asked for."""
+        """Its statements, parsed on first use."""
         if self._body is None:
             self._body = self.node if isinstance(self.node, cst.Module) else self.node.body
             if self._cut is not None:
@@ -87,7 +87,7 @@ class Function:
         return self._inner
 
     def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
-        """Say where a node of its body stands in the file, on request with the brackets around it.
+        """Return the place of a node of its body in the file, on request with the brackets around it.
 
         Raises:
             ValueError: LibCST would write another text than it read.
@@ -99,7 +99,7 @@ class Function:
 
     @property
     def line(self) -> int:
-        """The line of its ``def``, found in the text where it can be: the positions of a whole outline cost more."""
+        """The line of its ``def``, found in the text if possible: the positions of a whole outline take longer."""
         if self._cut is None or self.parent is None:
             return (self.parent or self).place(self.node).line
         data, name, end = self.module.lines.data, self.name.encode(), self._cut.start
@@ -129,12 +129,12 @@ class Function:
         return names[1:] if self.owner is not None and not self.static and names else names
 
     def is_parameter(self, node: cst.CSTNode) -> bool:
-        """Return whether a name is a parameter of the function and nothing else."""
+        """Return whether a name is a parameter of the function and has no other definition."""
         known = isinstance(node, cst.Name) and node.value in self.parameters
         return known and all(definition.kind == "parameter" for definition in self.flow.reaching(node))
 
     def given(self, call: cst.Call, parameter: str) -> Optional[cst.BaseExpression]:
-        """Return the argument that a call of it gives for a parameter; None where it is left out, or cannot be seen."""
+        """Return the argument of a call of it for a parameter; None where it is missing or starred."""
         positional, keywords, _ = arguments(call)
         if parameter in keywords or parameter not in self.parameters:
             return keywords.get(parameter)
@@ -143,7 +143,7 @@ class Function:
 
     @property
     def runs_by_instance(self) -> bool:
-        """Return whether calling an instance of its class runs it."""
+        """Return whether a call of an instance of its class runs it."""
         return self.name in CALLED
 
     @property
@@ -164,7 +164,7 @@ class Function:
 
 
 class Class:
-    """A class: its methods, and what is stored in its attributes by any of them."""
+    """A class: its methods, and the values that they store in its attributes."""
 
     def __init__(self, module: Module, node: cst.ClassDef, parent: Function) -> None:
         self.module = module
@@ -208,7 +208,7 @@ class Module:
         text, lines: the file's text.
         outline, outline_text: the file without the bodies of its functions.
         classes: every class in it, but for those that functions define.
-        failure: why a body of it could not be parsed after all.
+        failure: why a body of it could not be parsed.
     """
 
     def __init__(self, path: str, text: str) -> None:
@@ -231,7 +231,7 @@ class Module:
     def collect(
         self, statements: Sequence[cst.CSTNode], parent: Function, owner: Optional[Class] = None
     ) -> List[Function]:
-        """Take in what statements define; return its functions, in source order."""
+        """Record what statements define; return its functions, in source order."""
         functions: List[Function] = []
         for node in _definitions(statements):
             if isinstance(node, cst.FunctionDef):
@@ -251,13 +251,13 @@ class Module:
         return functions
 
     def says(self, piece: str) -> bool:
-        """Return whether a piece of text is in the file: of each of its functions it may be asked."""
+        """Return whether a piece of text is in the file, cached: each of its functions may ask."""
         if piece not in self._says:
             self._says[piece] = piece in self.text
         return self._says[piece]
 
     def functions(self, says: Callable[[str], object]) -> Iterator[Function]:
-        """Yield the functions whose text says so, methods and nested functions too, in source order."""
+        """Yield the functions whose text matches, methods and nested functions included, in source order."""
         return _chosen(self._functions, says)
 
     def named(self, name: str) -> Iterator[Function]:
@@ -269,11 +269,11 @@ class Module:
                 yield from (inner for inner in _chosen(function.inner, bool) if inner.name == name)
 
     def scopes(self, says: Callable[[str], object]) -> Iterator[Function]:
-        """Yield the top level and the functions whose text says so."""
+        """Yield the top level and the functions whose text matches."""
         return _chosen([self.top, *self._functions], says)
 
     def mentioning(self, name: str, called: bool = False) -> Iterator[Function]:
-        """Yield those of the scopes whose text has a word, or calls it, by an index: any function may be asked for."""
+        """Yield the scopes whose text has a word, or calls it, from an index of words."""
         if self._by_word is None:
             self._by_word = {}
             for scope in (self.top, *self._functions):
@@ -287,7 +287,7 @@ class Module:
 
 
 def said(text: str) -> Set[str]:
-    """Return the words of a text, and with a bracket behind them those that it calls."""
+    """Return the words of a text; those that it calls also with a bracket appended."""
     found = set(_SAID.findall(text))
     return {word for word, _ in found} | {f"{word}(" for word, bracket in found if bracket}
 
@@ -295,7 +295,7 @@ def said(text: str) -> Set[str]:
 def _chosen(
     functions: Sequence[Function], says: Callable[[str], object], said: Optional[str] = None
 ) -> Iterator[Function]:
-    """Yield the functions whose text says so; one that is written in a text that said so already is not asked again."""
+    """Yield the functions whose text matches; a text that several share is matched once."""
     for function in functions:
         if function.text is said or says(function.text):
             yield function
@@ -303,7 +303,7 @@ def _chosen(
 
 
 def parse(source: Source) -> Module | Unreadable:
-    """Parse one file; what is not Python, not of this version, or over the limits, is returned with its reason."""
+    """Parse one file; a file that does not parse or is over the limits is returned with the reason."""
     over = over_the_limits(source.text)
     if over:
         return Unreadable(source.path, over)

@@ -1,8 +1,8 @@
-"""A file parsed in parts: its outline first, the body of a function only when somebody asks for it.
+"""Parse a file in parts: its outline first, the body of a function on first use.
 
-LibCST keeps every space and makes a node of each, which costs some fifteen times what Python's own parser costs. That
-one finds where the bodies stand; the outline has ``pass`` in their place. What it cannot read, or cannot place (before
-Python 3.8), is parsed in one part.
+LibCST makes a node of every space, and takes some fifteen times as long as Python's own parser. The latter finds the
+positions of the bodies; the outline has ``pass`` in their place. What it cannot read, or cannot locate (before Python
+3.8), is parsed in one part.
 """
 
 from __future__ import annotations
@@ -59,16 +59,16 @@ class Lines:
         return self.data[self.start(line) : self.start(line + 1)].decode("utf-8").strip()
 
     def place(self, start: int, end: int) -> Place:
-        """Say where bytes stand."""
+        """Return the place of a span of bytes."""
         line, last = bisect.bisect_right(self._starts, start), bisect.bisect_left(self._starts, end)
         return Place(start, end, line, start - self._starts[line - 1], max(line, last))
 
 
 class _Written(ByteSpanPositionProvider):
-    """Write a tree once, for its text and its spans: LibCST's own wrapper walks it three times for them."""
+    """Write a tree once, for its text and its spans: LibCST's own wrapper walks it three times."""
 
     def of(self, tree: cst.Module) -> Tuple[bytes, Mapping[cst.CSTNode, CodeSpan]]:
-        """Return the bytes of a tree, and where its nodes stand in them."""
+        """Return the bytes of a tree, and the spans of its nodes."""
         state = SpanProvidingCodegenState(
             tree.default_indent, tree.default_newline, provider=self, get_length=byte_length_in_utf8
         )
@@ -77,7 +77,7 @@ class _Written(ByteSpanPositionProvider):
 
 
 class Part:
-    """Bytes that were parsed by themselves, and how they map to the file.
+    """Bytes that were parsed separately, and how they map to the file.
 
     Attributes:
         tree: what was parsed.
@@ -92,7 +92,7 @@ class Part:
         self._spans: Mapping[cst.CSTNode, CodeSpan] = {}
 
     def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
-        """Say where a node stands in the file, on request with the brackets around it.
+        """Return the place of a node in the file, on request with the brackets around it.
 
         Raises:
             ValueError: LibCST would write another text than it read.
@@ -117,7 +117,7 @@ def outline_part(lines: Lines) -> Tuple[Part, List[Optional[Cut]]]:
     """Parse a file without the bodies of its functions and methods.
 
     Returns:
-        It, and for each of those functions, in source order, what was cut; nothing where nothing could be cut.
+        The outline, and for each of those functions, in source order, what was cut; empty where nothing was cut.
 
     Raises:
         libcst.ParserSyntaxError, RecursionError, ValueError: it does not parse.
@@ -175,7 +175,7 @@ def _cuts(lines: Lines) -> List[Optional[Cut]]:
 
 
 def _functions(statements: Sequence[ast.stmt]) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
-    """Yield the functions and methods that stand in no other function, in source order."""
+    """Yield the functions and methods that are not nested in another function, in source order."""
     for node in statements:
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             yield node
@@ -188,7 +188,7 @@ def _functions(statements: Sequence[ast.stmt]) -> Iterator[ast.FunctionDef | ast
 
 
 def _cut(lines: Lines, node: ast.FunctionDef | ast.AsyncFunctionDef) -> Optional[Cut]:
-    """Say where a body stands, if it has lines of its own and Python says where they end."""
+    """Return the span of a body, if it has its own lines and Python reports where they end."""
     first, last = node.body[0], node.body[-1]
     end_line, end_column = getattr(last, "end_lineno", None), getattr(last, "end_col_offset", None)
     if end_line is None or end_column is None:

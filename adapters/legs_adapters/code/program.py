@@ -1,7 +1,6 @@
-"""Resolve names across a checkout: say which function, class, module or library a name in one file refers to.
+"""Resolve names across a checkout: find the function, class, module or library that a name refers to.
 
-What Python decides at run time (a method of an unknown object) is looked up by its name: everything that it could be
-is returned.
+What Python decides at run time (a method of an unknown object) is looked up by its name: all candidates are returned.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ class Program(Members):
     """The files of a checkout, linked by the names in them."""
 
     def resolve(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[Reference]:
-        """Return what an expression may refer to; empty where nothing is known."""
+        """Return what an expression may refer to; empty where it is unknown."""
         if depth > DEPTH:
             return []
         if isinstance(node, cst.Name):
@@ -65,7 +64,7 @@ class Program(Members):
         return []
 
     def lookup(self, function: Function, node: cst.CSTNode) -> Optional[List[Tuple[Function, Definition]]]:
-        """Return the definitions that a place may come from, each with the function it stands in; None if unknown."""
+        """Return the definitions that a place may come from, each with its function; None if unknown."""
         return self._definitions(function, node)
 
     def _definitions(self, function: Function, node: cst.CSTNode) -> Optional[List[Tuple[Function, Definition]]]:

@@ -1,6 +1,6 @@
 """Reaching definitions: for every place that is read, the assignments that its value can come from.
 
-``losses["im"] = x`` and ``self.x = y`` are places of their own and also belong to the whole (``losses``, ``self``);
+``losses["im"]`` and ``self.x`` are separate places that also belong to the whole (``losses``, ``self``);
 ``losses.append(x)`` adds to the whole.
 """
 
@@ -21,12 +21,12 @@ _PART = re.compile(r"[.\[]")
 
 @dataclass(eq=False)
 class Definition:
-    """One way in which a place got its value.
+    """One definition of a place.
 
     Attributes:
         place: ``x``, ``self.x`` or ``losses['im']``.
         kind: "assign", "augment" (``x += v``), "element" (of a loop, or of what is unpacked), "part" (of such an
-            element that is unpacked in its turn), "parameter", "import", "function", "class", "mutate"
+            element that is itself unpacked), "parameter", "import", "function", "class", "mutate"
             (``x.append(v)``), "store" (``x[...] = v``, seen from ``x``), "with", "inplace" (``x.mul_(v)``).
         node: the statement, parameter or expression that did it.
         value: where the value comes from, if that is an expression.
@@ -48,7 +48,7 @@ Env = Dict[str, FrozenSet[Definition]]
 
 
 def join(envs: Sequence[Optional[Env]]) -> Optional[Env]:
-    """Return what may stand in each place after one of several ways; None where none of them goes on."""
+    """Join the definitions at the end of several branches; None where no branch continues."""
     alive = [env for env in envs if env is not None]
     if not alive:
         return None
@@ -79,7 +79,7 @@ class Reaching:
         return [definition for definitions in self.definitions.values() for definition in definitions]
 
     def assigned(self, node: cst.CSTNode) -> List[cst.CSTNode]:
-        """Return the values that assignments give a place, of those that reach this use."""
+        """Return the values of the assignments that reach this use."""
         return [d.value for d in self.reaching(node) if d.kind == "assign" and d.value is not None]
 
     def reaching(self, node: cst.CSTNode) -> FrozenSet[Definition]:
@@ -87,7 +87,7 @@ class Reaching:
         return frozenset(self._reaching.get(id(node), ()))
 
     def value_of(self, node: cst.CSTNode) -> Optional[cst.CSTNode]:
-        """Return what a name was assigned, where one assignment alone can reach it; else None."""
+        """Return the value of a name, where exactly one assignment reaches it; else None."""
         found = list(self.reaching(node)) if isinstance(node, cst.Name) else []
         return found[0].value if len(found) == 1 and found[0].kind == "assign" else None
 
@@ -110,7 +110,7 @@ class Reaching:
     def _bind(self, env: Env, definition: Definition) -> None:
         definition = self._known(definition)
         place = definition.place
-        if place in self._holders:  # a top level may bind thousands of names: few of them have parts
+        if place in self._holders:  # a top level may bind thousands of names, and few of them have parts
             for other in [other for other in env if other.startswith((place + ".", place + "["))]:
                 del env[other]
         env[place] = frozenset([definition])
@@ -120,7 +120,7 @@ class Reaching:
         env[definition.place] = env.get(definition.place, frozenset()) | {definition}
 
     def unchanged(self, *nodes: cst.CSTNode) -> bool:
-        """Return whether the names in expressions mean the same all through the body, once they have been read here."""
+        """Return whether the names in expressions are not reassigned anywhere in the body."""
         for part in (part for node in nodes for part in walk_expressions(node)):
             if isinstance(part, cst.Name):
                 known = self.reaching(part)
@@ -130,7 +130,7 @@ class Reaching:
         return True
 
     def unchanged_at(self, call: cst.CSTNode, *nodes: cst.CSTNode) -> bool:
-        """Return whether names that were read in expressions mean the same at a call further down."""
+        """Return whether the names in expressions have the same definitions at a later call."""
         return all(
             self.names_at(call, part.value) == self.reaching(part)
             for node in nodes

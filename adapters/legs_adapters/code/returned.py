@@ -1,4 +1,4 @@
-"""Tell what functions return: one expression, a parameter passed on, the entries of a dictionary and their keys."""
+"""Find what functions return: one expression, a parameter, the entries of a dictionary and their keys."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _Entry = Tuple[Function, cst.CSTNode]  # a value, and the function that it stand
 def returned(function: Function, known: Dict[str, object]) -> Optional[cst.CSTNode]:
     """Return what a function returns, its local names filled in; None where that is not one expression.
 
-    ``known`` are values of parameters, which settle the branches that ask for them.
+    ``known`` are values of parameters, which decide the branches that test them.
     """
     return _follow(function.body.body, {}, known)
 
 
 def known_arguments(function: Function, call: Optional[cst.Call]) -> Dict[str, object]:
-    """Return the parameters whose values the call settles: literals, and defaults of what it leaves out."""
+    """Return the parameters whose values a call fixes: literals, and defaults of missing arguments."""
     assert isinstance(function.node, cst.FunctionDef)
     if call is None:
         return {}
@@ -155,7 +155,7 @@ def _truth(node: cst.BaseExpression, known: Dict[str, object]) -> Optional[bool]
 
 
 def passed_on(function: Function, node: cst.CSTNode) -> Optional[str]:
-    """Return the parameter that an expression is, or is an element of, whichever way the function went."""
+    """Return the parameter that an expression is, or is an element of, on every path."""
     found: Set[Optional[str]] = set()
     work, seen = [node], set()
     while work:
@@ -181,7 +181,7 @@ def passed_on(function: Function, node: cst.CSTNode) -> Optional[str]:
 
 
 def called_makers(program: Program, function: Function, package: cst.CSTNode) -> List[Function]:
-    """Return the functions that ``package = render(...)`` calls, of a package that nothing else has made."""
+    """Return the functions that ``package = render(...)`` calls, where that is the only definition of the package."""
     made = list(function.flow.reaching(package))
     call = made[0].value if len(made) == 1 and made[0].kind == "assign" else None
     if not isinstance(call, cst.Call):
@@ -199,7 +199,7 @@ def forward_maker(function: Function, package: cst.CSTNode) -> List[Function]:
 
 
 def written(makers: Iterable[Function], key: str) -> List[_Entry]:
-    """Return what stands under a name in the dictionaries that functions return: ``{"photo": image}``."""
+    """Return the values of a key in the dictionaries that functions return: ``{"photo": image}``."""
     returned = [
         (maker, value)
         for maker in makers
@@ -216,7 +216,7 @@ def written(makers: Iterable[Function], key: str) -> List[_Entry]:
 
 
 def stored(makers: Iterable[Function], key: str) -> List[_Entry]:
-    """Return what functions store under a name in what they return: ``package["photo"] = image``."""
+    """Return the values that functions store under a key of their result: ``package["photo"] = image``."""
     return [
         (maker, definition.value)
         for maker in makers
@@ -228,7 +228,7 @@ def stored(makers: Iterable[Function], key: str) -> List[_Entry]:
 
 
 def formatted_key(node: cst.Subscript) -> Optional[str]:
-    """Return what is literal in the key of ``outputs[f"image_{i}"]`` or ``outputs["color", i]``."""
+    """Return the literal part of the key of ``outputs[f"image_{i}"]`` or ``outputs["color", i]``."""
     element = node.slice[0].slice
     values = [each.slice.value for each in node.slice if isinstance(each.slice, cst.Index)]
     values += [each.value for value in values if isinstance(value, cst.Tuple) for each in value.elements]
@@ -241,7 +241,7 @@ def formatted_key(node: cst.Subscript) -> Optional[str]:
 
 
 def computed_key(function: Function, node: cst.Subscript) -> Optional[str]:
-    """Return what is literal in the key of ``target["target_" + key]``; of ``pred[key]`` beside it, nothing."""
+    """Return the literal part of the key of ``target["target_" + key]``; nothing for ``pred[key]`` beside it."""
     index = node.slice[0].slice
     if len(node.slice) != 1 or not isinstance(index, cst.Index):
         return None

@@ -1,4 +1,4 @@
-"""A checkout and its files as they stand on disk: bytes, and what Python reads in them."""
+"""A checkout and its files on disk: bytes, and the text that Python decodes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from legs_loss.system import read_regular
 
 __all__ = ["BOM", "Files", "Source", "Unreadable", "check_root", "decode", "read_files", "read_source"]
 
-_UNREAD = 64 << 20  # bytes of all together; of what is over it, it is not asked which names it says
+_UNREAD = 64 << 20  # bytes in total; files over it are not searched for names
 BOM = b"\xef\xbb\xbf"
 
 _CODING = re.compile(rb"^[ \t\f]*#.*?coding[:=][ \t]*([-\w.]+)")
@@ -26,12 +26,12 @@ _UTF8_NAMES = {"utf8", "utf-8", "utf_8", "u8", "utf8-sig", "utf-8-sig", "ascii",
 
 @dataclass(frozen=True)
 class Source:
-    """One Python file, as it stands on disk.
+    """One Python file on disk.
 
     Attributes:
         path: relative to the root, posix separators.
         data: its exact bytes.
-        text: what Python reads: decoded, without a byte order mark, line ends as they are.
+        text: decoded as Python does, without a byte order mark, line ends unchanged.
     """
 
     path: str
@@ -46,7 +46,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Unreadable:
-    """A file that was left because it cannot be read as Python: reported, never fatal."""
+    """A file that cannot be read as Python: reported, never fatal."""
 
     path: str
     reason: str
@@ -56,9 +56,9 @@ class Files(NamedTuple):
     """The Python files of a checkout.
 
     Attributes:
-        readable: those that are to be looked at.
-        unreadable: those that cannot be.
-        unread: by path, the text of what is excluded or no Python: names in it may be of functions that are patched.
+        readable: those that are analysed.
+        unreadable: those that cannot be read.
+        unread: by path, the text of excluded and unparsable files, which may mention functions that are patched.
     """
 
     readable: List[Source]
@@ -67,7 +67,7 @@ class Files(NamedTuple):
 
 
 def check_root(path: str | os.PathLike[str]) -> Path:
-    """Return the folder to work in, absolute.
+    """Return the checkout's folder, absolute.
 
     Raises:
         LegsError: it is not a folder, or it is the root of the file system.
@@ -83,10 +83,10 @@ def check_root(path: str | os.PathLike[str]) -> Path:
 
 
 def read_files(root: Path, exclude: Sequence[str]) -> Files:
-    """Read the Python files of a checkout, but for those that are excluded."""
+    """Read the Python files of a checkout, except for excluded ones."""
     own, excluded = own_and_excluded(root, exclude)
     over = largest_over({path: size for path, size in _sizes(root, own).items() if size <= LARGEST}, READ)
-    why = f"too large: all files have more than {READ >> 20} MiB together; leave others out by --exclude"
+    why = f"too large: all files have more than {READ >> 20} MiB together; exclude some with --exclude"
     read = [Unreadable(path, why) if path in over else read_source(root, path) for path in own]
     unreadable = [source for source in read if isinstance(source, Unreadable)]
     sizes = _sizes(root, [*excluded, *(source.path for source in unreadable)])
@@ -106,12 +106,12 @@ def _sizes(root: Path, paths: Sequence[str]) -> Dict[str, int]:
 
 
 def read_source(root: Path, path: str) -> Source | Unreadable:
-    """Read one file; what cannot be read as UTF-8, or has a name that is never written, is returned with its reason."""
+    """Read one file; one that is not UTF-8, or has a name that is never written, is returned with the reason."""
     try:
         check_name(path)
         data = read_regular(root / path, LARGEST)
     except LegsError:
-        return Unreadable(path, "a file of this name is not written: rename it")
+        return Unreadable(path, "legs-patch writes no file of this name: rename it")
     except OSError as error:
         large = error.errno == errno.EFBIG
         return Unreadable(path, f"larger than {LARGEST >> 20} MiB" if large else f"cannot be read: {error.strerror}")

@@ -1,4 +1,4 @@
-"""Small questions to a LibCST tree: what is this node called, which words are in its name, which constant is it."""
+"""Helpers for LibCST trees: a node's name, the words in it, the value of a constant."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def dotted(node: cst.CSTNode) -> Optional[str]:
 
 
 def word_set(text: str) -> FrozenSet[str]:
-    """Return the words of a text as a set: a long list that is pleasant to read."""
+    """Return the words of a text as a set."""
     return frozenset(text.split())
 
 
@@ -143,7 +143,7 @@ def root_of(node: cst.Name | cst.Attribute) -> str:
 
 
 def call_name(node: cst.Call) -> str:
-    """Return the last name of what is called: ``f`` of ``a.b.f(x)``; empty where it has none."""
+    """Return the last name of the callee: ``f`` of ``a.b.f(x)``; empty without one."""
     if isinstance(node.func, cst.Name):
         return node.func.value
     if isinstance(node.func, cst.Attribute):
@@ -205,7 +205,7 @@ def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
 
 
 def loops_around(root: cst.CSTNode, node: cst.CSTNode) -> List[cst.CSTNode]:
-    """Return the loops that an expression stands in, the innermost first."""
+    """Return the loops around an expression, the innermost first."""
     stack: List[Tuple[cst.CSTNode, Tuple[cst.CSTNode, ...]]] = [(root, ())]
     while stack:
         part, loops = stack.pop()
@@ -217,7 +217,7 @@ def loops_around(root: cst.CSTNode, node: cst.CSTNode) -> List[cst.CSTNode]:
 
 
 def _is_node(kind: type) -> bool:
-    """Return whether a class is one of LibCST's nodes: to ask isinstance of every node costs more than all the rest."""
+    """Return whether a class is one of LibCST's nodes, cached: isinstance on every node is slow."""
     if kind not in _NODES:
         _NODES[kind] = issubclass(kind, cst.CSTNode)
     return _NODES[kind]
@@ -236,12 +236,12 @@ def _fields(kind: type) -> Tuple[str, ...]:
 
 
 def same(a: cst.CSTNode, b: cst.CSTNode) -> bool:
-    """Return whether two expressions are written alike, brackets and spaces aside."""
+    """Return whether two expressions have the same text, brackets and spaces aside."""
     return squeezed(a) == squeezed(b)
 
 
 def squeezed(node: cst.CSTNode) -> str:
-    """Return what an expression is written as, without brackets around it, spaces and comments."""
+    """Return the text of an expression without brackets around it, spaces and comments."""
     return re.sub(r"\s+|#[^\n]*", "", strip_parens(code(node)))
 
 

@@ -1,4 +1,4 @@
-"""Tell what a call depicts: a rendering, a loaded photograph, what a function makes of the image that it is given."""
+"""Find what a call depicts: a rendering, a loaded photograph, or a function of an image."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, depth: int) -> Meaning:
-    """Return what a call depicts, by its name, by what it is given, and by what is known of the function."""
+    """Return what a call depicts, from its name, its arguments and the definition of the function."""
     name = call_name(node)
     positional, keywords, _ = arguments(node)
     values = [*positional, *keywords.values()]
@@ -94,7 +94,7 @@ def _is_module(program: Program, function: Function, node: cst.Name) -> bool:
 
 
 def _made_by(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int) -> Optional[Meaning]:
-    """Return the meaning by what is called: an instance of a rasterizer, a function whose returns are images."""
+    """Return the meaning from the callee: an instance of a rasterizer, a function that returns images."""
     for reference in meanings.program.resolve(function, node):
         if reference.kind in ("instance", "class", "made by", "external", "function"):
             name = getattr(reference.target, "name", str(reference.target))

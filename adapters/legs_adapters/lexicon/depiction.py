@@ -1,8 +1,8 @@
-"""Tell what an expression depicts in a training step: which kind of picture, and whether it was rendered.
+"""Find what an expression depicts in a training step: which kind of image, and whether it was rendered.
 
 The evidence is the dataflow (where a value comes from, through assignments, clamps, indexing, exposure, ``.cuda()``)
-and the field's words in the names on the way. A name that says "depth" or "feature" on the way outweighs one
-that says "image": ``gt_image = cam.depth`` is a depth.
+and the field's words in the names along it. A name with "depth" or "feature" outweighs one with "image":
+``gt_image = cam.depth`` is a depth.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ from legs_adapters.tensors.backward import Training
 __all__ = ["Meanings"]
 
 _DEPTH = 40
-_BUDGET = 20000  # steps to answer one question: some code is one large knot
+_BUDGET = 20000  # steps for one question: some dataflow is one large cycle
 
 
 _Question = Tuple[str, int]  # of an expression, or of the definitions that reach it; its id
 
 
 class Meanings:
-    """Answers for the expressions of one program."""
+    """Answer for the expressions of one program."""
 
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
@@ -70,7 +70,7 @@ class Meanings:
         self._spent = 0
 
     def of(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Meaning:
-        """Return what an expression stands for."""
+        """Return the meaning of an expression."""
         return self._asked(("expression", id(node)), function, node, depth, self._of)
 
     def _asked(
@@ -81,7 +81,7 @@ class Meanings:
         depth: int,
         answer: Callable[[Function, cst.CSTNode, int], Meaning],
     ) -> Meaning:
-        """Answer a question once: what depends on itself, or on too much, is unknown."""
+        """Answer a question once; unknown where the answer depends on itself or exceeds the budget."""
         if question in self._known:
             return self._known[question]
         if question in self._here:
@@ -95,7 +95,7 @@ class Meanings:
             meaning = answer(function, node, depth + 1)
         finally:
             self._open.discard(question)
-        # What was found inside of a loop is incomplete: it serves this question only.
+        # An answer from inside a cycle is incomplete: it is not cached.
         self._here[question] = meaning
         if outermost:
             self._known[question] = meaning
@@ -103,7 +103,7 @@ class Meanings:
         return meaning
 
     def origin(self, function: Function, node: cst.CSTNode) -> Meaning:
-        """Return what a name's definitions say of it, whatever the name itself says."""
+        """Return the meaning from a name's definitions, without the name itself."""
         return self.flow(function, node, 0) if isinstance(node, cst.Name) else self.of(function, node)
 
     def _of(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
@@ -154,7 +154,7 @@ class Meanings:
         return Meaning(min(kinds, key=KINDS.index) if kinds else None, role_of_words(name) or flow.role)
 
     def flow(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
-        """Join what the definitions say that reach this use."""
+        """Join the meanings of the definitions that reach this use."""
         return self._asked(("definitions", id(node)), function, node, depth, self._defined)
 
     def _defined(self, function: Function, node: cst.CSTNode, depth: int) -> Meaning:
@@ -225,7 +225,7 @@ class Meanings:
         return mix(found)
 
     def _parameter(self, function: Function, definition: Definition, depth: int) -> Meaning:
-        """A parameter is what it is given where training calls the function."""
+        """Return the meaning of a parameter: that of its arguments where training calls the function."""
         if definition.place not in function.parameters:
             return UNKNOWN
         found = []
@@ -239,7 +239,7 @@ class Meanings:
         return given if said is None else given._replace(kind=said)
 
     def _said_by_class(self, function: Function) -> Optional[str]:
-        """Return the kind that a loss class is named for, where one call in a base class serves several."""
+        """Return the kind in the name of a loss class, where a call in its base class serves several."""
         owner = function.owner
         if owner is None or not set(words(owner.name)) & LOSS_CLASS:
             return None
@@ -249,7 +249,7 @@ class Meanings:
         return kind if kind in COMPARED else None
 
     def _calls_of(self, function: Function) -> List[Tuple[Function, cst.Call]]:
-        """Return the calls of a function that training does not go through."""
+        """Return the calls of a function outside of training."""
         if function not in self._calls:
             self._calls[function] = list(sure_calls(self.program, function))
         return self._calls[function]
@@ -292,9 +292,9 @@ class Meanings:
         return self.of(function, node.value, depth)
 
     def _entry(self, function: Function, node: cst.CSTNode, key: str, depth: int) -> Meaning:
-        """Return the meaning of ``package["photo"]``, of a package that the codebase's own function made.
+        """Return the meaning of ``package["photo"]``, of a package that a function of the codebase returned.
 
-        What a renderer writes into its dictionary has the names that the loss knows; inside, it is made of depths, too.
+        A renderer's keys say what the entries are; the values inside a renderer are made of depths, too.
         """
         held = stored(called_makers(self.program, function, node), key)
         held = held or written(forward_maker(function, node), key)
@@ -302,6 +302,6 @@ class Meanings:
 
 
 def _is_called_for_another(value: cst.CSTNode, place: str, kind: Optional[str]) -> bool:
-    """Return whether the kind is only in a function's name, and the name of this one of its results says image."""
+    """Return whether only the function's name has the kind, and the name of this result is an image's."""
     named = isinstance(value, cst.Call) and kind is not None and kind_of_words(call_name(value)) == kind
     return named and kind != "image" and kind_of_words(place) == "image"

@@ -1,4 +1,4 @@
-"""Tell the role of an expression by what holds it: ``outputs["rgb"]`` is a rendering, ``batch["rgb"]`` a target."""
+"""Find the role of an expression from its container: ``outputs["rgb"]`` is a rendering, ``batch["rgb"]`` a target."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["role_of_holder"]
 
 
 def role_of_holder(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int) -> Optional[str]:
-    """Return the role by the holder: ``outputs["rgb"]`` is rendered, ``batch["rgb"]`` a target."""
+    """Return the role from the container: ``outputs["rgb"]`` is rendered, ``batch["rgb"]`` a target."""
     if isinstance(node, cst.Name):
         found = set(words(node.value))
         name_role = role_of_words(node.value)
@@ -48,7 +48,7 @@ def _given_role(meanings: Meanings, function: Function, node: cst.Name) -> Optio
 
 
 def _is_rendered(function: Function, node: cst.Name) -> bool:
-    """Return whether ``view = render(camera)`` made it; ``data = render(data)`` has what it had before, too."""
+    """Return whether ``view = render(camera)`` made it; ``data = render(data)`` keeps its earlier entries, too."""
     made = [definition.value for definition in function.flow.reaching(node)]
     return any(
         isinstance(call, cst.Call)

@@ -1,4 +1,4 @@
-"""Tell images from lists of pixels: masks that pick pixels, reshapes that flatten images."""
+"""Distinguish images from lists of pixels: mask indexing, and reshapes that flatten images."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def is_mask(meanings: Meanings, function: Function, element: cst.SubscriptElemen
 
 
 def _is_list_of_views(function: Function, node: cst.CSTNode) -> bool:
-    """Return whether a mask was made of a list, and picks views: ``tensor([camera.is_seen for camera in batch])``."""
+    """Return whether a mask is made of a list, and selects views: ``tensor([camera.is_seen for camera in batch])``."""
     made = function.flow.assigned(node)
     made = [value.body if isinstance(value, cst.IfExp) else value for value in made]
     return bool(made) and all(
@@ -48,7 +48,7 @@ def _is_list_of_views(function: Function, node: cst.CSTNode) -> bool:
 
 
 def _is_list(function: Function, node: cst.CSTNode) -> bool:
-    """Return whether an expression is a list, ``[... for camera in batch]``, or a name for one."""
+    """Return whether an expression is a list, ``[... for camera in batch]``, or a name of one."""
     if isinstance(node, (cst.ListComp, cst.List)):
         return True
     made = function.flow.assigned(node) if isinstance(node, cst.Name) else []
@@ -56,17 +56,17 @@ def _is_list(function: Function, node: cst.CSTNode) -> bool:
 
 
 def makes_mask(call: cst.Call) -> bool:
-    """Return whether a function makes a mask of an error map, going by its name."""
+    """Return whether a function makes a mask of an error map, by its name."""
     return bool(set(words(call_name(call))) & PICKING) or call_name(call) == "quantile"
 
 
 def _is_picked(meanings: Meanings, function: Function, node: Optional[cst.CSTNode]) -> bool:
-    """Return whether an expression is the pixels of a mask, ``image[:, mask]``."""
+    """Return whether an expression is mask indexing, ``image[:, mask]``."""
     return isinstance(node, cst.Subscript) and any(is_mask(meanings, function, part) for part in node.slice)
 
 
 def picked_from(meanings: Meanings, function: Function, node: cst.CSTNode) -> Optional[cst.Subscript]:
-    """Return ``image[:, mask]``, for a name that stands for that and nothing else."""
+    """Return ``image[:, mask]``, also for a name whose only definition it is."""
     found = function.flow.reaching(node) if isinstance(node, cst.Name) else ()
     values = [definition.value for definition in found if definition.kind == "assign"]
     value = values[0] if len(found) == len(values) == 1 else None
@@ -74,7 +74,7 @@ def picked_from(meanings: Meanings, function: Function, node: cst.CSTNode) -> Op
 
 
 def is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
-    """Return whether an expression is a list of pixels, ``image.reshape(-1, 3)``, whose neighbours are lost."""
+    """Return whether an expression is a list of pixels, ``image.reshape(-1, 3)``, without neighbours."""
 
     def are(parts: Iterable[Tuple[Function, cst.CSTNode]]) -> bool:
         return any(is_rows(meanings, where, part, depth + 1) for where, part in parts)

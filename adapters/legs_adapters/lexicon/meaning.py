@@ -1,4 +1,4 @@
-"""The meaning of an expression: which kind of picture it is, and whether it was rendered; how several are joined."""
+"""The meaning of an expression: the kind of image, and whether it was rendered; and how meanings are joined."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ UNKNOWN = Meaning(None, None)
 
 
 def more_special(word: Optional[str], flow: Optional[str]) -> Optional[str]:
-    """Return the more special of two kinds, of which either may be unknown."""
+    """Return the more specific of two kinds; either may be unknown."""
     kinds = [kind for kind in (word, flow) if kind is not None]
     return min(kinds, key=KINDS.index) if kinds else None
 
 
 def mix(parts: Iterable[Meaning]) -> Meaning:
-    """Join the meanings of an expression's parts: a mask or a number laid over an image leaves an image."""
+    """Join the meanings of an expression's parts: a mask or a number applied to an image gives an image."""
     known = [part for part in parts if part != UNKNOWN]
     if not known:
         return UNKNOWN

@@ -1,4 +1,4 @@
-"""Read names: the kind of picture that one speaks of, a rendering or a photograph, an L1 function."""
+"""Read names: the kind of image, whether it is a rendering or a photograph, whether it is an L1 function."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _L1_NAME = re.compile(
 
 
 def kind_of_words(name: str) -> Optional[str]:
-    """Return the kind that a name speaks of; the more special where it has several."""
+    """Return the kind of image in a name; the most specific of several."""
     spoken = words(name)
-    if "and" in spoken:  # of what image_and_depth holds the one is no depth, the other no image
+    if "and" in spoken:  # image_and_depth holds one of each
         at = spoken.index("and")
         both = {kind_of_words("_".join(part)) for part in (spoken[:at], spoken[at + 1 :])}
         if "image" in both and len(both - {None}) > 1:
@@ -40,7 +40,7 @@ def kind_of_words(name: str) -> Optional[str]:
         spoken = spoken[: spoken.index("no", 1)]
     said = [word for word in spoken if not word.isdigit() and word not in HELD_IN | WHICH]
     if said and said[-1] in LAID_OVER:
-        return "mask"  # of whatever: laid over an image, it leaves an image
+        return "mask"  # applied to an image, it gives an image
     kinds = {KIND_OF[word] for word in spoken if word in KIND_OF}
     if "image" in kinds:  # sky_rgb, render_sh
         if spoken[-1] in LIT_BY and "image" in spoken and TARGET.intersection(spoken):
@@ -54,14 +54,14 @@ def kind_of_words(name: str) -> Optional[str]:
 
 
 def role_of_words(name: str) -> Optional[str]:
-    """Return the role that a name speaks of, if it speaks of one."""
+    """Return the role in a name, None without one."""
     found = set(words(name))
     target, render = bool(found & TARGET), bool(found & RENDER)
-    if target and render:  # rendered_gt, gt_pred: only a closer look can tell
+    if target and render:  # rendered_gt, gt_pred: the name does not decide
         return None
     return "target" if target else "render" if render else None
 
 
 def is_l1_name(name: str) -> bool:
-    """Return whether a function of this name is an L1, going by the name."""
+    """Return whether a function is an L1, by its name."""
     return _L1_NAME.match(name.replace("_", "").lower()) is not None

@@ -1,4 +1,4 @@
-"""Say in the field's words what an optimiser moves: Gaussians, camera poses, an embedding."""
+"""Find what an optimiser updates, in the field's words: Gaussians, camera poses, an embedding."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _DEPTH = 3
 
 
 class Optimised:
-    """Finds for the optimisers of one program the words for what they move."""
+    """Find the words for the parameters of the optimisers of one program."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
 
     def words(self, function: Function, step: cst.Call) -> Set[str]:
-        """Return the words in an optimiser's name, and in what it was made of."""
+        """Return the words in an optimiser's name, and in its definition."""
         assert isinstance(step.func, cst.Attribute)
         parts: List[cst.CSTNode] = [step.func.value, *(arg.value for arg in step.args)]
         return {word for part in parts for word in self._words_of(function, part, 0)} - PLUMBING
@@ -72,7 +72,7 @@ class Optimised:
         return owner.stores(node.attr.value)
 
     def _handed_in(self, function: Function, node: cst.CSTNode) -> Optional[Set[str]]:
-        """Return the words in what ``model.setup(pose)`` gave ``model.optimizer``, if nothing of the model learns."""
+        """Return the words in the parameters that ``model.setup(pose)`` optimises, if none of them is the model's."""
         if not isinstance(node, cst.Attribute):
             return None
         place = f"self.{node.attr.value}"
@@ -94,7 +94,7 @@ class Optimised:
         return found - GAUSSIANS if found & POSES else None
 
     def _given(self, where: Function, node: cst.CSTNode) -> Set[str]:
-        """Return the words in an argument of an optimiser; of a list with a name also in what is added to it."""
+        """Return the words in an argument of an optimiser, and in what is appended to a list that it names."""
         found = self._moved(where, node)
         if isinstance(node, cst.Name):  # opt_params = [], then opt_params.append(...)
             for other in where.flow.definitions.get(node.value, []):
@@ -104,7 +104,7 @@ class Optimised:
         return found
 
     def _moved(self, where: Function, node: cst.CSTNode) -> Set[str]:
-        """Return the words in what an optimiser is given; of ``model._rot`` those of the model's class, if a pose's."""
+        """Return the words in the parameters of an optimiser; for ``model._rot`` of a pose class the class's."""
         found: Set[str] = set()
         held: Set[str] = set()
         for part in _learning(node):
@@ -118,7 +118,7 @@ class Optimised:
 
 
 def _handed_to(call: cst.Call) -> Set[str]:
-    """Return the words in what ``setup_optimizer(config, cams=[camera])`` gets, without names of settings."""
+    """Return the words in the arguments of ``setup_optimizer(config, cams=[camera])``, without settings."""
     found: Set[str] = set()
     for arg in call.args:
         if constant(arg.value, _NOTHING) is _NOTHING:
@@ -127,9 +127,9 @@ def _handed_to(call: cst.Call) -> Set[str]:
 
 
 def _learning(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
-    """Yield the parts of what an optimiser is given, without groups that stay, ``{"params": [xyz], "lr": 0.0}``.
+    """Yield the parameters of an optimiser, without groups of rate 0, ``{"params": [xyz], "lr": 0.0}``.
 
-    Of ``camera.parameters()`` that is the camera.
+    For ``camera.parameters()`` that is the camera.
     """
     if isinstance(node, cst.Attribute) and node.attr.value in ("parameters", "named_parameters"):
         yield from _learning(node.value)

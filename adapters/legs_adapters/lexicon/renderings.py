@@ -18,13 +18,13 @@ __all__ = ["is_of_mesh", "is_rendering"]
 
 
 def is_rendering(function: Function, node: cst.CSTNode) -> bool:
-    """Return whether a value came out of functions that render, each of the ways that it can have come."""
+    """Return whether a value was produced by functions that render, on every path."""
     makers = _makers(function, node, set())
     return bool(makers) and all(maker is not None and _renders(maker) for maker in makers)
 
 
 def is_of_mesh(program: Program, function: Function, node: cst.CSTNode) -> bool:
-    """Return whether a value can have come out of a rasterizer of triangles, or is sampled from their texture."""
+    """Return whether a rasterizer of triangles may have produced a value, or it is sampled from a texture."""
     return any(
         _draws_mesh(maker) or _rasterizes_mesh(program, function, maker, 0)
         for maker in _makers(function, node, set())
@@ -33,7 +33,7 @@ def is_of_mesh(program: Program, function: Function, node: cst.CSTNode) -> bool:
 
 
 def _rasterizes_mesh(program: Program, function: Function, call: cst.Call, depth: int) -> bool:
-    """Return whether a call is of a rasterizer of triangles, or of a method that calls one."""
+    """Return whether a call runs a rasterizer of triangles, directly or in a method."""
     for reference in program.resolve(function, call.func):
         if reference.kind in ("external", "made by") and str(reference.target).startswith(MESH_RASTERIZERS):
             return True
@@ -60,7 +60,7 @@ def _samples_texture(function: Function) -> bool:
 
 
 def _draws_mesh(call: cst.Call) -> bool:
-    """Return whether a call draws a mesh by its name: ``render_mesh(...)``, ``mesh_renderer(...)``."""
+    """Return whether a call draws a mesh, by its name: ``render_mesh(...)``, ``mesh_renderer(...)``."""
     spoken = words(call_name(call))
     return "mesh" in spoken and any(word.startswith(("render", "raster")) for word in spoken)
 
@@ -71,9 +71,9 @@ def _renders(call: cst.Call) -> bool:
 
 
 def _makers(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> List[Optional[cst.Call]]:
-    """Return the calls that produced a value, but for its type, axes and range; None for anything else.
+    """Return the calls that produced a value, through changes of type, axes and range; None for anything else.
 
-    What depends on itself has no maker there.
+    A value that depends on itself has no producer there.
     """
     if node is None:
         return [None]
@@ -107,7 +107,7 @@ def _is_empty(node: Optional[cst.CSTNode]) -> bool:
 
 
 def _value(definition: Definition) -> Optional[cst.CSTNode]:
-    """Return what is assigned, or what a loop goes over."""
+    """Return the value that is assigned, or that a loop iterates over."""
     value = definition.value
     if definition.kind == "mutate" and isinstance(value, cst.Call):  # renderings.append(image)
         given = arguments(value)[0]
@@ -118,5 +118,5 @@ def _value(definition: Definition) -> Optional[cst.CSTNode]:
             return given[0] if index == 1 else None
         if call_name(value) == "zip" and index is not None:
             return given[index] if index < len(given) else None
-        return None if index else value  # what renders returns the rendering first
+        return None if index else value  # a renderer returns the rendering first
     return value if definition.kind in ("assign", "element") else None

@@ -1,4 +1,4 @@
-"""Tell by the code around an expression what it is, whatever its name says: a mask, a crop, a rendering."""
+"""Find from the code around an expression what it is, independent of its name: a mask, a crop, a rendering."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def is_box(function: Function, node: cst.CSTNode) -> bool:
 
 
 def is_cropped(function: Function, node: cst.Name) -> bool:
-    """Return whether a name stands for a part of a picture, ``image[:, :half]``, and for nothing else."""
+    """Return whether the only definition of a name is a part of an image, ``image[:, :half]``."""
     made = function.flow.assigned(node)
     return len(made) == len(function.flow.reaching(node)) and all(
         isinstance(value, cst.Subscript) and all(isinstance(part.slice, cst.Slice) for part in value.slice)
@@ -47,7 +47,7 @@ def is_cropped(function: Function, node: cst.Name) -> bool:
 
 
 def is_masked(function: Function, node: cst.Name) -> bool:
-    """Return whether a name that speaks of an image, too, stands for a product and for nothing else."""
+    """Return whether the only definition of a name that also has a word for images is a product."""
     made = function.flow.assigned(node)
     products = [v for v in made if isinstance(v, cst.BinaryOperation) and isinstance(v.operator, cst.Multiply)]
     says_image = any(kind_of_words(word) == "image" for word in words(node.value))
@@ -55,7 +55,7 @@ def is_masked(function: Function, node: cst.Name) -> bool:
 
 
 def is_taken_from_one(function: Function, node: cst.Name) -> bool:
-    """Return whether ``1 - objects`` stands somewhere: whatever it is called, it is a mask."""
+    """Return whether ``1 - objects`` is computed somewhere: it is a mask then, whatever its name."""
     return any(
         isinstance(part, cst.BinaryOperation)
         and isinstance(part.operator, cst.Subtract)
@@ -71,7 +71,7 @@ def are_neighbours(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:
 
 
 def is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
-    """Return whether a dictionary is what a data loader hands out, and the entry its own: nothing has rendered it."""
+    """Return whether a dictionary is from a data loader, and the entry too, not from a renderer."""
     made = [d for d in function.flow.reaching(node) if d.kind != "store" or d.key in (None, key)]
     sources = [part for d in made if d.kind == "element" and d.value is not None for part in walk_expressions(d.value)]
     loaders = [part for part in sources if isinstance(part, cst.Name) and set(words(part.value)) & LOADERS]
@@ -79,5 +79,5 @@ def is_loaded(function: Function, node: cst.CSTNode, key: str) -> bool:
 
 
 def is_asked_for(key: str) -> bool:
-    """Return whether a key says no more than that it is a result: ``images_output``."""
+    """Return whether a key only says that it is a result: ``images_output``."""
     return all(role_of_words(word) != "render" or word in RESULT for word in words(key))

@@ -1,7 +1,7 @@
-"""Tell whether a camera's name is that of one photograph alone: only then may a view be named by it.
+"""Decide whether a camera's name identifies one photograph: only then it is passed as ``view=``.
 
-The camera's class has to store a name, and the readers have to give each image its own; nothing may put another image
-into a camera, or make a camera anew; and one run may not go through several scenes.
+The camera's class has to store a name, and the readers have to give each image its own; nothing may assign another
+image to a camera, or copy a camera; and one run may not go through several scenes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _PLACED = re.compile(r"\.source_path\s*=[^=]")  # in the settings that Inria's S
 
 
 class Names:
-    """Answers for one program."""
+    """Answer for one program."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -61,7 +61,7 @@ class Names:
         )
 
     def unstored(self, attribute: str) -> Optional[str]:
-        """Return why no camera has an image under this attribute and a name for it; None where one has."""
+        """Return why no camera class stores this attribute and a name; None where one does."""
         if self._cameras is None:
             self._cameras = []
             for module in self.program.matching(re.compile(r"self\.image_name\s*=")):
@@ -72,15 +72,15 @@ class Names:
             return f"no class of this codebase stores both {attribute} and {NAME}"
         for camera in self._cameras:
             if attribute in camera.methods and "property" in camera.methods[attribute].decorators:
-                return f"{attribute} is computed anew each time"
+                return f"{attribute} is recomputed at each access"
             for method, _ in camera.stores(NAME):
                 renames = method.name != "__init__" and NAME in method.parameters
                 if renames and self.program.mentioning(method.name, called=True):
-                    return f"{method.name} gives a camera another {NAME}"
+                    return f"{method.name} changes the {NAME} of a camera"
         return self._named()
 
     def _named(self) -> Optional[str]:
-        """Return why what the cameras get as a name is none of a photograph, if it is none wherever they are made."""
+        """Return why the name of the cameras is not a photograph's, if it is not at any place that makes them."""
         makers = [
             (function, keywords[NAME])
             for name in {camera.name for camera in self._cameras or ()}
@@ -96,11 +96,11 @@ class Names:
         for module in self.program.matching(_NAMING):
             for function in module.scopes(_NAMING.search):
                 if self._is_used(function) and any(_names_again(function, call) for call in function.flow.calls):
-                    return f"{function.name} gives several images one {NAME}"
+                    return f"{function.name} gives several images the same {NAME}"
         return None
 
     def _is_used(self, function: Function, depth: int = 0) -> bool:
-        """Return whether something can lead to a function; to what a fork has kept and does not call, nothing does."""
+        """Return whether a function may be called; forks keep functions that are dead code."""
         if function.owner is not None or function.parent is None or depth > _DEPTH:
             return True
         callers = [caller for caller in self.program.mentioning(function.name) if _calls(caller, function)]
@@ -114,21 +114,21 @@ class Names:
                     d for d in other.flow.every_definition if d.place.endswith(".source_path") and _changes(other, d)
                 ]
                 if placed and module.path in self.program.together(function.module):
-                    return f"{other.name or module.path} reads several scenes, where names come again"
+                    return f"{other.name or module.path} reads several scenes, whose names may repeat"
         return None
 
     def _remade(self, function: Function, holder: cst.Name, attribute: str) -> Optional[str]:
-        """Return why the camera may be another than the one that has the name: ``view = scaled(camera, 0.5)``."""
+        """Return why the camera may be a changed copy: ``view = scaled(camera, 0.5)``."""
         for definition in function.flow.reaching(holder):
             made = definition.value if definition.kind == "assign" else None
             for reference in self.program.resolve(function, made.func) if isinstance(made, cst.Call) else ():
                 maker = reference.target
                 if isinstance(maker, Function) and re.search(rf"\.{attribute}\s*=[^=]", code(maker.body)):
-                    return f"{maker.name} gives it another {attribute}"
+                    return f"{maker.name} changes its {attribute}"
         return None
 
     def _reads_twice(self) -> bool:
-        """Return whether a reader makes cameras of the same poses again, with the images of another folder."""
+        """Return whether a reader makes a second camera for each pose, with the images of another folder."""
         for module in self.program.matching(_POSES):
             for function in module.scopes(_POSES.search):
                 read = [(call_name(call), arguments(call)[1].get("cam_extrinsics")) for call in function.flow.calls]
@@ -167,7 +167,7 @@ class Names:
 
 
 def _calls(caller: Function, function: Function) -> bool:
-    """Return whether it calls a function of this name, or hands it on."""
+    """Return whether it calls a function of this name, or passes it on."""
     if caller is function:
         return False
     read = [part.value for part in caller.flow.reads]
@@ -175,15 +175,15 @@ def _calls(caller: Function, function: Function) -> bool:
 
 
 def _of_no_photograph(function: Function, site: cst.CSTNode) -> Optional[str]:
-    """Return why the cameras have no photograph here: ``if camera.is_virtual:``."""
+    """Return the condition under which the cameras have no photograph: ``if camera.is_virtual:``."""
     for name in function.flow.conditions.get(id(site), ()):
         if NO_PHOTOGRAPHS & set(words(name)):
-            return f"only where {name}"
+            return f"only if {name}"
     return None
 
 
 def _of_several(function: Function, node: cst.CSTNode, seen: Set[int]) -> Optional[str]:
-    """Return why names may come again: ``for scene in scenes: ... scene.getTrainCameras()``."""
+    """Return why names may repeat: ``for scene in scenes: ... scene.getTrainCameras()``."""
     for definition in function.flow.reaching(node):
         if definition.value is None or id(definition) in seen:
             continue
@@ -191,7 +191,7 @@ def _of_several(function: Function, node: cst.CSTNode, seen: Set[int]) -> Option
         root = list(attribute_chain(definition.value))[-1]
         scenes = function.flow.reaching(root) if "getTrainCameras" in code(definition.value) else ()
         if any(_is_turn(function, scene) for scene in scenes):
-            return f"{code(root)} is one of several, where names come again"
+            return f"{code(root)} is one of several, whose names may repeat"
         found = _of_several(function, root, seen)
         if found is not None:
             return found
@@ -199,25 +199,25 @@ def _of_several(function: Function, node: cst.CSTNode, seen: Set[int]) -> Option
 
 
 def _is_turn(function: Function, definition: Definition) -> bool:
-    """Return whether a name is what a loop goes over, or a part of that."""
+    """Return whether a name is a loop's target, or a part of it."""
     loops = [loop for loop in loops_around(function.body, definition.node) if isinstance(loop, cst.For)]
     return any(definition.node is part for loop in loops for part in walk_expressions(loop.target))
 
 
 def _told_apart(function: Function, holder: str) -> Optional[str]:
-    """Return why a name alone may be of several images: ``masks[time, camera.image_name]`` asks for more."""
+    """Return why a name may be of several images: ``masks[time, camera.image_name]`` uses more than the name."""
     for node in walk_expressions(function.body):
         if isinstance(node, cst.Subscript):
             keys = [part.slice.value for part in node.slice if isinstance(part.slice, cst.Index)]
             if len(keys) == 1 and isinstance(keys[0], cst.Tuple):
                 keys = [element.value for element in keys[0].elements]
             if len(keys) > 1 and any(dotted(key) == f"{holder}.{NAME}" for key in keys):
-                return f"{brief(node)} asks for more than the name"
+                return f"{brief(node)} needs more than the name"
     return None
 
 
 def _changes(function: Function, definition: Definition) -> bool:
-    """Return whether a value is another at each turn of a loop, or for each item of a dataset."""
+    """Return whether a value changes with each iteration of a loop, or each item of a dataset."""
     loops = [loop for loop in loops_around(function.body, definition.node) if isinstance(loop, cst.For)]
     turns = {part.value for loop in loops for part in walk_expressions(loop.target) if isinstance(part, cst.Name)}
     turns |= set(function.parameters) if function.name == "__getitem__" else set()
@@ -227,7 +227,7 @@ def _changes(function: Function, definition: Definition) -> bool:
 def _names_again(function: Function, call: cst.Call) -> bool:
     """Return whether a camera is made for each frame with one name: ``CameraInfo(image=image, image_name=image_name)``.
 
-    The image depends on what the innermost loop goes over, the name does not.
+    The image depends on the target of the innermost loop, the name does not.
     """
     keywords = arguments(call)[1]
     loops = loops_around(function.body, call) if {"image", NAME} <= set(keywords) else []
@@ -238,26 +238,26 @@ def _names_again(function: Function, call: cst.Call) -> bool:
 
 
 def _overwritten(function: Function, holder: str, attribute: str) -> Optional[str]:
-    """Return why the image may be another by then: it is written here, or the file puts others in their places."""
+    """Return why the image may have been replaced: it is assigned here, or elsewhere in the file."""
     for definition in function.flow.definitions.get(f"{holder}.{attribute}", []):
-        return f"{holder}.{attribute} is written here: {brief(definition.node)}"
+        return f"{holder}.{attribute} is assigned here: {brief(definition.node)}"
     for scope in function.module.scopes(re.compile(rf"\.{attribute}\s*=[^=]").search):
         for place, definitions in scope.flow.definitions.items():
             if place.endswith(f".{attribute}") and not place.startswith("self."):
                 for definition in definitions:
                     if definition.value is not None and not _of_same(definition.value, attribute):
-                        return f"{place} is written in this file: {brief(definition.node)}"
+                        return f"{place} is assigned in this file: {brief(definition.node)}"
     return None
 
 
 def _of_same(value: cst.CSTNode, attribute: str) -> bool:
-    """Return whether a value is ``None``, or what was stored before: ``camera.original_image_backup.cuda()``."""
+    """Return whether a value is ``None``, or the stored image itself: ``camera.original_image_backup.cuda()``."""
     parts = attribute_chain(value)
     stored = any(isinstance(part, cst.Attribute) and part.attr.value.startswith(attribute) for part in parts)
     return stored or constant(value, value) is None
 
 
 def _is_no_name(node: cst.CSTNode) -> bool:
-    """Return whether a value names no image: ``info.image_path``, or the same for all, ``None``."""
+    """Return whether a value does not name an image: ``info.image_path``, or a constant such as ``None``."""
     path = dotted(node) is not None and "path" in words(code(node).split(".")[-1])
     return path or constant(node, node) is not node

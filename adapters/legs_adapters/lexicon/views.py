@@ -1,6 +1,6 @@
-"""Tell whether a target is a view's own stored image, untouched between loading and loss: only then is it named.
+"""Decide whether a target is a view's stored image, unchanged between loading and loss: only then ``view=`` is passed.
 
-The proof wants three things: the target is ``camera.original_image`` (or what the codebase calls it), moved between
+The proof needs three facts: the target is ``camera.original_image`` (or what the codebase calls it), moved between
 devices and types but not changed; ``camera`` is the same view where the name is asked; and its name is that image's.
 """
 
@@ -35,25 +35,25 @@ class Views:
         self.names: Names = Names(program)
 
     def of(self, function: Function, target: cst.CSTNode, site: cst.CSTNode) -> View:
-        """Return the verdict for the target of one site."""
+        """Return the verdict for the target of one call site."""
         images: List[Tuple[cst.Attribute, Function]] = []
         problem = self._trace(function, target, images, set())
         if problem is not None:
             return View(None, problem)
         if not images:
-            return View(None, "not a view's own image")
+            return View(None, "not a view's stored image")
         if len({(code(image), where) for image, where in images}) != 1:
-            return View(None, "comes from several places")
+            return View(None, "has several sources")
         image, where = images[0]
         holder = image.value
         if where is not function or not isinstance(holder, cst.Name):
-            return View(None, f"{code(image)} is not named where the loss is")
+            return View(None, f"{code(image)} has no name at the call site")
         unstored = self.names.unstored(image.attr.value)
         if unstored is not None:
             return View(None, unstored)
         then = function.flow.reaching(holder)
         if not then or function.flow.names_at(site, holder.value) != then:
-            return View(None, f"{holder.value} may be another view by then")
+            return View(None, f"{holder.value} may be another view at the call site")
         doubt = self.names.doubt(function, holder, image.attr.value, site)
         if doubt is not None:
             return View(None, doubt)
@@ -73,7 +73,7 @@ class Views:
         if isinstance(node, cst.Name):
             definitions = function.flow.reaching(node)
             if not definitions:
-                return f"{node.value} is not made in this function"
+                return f"{node.value} is not assigned in this function"
             for definition in sorted(definitions, key=lambda d: d.order):
                 problem = self._definition(function, definition, images, seen)
                 if problem is not None:
@@ -93,7 +93,7 @@ class Views:
             if _first_channels(node):
                 return self._trace(function, node.value, images, seen)
             if isinstance(node.slice[0].slice, cst.Index) and isinstance(constant(node.slice[0].slice.value), str):
-                return f"{brief(node)} has no name of its own"
+                return f"{brief(node)} has no view name"
             return self._trace(function, node.value, images, seen) or f"indexed: {brief(node)}"
         if isinstance(node, cst.Call):
             name = call_name(node)
@@ -123,7 +123,7 @@ class Views:
             return f"{definition.place} is a parameter"
         if definition.kind in ("augment", "inplace", "store", "mutate"):
             return f"changed in place: {brief(definition.node)}"
-        return f"{definition.place} comes out of a batch"
+        return f"{definition.place} comes from a batch"
 
 
 def _unit_range(node: cst.Call, skip: int) -> bool:

@@ -1,1 +1,1 @@
-"""Decide what becomes of each L1 term: weighted, skipped by a rule, or left to a person."""
+"""Decide on each L1 term: weighted, skipped by a rule, or in need of a manual edit."""

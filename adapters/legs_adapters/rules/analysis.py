@@ -28,7 +28,7 @@ class Analysis:
 
     Args:
         program: the program.
-        speaks: what a text says that has a term itself; without, the words of an L1.
+        speaks: a pattern of texts that contain a term; default: the words of an L1.
 
     Attributes:
         program: its files, linked by names.
@@ -37,7 +37,7 @@ class Analysis:
         meanings: what its expressions depict.
         views: whose images its targets are.
         forms: its L1 expressions.
-        purposes: what its backward passes are for.
+        purposes: the purposes of its backward passes.
         splats: which of its functions are about Gaussian splatting.
     """
 
@@ -56,7 +56,7 @@ class Analysis:
 
     @classmethod
     def of(cls, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> Analysis:
-        """Analyse the L1 terms of these files; ``unread`` are the texts of files that are not to be looked at."""
+        """Analyse the L1 terms of these files; ``unread`` are the texts of ignored files."""
         return cls(Program(sources, unread, TORCH))
 
     @property

@@ -1,4 +1,4 @@
-"""Say in words what the rules do, from their docstrings: for ``--explain``, for the documentation, for the tests."""
+"""Describe the rules, from their docstrings: for ``--explain``, for the documentation, for the tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Description", "describe", "explain", "listed", "table"]
 
 
 class Description(NamedTuple):
-    """The docstring of a rule: why it leaves a term, code that it leaves, and code that is weighted."""
+    """The docstring of a rule: why it skips a term, an example that it skips, and one that is weighted."""
 
     why: str
     left: str
@@ -33,7 +33,7 @@ def explain(name: str) -> str:
     """Return what ``--explain`` prints of a rule, or of each rule with a reason.
 
     Raises:
-        LegsError: there is no such rule; the message lists them, and names one that is written alike.
+        LegsError: there is no such rule; the message lists the rules and proposes a similar name.
     """
     rules = [rule for rule in RULES.values() if name == rule.id] or [r for r in RULES.values() if name == r.reason]
     if not rules:
@@ -63,7 +63,7 @@ def listed() -> str:
     """Return the rules, a line each."""
     wide = max(map(len, RULES))
     lines: List[str] = [f"  {name:<{wide}}  {describe(rule).why}" for name, rule in RULES.items()]
-    return "\n".join(["rules, in the order in which they are asked:", *lines, ""])
+    return "\n".join(["rules, in the order in which they are checked:", *lines, ""])
 
 
 def _clause(sentence: str) -> str:

@@ -1,4 +1,4 @@
-"""Pick the skipped terms that a person should look at, and those that the report need not list."""
+"""Select the skipped terms that need a warning, and those that the report omits."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ __all__ = ["Doubt", "Doubts"]
 
 
 class Doubt(NamedTuple):
-    """A term that was left and may be the loss after all.
+    """A skipped term that may be the loss.
 
     Attributes:
-        problem: what to tell a person.
-        is_told_beside_sites: whether to do so also where the codebase has other terms.
+        problem: the warning.
+        is_told_beside_sites: whether to warn also where the codebase has other terms.
     """
 
     problem: Problem
@@ -34,14 +34,14 @@ class Doubt(NamedTuple):
 
 
 class Doubts:
-    """Tells for the terms of one program that were left whether a person should look at them."""
+    """Decide which skipped terms of one program need a warning."""
 
     def __init__(self, analysis: Analysis, verdicts: Verdicts) -> None:
         self.analysis = analysis
         self._verdicts = verdicts
 
     def is_doubtful(self, function: Function, form: Form, left: Left) -> bool:
-        """Return whether a person is to look at what was left, if nothing else is found."""
+        """Return whether a skipped term needs a warning, if nothing else is found."""
         rule, term = _rule(left), Term(self.analysis, function, form)
         if rule is None or not rule.may_be_loss(term):
             return False
@@ -54,7 +54,7 @@ class Doubts:
         return pictures and roles and not same_root(form) and not is_asked(function, form)
 
     def of(self, function: Function, form: Form, place: Place, left: Left) -> Doubt:
-        """Return a term that was left as a doubt."""
+        """Return a skipped term as a doubt."""
         term, rule = Term(self.analysis, function, form), _rule(left)
         beside = rule is None or rule.is_doubted_beside_sites
         flipped = bool(swapped(term.pair.a, term.pair.b))
@@ -67,14 +67,14 @@ class Doubts:
         return Doubt(self._verdicts.problem(function, form, place, why)._replace(advice=advice), True)
 
     def of_uncalled(self, function: Function) -> Iterator[Doubt]:
-        """Yield L1 functions under names that no call in sight uses: ``base = F.l1_loss``, for a function made here."""
+        """Yield L1 functions that are assigned to names without a call in the codebase: ``base = F.l1_loss``."""
         for name, value in self.analysis.callbacks.uncalled(function):
             why = f"nothing shows where {name} is called"
             advice = f"legs_loss.l1_loss(rendering, photograph, own={one_line(value)}), where it is called"
             yield Doubt(Problem.at(function, function.place(value), why, advice))
 
     def is_noise(self, function: Function, form: Form, left: Left) -> bool:
-        """Return whether it is an absolute difference that is no loss: of angles, sizes, neighbouring pixels."""
+        """Return whether an absolute difference is not a loss: of angles, sizes or neighbouring pixels."""
         if form.callee is not None or form.is_mean:
             return False
         rule = _rule(left)
@@ -83,7 +83,7 @@ class Doubts:
         trained = self.analysis.training.includes(form.node) and rule.is_picture and not same_root(form)
         if trained or rule.is_always_listed:
             return False
-        # Of a rendering and a photograph it is said all the same, where it may be that the trail was lost.
+        # A difference of a rendering and a photograph is listed where the dataflow analysis may have lost it.
         return not rule.is_listed_for_pictures or not self._compares_pictures(function, form)
 
     def _compares_pictures(self, function: Function, form: Form) -> bool:

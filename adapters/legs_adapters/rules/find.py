@@ -1,7 +1,7 @@
-"""Find the photometric L1 terms of a checkout's training steps; and every other L1, with the reason why it is left.
+"""Find the photometric L1 terms of a checkout's training steps; and every other L1, with the reason why it is skipped.
 
 A site is an L1 between a rendering and the ground truth whose value reaches a backward pass. Everything is decided from
-the syntax tree; what cannot be decided is a problem that a person settles, never a guess.
+the syntax tree; a term that cannot be decided becomes a problem that needs a manual edit, never a guess.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def find(
 
     Args:
         sources: its files.
-        by_hand: (path, line) of L1 terms that are sites because the user says so; nothing else is a site then.
-        unread: by path, the text of files that are not to be looked at, or cannot be.
+        by_hand: (path, line) of the L1 terms that the user named as sites; nothing else is a site then.
+        unread: by path, the text of files that are ignored or cannot be read.
         ssim: find the SSIM terms, too.
     """
     found = _Finder(Analysis.of(sources, unread), by_hand).run()
@@ -73,7 +73,7 @@ class _Finder:
         return self.found
 
     def _trains_alone(self, doubt: Doubt) -> bool:
-        """Return whether its file trains something, in which nothing was weighted or quoted."""
+        """Return whether its file trains, and has no term that is weighted or reported as a problem."""
         settled = {site.path for site in self.found.sites} | {entry.path for entry in self.found.patched}
         settled |= {problem.path for problem in self.found.problems}
         path = doubt.problem.path
@@ -121,8 +121,8 @@ class _Finder:
         return "too many places speak of an L1 in all files: leave others out" if self.asked > ASKED_TOGETHER else ""
 
     def _entries(self, function: Function) -> Iterator[_Entry]:
-        """Yield what becomes of each L1 in a function, with its place."""
-        # Elsewhere an L1 could only be one by a name of a name, and nothing trains on it.
+        """Yield the verdict on each L1 in a function, with its place."""
+        # Elsewhere an L1 could only be reached through two names, and nothing trains on it.
         if self.analysis.prospects.near(function.text) or self.analysis.training.touches(function):
             yield from self._of_forms(function)
             if not self.by_hand:

@@ -1,4 +1,4 @@
-"""List the rules in the order in which they are asked: the first that applies is why a term is left."""
+"""List the rules in the order in which they are checked: the first that applies skips the term."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ ORDER: Tuple[Rule, ...] = (
     evaluation.EmbeddingStep(),
     untrained.NoStep(),
 )
-# Asked by verdict.py in places of their own: HUBER and UNREAD also of a term that a person chose.
+# Checked by verdict.py separately: HUBER and UNREAD also for a term that the user named.
 AMBIGUOUS = (unknown.Ambiguous(),)
 HUBER = (huber.Huber(),)
 UNREAD = (weighting.ErrorMask(), weighting.UnreadError())
-# Asked of an SSIM, with legs-patch --ssim: nothing is weighted there, so that it does not matter what is compared.
+# For SSIM terms, with legs-patch --ssim: nothing is weighted, so the compared images do not matter.
 _OF_SSIM = (
     structural.Library(),
     structural.Settings(),
@@ -97,7 +97,7 @@ RULES = {rule.id: rule for rule in (*DEFINITION, *ORDER, *AMBIGUOUS, *HUBER, *UN
 
 
 def first(term: Term, rules: Tuple[Rule, ...] = ORDER) -> Optional[Evidence]:
-    """Return the evidence of the first rule that leaves a term; None where it is to be weighted."""
+    """Return the evidence of the first rule that skips a term; None where it is weighted."""
     for rule in rules:
         deciders = rule.evidence(term)
         if deciders:
@@ -106,7 +106,7 @@ def first(term: Term, rules: Tuple[Rule, ...] = ORDER) -> Optional[Evidence]:
 
 
 def first_of_call(call: CallOfTerm) -> Optional[Evidence]:
-    """Return the evidence of the first rule that says a call is not for the loss; None where it may be."""
+    """Return the evidence of the first rule by which a call is not for the loss; None where it may be."""
     for rule in ORDER:
         deciders = rule.of_call(call)
         if deciders:

@@ -1,7 +1,7 @@
-"""Tell the purpose of a backward pass by the optimiser that steps after it: of Gaussians, poses, an embedding, none.
+"""Find the purpose of a backward pass from the optimiser that steps after it: of Gaussians, poses, an embedding, none.
 
-An L1 whose gradients move a pose alone is tracking; one that moves an embedding alone fits a view for evaluation; one
-whose gradients are read and thrown away scores Gaussians. Only where something else moves is it training.
+An L1 whose gradients update only a pose is tracking; one that updates only an embedding fits a view for evaluation; one
+whose gradients are read and discarded scores Gaussians. Everything else is training.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _DEPTH = 3
 
 
 class Purpose(NamedTuple):
-    """The purpose of a backward pass that does not train: "tracking", "evaluation" or "scoring"; and what shows it.
+    """The purpose of a backward pass that does not train: "tracking", "evaluation" or "scoring"; with the evidence.
 
     Attributes:
         word: the purpose.
@@ -47,7 +47,7 @@ class Purpose(NamedTuple):
 
 
 class Purposes:
-    """Tells for the expressions of one program which purpose their backward pass has."""
+    """Find the purpose of the backward pass of the expressions of one program."""
 
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
@@ -86,7 +86,7 @@ class Purposes:
                 or self._reads_its_own(function, scope)
             ):
                 return Purpose("scoring", function, next(call for call in asked if is_backward(call)))
-        # At a module's top nobody else can take the step.
+        # At a module's top level no caller can take the step.
         return Purpose("scoring", function, passes[0]) if stepped or function.parent is None else None
 
     @staticmethod
@@ -97,7 +97,7 @@ class Purposes:
         return not other and any(is_step(call) and not elsewhere for call, elsewhere in around)
 
     def _nobody_steps(self, function: Function, depth: int) -> bool:
-        """Return whether neither a function nor what calls it, as far as that is known, can step."""
+        """Return whether neither a function nor its known callers can step an optimiser."""
         if may_step(function.flow.calls):
             return False
         if function.parent is None:
@@ -109,12 +109,12 @@ class Purposes:
         return list(dict.fromkeys(caller for caller, _ in likely_calls(self.program, function)))
 
     def _emptied_by_callers(self, function: Function) -> bool:
-        """Return whether each caller has the gradients read, and sets them to nothing, before anything can step."""
+        """Return whether each caller reads the gradients, and resets them, before an optimiser can step."""
         calls = list(likely_calls(self.program, function))
         return bool(calls) and all(self._is_emptied_after(caller, call) for caller, call in calls)
 
     def _is_emptied_after(self, caller: Function, call: cst.Call) -> bool:
-        """Return whether gradients are read, then emptied, after a call: ``prune()``, then ``zero_grad()``."""
+        """Return whether gradients are read, then reset, after a call: ``prune()``, then ``zero_grad()``."""
         at = caller.place(call).last_line
         after = sorted((caller.place(other).line, i) for i, other in enumerate(caller.flow.calls))
         read = False
@@ -137,7 +137,7 @@ class Purposes:
         return read and not any(map(has_step, called))
 
     def _called(self, *functions: Function) -> List[Function]:
-        """Return what functions call: a step may stand there under any name, ``gaussians.post_backward()``."""
+        """Return the callees of functions: one may step under any name, ``gaussians.post_backward()``."""
         called = [
             reference.target
             for function in functions
@@ -147,7 +147,7 @@ class Purposes:
         return [each for each in called if isinstance(each, Function)]
 
     def _reads_its_own(self, function: Function, scope: cst.CSTNode) -> bool:
-        """Return whether the gradients that are read are of models made here, which nobody else gets to step on."""
+        """Return whether the gradients that are read are of local models, which no other function can update."""
         roots = [list(attribute_chain(part))[-1] for part in gradients_read(list(walk_all(scope)))]
         names = [root for root in roots if isinstance(root, cst.Name)]
         given = {
@@ -170,7 +170,7 @@ class Purposes:
         )
 
     def _made_here(self, function: Function, model: cst.Name) -> bool:
-        """Return whether a model is made here, ``gaussians = GaussianModel(3)``, whatever is stored in it then."""
+        """Return whether a model is created here, ``gaussians = GaussianModel(3)``."""
         made = [definition.value for definition in function.flow.reaching(model) if definition.kind != "store"]
         return bool(made) and all(isinstance(v, cst.Call) and set(words(call_name(v))) & GAUSSIANS for v in made)
 

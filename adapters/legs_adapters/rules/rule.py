@@ -1,7 +1,7 @@
-"""The base class of the rules, each a cause for which a term is left; and what a rule is asked about.
+"""The base class of the rules that skip terms, and the terms and calls that they are given.
 
-A rule is a class in ``causes/``. Its docstring says why in one sentence, then shows a term that it leaves and one that
-is weighted; both are tests. ``order.py`` lists the rules in the order in which they are asked.
+A rule is a class in ``causes/``. Its docstring says why in one sentence, then shows a term that it skips and one that
+is weighted; both are tests. ``order.py`` lists the rules in the order in which they are checked.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Asked:
         analysis: those analyses.
         function: the function that the call stands in.
         call: the call.
-        here: the call, or the term that is asked about, as what decided.
+        here: the call, or the term, as evidence.
     """
 
     def __init__(self, analysis: Analysis, function: Function, call: cst.CSTNode) -> None:
@@ -42,7 +42,7 @@ class Asked:
         self.here: List[Decider] = [(function, call)]
 
     def serves(self, purpose: str) -> List[Decider]:
-        """Return what shows that its backward pass has this purpose; nothing where that may be another, or training."""
+        """Return the evidence that its backward pass has this purpose; nothing where it may train."""
         found = self.analysis.purposes.purpose(self.function, self.call)
         return [(found.function, found.node)] if found is not None and found.word == purpose else []
 
@@ -82,7 +82,7 @@ class Term(Asked):
 
     @property
     def target(self) -> cst.BaseExpression:
-        """The side that is the photograph; the second where neither says so."""
+        """The side that is the photograph; the second where neither name says so."""
         return self.pair.first if swapped(self.pair.a, self.pair.b) else self.pair.second
 
     @property
@@ -104,7 +104,7 @@ class CallOfTerm(Asked):
 
 
 class Rule:
-    """One cause for which a term is left.
+    """One cause to skip a term.
 
     Attributes:
         id: its name, for ``--explain`` and the report.
@@ -112,8 +112,8 @@ class Rule:
         is_picture: the term compares pictures in a training step, of another kind than photographs.
         is_always_listed: the report lists the term, also where it is a bare absolute difference.
         is_listed_for_pictures: the report lists a bare absolute difference where it is of a rendering and a photograph.
-        needs_target: a person is asked about the term only if a side is known to be the photograph.
-        is_doubted_beside_sites: a person is asked about the term also where the codebase has other terms.
+        needs_target: warn of the term only if a side is known to be the photograph.
+        is_doubted_beside_sites: warn of the term also where the codebase has other terms.
     """
 
     id = ""
@@ -125,24 +125,24 @@ class Rule:
     is_doubted_beside_sites = True
 
     def evidence(self, term: Term) -> List[Decider]:
-        """Return what decides that a term is left; nothing where the rule does not apply."""
+        """Return the evidence to skip a term; nothing where the rule does not apply."""
         raise NotImplementedError
 
     def of_call(self, call: CallOfTerm) -> List[Decider]:
-        """Return what decides that a call is not for the loss; nothing where the rule does not apply."""
+        """Return the evidence that a call is not for the loss; nothing where the rule does not apply."""
         return []
 
     def found(self, deciders: Sequence[Decider]) -> Evidence:
-        """Return as evidence what decided by this rule."""
+        """Return these nodes as evidence for this rule."""
         return Evidence(self.id, self.reason, deciders)
 
     def may_be_loss(self, term: Term) -> bool:
-        """Return whether a person is to be asked about a term that this rule left, if nothing else is found."""
+        """Return whether a term that this rule skipped needs a warning, if nothing else is found."""
         return False
 
 
 class ByPurpose(Rule):
-    """A rule that leaves a term, or a call, for the purpose of its backward pass: the rule's reason."""
+    """A rule that skips a term, or a call, by the purpose of its backward pass: the rule's reason."""
 
     def evidence(self, term: Asked) -> List[Decider]:
         """Return the step, or the backward pass without one, that shows the purpose."""
@@ -154,19 +154,19 @@ class ByPurpose(Rule):
 
 
 def header(function: Function) -> Decider:
-    """Return the ``def`` of a function as what decided."""
+    """Return the ``def`` of a function as evidence."""
     return function, function.node
 
 
 def source_of(
     function: Function, node: cst.CSTNode, says: Optional[Callable[[str], bool]] = None, depth: int = 0
 ) -> Optional[Decider]:
-    """Return where an expression or what it is made from says something: the name, string or definition that does.
+    """Return the name, string or definition that decides: in an expression, or in the values that it is made from.
 
     Args:
         function: where the expression stands.
         node: the expression.
-        says: a function of a name's or string's text; without, the nearest definition is returned.
+        says: a predicate on the text of a name or string; without it the nearest definition is returned.
         depth: how many definitions were followed already.
     """
     parts = list(walk_expressions(node))

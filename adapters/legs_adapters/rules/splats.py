@@ -1,4 +1,4 @@
-"""Tell by the words of the files around a term whether it is about Gaussian splatting."""
+"""Find from the words of the files around a term whether it is about Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Splats", "made_of"]
 
 
 class Splats:
-    """Tells for the functions of one program whether they are about Gaussian splatting."""
+    """Decide which functions of one program are about Gaussian splatting."""
 
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
@@ -26,11 +26,11 @@ class Splats:
         self._rays: Dict[str, bool] = {}
 
     def about(self, function: Function, form: Form) -> bool:
-        """Return whether the term of a function is about splats: by its files, or by the rendering itself."""
+        """Return whether the term of a function is about splats: by its files, or by the rendering."""
         return self._speaks_around(function) or self._rendered(function.module, function, form)
 
     def _speaks_around(self, function: Function) -> bool:
-        """Return whether the file, or a file that trains through it, speaks of Gaussian splatting."""
+        """Return whether the file, or a file that trains through it, mentions Gaussian splatting."""
         seen: Set[Function] = set()
         queue = [function]
         while queue:
@@ -50,7 +50,7 @@ class Splats:
         return near or other.path in self.program.together(module)
 
     def _rendered(self, module: Module, function: Function, form: Form) -> bool:
-        """Return whether a name in the term or a file beside it says so, where the file is not about rays."""
+        """Return whether a name in the term or a neighbouring file is about splats, and the file is not about rays."""
         sides = made_of(function, form)
         names = {w for part in sides if isinstance(part, (cst.Name, cst.SimpleString)) for w in words(part.value)}
         if self._speaks_of_rays(module) or "mesh" in words(module.path.rpartition("/")[2]):
@@ -58,7 +58,7 @@ class Splats:
         rendered = any(word.startswith(("render", "raster")) for word in names)
         folder = module.path.rpartition("/")[0]
         near = [path for path in self.program.sources if not folder or path.startswith(folder + "/")]
-        if rendered and folder:  # of what, if no Gaussians are near? A mesh is rasterized, too
+        if rendered and folder:  # without Gaussians nearby: a mesh is rasterized, too
             top = folder.split("/")[0] + "/"
             together = self.program.together(module)
             near = [path for path in self.program.sources if path.startswith(top) or path in together]
@@ -66,7 +66,7 @@ class Splats:
         return any(self._speaks_of_splats(path) for path in near)
 
     def _takes_splats(self, module: Module) -> bool:
-        """Return whether a file imports something Gaussian, ``GazeGaussianNet``, from one that speaks of splats."""
+        """Return whether a file imports a Gaussian class, ``GazeGaussianNet``, from one that mentions splats."""
         for node in module.top.flow.imports:
             if isinstance(node, cst.ImportFrom) and "gaussian" in code(node).lower():
                 found = self.program.imported_from(module, node)

@@ -1,6 +1,6 @@
 """Find the SSIM terms of a checkout's training steps that legs_loss.ssim can compute; and every other, with the reason.
 
-The L1 terms are found before, and what is found here changes nothing of them: it has a backward slice of its own.
+The L1 terms are found before, and the findings here do not change them: they use a backward slice of their own.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class _Finder:
             self.left.append((Left.at(function, place, "not chosen"), set()))
 
     def _is_free(self, function: Function, place: Place) -> bool:
-        """Return whether the term may be edited: it is chosen, where some are, and stands in no other edit."""
+        """Return whether the term may be edited: the user named it, or named none, and it is in no other edit."""
         path = function.module.path
         chosen = any(path == name and place.line <= line <= place.last_line for name, line in self.by_hand)
         within = any(path == name and taken.start <= place.start < taken.end for name, taken in self.taken)

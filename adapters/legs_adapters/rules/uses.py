@@ -20,12 +20,12 @@ __all__ = ["Use", "Uses"]
 
 
 class Use(NamedTuple):
-    """A call of a function that compares pictures.
+    """A call of a function that compares images.
 
     Attributes:
         caller, call: the call, and the function that it stands in.
         other: the evidence that it is not for the loss; None where it is.
-        sure: whether what it passes says so.
+        sure: whether its arguments show that.
     """
 
     caller: Function
@@ -40,7 +40,7 @@ class Use(NamedTuple):
 
 
 class Uses:
-    """Answers for one program."""
+    """Answer for one program."""
 
     def __init__(self, analysis: Analysis) -> None:
         self.analysis = analysis
@@ -59,7 +59,7 @@ class Uses:
                 given = [node for node in (rendering, photograph) if node is not None]
                 meanings = [self.analysis.meanings.of(caller, node) for node in given]
                 sure = not arguments(call)[2] and not any(self._is_handed_on(caller, node) for node in given)
-                if meanings[-1].role is None and detaches(photograph):  # which no photograph needs
+                if meanings[-1].role is None and detaches(photograph):  # a photograph needs no detach()
                     meanings[-1], sure = meanings[-1]._replace(role="render"), False
                 other = first_of_call(CallOfTerm(self.analysis, caller, call, meanings))
                 sure = sure and (other is not None or _are_pair(meanings))
@@ -71,9 +71,9 @@ class Uses:
         ]
 
     def unsettled(self, function: Function, uses: Sequence[Use]) -> Optional[str]:
-        """Return where a call stands, or may stand, of which the purpose cannot be told; None for nowhere.
+        """Return the place of a call, or possible call, of unknown purpose; None without one.
 
-        Without gradients nothing is weighted, so that what such a call is for does not matter.
+        Nothing is weighted without gradients, so the purpose of such a call does not matter.
         """
         sure = {id(use.call) for use in uses if use.sure}
         calls = calls_of(self.analysis.program, function)
@@ -90,12 +90,12 @@ class Uses:
 
 
 def _unknown(use: Use) -> Evidence:
-    """Return the evidence that it cannot be told what a call is for."""
+    """Return the evidence that the purpose of a call is unknown."""
     return Evidence("unknown", "something unknown", [(use.caller, use.call)])
 
 
 def _whole(node: cst.CSTNode) -> cst.CSTNode:
-    """Return ``gt`` of ``gt[:3]``; what a dictionary holds, ``batch["image"]``, is none of its parts."""
+    """Return ``gt`` of ``gt[:3]``; an entry of a dictionary, ``batch["image"]``, is returned as it is."""
     while isinstance(node, cst.Subscript) and not isinstance(key_of(node), str):
         node = node.value
     return node

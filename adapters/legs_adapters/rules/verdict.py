@@ -1,4 +1,4 @@
-"""Decide on one form: a site, a term that a rule leaves, or a problem that a person must settle."""
+"""Decide on one form: a site to weight, a term that a rule skips, or a problem that needs a manual edit."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ __all__ = ["Verdicts"]
 
 
 class Verdicts:
-    """Gives the verdicts on the forms of one program."""
+    """Decide on the forms of one program."""
 
     def __init__(self, analysis: Analysis) -> None:
         self.analysis = analysis
         self.uses: Uses = Uses(analysis)
 
     def of(self, function: Function, form: Form, place: Place, by_hand: bool) -> Site | Left | Problem:
-        """Return what becomes of a form; ``by_hand`` where a person says that it is the loss."""
+        """Return the verdict on a form; ``by_hand`` where the user named it as the loss."""
         term = Term(self.analysis, function, form)
         pair = term.pair
         evidence = None if by_hand else first(term, (*DEFINITION, *ORDER, *AMBIGUOUS))
@@ -57,7 +57,7 @@ class Verdicts:
         if is_rows(self.analysis.meanings, function, pair.first) or is_rows(
             self.analysis.meanings, function, pair.second
         ):
-            why = "the images are lists of pixels there, of which there is no weight map"
+            why = "the sides are lists of pixels: a weight map needs whole images"
             return self.problem(function, form, place, why, flipped)
         evidence = first(term, HUBER)
         if evidence is not None:
@@ -65,16 +65,16 @@ class Verdicts:
         if form.why_by_hand():
             return self.problem(function, form, place, form.why_by_hand(), flipped)
         if form.is_named and not function.flow.unchanged_at(form.call, form.first, form.second):
-            return self.problem(function, form, place, "the difference has a name of its own", flipped)
+            return self.problem(function, form, place, "the images change before the absolute value is taken", flipped)
         uses = self.uses.of(function, prediction, target)
         others = [(use, use.other) for use in uses if use.other is not None]
         if others and len(others) == len(uses):
             return Left.at(function, place, others[0][1])
         unsettled = self.uses.unsettled(function, uses) if others else None
-        if unsettled is not None:  # its body cannot be both
+        if unsettled is not None:  # one body cannot serve both
             use, other = others[0]
-            why = f"{function.name} also serves {other.reason} at {use.where}"
-            why += f"; what it serves at {unsettled} cannot be told" if unsettled != use.where else ""
+            why = f"{function.name} is also called for {other.reason} at {use.where}"
+            why += f"; the purpose of the call at {unsettled} is unknown" if unsettled != use.where else ""
             problem = self.problem(function, form, place, why, flipped)
             return problem._replace(advice=problem.advice + _in_a_copy(function, uses))
         evidence = first(Term(self.analysis, function, form), UNREAD)
@@ -88,7 +88,7 @@ class Verdicts:
         elif shared is not None and shared.aside:
             aside = tuple(shared.aside)
         elif shared is not None:
-            return self.problem(function, form, place, f"{one_line(form.node)} serves more than the loss", flipped)
+            return self.problem(function, form, place, f"{one_line(form.node)} has other uses than the loss", flipped)
         last = self._is_channels_last(function, prediction, target, form.node)
         last = last or (picked is not None and lies_last(function, picked[0]))
         view = self.analysis.views.of(function, target, form.call)
@@ -97,17 +97,17 @@ class Verdicts:
         return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside, kept)
 
     def of_any(self, function: Function, form: Form, place: Place) -> Left | Problem:
-        """Return what becomes of a call whose function settings choose: a person is asked, unless a rule applies."""
+        """Return the verdict on a call whose function is chosen by settings: a problem, unless a rule applies."""
         term = Term(self.analysis, function, form)
         evidence = first(term)
         if evidence is not None:
             return Left.at(function, place, evidence)
         assert form.callee is not None
-        why = f"{one_line(form.callee)} is settled at run time, and may be no L1"
+        why = f"{one_line(form.callee)} is chosen at run time, and may not be an L1"
         return self.problem(function, form, place, why, bool(swapped(term.pair.a, term.pair.b)))
 
     def of_callback(self, holder: Function, callback: Callback) -> Site | Left:
-        """Return what becomes of an L1 function that is passed by name, by what it is called with."""
+        """Return the verdict on an L1 function that is passed as a callback, from the arguments of its call."""
         term = Term(self.analysis, callback.caller, callback.form)
         unknown = RULES["unknown"].found(term.here)
         evidence = first(term)
@@ -122,7 +122,7 @@ class Verdicts:
 
     @staticmethod
     def callable(function: Function, form: Form) -> Site:
-        """Return a function that is passed by name as a site: which view it is called for is not known."""
+        """Return a callback as a site: the view of its call is not known."""
         place = function.place(form.node)
         stands = (function.module.path, place.line, place.column, place.line)
         return Site(*stands, form, False, "", False, View(None, "a callable has no view"), function)
@@ -135,7 +135,7 @@ class Verdicts:
     def _picked(self, function: Function, form: Form) -> Optional[Tuple[cst.Subscript, cst.Subscript]]:
         """Return ``image[:, mask]`` and ``photo[:, mask]`` of a form that compares names of theirs.
 
-        None where the names stand for anything else, or where image, photo or mask is another by then.
+        None where the names have other values, or where image, photo or mask is reassigned before the term.
         """
         if not form.takes_index:
             return None
@@ -148,7 +148,7 @@ class Verdicts:
     def _is_channels_last(
         self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode, error: cst.CSTNode
     ) -> bool:
-        """Return whether the two are [H, W, C], or another photograph that the same rendering is compared with."""
+        """Return whether the two are [H, W, C], or another target that the same rendering is compared with."""
         others = [
             form.second
             for form in self.analysis.forms.of(function)
@@ -163,7 +163,7 @@ class Verdicts:
         return any(lie)
 
     def problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
-        """Return a form as a problem, with the text to write there by hand."""
+        """Return a form as a problem, with the advice for the manual edit."""
         last = is_channels_last(self.analysis.training, function, form.first, form.second)
         rows = any(is_rows(self.analysis.meanings, function, side) for side in (form.first, form.second))
         text = form.advice(Writing(swapped=flipped, channels_last=last), rows)
@@ -175,18 +175,18 @@ def _index(node: cst.Subscript) -> str:
 
 
 def _is_same_place(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
-    """Return whether two expressions that are written alike are of the same values."""
+    """Return whether two expressions of the same text have the same values."""
     names = [[part for part in walk_expressions(node) if isinstance(part, cst.Name)] for node in (first, second)]
     return all(function.flow.reaching(one) == function.flow.reaching(other) for one, other in zip(*names))
 
 
 def _in_a_copy(function: Function, uses: Sequence[Use]) -> str:
-    """Return advice to weight a copy of a function that some calls need unchanged; empty without such a call."""
+    """Return the advice to weight a copy of a function, for the calls of the loss; empty without such a call."""
     calls = [use.where for use in uses if use.other is None]
     shown = ", ".join(calls[:3]) + (f" and {len(calls) - 3} more" if len(calls) > 3 else "")
     return f", in a copy of {_called(function)} for {shown}" if calls else ""
 
 
 def _called(function: Function) -> str:
-    """Return the name that calls use: of a ``forward`` that of its class."""
+    """Return the name that calls use: for a ``forward`` the name of its class."""
     return function.owner.name if function.owner is not None and function.runs_by_instance else function.name

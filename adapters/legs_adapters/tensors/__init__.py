@@ -1,1 +1,1 @@
-"""The meaning of torch's operations: gradients, backward passes, optimiser steps, axes. Knows nothing of splats."""
+"""The meaning of torch's operations: gradients, backward passes, optimiser steps, axes. No splats."""

@@ -33,7 +33,7 @@ def is_difference(node: cst.CSTNode) -> bool:
 
 
 def mean_of(node: cst.Call) -> Optional[cst.Call]:
-    """Return ``x`` of ``x.mean()`` or ``torch.mean(x)``: the mean of everything, nothing else asked for."""
+    """Return ``x`` of ``x.mean()`` or ``torch.mean(x)``: the mean over all axes, without further arguments."""
     if call_name(node) != "mean" or not isinstance(node.func, cst.Attribute):
         return None
     if not node.args and isinstance(node.func.value, cst.Call):
@@ -44,7 +44,7 @@ def mean_of(node: cst.Call) -> Optional[cst.Call]:
 
 
 def abs_argument(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
-    """Return what an absolute value is taken of; None of what takes none."""
+    """Return the argument of an absolute value; None for any other node."""
     if not isinstance(node, cst.Call) or not is_abs(node):
         return None
     if isinstance(node.func, cst.Attribute) and not node.args:
@@ -62,5 +62,5 @@ def is_abs(node: cst.Call) -> bool:
 
 
 def _is_module(node: cst.CSTNode) -> bool:
-    """Return whether what has ``abs`` or ``mean`` can be torch, under whatever name: a tensor's own take no tensor."""
+    """Return whether the owner of ``abs`` or ``mean`` can be torch: a tensor's own methods take no tensor."""
     return isinstance(node, cst.Name) and node.value not in ("np", "numpy", "math", "jnp", "cp", "cupy", "tf")

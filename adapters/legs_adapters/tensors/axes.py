@@ -1,4 +1,4 @@
-"""Tell which axes an operation moves, adds or reduces: permutations, swaps, einops patterns, indices with ``None``."""
+"""Find which axes an operation moves, adds or reduces: permutations, swaps, einops patterns, indices with ``None``."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def reduced_axis(node: cst.Call) -> Optional[int]:
 
 
 def subject(node: cst.Call) -> Optional[cst.CSTNode]:
-    """Return the tensor that a call works on: of a method its object, of a function its first argument."""
+    """Return the tensor that a call operates on: the object of a method, the first argument of a function."""
     if (
         isinstance(node.func, cst.Attribute)
         and isinstance(node.func.value, cst.Name)

@@ -1,4 +1,4 @@
-"""Slice a program backwards from every ``.backward()``: the expressions that the value comes from, across files."""
+"""Compute the backward slice of every ``.backward()``: the expressions that its value comes from, across files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Training:
     """The slice of a program that its backward passes depend on.
 
     Args:
-        matters: whether the text of a function can have in it what is looked for: the slice does not enter others.
+        matters: a predicate on the text of a function: the slice does not enter functions where it is false.
 
     Attributes:
         roots: the functions that call ``.backward()`` or return what a framework trains on.
@@ -80,7 +80,7 @@ class Training:
                 self._upwards(function, value)
 
     def _upwards(self, function: Function, value: cst.CSTNode) -> None:
-        """Follow ``def step(loss): loss.backward()`` to its calls: what is trained stands there."""
+        """Follow ``def step(loss): loss.backward()`` to its calls, which pass the trained value."""
         for definition in function.flow.reaching(value):
             if definition.kind != "parameter" or definition.place not in function.parameters:
                 continue
@@ -184,7 +184,7 @@ class Training:
             self._push(function, node.func)
 
     def _called(self, caller: Function, call: cst.Call, callee: Function) -> None:
-        """Note a call through which a function contributes."""
+        """Record a call through which a function contributes."""
         sites = self.sites.setdefault(callee, [])
         if (caller, call) not in sites:
             sites.append((caller, call))

@@ -1,4 +1,4 @@
-"""Tell where gradients are cut: by ``torch.no_grad()`` and its like around an expression, by ``detach()`` in it."""
+"""Find where gradients are cut: by ``torch.no_grad()`` and its like around an expression, by ``detach()`` in it."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ __all__ = ["detaches", "is_detached", "is_without_grad", "no_grad_around", "unde
 
 
 def under_no_grad(function: Function, node: cst.CSTNode) -> bool:
-    """Return whether a node stands in a ``with torch.no_grad():`` of its function."""
+    """Return whether a node is in a ``with torch.no_grad():`` of its function."""
     return any(map(_stops_gradients, function.flow.contexts.get(id(node), ())))
 
 
 def is_without_grad(function: Function, *nodes: cst.CSTNode) -> bool:
-    """Return whether expressions stand where no gradient is kept: in a block, or by a decorator of a function."""
+    """Return whether expressions are under ``no_grad``: in a block, or by a decorator of a function."""
     return no_grad_around(function, *nodes) is not None
 
 
 def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Function, cst.CSTNode]]:
-    """Return what keeps no gradient around expressions, with its function: the block's call, or the decorator."""
+    """Return the ``no_grad`` around expressions, with its function: the block's call, or the decorator."""
     for node in nodes:
         for context in function.flow.contexts.get(id(node), ()):
             if _stops_gradients(context):
@@ -36,12 +36,12 @@ def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Fu
 
 
 def is_detached(node: cst.CSTNode) -> bool:
-    """Return whether no gradient goes that way."""
+    """Return whether a chain of attributes and calls cuts the gradient."""
     return any(isinstance(part, cst.Call) and call_name(part) in ENDS_GRADIENT for part in attribute_chain(node))
 
 
 def detaches(node: cst.CSTNode) -> bool:
-    """Return whether a gradient is cut off somewhere in an expression."""
+    """Return whether a gradient is cut somewhere in an expression."""
     return any(isinstance(part, cst.Call) and call_name(part) == "detach" for part in walk_expressions(node))
 
 

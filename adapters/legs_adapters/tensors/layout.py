@@ -1,4 +1,4 @@
-"""Tell where the channels stand in an image, from the code around it: [C, H, W] as in 3DGS, [H, W, C] as in gsplat."""
+"""Find the layout of an image from the code around it: [C, H, W] as in 3DGS, [H, W, C] as in gsplat."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ __all__ = ["is_channels_last", "lies_last"]
 def is_channels_last(
     training: Training, function: Function, *images: cst.CSTNode, error: Optional[cst.CSTNode] = None
 ) -> bool:
-    """Return whether the images are [H, W, C] or [B, H, W, C]; without a sign of it they are not.
+    """Return whether the images are [H, W, C] or [B, H, W, C]; False without evidence.
 
-    ``error`` is what has been made of them, on which a mask may be laid.
+    ``error`` is their error, to which a mask may be applied.
     """
     votes = [vote for image in _without_factor(*images) for vote in _votes(training, function, image, set(), 0)]
     votes += _votes_of_callees(training, function, images)
@@ -66,7 +66,7 @@ def lies_last(function: Function, index: cst.CSTNode) -> bool:
 
 
 def _without_factor(*images: cst.CSTNode) -> Tuple[cst.CSTNode, ...]:
-    """Return ``image`` and ``gt`` of ``weight * image`` and ``weight * gt``: the weight says nothing of the layout."""
+    """Return ``image`` and ``gt`` of ``weight * image`` and ``weight * gt``: the weight shows no layout."""
     products = [i for i in images if isinstance(i, cst.BinaryOperation) and isinstance(i.operator, cst.Multiply)]
     if len(products) == 2:
         one, other = products
@@ -107,9 +107,9 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
         if call_name(node) in ("array", "asarray") and node.args and _is_picture(function, node.args[0].value):
             return [Vote(LAST, 3)]
         made = node.func if isinstance(node.func, cst.Call) else node
-        if words(call_name(made)) == ("to", "tensor"):  # torchvision's: of a picture as of an array
+        if words(call_name(made)) == ("to", "tensor"):  # torchvision's: of an image or an array
             return [Vote(FIRST, 3)]
-        if {"transform", "transforms"} & set(words(call_name(node))):  # what it may do besides is not known
+        if {"transform", "transforms"} & set(words(call_name(node))):  # its further operations are unknown
             return []
         if call_name(node) in ("reshape", "view", "flatten", "mv", "mm", "matmul"):
             return shape_vote(node)
@@ -139,7 +139,7 @@ def _votes(training: Training, function: Function, node: cst.CSTNode, seen: Set[
             if definition.value is None:
                 continue
             if definition.kind == "element" and isinstance(definition.value, cst.Call):
-                # what a call returns says something of its first element only
+                # a call is evidence for its first element only
                 if not definition.index and call_name(definition.value) in CHANNELS_LAST:
                     votes.append(Vote(LAST, 2))
             elif definition.kind in ("assign", "augment"):
@@ -165,7 +165,7 @@ def _is_picture(function: Function, node: cst.CSTNode) -> bool:
 
 
 def _votes_of_callers(training: Training, function: Function, name: str, seen: Set[int], depth: int) -> List[Vote]:
-    """A parameter lies as what it is given where training calls the function."""
+    """Return votes for a parameter: those of its arguments where training calls the function."""
     votes: List[Vote] = []
     for caller, call in training.sites.get(function, [])[:4]:
         value = function.given(call, name)
@@ -175,7 +175,7 @@ def _votes_of_callers(training: Training, function: Function, name: str, seen: S
 
 
 def _votes_of_callees(training: Training, function: Function, images: Tuple[cst.CSTNode, ...]) -> List[Vote]:
-    """Pictures that go together into a function of the codebase lie as it takes them, for SSIM as for the L1."""
+    """Return votes from a function of the codebase that takes both images, such as SSIM."""
     votes: List[Vote] = []
     wanted = {squeezed(image) for image in images}
     for scope in _beside(function):
@@ -203,7 +203,7 @@ def _without_batch(node: cst.CSTNode) -> cst.CSTNode:
 
 
 def _beside(function: Function) -> List[Function]:
-    """Return the function, and where it is nested in another one those beside it that take the same."""
+    """Return the function, and for a nested one its neighbours with the same parameter."""
     parent = function.parent
     if parent is None or parent.parent is None:
         return [function]
@@ -212,7 +212,7 @@ def _beside(function: Function) -> List[Function]:
 
 
 def _of_parameter(function: Function, name: str) -> List[Vote]:
-    """Return votes for a parameter's layout, by what the function does with it in any case."""
+    """Return votes for a parameter's layout, from what the function does with it on every path."""
     given = frozenset(d for d in function.flow.definitions.get(name, []) if d.kind == "parameter")
     certain = [line for line in function.body.body if isinstance(line, cst.SimpleStatementLine)]
     calls = [part for line in certain for part in walk_expressions(line) if isinstance(part, cst.Call)]
@@ -220,7 +220,7 @@ def _of_parameter(function: Function, name: str) -> List[Vote]:
 
 
 def _uses(function: Function, node: cst.CSTNode) -> List[Vote]:
-    """Return votes by what else the function does with the value: permuting it for SSIM tells how it lay before."""
+    """Return votes from other uses of the value: a permutation for SSIM shows the layout before."""
     place, definitions = path_of(node), function.flow.reaching(node)
     if place is None or (isinstance(node, cst.Name) and not definitions):
         return []

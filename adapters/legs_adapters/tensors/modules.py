@@ -1,4 +1,4 @@
-"""Say how torch and the libraries around it pass an ``nn.Module`` on: they move it, wrap it, return it."""
+"""List how torch and the libraries around it pass an ``nn.Module`` on: they move it, wrap it, return it."""
 
 from __future__ import annotations
 

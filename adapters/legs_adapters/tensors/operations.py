@@ -1,4 +1,4 @@
-"""Say what torch's operations, and Python's around them, do to a value: one table, by what an operation does.
+"""List what torch's and Python's operations do to a value: one table, a row for each effect.
 
 An operation may stand in several rows: ``detach`` moves a value, and ends its gradient.
 """
@@ -63,45 +63,45 @@ def _rows() -> Dict[str, FrozenSet[str]]:
 
 
 _ROWS = _rows()
-MOVES = _ROWS["moves"]  # the same values: on another device, in another type or in memory of their own
+MOVES = _ROWS["moves"]  # the same values: on another device, of another type or copied
 MAKES = _ROWS["makes"]  # a tensor or an array of the same values
 LIMITS = _ROWS["limits"]  # the same values where they are in range
 AXES = _ROWS["axes"]  # the same values in another order or shape
 JOINS = _ROWS["joins"]  # several values as one
-KEEPS_AXES = MOVES | LIMITS  # what leaves every value where it is
-KEEPS_VALUES = KEEPS_AXES | MAKES | AXES | JOINS  # what leaves the values, wherever they go
-CONSTANT = _ROWS["constant"]  # made of nothing but a size
-LIKE = _ROWS["like"]  # what takes a tensor's type or shape, and none of its values
-ASKS = _ROWS["asks"]  # what is asked of values that are not compared
-SIZES = _ROWS["sizes"]  # what is asked of a tensor without a look at its values
+KEEPS_AXES = MOVES | LIMITS  # every value keeps its place
+KEEPS_VALUES = KEEPS_AXES | MAKES | AXES | JOINS  # the values are kept, in any order
+CONSTANT = _ROWS["constant"]  # made from a size only
+LIKE = _ROWS["like"]  # uses a tensor's type or shape, not its values
+ASKS = _ROWS["asks"]  # tests of values
+SIZES = _ROWS["sizes"]  # properties that do not depend on the values
 REDUCES, EXTREMES = _ROWS["reduces"], _ROWS["extremes"]
-NUMBERS = _ROWS["numbers"]  # Python's, of which there is one
-LEAVES = _ROWS["leaves"]  # what makes numbers or arrays of a tensor
-ENDS_GRADIENT = _ROWS["detaches"] | LEAVES  # no gradient comes back
+NUMBERS = _ROWS["numbers"]  # Python's numbers, which are scalars
+LEAVES = _ROWS["leaves"]  # conversions of a tensor to numbers or arrays
+ENDS_GRADIENT = _ROWS["detaches"] | LEAVES  # these cut the gradient
 NO_GRAD = _ROWS["no_grad"]  # contexts and decorators under which no gradient is kept
 BACKWARD = _ROWS["backward"]  # manual_backward is Lightning's
-TRANSFORMS = _ROWS["transforms"]  # an absolute value is none any more
-OTHER_LOSSES = _ROWS["other_losses"]  # than an L1
+TRANSFORMS = _ROWS["transforms"]  # the result is no longer an absolute error
+OTHER_LOSSES = _ROWS["other_losses"]  # losses other than an L1
 CHANNELS_LAST = _ROWS["channels_last"]  # renderers that return [H, W, C]: gsplat's
 MODULES = _ROWS["modules"]  # the names under which torch and its neighbours are imported
 MODULE_SELF = _ROWS["module_self"]  # methods of an nn.Module that return it
-MODULE_WRAPS = _ROWS["module_wraps"]  # what returns a module wrapped; Lightning's fabric.setup, accelerate's prepare
-EVERYDAY = _ROWS["everyday"]  # methods of tensors, modules and optimisers: the name alone does not say whose
+MODULE_WRAPS = _ROWS["module_wraps"]  # these return a module wrapped; Lightning's fabric.setup, accelerate's prepare
+EVERYDAY = _ROWS["everyday"]  # methods of tensors, modules and optimisers: the name alone is ambiguous
 TRANSPARENT = _ROWS["transparent"]  # decorators that return what the function returns
-HOLDERS = _ROWS["holders"]  # what is made of what it holds
+HOLDERS = _ROWS["holders"]  # containers of their arguments
 HOOKS = _ROWS["hooks"]  # methods whose result a framework trains on: Lightning, nerfstudio
 # Words in the names of optimisers, of what steps them, and of what has a step() of another kind.
 OPTIMISERS, STEPS, SCHEDULES = _ROWS["optimisers"], _ROWS["steps"], _ROWS["schedules"]
-# What leaves a picture a picture: its methods, which keep its values, pick some of them or mix in others...
+# Operations on an image that return an image: methods, which keep, select or combine its values...
 PICTURE_METHODS = KEEPS_AXES | AXES | _ROWS["picks"] | _ROWS["computes"]
-# ... and functions of it, which also make a tensor of it, filter it or give it another size.
+# ... and functions, which also convert, filter or resize it.
 PICTURE_FUNCTIONS = PICTURE_METHODS.union(
     MAKES, _ROWS["passes"], _ROWS["gathers"], _ROWS["filters"], _ROWS["resamples"]
 )
 
 
 def depends(function: Function, node: cst.CSTNode, names: Set[str]) -> bool:
-    """Return whether an expression of a function is made of what one of these names holds, not of its size alone."""
+    """Return whether an expression of a function depends on the value of one of these names, not only on its size."""
     seen: Set[int] = set()
     work: List[cst.CSTNode] = [node]
     while work:

@@ -37,7 +37,7 @@ def is_step(call: cst.Call) -> bool:
 
 
 def may_step(calls: Iterable[cst.Call]) -> bool:
-    """Return whether a call is named for a step: ``gaussians.update(opt)``; not ``pbar.update(1)``."""
+    """Return whether a call may be a step, by its name: ``gaussians.update(opt)``; not ``pbar.update(1)``."""
     return any(set(words(call_name(call))) & STEPS and not _is_of_schedule(call) for call in calls)
 
 
@@ -46,14 +46,14 @@ def _is_of_schedule(call: cst.Call) -> bool:
 
 
 def has_step(function: Function) -> bool:
-    """Return whether an optimiser steps in a function; its text may be its whole file's, and is no proof."""
+    """Return whether an optimiser steps in a function; its text, which may be the whole file's, is only a filter."""
     return "step" in function.text and any(map(is_step, function.flow.calls))
 
 
 def only_reads_gradients(scope: cst.CSTNode, calls: List[cst.Call], for_good: bool) -> bool:
     """Return whether the gradients are read after each backward pass, and nothing can have stepped.
 
-    They are set to nothing then; where nobody steps, ``for_good``, they need not be.
+    They have to be reset then, except ``for_good``, where no caller can step.
     """
     last = max(i for i, call in enumerate(calls) if is_backward(call))
     if may_step(calls):
@@ -66,7 +66,7 @@ def only_reads_gradients(scope: cst.CSTNode, calls: List[cst.Call], for_good: bo
 
 
 def gradients_read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
-    """Return the gradients that are read, ``xyz.grad``; none where a step by hand takes one of them."""
+    """Return the gradients that are read, ``xyz.grad``; none where a manual step uses one of them."""
     asked = {id(p) for part in parts if _asks(part) for p in walk_all(part)}
     taken = {id(p) for part in parts for given in _taken(part) for p in walk_all(given)}
     read = [p for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in asked]
@@ -74,19 +74,19 @@ def gradients_read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
 
 
 def _empties(node: cst.CSTNode) -> bool:
-    """Return whether ``xyz.grad = None`` stands here: in a loop each pass but the last loses its gradients."""
+    """Return whether a node is ``xyz.grad = None``, which resets the gradients."""
     if not isinstance(node, cst.Assign) or constant(node.value, _NOTHING) is not None:
         return False
     return any(isinstance(t.target, cst.Attribute) and t.target.attr.value == "grad" for t in node.targets)
 
 
 def _asks(node: cst.CSTNode) -> bool:
-    """Return whether a gradient is only asked for: ``xyz.grad is not None``."""
+    """Return whether a gradient is only compared or reset: ``xyz.grad is not None``."""
     return isinstance(node, cst.Comparison) or _empties(node)
 
 
 def _taken(node: cst.CSTNode) -> List[cst.CSTNode]:
-    """Return what a step by hand takes: ``xyz -= lr * xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``."""
+    """Return the operands of a manual step: ``xyz -= lr * xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``."""
     if isinstance(node, cst.AugAssign):
         return [node.value] if isinstance(node.operator, cst.SubtractAssign) else []
     if isinstance(node, cst.BinaryOperation):  # xyz.grad - other.grad compares the two

@@ -35,7 +35,7 @@ class Vote(NamedTuple):
 
 
 def shape_vote(node: cst.Call) -> List[Vote]:
-    """Return the vote of ``x.reshape(height, width, 3)``: what stood where before does not count."""
+    """Return the vote of ``x.reshape(height, width, 3)``, whatever the layout before."""
     sizes = [constant(value) for value in arguments(node)[0]]
     sizes = list(sizes[0]) if len(sizes) == 1 and isinstance(sizes[0], tuple) else sizes
     if call_name(node) not in ("reshape", "view") or len(sizes) not in (3, 4):
@@ -66,7 +66,7 @@ def slice_vote(node: cst.Subscript) -> List[Vote]:
 
 
 def added_axis(function: Function, node: cst.CSTNode) -> Optional[int]:
-    """Return where an image's channels are by the axes that are added to what is laid over it."""
+    """Return the channel axis of an image, from the axes that are added to a mask or colour applied to it."""
     if isinstance(node, cst.Name):
         made = function.flow.assigned(node)
         return (
@@ -89,7 +89,7 @@ def added_axis(function: Function, node: cst.CSTNode) -> Optional[int]:
 def permuted(
     function: Function, calls: List[cst.Call], place: str, definitions: FrozenSet[Definition]
 ) -> Iterator[Vote]:
-    """Yield what calls say that permute, or reduce, the value which a place has from these definitions."""
+    """Yield the votes of calls that permute or reduce the value of a place with these definitions."""
     for call in calls:
         order, pattern, axis = permutation(call), einops_pattern(call), reduced_axis(call)
         if order is None and pattern is None and axis is None:
@@ -111,9 +111,9 @@ def permuted(
 
 
 def _before(node: Optional[cst.CSTNode], order: Optional[Tuple[int, ...]]) -> List[cst.CSTNode]:
-    """Return ``x`` of what is permuted, ``x.clip(0, 1)[None]``: only an axis for the batch has come before x's own.
+    """Return ``x`` of a permuted ``x.clip(0, 1)[None]``, where at most a batch axis was added.
 
-    Of a product, ``x * mask``, each factor.
+    For a product, ``x * mask``, return each factor.
     """
     while node is not None:
         if isinstance(node, cst.Call) and call_name(node) in KEEPS_AXES:

@@ -1,4 +1,4 @@
-"""An error map that serves more than the loss: ``error = torch.abs(image - gt)`` that also makes a mask, say."""
+"""Error maps with other uses than the loss: ``error = torch.abs(image - gt)`` that also makes a mask."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Shared", "is_asked", "is_huber", "is_measured", "is_rescaled", "shar
 
 
 class Shared(NamedTuple):
-    """The reads of an error map: the one to be weighted in its place; and those that are to keep the plain map.
+    """The reads of an error map: the one to weight in its place, and those that keep the plain map.
 
     ``trains`` is False where none of the reads is the loss.
     """
@@ -29,9 +29,9 @@ class Shared(NamedTuple):
 
 
 def shared_of(training: Training, function: Function, form: Form) -> Optional[Shared]:
-    """Say which reads of a form that got a name are the loss, and which are not.
+    """Return which reads of a named error map are the loss, and which are not.
 
-    None where it is the loss alone (and what is logged of it).
+    None where the loss (and logging) is its only use.
     """
     made = [
         definition
@@ -60,7 +60,7 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
     if not loss:
         return Shared([], [], False)
     if any(id(read) in edited for read in reads):
-        return Shared([], [])  # error[mask] *= 2: another map in the loss's place would not have that
+        return Shared([], [])  # error[mask] *= 2: a new map in the loss's place would lack the change
     alone = [read for read in reads if function.flow.reaching(read) == {made[0]}]  # no other branch made it
     again = loss if len(loss) == 1 and loss[0] in alone and function.flow.unchanged(form.first, form.second) else []
     known = all(
@@ -73,7 +73,7 @@ def shared_of(training: Training, function: Function, form: Form) -> Optional[Sh
 def is_huber(training: Training, function: Function, form: Form) -> bool:
     """Return whether an error is squared below a threshold: ``where(error < d, error ** 2 / 2, d * (error - d / 2))``.
 
-    A mean that is squared for a log line, ``torch.log10(1 / torch.sqrt(loss ** 2))``, makes none.
+    A mean that is squared for logging, ``torch.log10(1 / torch.sqrt(loss ** 2))``, does not count.
     """
 
     def reads_it(nodes: List[cst.CSTNode]) -> bool:
@@ -93,7 +93,7 @@ def is_huber(training: Training, function: Function, form: Form) -> bool:
 
 
 def is_rescaled(function: Function, form: Form) -> bool:
-    """Return whether a map is only scaled to 0..1, ``(e - e.min()) / (e.max() - e.min())``, to be cut."""
+    """Return whether a map is only scaled to 0..1, ``(e - e.min()) / (e.max() - e.min())``, for a threshold."""
     reads = [read for read in function.flow.reads if form.node in _values(function, read)]
     ranges = {id(part) for node in function.flow.expressions for part in _of_range(node)}
     extremes = [call for call in function.flow.calls if call_name(call) in EXTREMES and not call.args]
@@ -112,7 +112,7 @@ def _of_range(node: cst.CSTNode) -> List[cst.CSTNode]:
 
 
 def is_measured(function: Function, form: Form) -> bool:
-    """Return whether a term is turned into a number, ``error.mean().item()``, from which no gradient comes back."""
+    """Return whether a term is converted to a number, ``error.mean().item()``, which has no gradient."""
     return any(
         call_name(call) in LEAVES and any(part is form.node for part in attribute_chain(call))
         for call in function.flow.calls
@@ -145,13 +145,13 @@ def _edited(function: Function) -> Set[int]:
 
 
 def _asked_for_size(function: Function) -> Set[int]:
-    """Return the ids of the names that are only asked for their size: ``error.shape``, ``error.dim()``."""
+    """Return the ids of the names of which only the size is read: ``error.shape``, ``error.dim()``."""
     parts = [part for part in walk_expressions(function.body) if isinstance(part, cst.Attribute)]
     return {id(part.value) for part in parts if part.attr.value in SIZES}
 
 
 def takes_no_gradient(training: Training, function: Function, call: cst.Call, given: cst.CSTNode) -> bool:
-    """Return whether a call makes a mask of a given error, or measures it: ``normalise(error).detach()``."""
+    """Return whether a call makes a mask of an error, or uses it without a gradient: ``normalise(error).detach()``."""
     return makes_mask(call) or _only_measured(training, function, call, given)
 
 

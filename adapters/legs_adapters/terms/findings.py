@@ -1,4 +1,4 @@
-"""Hold what is found in a checkout: terms to weight, terms that are left, and terms that a person must settle."""
+"""The findings in a checkout: terms to weight, skipped terms, and terms that need a manual edit."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Decider = Tuple[Function, cst.CSTNode]
 
 
 class Kept(NamedTuple):
-    """A call that stays unweighted although the function it calls has a site in it.
+    """A call that is not weighted although the function it calls contains a site.
 
     Attributes:
-        path, line, text: where it stands, and what that line says.
-        reason: what it is for, in one word.
-        function: what is called.
+        path, line, text: its place, and the text of that line.
+        reason: its purpose, in one word.
+        function: the name of the called function.
         call: all of it.
         scope: the function that it stands in.
     """
@@ -51,7 +51,7 @@ class Site(NamedTuple):
         channels_last: the images are [H, W, C].
         view: the verdict on ``view=``.
         scope: the function that it stands in.
-        aside: other reads of the same error map, which are not the loss and keep the plain one.
+        aside: other reads of the same error map, which keep the plain map.
         kept: calls of that function that are not the loss.
     """
 
@@ -74,12 +74,12 @@ class Site(NamedTuple):
         return self.scope.name
 
     def named_by(self, line: int) -> bool:
-        """Return whether a line that a person names is one of its lines."""
+        """Return whether a line is one of its lines."""
         return self.line <= line <= self.last_line
 
 
 class Line(NamedTuple):
-    """A line of a checkout: where it is, and what it says."""
+    """A line of a checkout: its place and its text."""
 
     path: str
     line: int
@@ -87,7 +87,7 @@ class Line(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """The rule for which a term is left, and what decided it.
+    """The rule that skips a term, and the nodes that decided.
 
     Attributes:
         rule: the rule's id.
@@ -107,7 +107,7 @@ class Evidence(NamedTuple):
 
 def _lines(function: Function, node: cst.CSTNode) -> Iterator[Line]:
     if isinstance(node, cst.Module):
-        return  # all of a file decides nothing that a line could show
+        return  # a whole file has no deciding line
     try:
         line = function.line if node is function.node else function.place(node).line
     except (KeyError, ValueError):  # a node that the analysis made, or a file that LibCST writes differently
@@ -116,10 +116,10 @@ def _lines(function: Function, node: cst.CSTNode) -> Iterator[Line]:
 
 
 class Left(NamedTuple):
-    """An L1 that was seen and left.
+    """A skipped L1.
 
     Attributes:
-        path, line, text: where it stands, and what that line says.
+        path, line, text: its place, and the text of that line.
         reason: why, in one word.
         evidence: the rule and what decided; None where no rule did.
     """
@@ -132,7 +132,7 @@ class Left(NamedTuple):
 
     @classmethod
     def at(cls, function: Function, place: Place, why: str | Evidence) -> Left:
-        """Return what stands at a place as left: for what a rule found, or for a reason that no rule has."""
+        """Return the term at a place as skipped: by a rule's evidence, or for another reason."""
         reason, evidence = (why, None) if isinstance(why, str) else (why.reason, why)
         return cls(function.module.path, place.line, function.module.lines.text(place.line), reason, evidence)
 
@@ -143,7 +143,7 @@ class Left(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """A term that a person must settle: where it is, what it says, and what to write there by hand."""
+    """A term that needs a manual edit: its place, its text, and the advice."""
 
     path: str
     line: int
@@ -153,14 +153,14 @@ class Problem(NamedTuple):
 
     @classmethod
     def at(cls, function: Function, place: Place, reason: str, advice: str) -> Problem:
-        """Return what stands at a place of a function as a problem."""
+        """Return the term at a place of a function as a problem."""
         return cls(function.module.path, place.line, function.module.lines.text(place.line), reason, advice)
 
 
 class Findings(NamedTuple):
-    """All that was found; in the order of the files.
+    """All findings, in the order of the files.
 
-    ``doubts`` are of what was left in a file that trains, where nothing else is weighted: perhaps the loss after all.
+    ``doubts`` are skipped terms that may be the loss: of files that train and have no weighted term.
     """
 
     sites: List[Site]
@@ -173,5 +173,5 @@ class Findings(NamedTuple):
 
     @property
     def kept(self) -> Dict[Kept, Site]:
-        """The calls that stay unweighted, each with a site in the function that it calls."""
+        """The calls that are not weighted, each with a site in the function that it calls."""
         return {kept: site for site in self.sites for kept in site.kept}

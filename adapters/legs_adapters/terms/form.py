@@ -1,4 +1,4 @@
-"""The form of a photometric term: what it compares, how it is edited, what is advised where it cannot be."""
+"""The form of a photometric term: what it compares, how it is edited, the advice where it cannot be."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Form:
         callee: what is called, for a form that is a call of a function; None for ``abs``.
         extras: the call's further arguments.
         difference: the ``a - b``, for a form that is an absolute value.
-        selection: for a difference with a name of its own, the index that it is taken with, ``[mask]``; empty without.
+        selection: the index of a named difference, ``[mask]``; empty without.
         makes: what becomes of the differences: "mean", "none" (the map), or "own", anything else that is an L1; see
             `L1Functions.shape`.
-        order: of the kinds that recognise one call, the least is taken.
-        is_named: whether the difference has a name of its own, so that there is no one expression to replace.
+        order: of several kinds that recognise a call, the one with the lowest order is used.
+        is_named: whether the difference is assigned to a name first, so that no single expression can be replaced.
         weighs: whether the edit weights the term.
         done: what the edit does to it, in words.
     """
@@ -57,7 +57,7 @@ class Form:
 
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
-        """Return the form that a call is, or None; a kind that is not found in calls has nothing to say."""
+        """Return the form of a call, or None; some kinds are not found in calls."""
         return None
 
     @property
@@ -88,11 +88,11 @@ class Form:
         raise NotImplementedError(type(self).__name__)
 
     def said(self, view: View) -> str:
-        """Return what the report says of the edited term."""
+        """Return the report's text for the edited term."""
         return f"view={view.text}: {view.reason}" if view.text else f"no view=: {view.reason}"
 
     def advice(self, writing: Writing, rows: bool) -> str:
-        """Return what to write by hand; ``rows`` where the images are lists of pixels."""
+        """Return the advice for a manual edit; ``rows`` where the images are lists of pixels."""
         prediction, target = writing.ordered(self.first, self.second)
         whole, other = without_rows(prediction), without_rows(target)
         if whole is not prediction and other is not target:
@@ -102,12 +102,12 @@ class Form:
 
     def _advice(self, writing: Writing, prediction: str, target: str, rows: bool) -> str:
         if rows:
-            return f"{writing.package}.l1_loss(rendering, photograph), with the pictures before they became lists"
+            return f"{writing.package}.l1_loss(rendering, photograph), on the images before they are flattened"
         return writing.call(prediction, target, self.is_map, self._own(writing))
 
     def _own(self, writing: Writing) -> str:
         return ""
 
     def moved(self: _F, selection: str) -> _F:
-        """Return the form with its selection written otherwise."""
+        """Return the form with another selection."""
         return replace(self, selection=selection)

@@ -1,4 +1,4 @@
-"""Find the L1 expressions of a function: every kind of ``terms/kinds`` is asked about each of its calls."""
+"""Find the L1 expressions of a function: each of its calls is given to every kind in ``terms/kinds``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Forms"]
 
 
 class Forms:
-    """The forms of each function of one program, looked for once."""
+    """The forms of each function of one program, cached."""
 
     def __init__(self, functions: L1Functions) -> None:
         self.functions = functions
@@ -66,7 +66,7 @@ def _kinds() -> List[Type[Form]]:
 
 
 def _transformed(function: Function) -> Set[int]:
-    """Return the ids of the calls whose values are squared, or go through a logarithm and its like: no L1 any more."""
+    """Return the ids of the calls whose values are squared or transformed (log, exp): they are not an L1."""
     found: Set[int] = set()
     for node in function.flow.expressions:
         parts: List[cst.CSTNode] = []

@@ -1,4 +1,4 @@
-"""Recognise the L1 functions of a codebase: their first two parameters meet in differences, and in no other way."""
+"""Recognise the L1 functions of a codebase: they use their first two parameters in differences only."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TORCH_MODULE = re.compile(r"(^|\.)L1Loss$")  # nerfstudio hands torch's on
 
 
 class L1Functions:
-    """The L1 functions that one program knows: its own, and torch's.
+    """The L1 functions of one program: its own, and torch's.
 
     Args:
         program: the program.
@@ -39,14 +39,14 @@ class L1Functions:
         self._uncalled: Dict[Function, Optional[str]] = {}  # shapes, whatever a call may give
 
     def shape(self, function: Function, call: Optional[cst.Call] = None, depth: int = 0) -> Optional[str]:
-        """Say what a function of the checkout makes of its first two arguments.
+        """Return what a function of the checkout computes from its first two arguments.
 
         Args:
-            call: how it is called: arguments that it does not get have their defaults.
+            call: a call of it: arguments that are missing have their defaults.
 
         Returns:
-            "mean" for ``abs(a - b).mean()``, "none" for ``abs(a - b)``, "own" for what else is an L1 and depends on
-            nothing but the difference (and on further arguments); None for what is not.
+            "mean" for ``abs(a - b).mean()``, "none" for ``abs(a - b)``, "own" for any other L1 that depends on
+            the difference (and on further arguments) only; None where it is not an L1.
         """
         if call is None and depth == 0:  # each of a function's terms asks it
             if function not in self._uncalled:
@@ -62,7 +62,7 @@ class L1Functions:
         if not self._only_differences(function, a, b, depth):
             return None
         if set(function.decorators) - TRANSPARENT:
-            return "own"  # what is returned is the decorator's to say: a mean, a weight
+            return "own"  # the decorator may change what is returned: a mean, a weight
         known = known_arguments(function, call)
         value = returned(function, known)
         if value is not None:
@@ -72,7 +72,7 @@ class L1Functions:
         return "own" if SPEAKS_OF_LOSS.search(function.name) or function.runs_by_instance else None
 
     def shape_of_reference(self, reference: Reference, node: cst.Call) -> Optional[str]:
-        """Say what a function makes of its first two arguments where it is called, as `shape` does: torch's, too."""
+        """Return what `shape` does for the function of a call, torch's functions included."""
         if reference.kind == "external":
             name = str(reference.target)
             if _GSPLAT_L1.match(name):
@@ -125,9 +125,9 @@ class L1Functions:
         return None
 
     def _only_differences(self, function: Function, a: str, b: str, depth: int) -> bool:
-        """Return whether the first two parameters of a function meet in differences, and in no other way."""
+        """Return whether a function uses its first two parameters in differences only."""
         if function not in self._only:
-            self._only[function] = False  # what asks for itself on the way
+            self._only[function] = False  # for recursion
             self._only[function] = self._meet_in_differences(function, a, b, depth)
         return self._only[function]
 
@@ -226,7 +226,7 @@ class L1Functions:
 def _picked_pairs(
     function: Function, nodes: List[cst.CSTNode], a: str, b: str
 ) -> Tuple[List[Tuple[str, str]], Set[int]]:
-    """Return the two parameters and what is picked alike out of them, ``x = a[:, mask]``, ``y = b[:, mask]``.
+    """Return the two parameters and equal selections of both, ``x = a[:, mask]``, ``y = b[:, mask]``.
 
     Returns:
         Those pairs of names, and the ids of the assignments' parts.
@@ -248,7 +248,7 @@ def _picked_pairs(
 
 
 def _mirrored(left: cst.BaseExpression, right: cst.BaseExpression, a: str, b: str) -> bool:
-    """Return whether two expressions are the same but for ``a`` in the one and ``b`` in the other."""
+    """Return whether two expressions are equal except for ``a`` in one and ``b`` in the other."""
     swap = re.compile(rf"\b({re.escape(a)}|{re.escape(b)})\b")
     texts = [re.sub(r"\s+", "", code(node)).strip("()") for node in (left, right)]
     found = [swap.findall(text) for text in texts]

@@ -1,4 +1,4 @@
-"""Find the folders that are not entered and yet mention an L1: the user may have meant one of them."""
+"""Find skipped folders that mention an L1: the user may have meant one of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TRAINS = re.compile(rb"\.backward\(")
 
 
 def not_entered(root: Path, exclude: Sequence[str] = ()) -> List[Skipped]:
-    """Return the folders, not looked into, whose Python mentions an L1; those that train with it first."""
+    """Return the skipped folders whose Python mentions an L1; those with a backward pass first."""
     found: Dict[Skipped, bool] = {}
     for _, folders in folders_of(root, exclude):
         for folder in folders:
@@ -26,7 +26,7 @@ def not_entered(root: Path, exclude: Sequence[str] = ()) -> List[Skipped]:
 
 
 def _mentions(root: Path, skipped: Skipped, found: Dict[Skipped, bool]) -> None:
-    """Note what a folder holds that mentions an L1, and whether it trains: of third_party what is in it, each alone."""
+    """Record whether a folder mentions an L1 and trains; the folders in third_party are recorded one by one."""
     if skipped.why not in PATCHABLE:
         return
     for files, folders in folders_of(root / skipped.path, ()):

@@ -1,4 +1,4 @@
-"""Find what an earlier patch, or a person, has weighted already."""
+"""Find terms that are weighted already, by an earlier patch or by hand."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PATCHED = (f"{PACKAGE}.l1_loss", f"{PACKAGE}.unweighted")
 
 
 def patched_nodes(program: Program, function: Function, names: Sequence[str] = _PATCHED) -> List[cst.CSTNode]:
-    """Return what refers to legs_loss's own in a function, by these names: what is called, and what names are given."""
+    """Return the calls and assigned values in a function that refer to these names of legs_loss."""
     if not function.module.says(PACKAGE):
         return []
     nodes: List[cst.CSTNode] = [call.func for call in function.flow.calls]

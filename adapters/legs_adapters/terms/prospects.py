@@ -1,8 +1,8 @@
-"""Find by its words which text can lead to an L1, or to an SSIM, at all: the others need no closer look.
+"""Find by words which text can lead to an L1, or to an SSIM: the others are not parsed.
 
-A text can lead to one if it speaks of one, or of a name that does: a function's, a class's whose ``forward`` does, or
-one that such a thing was given (``self.criterion = nn.L1Loss()``). That is too often so, never too seldom, and costs a
-hundredth of parsing.
+A text can lead to one if it mentions one, or a name that does: of a function, of a class whose ``forward`` does, or of
+a variable that holds one (``self.criterion = nn.L1Loss()``). False positives are possible, false negatives are not;
+the search costs a hundredth of parsing.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _DEFAULT = re.compile(r"\b(\w+)(?:[ \t]*:[^=,()\n]+)?[ \t]*=[ \t]*([\w.]*[lL]1\w
 
 
 class Prospects:
-    """Answers for the texts of one program.
+    """Answer for the texts of one program.
 
     Args:
         texts: its files.
-        speaks: what a text says that has it itself; without, the words of an L1.
+        speaks: a pattern of texts that contain one; default: the words of an L1.
     """
 
     def __init__(self, texts: Iterable[str], speaks: Pattern[str] = SPEAKS_OF_L1) -> None:
@@ -66,12 +66,12 @@ class Prospects:
         return self._answers[text]
 
     def near(self, text: str) -> bool:
-        """Return whether a text speaks of an L1, or of something whose own text does."""
+        """Return whether a text mentions an L1, or a name whose own text does."""
         return bool(self._speaks.search(text)) or not self._near.isdisjoint(_WORD.findall(text))
 
 
 def _said(text: str) -> Iterator[Tuple[str, str]]:
-    """Yield names, each with a text that says what it stands for."""
+    """Yield names, each with the text of its definition."""
     classes: List[Tuple[int, str]] = []
     definitions = list(_DEFINITION.finditer(text))
     for i, match in enumerate(definitions):
@@ -93,7 +93,7 @@ def _said(text: str) -> Iterator[Tuple[str, str]]:
 
 
 def _made(value: str) -> str:
-    """Return what a value is made by: of one call that is all of it the function, which its arguments do not change."""
+    """Return what produces a value: for a single call the function, since arguments do not change it."""
     call = _CALLEE.match(value)
     if call is None or call.group(1) in HOLDERS:
         return value

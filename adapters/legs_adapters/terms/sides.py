@@ -1,4 +1,4 @@
-"""The two sides of an L1: what both of them share, and which is the ground truth."""
+"""The two sides of an L1: what they share, and which one is the target."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Pair(NamedTuple):
     Attributes:
         first, second: the two sides, without an index by a mask that both carry.
         selection: that index as written, with its brackets; empty without.
-        a, b: what the two stand for; a factor that both have says nothing of it.
+        a, b: the meanings of the two, without a factor that both have.
     """
 
     first: cst.BaseExpression
@@ -36,12 +36,12 @@ class Pair(NamedTuple):
 
     @property
     def speaks_of_images(self) -> bool:
-        """Return whether both sides have a name that speaks of an image."""
+        """Return whether the names of both sides are about images."""
         return _speaks_of_images(self.first) and _speaks_of_images(self.second)
 
 
 def pair_of(meanings: Meanings, function: Function, form: Form) -> Pair:
-    """Look at the two sides of a form."""
+    """Return the two sides of a form, with their meanings."""
     first, second, selection = form.first, form.second, ""
     if isinstance(first, cst.Subscript) and isinstance(second, cst.Subscript):
         inner = [code(node)[len(code(node.value)) :] for node in (first, second)]
@@ -67,7 +67,7 @@ def _without_shared_factors(first: cst.BaseExpression, second: cst.BaseExpressio
 
 
 def same_root(form: Form) -> bool:
-    """Return whether a picture is compared with itself: ``x[1:] - x[:-1]``."""
+    """Return whether an image is compared with itself: ``x[1:] - x[:-1]``."""
     a, b = form.first, form.second
     if not (isinstance(a, cst.Subscript) and isinstance(b, cst.Subscript)) or isinstance(key_of(a), str):
         return False
@@ -75,7 +75,7 @@ def same_root(form: Form) -> bool:
 
 
 def are_counterparts(form: Form) -> bool:
-    """Return whether two names are of the same thing, once rendered and once photographed: ``gt_lips``."""
+    """Return whether two names are of one thing, rendered and photographed: ``lips`` and ``gt_lips``."""
     names = []
     for node in (form.first, form.second):
         key = key_of(node)
@@ -88,12 +88,12 @@ def are_counterparts(form: Form) -> bool:
 
 
 def of_rays(form: Form) -> bool:
-    """Return whether the names speak of rays, or of a field that they go through: a list of colours."""
+    """Return whether the names are about rays or a radiance field: lists of colours."""
     return any(OF_RAYS.search(code(node)) for node in (form.first, form.second))
 
 
 def is_role(node: cst.CSTNode) -> bool:
-    """Return whether a name says nothing but what it is to the loss: ``pred``, ``target``."""
+    """Return whether a name is only a role in the loss: ``pred``, ``target``."""
     return isinstance(node, cst.Name) and all(role_of_words(word) is not None for word in words(node.value))
 
 

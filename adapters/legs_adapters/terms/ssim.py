@@ -1,4 +1,4 @@
-"""Tell whether an SSIM is taken of the same two images: they are pictures then, whatever else their names say."""
+"""Find whether an SSIM is computed of the same two expressions: they are images then, whatever their names."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["is_beside_ssim", "is_given"]
 
 
 def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
-    """Return whether an SSIM is taken of the same two: they are pictures then, whatever their names say."""
+    """Return whether an SSIM is computed of the same two expressions: they are images then."""
     structural = [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
     return any(is_given(function, call, first) and is_given(function, call, second) for call in structural)
 
 
 def is_given(function: Function, call: cst.Call, picture: cst.CSTNode) -> bool:
-    """Return whether a call has a picture, or one with another axis, ``image.unsqueeze(0)``, among its arguments."""
+    """Return whether an image, or one with another axis, ``image.unsqueeze(0)``, is an argument of a call."""
     parts = [part for arg in call.args for part in attribute_chain(arg.value)]
     return any(same(part, picture) for part in parts) and function.flow.unchanged_at(call, picture)

@@ -1,4 +1,4 @@
-"""Read and replace spans of a file's text: what stands between two nodes, and what must stay of it."""
+"""Read and replace spans of a file's text; keep the comments and line breaks between two nodes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Edit(NamedTuple):
 
 
 class Text:
-    """A file's bytes, and where the nodes of one function stand in them."""
+    """A file's bytes, and the positions of one function's nodes."""
 
     def __init__(self, source: Source, function: Function) -> None:
         self.source = source
@@ -43,7 +43,7 @@ class Text:
         return place.start, place.end
 
     def between(self, start: int, end: int) -> str:
-        """Return what stands from one byte to another."""
+        """Return the text of a span of bytes."""
         return self.bytes[start:end].decode("utf-8")
 
     def of(self, node: cst.CSTNode, brackets: bool = False) -> str:
@@ -51,7 +51,7 @@ class Text:
         return self.between(*self.span(node, brackets))
 
     def replace(self, start: int, end: int, after: str) -> Edit:
-        """Return the edit that puts a text in place of what stands from one byte to another."""
+        """Return the edit that replaces a span of bytes by a text."""
         start, end = start + self._shift, end + self._shift
         return Edit(start, end, self.source.data[start:end], after.encode("utf-8"))
 
@@ -83,7 +83,7 @@ def on_one_line(text: str) -> str:
 
 
 def residue(text: str) -> str:
-    """Return what must stay of text that goes: its comments and its line breaks."""
+    """Return what is kept of a text that is removed: its comments and its line breaks."""
     if "\n" not in text and "\r" not in text:
         return ""
     return "".join(kept for _, kept in _KEPT.findall(text))

@@ -1,4 +1,4 @@
-"""Write the weighted call: the one place where its text is made, for edits and for advice."""
+"""Write the text of the weighted call, for edits and for advice."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Writing(NamedTuple):
 
         Args:
             as_map: whether the unreduced map is asked for.
-            own: the codebase's own L1, where that is more than a mean.
+            own: the codebase's own L1, where it is more than a mean.
         """
         parts = [] if self.view is None else [f"view={self.view}"]
         parts += ["channels_last=True"] if self.channels_last else []
@@ -61,7 +61,7 @@ class Writing(NamedTuple):
         return f"{self.package}.weight_map({target}{', channels_last=True' if self.channels_last else ''})"
 
     def own(self, callee: cst.BaseExpression, extras: Sequence[cst.Arg]) -> str:
-        """Return the codebase's own function of (prediction, target), with what else it is given."""
+        """Return the codebase's own function of (prediction, target), with its further arguments."""
         name = on_one_line(code(callee))
         if not extras and not self.selection and not self.swapped:
             return name

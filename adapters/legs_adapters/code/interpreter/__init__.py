@@ -1,5 +1,5 @@
-"""Evaluate functions of a checkout on given values, without running them: a small part of Python, every step bounded.
+"""Interpret functions of a checkout on given values: a small subset of Python, with bounded steps.
 
-No code of the checkout is executed. What is not known to the interpreter, or to the library that stands for what the
-checkout imports, ends the evaluation with `Unknown`, which names the place.
+No code of the checkout is executed. What the interpreter, or the library that replaces the checkout's imports, does not
+support ends the evaluation with `Unknown`, which names the place.
 """

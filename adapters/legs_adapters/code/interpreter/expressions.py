@@ -1,4 +1,4 @@
-"""Evaluate the expressions of a function, in the values that its names have."""
+"""Evaluate the expressions of a function, given the values of its names."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Expressions:
 
     Args:
         program: the program.
-        library: what stands for what it imports.
+        library: the replacement of its imports.
     """
 
     def __init__(self, program: Program, library: Library) -> None:
@@ -83,14 +83,14 @@ class Expressions:
         return bool(value)
 
     def elements(self, function: Function, node: cst.CSTNode, env: Env) -> Sequence[Any]:
-        """Return what a loop over an expression goes through."""
+        """Return the elements of a loop over an expression."""
         value = self.value(function, node, env)
         if not isinstance(value, (tuple, range)) or len(value) > _MOST:
             self.unknown(function, node)
         return value
 
     def assign(self, function: Function, target: cst.CSTNode, value: Any, env: Env) -> None:
-        """Give a value to a name, or its parts to several."""
+        """Assign a value to a name, or its parts to several."""
         if isinstance(target, cst.Name):
             env[target.value] = value
             return
@@ -106,11 +106,11 @@ class Expressions:
     def operate(
         self, function: Function, node: cst.CSTNode, apply: Callable[[Any, Any], Any], left: Any, right: Any
     ) -> Any:
-        """Return what an operator makes of two values."""
+        """Return the result of an operator on two values."""
         if not all(isinstance(value, (int, float)) for value in (left, right)):
             return self._asked(function, node, self.library.operate, apply, left, right)
         if isinstance(left, int) and left.bit_length() * (abs(right) if apply is operator.pow else 1) > _MOST:
-            self.unknown(function, node)  # a number that grows at every step would take all memory
+            self.unknown(function, node)  # unbounded growth would take all memory
         return self._asked(function, node, apply, left, right)
 
     def unknown(self, function: Function, node: cst.CSTNode) -> NoReturn:
@@ -141,7 +141,7 @@ class Expressions:
         )
 
     def _global(self, function: Function, node: cst.Name | cst.Attribute) -> Any:
-        """Return what a name from outside of a function stands for: a function, a library's name, a constant."""
+        """Return the value of a global name: a function, a library's name, a constant."""
         references = self.program.resolve(function, node)
         if len(references) == 1 and not references[0].guess:
             if references[0].kind == "function":
@@ -160,7 +160,7 @@ class Expressions:
         assert definition.value is not None
         return self.value(where, definition.value, {})
 
-    # -- what is made of values
+    # -- values computed from values
 
     def _of_literal(self, function: Function, node: cst.CSTNode, env: Env) -> Any:
         value = constant(node, _MISSING)
@@ -256,7 +256,7 @@ class Expressions:
 
 
 def _is_plain(value: Any) -> bool:
-    """Return whether a value is Python's own, so that it can be compared."""
+    """Return whether a value is of a built-in type, which can be compared."""
     if isinstance(value, tuple):
         return all(map(_is_plain, value))
     return isinstance(value, (int, float, str, type(None)))

@@ -1,4 +1,4 @@
-"""Evaluate a function: bind its arguments, then follow its statements."""
+"""Evaluate a function: bind its arguments, then execute its statements."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class _Returned(NamedTuple):
 
 
 class Interpreter(Expressions):
-    """Evaluates functions of one program: once, since what it has spent is counted.
+    """Evaluate functions of one program: for one evaluation, since its steps are counted.
 
     Args:
         program: the program.
-        library: what stands for what it imports.
+        library: the replacement of its imports.
     """
 
     def __init__(self, program: Program, library: Library) -> None:
@@ -38,7 +38,7 @@ class Interpreter(Expressions):
         """Return what a function returns for these arguments.
 
         Raises:
-            Unknown: it does what cannot be evaluated; a method does, since its object's state is not followed.
+            Unknown: it cannot be evaluated; methods cannot, since the state of objects is not tracked.
             Raised: it raises an error.
         """
         node = function.node
@@ -77,7 +77,7 @@ class Interpreter(Expressions):
         return None
 
     def _statement(self, function: Function, node: cst.CSTNode, env: Env) -> Optional[_Returned]:
-        """Follow one statement; return what the function returns there, None where it goes on."""
+        """Execute one statement; return the function's result, None where it continues."""
         if isinstance(node, cst.Return):
             return _Returned(None if node.value is None else self.value(function, node.value, env))
         if isinstance(node, cst.If):
@@ -117,6 +117,6 @@ class Interpreter(Expressions):
         if not isinstance(node.target, cst.Name) or type(node.operator) not in OPERATORS:
             self.unknown(function, node)
         before, by = self.value(function, node.target, env), self.value(function, node.value, env)
-        if not isinstance(before, (int, float)):  # a tensor would change for whoever else holds it
+        if not isinstance(before, (int, float)):  # a tensor would be changed in place
             self.unknown(function, node)
         env[node.target.value] = self.operate(function, node, OPERATORS[type(node.operator)], before, by)

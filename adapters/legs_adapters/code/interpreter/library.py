@@ -1,4 +1,4 @@
-"""A stand-in for a checkout's imports while a function is evaluated, and the ways in which that can end."""
+"""The replacement of a checkout's imports in an evaluation, and the exceptions that end one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Library", "Raised", "Unknown", "Unsupported"]
 
 
 class Unknown(Exception):
-    """An evaluation met what it cannot evaluate.
+    """The evaluation reached a node that it does not support.
 
     Attributes:
         function, node: where.
@@ -25,7 +25,7 @@ class Unknown(Exception):
 
 
 class Unsupported(Exception):
-    """A library cannot answer."""
+    """The library does not support an operation."""
 
 
 class Raised(Exception):
@@ -33,7 +33,7 @@ class Raised(Exception):
 
 
 class Library:
-    """A stand-in for the libraries that a checkout imports, and for the values that they make."""
+    """The replacement of the libraries that a checkout imports, and of their values."""
 
     def external(self, name: str) -> Any:
         """Return a function or a constant of a library, or a builtin, by its dotted name."""
@@ -44,7 +44,7 @@ class Library:
         raise Unsupported(name)
 
     def operate(self, function: Callable[[Any, Any], Any], left: Any, right: Any) -> Any:
-        """Return what an operator makes of two values, of which at least one is the library's."""
+        """Return the result of an operator on two values, at least one of them the library's."""
         raise Unsupported("an operator")
 
     def index(self, value: Any, key: Any) -> Any:

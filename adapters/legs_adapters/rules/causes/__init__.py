@@ -1,1 +1,1 @@
-"""One file for each cause for which a term is left."""
+"""The rules that skip terms, one file for each cause."""

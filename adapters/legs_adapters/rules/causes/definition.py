@@ -1,4 +1,4 @@
-"""Leave the body of the codebase's own L1 function: its calls are the terms."""
+"""Skip the body of the codebase's own L1 function: its calls are the terms."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Definition"]
 
 
 class Definition(Rule):
-    """It is the body of the codebase's own L1 function, whose calls are what counts.
+    """The term is in the body of the codebase's own L1 function, whose calls are decided one by one.
 
     left:
         def photometric(image, gt):

@@ -1,4 +1,4 @@
-"""Leave a term between two renderings."""
+"""Skip a term between two renderings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Distillation"]
 
 
 class Distillation(Rule):
-    """The target was rendered: of another model, another view, or by the same model before.
+    """The target is a rendering: of another model, of another view, or of the same model at an earlier step.
 
     left:
         teacher_image = render(camera, teacher, None, None)["render"]
@@ -40,5 +40,5 @@ class Distillation(Rule):
         return call.here if call.given[-1].role == "render" else []
 
     def may_be_loss(self, term: Term) -> bool:
-        """Return whether no side is detached, which no photograph needs."""
+        """Return whether no side is detached; a photograph needs no ``detach()``."""
         return not any(detaches(side) for side in term.sides)

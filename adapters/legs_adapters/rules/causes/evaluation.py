@@ -1,4 +1,4 @@
-"""Leave a term of code that evaluates: by the name around it, or by what its optimiser moves."""
+"""Skip a term of evaluation code: by the names around it, or by the parameters of its optimiser."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ __all__ = ["EmbeddingFit", "EmbeddingStep", "EvaluationName", "EvaluationRule", 
 
 
 class EvaluationRule(Rule):
-    """Leave a term of an evaluation."""
+    """Skip a term of an evaluation."""
 
     reason = "evaluation"
 
     def may_be_loss(self, term: Term) -> bool:
-        """Return whether the function is named a loss, some of whose callers evaluate."""
+        """Return whether the function is named as a loss: only some of its callers may evaluate."""
         return "loss" in words(term.function.name)
 
 
 class EvaluationName(EvaluationRule):
-    """The function, its file or its folder is named for rendering, testing or evaluating.
+    """The name of the function, its file or its folder is about rendering, testing or evaluation.
 
     left:
         def evaluate_views(gaussians, cameras):
@@ -53,7 +53,7 @@ class EvaluationName(EvaluationRule):
 
 
 class EmbeddingFit(EvaluationRule):
-    """The function is named for fitting a test view's embedding.
+    """The name of the function says that it fits the embedding of a test view.
 
     left:
         def optimize_embedding(gaussians, camera):
@@ -75,7 +75,7 @@ class EmbeddingFit(EvaluationRule):
 
 
 class EmbeddingStep(ByPurpose, EvaluationRule):
-    """The optimiser that steps moves an embedding alone, with which a test view is fitted.
+    """The optimiser updates an embedding only, to fit a test view.
 
     left:
         def adapt(gaussians, camera, embedding):
@@ -93,11 +93,11 @@ class EmbeddingStep(ByPurpose, EvaluationRule):
 
 
 def is_of_evaluating_class(term: Term) -> bool:
-    """Return whether the term's class says that it evaluates: ``TestLoss``."""
+    """Return whether the name of the term's class is about evaluation: ``TestLoss``."""
     return bool(set(words(term.class_name)) & EVALUATING)
 
 
 def _is_of_training_step(term: Term) -> bool:
-    """Return whether it returns its part of a loss to functions that say that they train: ``render_batch``."""
+    """Return whether it returns a loss to functions whose names say that they train: ``render_batch``."""
     callers = [caller for caller, _ in term.analysis.training.sites.get(term.function, [])]
     return bool(callers) and all("train" in words(caller.name) for caller in callers)

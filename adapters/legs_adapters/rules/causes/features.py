@@ -1,4 +1,4 @@
-"""Leave a term that compares features: of a network, of a scanner, or maps that have a name of their own."""
+"""Skip a term that compares features: network outputs, laser scans, or maps with names of their own."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Feature(Rule):
 
 
 class Scan(_Feature):
-    """A side is a channel of what a laser scanner sees.
+    """One side is a channel of a laser scan.
 
     left:
         def training(gaussians, camera):
@@ -52,7 +52,7 @@ class Scan(_Feature):
 
 
 class Network(_Feature):
-    """The term stands in a perceptual loss, and its sides are made by a network.
+    """The term is part of a perceptual loss, and its sides are outputs of a network.
 
     left:
         def perceptual_loss(network, image, gt):
@@ -78,7 +78,7 @@ class Network(_Feature):
 
 
 class NamedMap(_Feature):
-    """Both sides share a word of no picture, and the same two hold the pictures that are compared beside them.
+    """Both names share a word that is not for images, and another L1 compares the images of the same two objects.
 
     left:
         def training(gaussians, camera):
@@ -109,7 +109,7 @@ class NamedMap(_Feature):
 
 
 def compared(forms: Forms, function: Function) -> Iterator[Tuple[cst.Call, cst.CSTNode, cst.CSTNode]]:
-    """Yield each L1 in a function with its two sides, whether or not it has been weighted already."""
+    """Yield each L1 in a function with its two sides, already weighted ones included."""
     for form in forms.of(function):
         yield form.call, form.first, form.second
     for call in function.flow.calls:
@@ -118,7 +118,7 @@ def compared(forms: Forms, function: Function) -> Iterator[Tuple[cst.Call, cst.C
 
 
 def _is_given_whole(function: Function, node: cst.CSTNode) -> bool:
-    """Return whether it is what a parameter was given, as it was given."""
+    """Return whether an expression is an unchanged parameter."""
     found = function.flow.reaching(node)
     return bool(found) and all(definition.kind == "parameter" for definition in found)
 
@@ -135,7 +135,7 @@ def _one_channel_of(node: cst.CSTNode) -> Optional[str]:
 
 
 def _entries(function: Function, *sides: cst.CSTNode) -> List[Tuple[str, str]]:
-    """Return what the sides are entries of, and under which names; nothing where one is none."""
+    """Return the object and the name that each side is an entry of; nothing where a side is not an entry."""
     found = [_entry(function, side, set()) for side in sides]
     return [entry for entry in found if entry is not None] if None not in found else []
 
@@ -162,6 +162,6 @@ def _entry(function: Function, node: Optional[cst.CSTNode], seen: Set[int]) -> O
 
 
 def _special(name: str) -> Set[str]:
-    """Return the words of a name that say neither that it is a picture nor which one."""
+    """Return the words of a name that are not for images, nor for one of several images."""
     found = {word for word in words(name) if not word.isdigit() and role_of_words(word) is None}
     return {word for word in found if kind_of_words(word) != "image"} - OF_PHOTOGRAPHS

@@ -1,4 +1,4 @@
-"""Leave a Huber loss."""
+"""Skip a Huber loss."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Huber"]
 
 
 class Huber(Rule):
-    """The error is squared below a threshold, which a weight would move.
+    """The error is squared below a threshold, and a weight would move that threshold.
 
     left:
         error = torch.abs(image - gt)

@@ -1,4 +1,4 @@
-"""Leave a term that compares other pictures than photographs: depth, normals, a flow."""
+"""Skip a term that compares images of another kind than photographs: depth, normals, optical flow."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 
 
 class _Kind(Rule):
-    """Leave a term of which a side is of one kind, as the first side that is of any of these kinds says."""
+    """Skip a term by the kind of its first side that is not a photograph or a rendering."""
 
     kind = ""
 
@@ -53,7 +53,7 @@ class _Kind(Rule):
 
 
 class Depth(_Kind):
-    """A side is a depth map, whose edges are not those of the photograph.
+    """One side is a depth map: its edges are not those of the photograph.
 
     left: loss = l1_loss(package["depth"], camera.invdepthmap)
     weighted: loss = l1_loss(package["render"], camera.original_image)
@@ -64,7 +64,7 @@ class Depth(_Kind):
 
 
 class Normals(_Kind):
-    """A side is a map of normals.
+    """One side is a normal map.
 
     left: loss = l1_loss(package["normals"], camera.normal_map)
     weighted: loss = l1_loss(package["render"], gt)
@@ -76,7 +76,7 @@ class Normals(_Kind):
 
 
 class Features(_Kind):
-    """A side is a map of features, labels or a transform.
+    """One side is a feature map, a label map or a transform of an image.
 
     left: loss = l1_loss(package["features"], camera.semantic_feature)
     weighted: loss = l1_loss(image, gt)
@@ -88,7 +88,7 @@ class Features(_Kind):
 
 
 class Flow(_Kind):
-    """A side is a motion between two times.
+    """One side is optical flow or motion.
 
     left: loss = l1_loss(package["flow"], camera.optical_flow)
     weighted: loss = l1_loss(image, gt)
@@ -99,7 +99,7 @@ class Flow(_Kind):
 
 
 class Mask(_Kind):
-    """A side is a mask or an opacity; a photograph under a mask is none.
+    """One side is a mask or an opacity map; a masked photograph is not one.
 
     left: loss = l1_loss(package["alpha"], camera.mask)
     weighted: loss = l1_loss(image * camera.mask, gt * camera.mask)
@@ -113,14 +113,14 @@ class _Synthetic(Rule):
     reason = "synthetic"
 
     def may_be_loss(self, term: Term) -> bool:
-        """Return whether it is not a side itself that says so: of some callers, perhaps."""
+        """Return whether no name in the sides themselves says so, but only a caller's."""
         parts = [part for side in term.sides for part in walk_expressions(side)]
         said = [part.value for part in parts if isinstance(part, (cst.Name, cst.SimpleString))]
         return not any(kind_of_words(text) == "warp" for text in said)
 
 
 class Synthetic(_Synthetic, _Kind):
-    """A side is a picture that was warped, edited, repainted or made up, and no photograph.
+    """One side is a warped, edited, inpainted or generated image, not a photograph.
 
     left: loss = l1_loss(image, warped_image)
     weighted: loss = l1_loss(image, gt)
@@ -131,7 +131,7 @@ class Synthetic(_Synthetic, _Kind):
 
 
 class Warping(_Synthetic):
-    """The function is named for warping one view into another.
+    """The name of the function says that it warps one view into another.
 
     left:
         def reprojection(gaussians, camera):
@@ -150,7 +150,7 @@ class Warping(_Synthetic):
 
 
 class Gradients(_Kind):
-    """A side is a map of edges or of an image's gradient.
+    """One side is an edge map or an image gradient.
 
     left: loss = l1_loss(sobel(image), camera.edges)
     weighted: loss = l1_loss(image, gt)
@@ -161,7 +161,7 @@ class Gradients(_Kind):
 
 
 class Parameters(_Kind):
-    """A side is a parameter of the model, of a camera or of a material.
+    """One side is a parameter of the model, of a camera or of a material.
 
     left: loss = torch.abs(gaussians.get_scaling - initial_scaling).mean()
     weighted: loss = torch.abs(image - gt).mean()
@@ -173,7 +173,7 @@ class Parameters(_Kind):
 
 
 class ImageChange(Rule):
-    """Both sides are differences of images: from pixel to pixel, from view to view.
+    """Both sides are differences of images, between pixels or between views.
 
     left: loss = l1_loss(image - blur(image), gt - blur(gt))
     weighted: loss = l1_loss(image, gt)
@@ -190,21 +190,21 @@ _KINDS = {rule.kind for rule in (Depth, Normals, Features, Flow, Mask, Synthetic
 
 
 def _is_named_picture(term: Term, meaning: Meaning, side: cst.CSTNode, beside: Meaning) -> bool:
-    """Return whether a side is an image, although a word of its name is of a mask, a parameter or a gradient."""
+    """Return whether a side is an image although its name has a word for a mask, a parameter or a gradient."""
     if meaning.kind not in LAID_OVER_PICTURES or beside.kind != "image":
         return False
     return is_beside_ssim(term.function, *term.sides) or _is_under_mask(term.form, side, meaning)
 
 
 def _is_under_mask(form: Form, side: cst.CSTNode, meaning: Meaning) -> bool:
-    """Return whether ``l1_loss_masked(image, data["seg_im"], mask)`` compares a photograph under the mask beside it."""
+    """Return whether a call compares a masked photograph: ``l1_loss_masked(image, data["seg_im"], mask)``."""
     masked = form.callee is not None and MASKED & set(words(call_name(form.call))) and form.extras
     name = side.value if isinstance(side, cst.Name) else str(key_of(side) or "")
     return bool(masked) and meaning.kind == "mask" and any(kind_of_words(word) == "image" for word in words(name))
 
 
 def _is_change(term: Term, node: cst.CSTNode) -> bool:
-    """Return whether a side is a change, ``image_b - image_a``, from view to view or under a filter."""
+    """Return whether a side is a difference of images, ``image_b - image_a``, of two views or of a filter."""
     sides = (node.left, node.right) if isinstance(node, cst.BinaryOperation) else ()
     changes = isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Subtract)
     return changes and all(term.analysis.meanings.of(term.function, side).kind == "image" for side in sides)

@@ -1,4 +1,4 @@
-"""Leave a term that is not the loss of a Gaussian model in torch: of rays, a mesh, a network, a hidden message."""
+"""Skip a term that is not the loss of a Gaussian model in torch: of rays, a mesh, a network, a watermark."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _Other(Rule):
 
 
 class FixedTarget(_Other):
-    """The target is made once, before the loop over the views, of nothing that has views.
+    """The target is made once before the loop over the views, and does not depend on a view.
 
     left:
         def training(gaussians, cameras, detector):
@@ -70,7 +70,7 @@ class FixedTarget(_Other):
 
 
 class NotSplats(_Other):
-    """Nothing around the term speaks of Gaussian splatting; or its sides are colours of rays, or of a mesh.
+    """The code around the term is not about Gaussian splatting, or the sides are colours of rays or of a mesh.
 
     left: loss = l1_loss(image[ray_indexes], gt[ray_indexes])
     weighted: loss = l1_loss(image, gt)
@@ -92,7 +92,7 @@ class NotSplats(_Other):
 
 
 class NotTorch(Rule):
-    """The file is of Jittor, JAX, Paddle or their like, and ``legs_loss`` takes torch's tensors.
+    """The file uses Jittor, JAX, Paddle or the like; ``legs_loss`` takes tensors of torch.
 
     left:
         import jittor
@@ -120,7 +120,7 @@ class NotTorch(Rule):
 
 
 def _ray_method(term: Term) -> List[Decider]:
-    """Return the method of its class that takes rays, which make no picture: ``get_outputs(self, ray_bundle)``."""
+    """Return the method of its class that takes rays instead of images: ``get_outputs(self, ray_bundle)``."""
     owner = term.analysis.program.owner_of(term.function)
     methods = owner.methods.values() if owner is not None else ()
     return [header(method) for method in methods if RAY_BUNDLES & set(method.parameters)][:1]

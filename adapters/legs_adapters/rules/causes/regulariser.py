@@ -1,4 +1,4 @@
-"""Leave a term that holds the model to something else than a photograph: a constant, a statistic, itself."""
+"""Skip a term whose target is not a photograph: a constant, a statistic, the model itself."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Regulariser(Rule):
 
 
 class Literal(_Regulariser):
-    """A side is a number, or rows of points that an index picks.
+    """One side is a number, or rows of points selected by an index.
 
     left: loss = torch.abs(image - 0.5).mean()
     weighted: loss = torch.abs(image - gt).mean()
@@ -39,7 +39,7 @@ class Literal(_Regulariser):
 
 
 class Statistic(_Regulariser):
-    """A side is a constant tensor, or one number made of a picture; or both are parts of one picture.
+    """One side is a constant tensor or a statistic of an image; or both sides are parts of one image.
 
     left: loss = l1_loss(image.mean(), gt.mean())
     weighted: loss = l1_loss(image, gt)
@@ -57,7 +57,7 @@ class Statistic(_Regulariser):
 
 
 class OfModel(_Regulariser):
-    """The target is what the Gaussians themselves hold.
+    """The target is stored by the Gaussian model itself.
 
     left:
         class GaussianModel:
@@ -84,14 +84,14 @@ class OfModel(_Regulariser):
 
 
 def _is_of_points(sides: Sequence[cst.CSTNode]) -> bool:
-    """Return whether a side is rows of points, ``model.rgb_colors[point_indexes]``, and no image."""
+    """Return whether a side is rows of points, ``model.rgb_colors[point_indexes]``, not an image."""
     indexed = [node for node in sides if isinstance(node, cst.Subscript)]
     names = [element.slice.value for node in indexed for element in node.slice if isinstance(element.slice, cst.Index)]
     return any(isinstance(name, cst.Name) and POINTS & set(words(name.value)) for name in names)
 
 
 def _is_number(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int) -> bool:
-    """Return whether a side is one number made of a picture, ``image.mean()``, or one of each channel."""
+    """Return whether a side is a statistic of an image, ``image.mean()``, or one per channel."""
     if isinstance(node, cst.Call):
         positional, keywords, _ = arguments(node)
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
@@ -121,7 +121,7 @@ def _is_torchs(node: cst.Call, operations: AbstractSet[str]) -> bool:
 def _is_constant_tensor(function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
     """Return whether a side is a tensor of constants, ``torch.eye(3)``, ``torch.tensor([0, 0, 1])[:, None]``.
 
-    Or a name for one, or for one of several, that nothing is written to.
+    Or a name that is assigned one or several of them, and is not changed in place.
     """
     parts: List[Optional[cst.CSTNode]] = []
     if isinstance(node, cst.Name) and constant(node) is None:

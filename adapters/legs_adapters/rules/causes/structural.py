@@ -1,4 +1,4 @@
-"""Leave an SSIM that is not 3DGS's, or of which that cannot be shown: legs-patch --ssim rewrites no other."""
+"""Skip an SSIM that is not 3DGS's, or cannot be shown to be: legs-patch --ssim rewrites no other."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Definition", "Library", "Settings", "Twice", "Unproven", "Value"]
 
 
 class Definition(Rule):
-    """With `--ssim`: it is in the body of the codebase's own SSIM function, whose calls are what counts.
+    """With `--ssim`: the call is in the body of the codebase's own SSIM function, whose calls are decided one by one.
 
     left:
         def ssim_of_pair(image, gt):
@@ -36,7 +36,7 @@ class Definition(Rule):
 
 
 class _Lacking(Rule):
-    """Leave an SSIM for what it lacks."""
+    """Skip an SSIM for the reason that its proof failed."""
 
     reason = "another SSIM"
 
@@ -46,7 +46,7 @@ class _Lacking(Rule):
 
 
 class Library(_Lacking):
-    """With `--ssim`: the SSIM is a library's (fused_ssim, torchmetrics), and no function of the checkout.
+    """With `--ssim`: the function is a library's (fused_ssim, torchmetrics), not the checkout's.
 
     left:
         import torch
@@ -67,7 +67,7 @@ class Library(_Lacking):
 
 
 class Settings(_Lacking):
-    """With `--ssim`: the call asks for another window, a mask or one value an image, or for what is no literal.
+    """With `--ssim`: the call has another window, a mask, one value per image, or an argument that is not a literal.
 
     left: loss = 1.0 - ssim(image, gt, window_size=7)
     weighted: loss = 1.0 - ssim(image, gt, window_size=11)
@@ -77,7 +77,7 @@ class Settings(_Lacking):
 
 
 class Value(_Lacking):
-    """With `--ssim`: the function computes something else: another window, padding or constant, no mean over all.
+    """With `--ssim`: the function computes another value: another window, padding or constant, or not the mean.
 
     left:
         def ssim_of_patches(image, gt):
@@ -96,7 +96,7 @@ class Value(_Lacking):
 
 
 class Unproven(_Lacking):
-    """With `--ssim`: what the function computes, or which function it is, cannot be told from the source.
+    """With `--ssim`: the source does not show which function is called, or what it computes.
 
     left:
         def ssim_clamped(image, gt):
@@ -116,7 +116,7 @@ class Unproven(_Lacking):
 
 
 class Twice(Rule):
-    """With `--ssim`: the loss is differentiated twice, and `legs_loss.ssim` is differentiable once.
+    """With `--ssim`: the loss is differentiated twice; `legs_loss.ssim` is differentiable once.
 
     left:
         loss = 1.0 - ssim(image, gt)

@@ -1,4 +1,4 @@
-"""Leave a term of camera tracking: by the names around it, or by what its optimiser moves."""
+"""Skip a term of camera tracking: by the names around it, or by the parameters of its optimiser."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class _Tracking(Rule):
 
 
 class Tracking(_Tracking):
-    """The function, its class or a condition around the term is named for tracking.
+    """The name of the function, its class or a condition around the term is about tracking.
 
     left:
         def track_camera(gaussians, camera):
@@ -43,7 +43,7 @@ class Tracking(_Tracking):
 
 
 class PoseStep(ByPurpose, _Tracking):
-    """The optimiser that steps moves camera poses, and no Gaussians.
+    """The optimiser updates camera poses and no Gaussians.
 
     left:
         def refine(gaussians, camera):
@@ -60,7 +60,7 @@ class PoseStep(ByPurpose, _Tracking):
 
 
 def _condition(term: Asked) -> List[cst.CSTNode]:
-    """Return the names for tracking in the conditions around a call; the call where they cannot be found."""
+    """Return the names about tracking in the conditions around a call; the call itself where there are none."""
     said = [name for name in term.function.flow.conditions.get(id(term.call), ()) if _tracks(name)]
     if not said:
         return []
@@ -73,6 +73,6 @@ def _condition(term: Asked) -> List[cst.CSTNode]:
 
 
 def _tracks(name: str) -> bool:
-    """Return whether a name says that poses are moved: to track, or to align a test view."""
+    """Return whether a name is about optimising poses: for tracking, or to align a test view."""
     said = set(words(name))
     return {"test", "pose"} <= said or bool(said & TRACKING and not said & MAPPING)

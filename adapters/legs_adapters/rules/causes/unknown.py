@@ -1,4 +1,4 @@
-"""Leave a term of which nothing says that it compares images."""
+"""Skip a term that is not known to compare images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class _Unknown(Rule):
 
 
 class Unknown(_Unknown):
-    """Nothing says that a side is an image.
+    """Neither side is known to be an image.
 
     left: loss = l1_loss(network(camera), camera.something)
     weighted: loss = l1_loss(image, camera.something)
@@ -34,7 +34,7 @@ class Unknown(_Unknown):
 
 
 class Ambiguous(_Unknown):
-    """Neither side says that it is the rendering or the photograph, and not both are named images.
+    """Neither side is known to be the rendering or the photograph, and not both names are about images.
 
     left: loss = l1_loss(fused_image(camera), other(camera))
     weighted: loss = l1_loss(image, gt)

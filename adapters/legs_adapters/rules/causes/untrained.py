@@ -1,4 +1,4 @@
-"""Leave a term that no backward pass reaches: for scoring, for evaluation, or for what cannot be seen."""
+"""Skip a term that no backward pass reaches: for scoring, for evaluation, or for an unknown purpose."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Scoring(Rule):
 
 
 class Scoring(_Scoring):
-    """No backward pass reaches the term, and it is for densification or pruning, as a name says.
+    """No backward pass reaches the term, and a name says that it is for densification or pruning.
 
     left:
         def importance_score(gaussians, camera):
@@ -41,7 +41,7 @@ class Scoring(_Scoring):
 
 
 class NoStep(ByPurpose, _Scoring):
-    """Nothing steps on the gradients: they are read and thrown away, to score the Gaussians.
+    """No optimiser uses the gradients: they are read to score the Gaussians, then discarded.
 
     left:
         def drop_unseen(gaussians, cameras):
@@ -58,7 +58,7 @@ class NoStep(ByPurpose, _Scoring):
 
 
 class Evaluation(EvaluationRule):
-    """No backward pass reaches the term, and it stands under ``no_grad``, or in what reports or tests.
+    """No backward pass reaches the term, and it is under ``no_grad``, or in code that reports or tests.
 
     left:
         with torch.no_grad():
@@ -85,7 +85,7 @@ class _Untrained(Rule):
 
 
 class Untrained(_Untrained):
-    """No backward pass reaches the term, and nothing says what it is for.
+    """No backward pass reaches the term, and no name says what it is for.
 
     left:
         def photometric(gaussians, camera):
@@ -104,7 +104,7 @@ class Untrained(_Untrained):
 
 
 class Leaf(_Untrained):
-    """A side is a tensor whose own gradient is asked for: no rendering made it.
+    """One side is a leaf tensor that requires a gradient, not a rendering.
 
     left:
         image = torch.tensor(camera.pixels).requires_grad_()
@@ -120,14 +120,14 @@ class Leaf(_Untrained):
 
 
 def _is_untrained(term: Term) -> bool:
-    """Return whether no backward pass reaches a term, or no gradient is kept of it."""
+    """Return whether no backward pass reaches a term, or it is under ``no_grad``."""
     training, form = term.analysis.training, term.form
     trained = training.includes(form.node) or training.includes(form.call) or _is_called_by_framework(term)
     return not trained or is_without_grad(term.function, form.call, form.node) or _is_asked_without_grad(term)
 
 
 def _is_called_by_framework(term: Term) -> bool:
-    """Return whether it makes the loss of a module's ``forward``, whose caller is settled at run time (a registry)."""
+    """Return whether it makes the loss of a module's ``forward``, whose caller is chosen at run time (a registry)."""
     training = term.analysis.training
     if not LOSS & set(words(term.function.name)):
         return False
@@ -141,13 +141,13 @@ def _is_called_by_framework(term: Term) -> bool:
 
 
 def _is_asked_without_grad(term: Term) -> bool:
-    """Return whether no caller keeps a gradient of it: an error map for the next step's mask."""
+    """Return whether every caller drops its gradient: an error map for the next step's mask."""
     sites = term.analysis.training.sites.get(term.function, [])
     return bool(sites) and all(is_without_grad(caller, call) for caller, call in sites)
 
 
 def _said(term: Term, spoken: AbstractSet[str]) -> List[Decider]:
-    """Return the first of the term's function, its class and its callers whose name is one of some words."""
+    """Return the first of the term's function, its class and its callers whose name has one of some words."""
     return [decider for name, decider in _names(term) if spoken & set(words(name))][:1]
 
 
@@ -176,9 +176,9 @@ def _callers(term: Term, function: Function) -> List[Function]:
 
 
 def _leaves(function: Function, node: cst.CSTNode) -> List[Decider]:
-    """Return the calls that make a leaf, ``torch.tensor(array).requires_grad_()``, made by no rendering.
+    """Return the calls that make a leaf tensor, ``torch.tensor(array).requires_grad_()``.
 
-    ``torch.cat(images).requires_grad_()`` has those of the renderings.
+    ``torch.cat(images).requires_grad_()`` keeps the gradients of renderings.
     """
     calls = [
         value

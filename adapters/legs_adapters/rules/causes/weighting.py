@@ -1,4 +1,4 @@
-"""Leave an error map that only makes weights or a mask."""
+"""Skip an error map that only makes weights or a mask."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["ErrorMask", "UnreadError", "Weighting"]
 
 
 class Weighting(Rule):
-    """The prediction is detached, or the error only becomes a weight or a mask.
+    """The prediction is detached, or the error is only used as a weight or a mask.
 
     left: loss = l1_loss(image.detach(), gt) * image.mean()
     weighted: loss = l1_loss(image, gt)
@@ -33,7 +33,7 @@ class Weighting(Rule):
 
 
 class ErrorMask(Rule):
-    """The error map has a name, and what reads it makes a mask.
+    """The error map is assigned to a name, and its reads make a mask.
 
     left:
         error = F.l1_loss(image, gt, reduction="none")
@@ -56,7 +56,7 @@ class ErrorMask(Rule):
 
 
 class UnreadError(Rule):
-    """The error map of a loss module has a name, and no backward pass in sight reaches what reads it.
+    """The error map of a loss module is assigned to a name, and no backward pass reaches the reads of that name.
 
     left:
         class ImageLoss(torch.nn.Module):

@@ -20,7 +20,7 @@ __all__ = ["Absolute"]
 
 @dataclass(frozen=True)
 class Absolute(Form):
-    """An absolute difference: the words around it go, and the difference becomes two arguments.
+    """An absolute difference: the text around it is replaced, and the difference becomes two arguments.
 
     Example:
         before: loss = torch.abs(image - gt_image).mean()

@@ -21,7 +21,7 @@ __all__ = ["Callback", "Callbacks", "PassedByName"]
 
 @dataclass(frozen=True)
 class PassedByName(Form):
-    """A function handed over by name; ``node`` is the name, ``call`` the call that it serves.
+    """A function that is passed by name; ``node`` is the name, ``call`` the call of the callback.
 
     Example:
         before: loss = combined(image, gt_image, [l1_loss])
@@ -40,7 +40,7 @@ class PassedByName(Form):
 class Callback(NamedTuple):
     """A callback: the form to replace, and the function in which it is called.
 
-    ``outer`` is the call that passes it there, for one of a list: one function may get images and depths so.
+    ``outer`` is the call that passes it, for one of a list: one function may get images and depths.
     """
 
     form: Form
@@ -49,7 +49,7 @@ class Callback(NamedTuple):
 
 
 class Callbacks:
-    """The callbacks of one program, looked for when they are first asked for."""
+    """The callbacks of one program, found on first use."""
 
     def __init__(self, program: Program, training: Training, forms: Forms) -> None:
         self._program = program
@@ -59,11 +59,11 @@ class Callbacks:
         self._by_holder: Optional[Dict[Function, List[Callback]]] = None
 
     def of(self, holder: Function) -> List[Callback]:
-        """Return the callbacks that a function, or a top level, names."""
+        """Return the callbacks that a function, or a module's top level, passes."""
         return self._found().get(holder, [])
 
     def includes(self, function: Function) -> bool:
-        """Return whether an L1 function is given to a name that is called."""
+        """Return whether an L1 function is assigned to a name that is called."""
         self._found()  # which fills them
         return function in self._assigned
 
@@ -81,7 +81,7 @@ class Callbacks:
         self._by_holder.setdefault(holder, []).append(callback)
 
     def _add_assigned(self, function: Function) -> None:
-        """Add the names that a function is given, ``self.criterion = l1_loss``, and that training calls."""
+        """Add names that are assigned an L1 function, ``self.criterion = l1_loss``, and that training calls."""
         own, calls = self._forms.functions, self._training.sites[function]
         shape = own.shape(function)
         if shape is None:
@@ -125,7 +125,7 @@ class Callbacks:
                         self._add(caller, Callback(form, function, outer))
 
     def uncalled(self, function: Function) -> Iterator[Tuple[str, cst.BaseExpression]]:
-        """Yield the names that a function gives to L1 functions and that no call in sight uses, each with the L1."""
+        """Yield names that are assigned L1 functions and have no call in the codebase, each with the L1."""
         known = {id(callback.form.node) for callback in self.of(function)}
         for form in self._forms.of(function):  # and what is called by a name of its own
             named = function.flow.reaching(form.callee) if form.callee is not None else ()
@@ -145,7 +145,7 @@ class Callbacks:
 
 
 def _is_read(holder: Function, place: str) -> bool:
-    """Return whether a function, or one in it, reads a name of its own; what has other names, others may read."""
+    """Return whether a function, or one in it, reads a local name; other places may be read elsewhere."""
     if holder.parent is None or "." in place:
         return True
     return any(read.value == place for each in (holder, *holder.inner) for read in each.flow.reads)

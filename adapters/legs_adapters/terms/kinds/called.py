@@ -36,7 +36,7 @@ class Called(Form):
 
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
-        """Find a call of an L1 function by what the function does, or by its name where it cannot be seen."""
+        """Find a call of an L1 function, by the function's body, or by its name where the body is not available."""
         if len(call.args) < 2:
             return None
         references = functions.program.resolve(function, call.func)
@@ -84,7 +84,7 @@ class Called(Form):
         return "" if self.takes_index else writing.own(self.callee, self.extras)
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
-        """Replace the function, order the two images, and put the settings in the further arguments' place."""
+        """Replace the function, order the two images, and replace the further arguments by the settings."""
         taken = [arg for arg in self.call.args if arg.value is self.first or arg.value is self.second]
         edits = [text.replace(*text.span(self.call.func, True), f"{writing.package}.l1_loss")]
         sides = writing.ordered(*(text.argument(arg.value, writing.selection) for arg in taken))
@@ -116,7 +116,7 @@ class Called(Form):
 
 
 def _handed_on(program: Program, function: Function, node: cst.Call) -> List[Reference]:
-    """Return torch's L1 for a parameter ``loss_fn``, where that is what every caller gives."""
+    """Return torch's L1 for a parameter ``loss_fn``, where every caller passes that."""
     name = call_name(node)
     if not function.is_parameter(node.func) or arguments(node)[2]:
         return []

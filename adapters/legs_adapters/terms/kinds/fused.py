@@ -1,4 +1,4 @@
-"""Find L1 and SSIM in one function from elsewhere, ``fused_l1_ssim_loss(image, gt)``: a person splits it."""
+"""Find library functions that fuse L1 and SSIM, ``fused_l1_ssim_loss(image, gt)``: they are split by hand."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def fused_losses(program: Program, training: Training, function: Function) -> It
             place = function.place(call)
             sides = ", ".join(one_line(arg.value) for arg in call.args[:2])
             advice = f"(1 - w) * legs_loss.l1_loss({sides}) + w * legs_loss.d_ssim({sides})"
-            why = "L1 and SSIM are one function here; with w, its weight of SSIM, they are two"
+            why = "one function computes L1 and SSIM: split it, with w the weight of SSIM"
             yield place, Problem.at(function, place, why, advice)
 
 

@@ -1,4 +1,4 @@
-"""``diff = a - b``, then ``diff[mask].abs().mean()``: the difference has a name of its own."""
+"""``diff = a - b``, then ``diff[mask].abs().mean()``: the difference is assigned to a name."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Named"]
 
 @dataclass(frozen=True)
 class Named(Form):
-    """A difference with a name: the two images are written in the name's place.
+    """A difference with a name: the two images replace the name.
 
     Example:
         before: diff = image - gt_image; loss = diff.abs().mean()
@@ -32,7 +32,7 @@ class Named(Form):
 
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
-        """Find ``abs`` of a name, or of an index of it, that is one difference."""
+        """Find ``abs`` of a name, or of an index of it, whose value is a difference."""
         found = absolute_value(call)
         if found is None:
             return None
@@ -53,7 +53,7 @@ class Named(Form):
         return cls(form.node, form.call, first, second, form.callee, selection=index, makes=makes)
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
-        """Replace the whole term; the name and its difference stay for whoever else reads them."""
+        """Replace the whole term; the name and its difference stay for other reads."""
         carried = writing.selection[: len(writing.selection) - len(self.selection)]
         first, second = (on_one_line(text.argument(side, carried)) for side in (self.first, self.second))
         tail = writing.selection + (".mean()" if writing.selection and self.is_mean else "")

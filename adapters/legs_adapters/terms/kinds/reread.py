@@ -1,4 +1,4 @@
-"""``error = abs(a - b)``, of which one read is the loss and others are not: that read alone is replaced."""
+"""``error = abs(a - b)``, of which one read is the loss and others are not: only that read is replaced."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A loss whose function is settled at run time, ``loss_fn = eval(f"{kind}_loss")``, beside D-SSIM of the same pair."""
+"""A loss whose function is chosen at run time, ``loss_fn = eval(f"{kind}_loss")``, beside D-SSIM of the same pair."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ __all__ = ["chosen_at_run_time"]
 
 
 def chosen_at_run_time(program: Program, training: Training, function: Function, known: Sequence[Form]) -> List[Form]:
-    """Return the calls that may be the L1 of a function's loss, going by what they stand beside.
+    """Return the calls that may be the L1 of a function's loss, from the SSIM beside them.
 
-    What is called is given a pair of pictures that SSIM is given too, and is looked up by a name that settings make.
-    ``known`` are the function's own forms: of a pair that has an L1, nothing else is one.
+    The call has the two images of an SSIM, and its function is looked up by a name from the settings.
+    ``known`` are the function's own forms: their pairs have an L1 already.
     """
     structural = [
         call for call in function.flow.calls if STRUCTURAL.search(call_name(call)) and training.includes(call)
@@ -43,7 +43,7 @@ def chosen_at_run_time(program: Program, training: Training, function: Function,
 
 
 def _is_looked_up(program: Program, function: Function, call: cst.Call) -> bool:
-    """Return whether it is not known what is called before the settings are."""
+    """Return whether the called function depends on settings."""
     if program.resolve(function, call.func) or is_l1_name(call_name(call)):
         return False
     definitions = program.lookup(function, call.func) or []
@@ -55,7 +55,7 @@ def _is_looked_up(program: Program, function: Function, call: cst.Call) -> bool:
 
 
 def _looks_up(value: Optional[cst.CSTNode]) -> bool:
-    """Return whether settings say what is called: ``eval(name)``, ``getattr(losses, name)``, ``losses[name]``."""
+    """Return whether a value is looked up by a name: ``eval(name)``, ``getattr(losses, name)``, ``losses[name]``."""
     if isinstance(value, cst.Subscript):
         return key_of(value) is None
     if not isinstance(value, cst.Call) or call_name(value) not in BY_NAME:

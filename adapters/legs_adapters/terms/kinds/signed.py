@@ -1,4 +1,4 @@
-"""``difference = relative(image, gt)``, then its absolute value: a function weighted the difference that it made."""
+"""``difference = relative(image, gt)``, then its absolute value: a function returns a weighted difference."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Signed"]
 
 @dataclass(frozen=True)
 class Signed(Form):
-    """The absolute value of a weighted difference; l1_loss would lose the weight, so a person writes it.
+    """The absolute value of a weighted difference; l1_loss would drop the weight, so it is edited by hand.
 
     Example:
         before: diff = relative(image, gt_image); loss = torch.abs(diff).mean()
@@ -41,8 +41,8 @@ class Signed(Form):
         return cls(call, found.call, first, second)
 
     def why_by_hand(self) -> str:
-        """Say where the weight came in."""
-        return f"the difference {self._difference()} was weighted where it was made, which l1_loss would lose"
+        """Return that the difference is weighted already."""
+        return f"the difference {self._difference()} already has a weight, which l1_loss would drop"
 
     def _advice(self, writing: Writing, prediction: str, target: str, rows: bool) -> str:
         mean = ".mean()" if self.node is not self.call else ""

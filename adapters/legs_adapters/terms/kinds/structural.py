@@ -1,4 +1,4 @@
-"""``ssim(image, gt)``: the structural term, which stays what it is and is computed by ``legs_loss.ssim``."""
+"""``ssim(image, gt)``: the structural term, computed by ``legs_loss.ssim`` with the same value."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Structural(Form):
 
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
-        """Find a call of what is named an SSIM, whatever it computes."""
+        """Find a call of a function that is named as an SSIM, whatever it computes."""
         inner = call_name(call.func) if isinstance(call.func, cst.Call) else ""  # SSIM()(image, gt)
         if not STRUCTURAL.search(call_name(call) or inner):
             return None
@@ -51,7 +51,7 @@ class Structural(Form):
         return cls(call, call, *sides, call.func, extras)
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
-        """Replace the function; what the call says beside the two images is what ``legs_loss.ssim`` does anyway."""
+        """Replace the function; the further arguments are the defaults of ``legs_loss.ssim``, and are dropped."""
         edits = [text.replace(*text.span(self.call.func, True), f"{writing.package}.ssim")]
         if self.extras or any(arg.keyword is not None for arg in self.call.args):
             start, end = text.span(self.call.args[0])[0], text.span(self.call.args[-1])[1]
@@ -60,7 +60,7 @@ class Structural(Form):
         return edits
 
     def said(self, view: View) -> str:
-        """Return why it may be: whose SSIM it is."""
+        """Return why the edit keeps the value: whose SSIM it is."""
         return view.reason
 
     def _advice(self, writing: Writing, prediction: str, target: str, rows: bool) -> str:

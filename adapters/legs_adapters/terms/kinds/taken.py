@@ -19,7 +19,7 @@ __all__ = ["Taken"]
 
 @dataclass(frozen=True)
 class Taken(Form):
-    """A difference whose absolute value a function takes; a person weights the difference.
+    """A difference whose absolute value a function takes; the difference is weighted by hand.
 
     Example:
         before: residual = image - gt_image; loss = robust(residual, 0.1)

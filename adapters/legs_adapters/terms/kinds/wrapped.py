@@ -19,7 +19,7 @@ __all__ = ["Wrapped"]
 
 @dataclass(frozen=True)
 class Wrapped(Form):
-    """An expression around the difference, which stays as a function of what is compared.
+    """An expression around the difference, which is kept as a function of the two sides.
 
     Example:
         before: loss = abs((image - gt_image) * 2).mean()
@@ -43,13 +43,13 @@ class Wrapped(Form):
         return None
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
-        """Make the expression a lambda of prediction and target, and hand it over as ``own=``."""
+        """Make the expression a lambda of prediction and target, and pass it as ``own=``."""
         difference = self.difference
         assert difference is not None
         start, end = text.span(self.node)
         left, right = text.span(difference.left, True), text.span(difference.right, True)
         pieces = [text.between(start, left[0]), text.between(left[1], right[0]), text.between(right[1], end)]
-        index = writing.selection  # into the pictures of own, for the weight is of whole ones
+        index = writing.selection  # applied inside own: the weight is of whole images
         a, b = names_for_two(on_one_line("\n".join([*pieces, index])))
         names = ", ".join(writing.ordered(a, b))
         own = on_one_line(f"lambda {names}: {pieces[0]}{a}{index}{pieces[1]}{b}{index}{pieces[2]}")

@@ -1,8 +1,8 @@
 """Torch's operations on small arrays, as far as an SSIM takes them, by numpy in double precision.
 
-Of an image only what is rational in its pixels is answered: sums, products, quotients, blurs, means. A function of
-these that agrees with another one at random images is that function. What looks at an image's values (``clamp``,
-``if image.max() > 1``) or its size (``if height > 256``), or cuts its gradient (``detach``), is not answered.
+Only rational functions of an image's pixels are evaluated: sums, products, quotients, blurs, means. Two of them that
+agree on random images are equal. Operations that test an image's values (``clamp``, ``if image.max() > 1``) or its
+size (``if height > 256``), or that cut its gradient (``detach``), are not supported.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Tensor:
 
 
 class _Size:
-    """The length of an image's axis: what asks whether it is large or small gets no answer."""
+    """The length of an image's axis: comparisons with it are not supported."""
 
     def __init__(self, value: int) -> None:
         self.value = value
@@ -43,13 +43,13 @@ _DEVICE, _FLOAT = _Token(), _Token()
 
 
 class Torch(Library):
-    """Answers for torch, in one evaluation.
+    """Evaluate torch's operations, in one evaluation.
 
     Args:
-        cuda: whether images say that they are on a GPU.
+        cuda: whether images report that they are on a GPU.
 
     Attributes:
-        depends_on_device: whether they were asked.
+        depends_on_device: whether the function asked for that.
     """
 
     def __init__(self, cuda: bool) -> None:
@@ -82,7 +82,7 @@ class Torch(Library):
         return lambda *given, **named: _METHODS[name](value, *given, **named)
 
     def operate(self, function: Callable[[Any, Any], Any], left: Any, right: Any) -> Any:
-        """Return what an operator makes of tensors, numbers and lengths."""
+        """Return the result of an operator on tensors, numbers and lengths."""
         if isinstance(left, _Size) or isinstance(right, _Size):
             return _Size(int(function(_length(left), _length(right))))
         if function is operator.pow:

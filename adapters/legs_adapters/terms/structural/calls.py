@@ -1,4 +1,4 @@
-"""Tell of the calls of SSIM functions whether what they compute is 3DGS's SSIM, and what shows it."""
+"""Decide whether calls of SSIM functions compute 3DGS's SSIM, with the evidence."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _MISSING = object()
 
 
 class Proof(NamedTuple):
-    """The value of a call.
+    """The verdict on the value of a call.
 
     Attributes:
         lack: why it is not 3DGS's SSIM, or not provably: "library" (the function is not of this checkout), "settings"
             (of this call), "value" (it computes something else), "unproven"; empty where it is.
-        deciders: what shows that.
+        deciders: the evidence.
         function: the function that is 3DGS's SSIM.
     """
 
@@ -34,20 +34,20 @@ class Proof(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Return in words whose SSIM it is, where it is 3DGS's."""
+        """Return the report's text where it is 3DGS's SSIM."""
         where = f"{self.function.module.path}:{self.function.line}" if self.function is not None else ""
         return f"{where} is the SSIM of 3DGS"
 
 
 class SsimCalls:
-    """Answers for one program."""
+    """Answer for one program."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
         self.functions: SsimFunctions = SsimFunctions(program)
 
     def proof(self, function: Function, form: Form) -> Proof:
-        """Return what a call in a function computes, with what shows it."""
+        """Return what a call in a function computes, with the evidence."""
         assert form.callee is not None
         here: Decider = (function, form.call)
         references = self.program.resolve(function, form.callee)
@@ -81,7 +81,7 @@ class SsimCalls:
         return len(function.parameters) >= 2 and bool(self.functions.answer(function).is_ssim)
 
     def _import(self, function: Function, callee: cst.BaseExpression) -> Optional[Decider]:
-        """Return the import, or the object, that a called name stands for."""
+        """Return the import, or the object, that a called name refers to."""
         name: cst.CSTNode = callee
         while isinstance(name, (cst.Attribute, cst.Call)):
             name = name.value if isinstance(name, cst.Attribute) else name.func

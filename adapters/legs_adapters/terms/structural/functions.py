@@ -1,4 +1,4 @@
-"""Tell which functions of a checkout are 3DGS's SSIM, by what they make of small images."""
+"""Find the functions of a checkout that are 3DGS's SSIM, from their values on small images."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Answer(NamedTuple):
     """The kind of SSIM that a function is.
 
     Attributes:
-        is_ssim: whether it is 3DGS's SSIM for these arguments; None where that cannot be told.
-        decider: where it cannot be told, the node that stops the evaluation, with its function.
+        is_ssim: whether it is 3DGS's SSIM for these arguments; None where that is unknown.
+        decider: where it is unknown, the node that stops the evaluation, with its function.
     """
 
     is_ssim: Optional[bool]
@@ -42,10 +42,10 @@ class SsimFunctions:
     def answer(
         self, function: Function, extras: Tuple[Any, ...] = (), keywords: Optional[Dict[str, Any]] = None
     ) -> Answer:
-        """Say whether a function of two images, given these further arguments, is 3DGS's SSIM.
+        """Decide whether a function of two images, with these further arguments, is 3DGS's SSIM.
 
-        It is where it has that one's value for random images of every shape that it takes, whether or not they are on
-        a GPU. What it does is rational in the pixels (see arrays.py), so that equal values are no chance.
+        It is where the values are equal for random images of every shape that it takes, on a CPU and on a GPU. The
+        function is rational in the pixels (see arrays.py), so equal values are not a coincidence.
         """
         named = keywords or {}
         key = function, repr((extras, sorted(named.items())))

@@ -32,7 +32,7 @@ class Reference(NamedTuple):
 
 
 class Conventions(NamedTuple):
-    """How libraries pass objects on, which the checkout itself does not show.
+    """The conventions by which libraries pass objects on, which the checkout itself does not show.
 
     Attributes:
         returning_self: methods that return the object itself, ``model.cuda()``.

@@ -56,7 +56,7 @@ class TestOthers:
 
     def test_what_a_fork_s_rasterizer_has_more_is_an_error_that_names_it(self):
         rasterizer = forks.module("diff_fork", Interface()).GaussianRasterizer(None)
-        with pytest.raises(MissingShim, match=r"diff_fork\.GaussianRasterizer\.integrate has no stand-in"):
+        with pytest.raises(MissingShim, match=r"diff_fork\.GaussianRasterizer\.integrate has no shim"):
             rasterizer.integrate(torch.ones(3))
         assert not hasattr(rasterizer, "_private")
 

@@ -184,7 +184,7 @@ class TestForks:
         assert done.returncode == 2
         assert done.stderr.splitlines()[-1] == (
             "legs: error: diff_gaussian_rasterization.GaussianRasterizer.forward's result 'out_flow' "
-            "has no stand-in on the CPU"
+            "has no shim on the CPU"
         )
 
     @pytest.mark.parametrize(
@@ -221,7 +221,7 @@ class TestTheScriptIsNotBent:
         assert done.returncode == 3
         *found, folder = done.stdout.splitlines()
         assert found[:3] == ["[0]", "['memory.used [MiB]', '0 MiB', '']", "['0, 0', '']"]
-        assert found[3] == "1  legs: error: nvidia-smi --gpu-reset has no stand-in on the CPU"
+        assert found[3] == "1  legs: error: nvidia-smi --gpu-reset has no shim on the CPU"
         assert not os.path.exists(folder)
 
     @pytest.mark.slow

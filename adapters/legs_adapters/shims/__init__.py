@@ -1,9 +1,9 @@
 """Run an upstream training script without a GPU: CUDA calls redirected to the CPU, CUDA modules replaced by shims.
 
-- torch_cuda/: what a script asks of torch.cuda and of CUDA devices.
-- modules/: one file an upstream module, named as it is imported.
-- inria/: what the rasterizers of Inria's family share, and the one that fits itself to an unknown fork.
-- finder.py: the import hook that puts the shims in.
+- torch_cuda/: replacements for torch.cuda and CUDA devices.
+- modules/: one file per upstream module, named as it is imported.
+- inria/: the common parts of the rasterizers of Inria's family, and one that adapts to an unknown fork.
+- finder.py: the import hook that installs the shims.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["MissingShim", "start"]
 
 
 def start(root: Path) -> None:
-    """Answer for CUDA in this process, for the codebase in ``root``, until it ends."""
+    """Replace CUDA in this process, for the codebase in ``root``, until the process ends."""
     from legs_adapters.shims import finder, nvidia_smi, torch_cuda
     from legs_adapters.shims.inria.survey import survey
 

@@ -1,8 +1,8 @@
-"""Find the shim of a CUDA module: the import hook that puts shims in before Python looks for the real modules.
+"""Find the shim of a CUDA module: the import hook that finds shims before Python finds the real modules.
 
 A file in modules/ is the shim of the module that it is named after. It lists in ``__all__`` what scripts import from
 that module; anything else is an error that names it. A module with submodules has ``module(name, interface)`` in place
-of ``__all__``, which returns it complete. ``REAL_FIRST = True`` leaves the import to a real module that is installed.
+of ``__all__``, which returns the module. With ``REAL_FIRST = True`` an installed real module is imported instead.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ AMENDED: Dict[str, str] = {
 
 
 class Shim(NamedTuple):
-    """The module of this package that builds a shim, and what the codebase expects of it."""
+    """The module of this package that builds a shim, and the interface that the codebase expects."""
 
     home: str
     interface: Interface
@@ -41,7 +41,7 @@ class Shim(NamedTuple):
 def table_for(expected: Optional[Dict[str, Interface]] = None) -> Dict[str, Shim]:
     """Return the shims by import name, for a codebase whose rasterizers are expected to have these interfaces.
 
-    A rasterizer without a file in modules/ is taken for a fork of Inria's.
+    A rasterizer without a file in modules/ is treated as a fork of Inria's.
     """
     table = {
         found.name: Shim(f"{modules.__name__}.{found.name}", Interface())
@@ -63,7 +63,7 @@ def build(name: str, shim: Shim) -> types.ModuleType:
 
 
 class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds the shims of a table, and their submodules."""
+    """Find the shims of a table, and their submodules."""
 
     def __init__(self, table: Dict[str, Shim]) -> None:
         self.table = table
@@ -99,7 +99,7 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return spec.loader_state
 
     def exec_module(self, module: types.ModuleType) -> None:
-        """Nothing: it is complete."""
+        """Do nothing: the module is complete."""
 
     def _made(self, name: str) -> bool:
         return getattr(getattr(sys.modules.get(name), "__spec__", None), "loader", None) is self
@@ -128,7 +128,7 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def _is_for_a_library() -> bool:
-    """Return whether an installed package imports: one that can do without torchvision must not get a part of it."""
+    """Return whether an installed package does the import: it must not get a partial torchvision."""
     frame = sys._getframe(2)
     while frame is not None and "importlib" in frame.f_code.co_filename:
         frame = frame.f_back  # type: ignore[assignment]
@@ -137,7 +137,7 @@ def _is_for_a_library() -> bool:
 
 
 def install(table: Optional[Dict[str, Shim]] = None) -> Finder:
-    """Put the import hook in front of Python's own, and return it."""
+    """Install the import hook before Python's own finders, and return it."""
     finder = Finder(table_for() if table is None else table)
     sys.meta_path.insert(0, finder)
     return finder

@@ -1,4 +1,4 @@
-"""Raise one error for what has no stand-in on the CPU; build modules that raise it for what they lack."""
+"""Raise one error for everything that has no shim on the CPU; build modules that raise it for missing names."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ __all__ = ["Absent", "Deferred", "MissingShim", "check_finite", "complete", "ref
 
 
 class MissingShim(LegsError, ImportError):
-    """A CUDA feature that the CPU does not have; the message names its module and function.
+    """A CUDA feature without a shim; the message names its module and function.
 
-    It is an ImportError too, so that a script that only tries whether a module has something goes on without it.
+    It is also an ImportError, so that a script that only tests for a feature continues without it.
     """
 
     def __init__(self, module: str, function: str, reason: str = "") -> None:
         what = f"{module}.{function}" if function else module
-        super().__init__(f"{what} has no stand-in on the CPU" + (f": {reason}" if reason else ""))
+        super().__init__(f"{what} has no shim on the CPU" + (f": {reason}" if reason else ""))
 
 
 def check_finite(owner: str, tensors: Dict[str, Any]) -> None:
@@ -31,7 +31,7 @@ def check_finite(owner: str, tensors: Dict[str, Any]) -> None:
 
 
 def refuse_unknown(module: str, inputs: Dict[str, Any]) -> None:
-    """Raise for the first input of a rasterizer's ``forward`` that is given and has no meaning here."""
+    """Raise for the first input of a rasterizer's ``forward`` that is given and not supported."""
     for name, value in inputs.items():
         if value is not None:
             raise MissingShim(module, f"GaussianRasterizer.forward({name}=...)")
@@ -40,8 +40,8 @@ def refuse_unknown(module: str, inputs: Dict[str, Any]) -> None:
 def complete(name: str, doc: Optional[str], *parts: Any, deferred: bool = False) -> types.ModuleType:
     """Return a module of these functions, classes and submodules, by their names.
 
-    Anything else asked of it is a `MissingShim`: at once or, ``deferred``, where it is used, for modules of which
-    scripts import more than they use.
+    Any other name is a `MissingShim`: at once or, ``deferred``, on its first use, for modules of which scripts import
+    more than they use.
     """
     made = types.ModuleType(name, doc)
     for part in parts:
@@ -59,7 +59,7 @@ def complete(name: str, doc: Optional[str], *parts: Any, deferred: bool = False)
 
 
 class Deferred:
-    """Stand in for a function or class that has no shim: calling it, or reading its attributes, is the error."""
+    """Replace a function or class that has no shim: a call, or a read of its attributes, is the error."""
 
     def __init__(self, module: str, name: str) -> None:
         self.__dict__["_error"] = (module, name)
@@ -75,7 +75,7 @@ class Deferred:
 
 
 class Absent:
-    """Stand in for a result that is not known here: any use of it is an error that names it."""
+    """Replace an unknown result of a rasterizer: any use of it is an error that names it."""
 
     def __init__(self, module: str, name: str) -> None:
         self.__dict__["_error"] = (module, f"GaussianRasterizer.forward's result {name!r}")

@@ -1,6 +1,6 @@
-"""`nvidia-smi` for scripts that ask it which GPU is free: there is one, and nothing in its memory is used.
+"""A replacement of `nvidia-smi` for scripts that look for a free GPU: it reports one with unused memory.
 
-Run as a program it needs Python alone. `offer` puts it on PATH where there is no other.
+As a program it needs only the standard library. `offer` puts it on PATH where there is no other.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["answer", "memory", "offer"]
 
 
 def memory() -> int:
-    """Return the machine's memory in bytes, which is what this GPU has."""
+    """Return the machine's memory in bytes, as the memory of this GPU."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
@@ -29,7 +29,7 @@ def answer(arguments: Sequence[str]) -> str:
     """Return what nvidia-smi prints for ``-q -d MEMORY``, or for ``--query-gpu=FIELDS --format=csv[,...]``.
 
     Raises:
-        KeyError: it is asked anything else.
+        KeyError: for any other query.
     """
     total = memory() >> 20
     if [word.lower() for word in arguments] == ["-q", "-d", "memory"]:
@@ -60,7 +60,7 @@ def answer(arguments: Sequence[str]) -> str:
 
 
 def offer() -> None:
-    """Put this program on PATH, for this process's children, until it ends; not where there is a real one."""
+    """Put this program on PATH, for this process's children, until it ends; unless there is a real one."""
     if os.name != "posix" or shutil.which("nvidia-smi"):
         return
     folder = tempfile.mkdtemp(prefix="legs-")
@@ -77,4 +77,4 @@ if __name__ == "__main__":
     try:
         print(answer(sys.argv[1:]))
     except KeyError:
-        sys.exit(f"legs: error: nvidia-smi {' '.join(sys.argv[1:])} has no stand-in on the CPU")
+        sys.exit(f"legs: error: nvidia-smi {' '.join(sys.argv[1:])} has no shim on the CPU")

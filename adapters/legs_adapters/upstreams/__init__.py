@@ -1,1 +1,1 @@
-"""Weight what is not a line in a script: one module for each codebase that needs more than the generic rule."""
+"""Weight losses that are not in a script: one module for each codebase that needs more than the general rules."""

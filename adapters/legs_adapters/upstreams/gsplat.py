@@ -1,8 +1,8 @@
 """gsplat: weight ``gsplat.losses.l1_loss``, which its trainers and others' call with a rendering and a photograph.
 
-That function takes tensors of any shape and returns unreduced errors. It is weighted for images of three channels that
-are trained on, whichever way they lie; depths, intensities and everything without a gradient stay as they are. A target
-that has a gradient itself is no photograph. Source: gsplat/losses.py, which gsplat has since its version 1.5.3.
+That function takes tensors of any shape and returns unreduced errors. It is weighted for trained images of three
+channels in either layout; depths, intensities and everything without a gradient are unchanged. A target that requires a
+gradient is not a photograph. Source: gsplat/losses.py, which gsplat has since its version 1.5.3.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def apply(applied: Applied) -> None:
 
 
 def _channels_last(image: Any) -> Optional[bool]:
-    """Return whether an image's channels come last, None of what is no image: [..., H, W, 3] or [..., 3, H, W]."""
+    """Return whether an image's channels come last, None for other tensors: [..., H, W, 3] or [..., 3, H, W]."""
     if image.dim() < 3 or not image.is_floating_point():
         return None
     first, last = image.shape[-3] == 3, image.shape[-1] == 3

@@ -24,7 +24,7 @@ class SplatfactoLegs(NerfStudio):
     _require_points3D = True
 
     def __init__(self, *, checkpoint: Any = None, train_dataset: Any = None, config_overrides: Any = None) -> None:
-        # ``--set`` hands over text, where nerfstudio's settings have types; ``method`` is no setting of nerfstudio.
+        # ``--set`` passes text, and nerfstudio's settings have types; ``method`` is not a setting of nerfstudio.
         settings = {
             name: yaml.safe_load(value) if isinstance(value, str) else value
             for name, value in (config_overrides or {}).items()
@@ -34,7 +34,7 @@ class SplatfactoLegs(NerfStudio):
 
     @classmethod
     def get_method_info(cls) -> Any:
-        """Return what the method needs and gives; NerfBaselines undistorts what is no pinhole camera."""
+        """Return the method's inputs and outputs; NerfBaselines undistorts other cameras than pinhole."""
         return {
             **super().get_method_info(),
             "supported_camera_models": frozenset(("pinhole",)),
@@ -47,7 +47,7 @@ class SplatfactoLegs(NerfStudio):
         pipeline = self._trainer.pipeline
         pipeline.eval()
         trained = pipeline.datamanager.train_dataparser_outputs
-        # The conventions of cameras are written down once, where the training views are read.
+        # The camera conventions are implemented once, where the training views are read.
         parser = _CustomDataParser(
             {"cameras": camera.item()[None], "masks": None},
             trained.dataparser_transform,
@@ -60,7 +60,7 @@ class SplatfactoLegs(NerfStudio):
         return self._format_output(images, options)
 
     def _patch_dataparser(self, dataparser_cls: Any, *, train_dataset: Any, **settings: Any) -> Any:
-        if train_dataset is not None:  # masks are handed over as arrays below, not as files
+        if train_dataset is not None:  # masks are passed as arrays below, not as files
             train_dataset = {**train_dataset, "masks": None}
         return super()._patch_dataparser(dataparser_cls, train_dataset=train_dataset, **settings)
 

@@ -1,8 +1,8 @@
 """nerfstudio: the method ``splatfacto-legs``, which is splatfacto with its L1 weighted and nothing else changed.
 
-After ``pip install legs-loss`` in nerfstudio's environment, ``ns-train splatfacto-legs`` is there, through the entry
-point ``nerfstudio.method_configs``. Nothing of nerfstudio is imported before it asks for the method: it asks while its
-own list of methods is being made, and this module must be importable then. ``legs_loss.apply_to_nerfstudio()`` weights
+After ``pip install legs-loss`` in nerfstudio's environment, ``ns-train splatfacto-legs`` is available, by the entry
+point ``nerfstudio.method_configs``. nerfstudio is imported only when it requests the method: it does so while it builds
+its list of methods, and this module must be importable then. ``legs_loss.apply_to_nerfstudio()`` weights
 ``splatfacto`` itself, for those who start it from Python.
 """
 
@@ -27,7 +27,7 @@ def __getattr__(name: str) -> Any:
         return _specification()
     if name == "SplatfactoLegsModel" and name in globals():
         return globals()[name]
-    if name == "SplatfactoLegsModel":  # under this name it stands in the config.yml of a run
+    if name == "SplatfactoLegsModel":  # the config.yml of a run has this name
         base = importlib.import_module("nerfstudio.models.splatfacto").SplatfactoModel
         globals()[name] = model = legs_model(base)
         return model
@@ -46,7 +46,7 @@ def _specification() -> Any:
 
 
 def apply(applied: Applied) -> None:
-    """Weight the loss of splatfacto itself, and of the methods that are made from it."""
+    """Weight the loss of splatfacto itself, and of methods derived from it."""
     model = importlib.import_module("nerfstudio.models.splatfacto").SplatfactoModel
     own = model.get_loss_dict
 
@@ -59,7 +59,7 @@ def apply(applied: Applied) -> None:
 
 
 class _Weighted:
-    """Marks the models of `splatfacto-legs`, whose loss is weighted already."""
+    """Mark the models of `splatfacto-legs`, whose loss is weighted already."""
 
 
 def legs_model(base: Any) -> Any:

@@ -1,7 +1,7 @@
 """A loss registered as a callable: NeRFICG, and FasterGS in it.
 
-``self.add_loss_metric('L1_Color', torch.nn.functional.l1_loss, weight)`` hands the function over; the framework
-calls it later, with ``input=`` and ``target=``. What is replaced is the callable.
+``self.add_loss_metric('L1_Color', torch.nn.functional.l1_loss, weight)`` registers the function; the framework
+calls it later, with ``input=`` and ``target=``. The callable is replaced.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def pinhole(settings: Any, module: str) -> View:
 
 
 def matrix(tensor: Any) -> np.ndarray:
-    """Return [4, 4] float64, of [4, 4] or [1, 4, 4]."""
+    """Return [4, 4] float64, from [4, 4] or [1, 4, 4]."""
     return np.asarray(tensor.detach().cpu().numpy(), np.float64).reshape(4, 4)
 
 

@@ -1,6 +1,6 @@
-"""Build a rasterizer for an unknown fork: it returns what the fork's own code unpacks, by the names it gives them.
+"""Build a rasterizer for an unknown fork: it returns the results that the fork's own code unpacks, by their names.
 
-Settings and inputs that change the image in a way that is not known here are an error, not ignored.
+Unknown settings and inputs that change the image are an error, not ignored.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from legs_loss.reference.rasterizer import Drawn, Lens
 
 __all__ = ["kind_of", "module"]
 
-# Settings that change nothing here, or only something that is read from the names of the results.
+# Settings without an effect here, or with one that is read from the names of the results.
 HARMLESS = ("prefiltered", "debug", "f_count", "do_depth", "require_depth", "return_accumulation", "bwd_depth")
-# Tensors that change nothing where all of their values are this.
+# Tensors without an effect where all of their values are this.
 NEUTRAL = {"subpixel_offset": 0, "confidence": 1}
-# What is drawn, by the name of a result; the first that fits.
+# The kinds of results, by name; the first match is used.
 RESULTS: Tuple[Tuple[str, str], ...] = (
     (r"^_$", "unused"),
     (r"radi", "radii"),
@@ -47,7 +47,7 @@ RESULTS: Tuple[Tuple[str, str], ...] = (
 
 
 def kind_of(name: str) -> str:
-    """Return what a result of this name is.
+    """Return the kind of a result, by its name.
 
     >>> [kind_of(name) for name in ("rendered_image", "radii", "rendered_depth", "accum_alpha", "out_flow")]
     ['image', 'radii', 'depth', 'alpha', 'unknown']
@@ -61,7 +61,7 @@ def module(name: str, interface: Interface) -> types.ModuleType:
     settings = settings_type(name, fields, optional=True)
 
     class GaussianRasterizer(Rasterizer):
-        """Draws Gaussians from the view of its settings, and returns what the caller's line unpacks."""
+        """Draw Gaussians from the view of its settings, and return the results that the caller unpacks."""
 
         module = name
         inputs = (*Gaussians._fields, "dc", "means2D_densify", "scores")
@@ -94,7 +94,7 @@ def _names_at_call(interface: Interface) -> Optional[Tuple[str, ...]]:
 
 
 def _lens(settings: Any, module: str) -> Lens:
-    """Return how the settings beyond Inria's change the footprints."""
+    """Return how the fork's own settings change the footprints."""
     lens = Lens()
     for field in settings._fields[len(SETTINGS) :]:
         value = getattr(settings, field)

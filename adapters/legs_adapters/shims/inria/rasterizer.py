@@ -16,11 +16,11 @@ __all__ = ["Gaussians", "Rasterizer", "RasterizerBase", "check_one_of", "given_o
 
 
 class Gaussians(NamedTuple):
-    """Inputs of Inria's rasterizer: colours as harmonics or ready, shapes as scales and rotations or as covariances.
+    """Inputs of Inria's rasterizer: spherical harmonics or colours, scales and rotations or covariances.
 
-    means3D [N, 3]; means2D [N, 2 to 4], whose gradient is asked for; opacities [N, 1]; shs [N, K, 3];
+    means3D [N, 3]; means2D [N, 2 to 4], which receives a gradient; opacities [N, 1]; shs [N, K, 3];
     colors_precomp [N, 3]; scales [N, 3] and rotations [N, 4], wxyz; or cov3D_precomp [N, 6], the upper triangle of each
-    covariance by its rows, in world units^2, to which no scale_modifier is applied. What is not given may be empty.
+    covariance by its rows, in world units^2, to which no scale_modifier is applied. Missing inputs may be empty.
     """
 
     means3D: Tensor
@@ -48,17 +48,17 @@ class RasterizerBase(nn.Module):
 
     @property
     def module(self) -> str:
-        """The import name of the module that this stands in for."""
+        """The import name of the module that this replaces."""
         return type(self).__module__.rpartition(".")[2]
 
     def markVisible(self, positions: Tensor) -> Tensor:
-        """Return bool [N]: which of the points [N, 3] are beyond the near plane; upstream looks at nothing else."""
+        """Return bool [N]: which of the points [N, 3] are beyond the near plane, as upstream."""
         view = self.raster_settings.viewmatrix
         with torch.no_grad():
             return positions @ view[:3, 2] + view[3, 2] > NEAR
 
     def bind(self, positional: Tuple[Any, ...], keywords: Dict[str, Any]) -> Dict[str, Any]:
-        """Return ``forward``'s arguments by name, None where they are not given; raise for those it does not have."""
+        """Return ``forward``'s arguments by name, None for missing ones; raise for unknown ones."""
         if len(positional) > len(self.inputs):
             raise TypeError(f"{self.module}.GaussianRasterizer.forward takes {len(self.inputs)} positional arguments")
         given = dict(dict.fromkeys(self.inputs), **dict(zip(self.inputs, positional)))
@@ -73,12 +73,12 @@ class RasterizerBase(nn.Module):
 
 
 class Rasterizer(RasterizerBase):
-    """Draws Gaussians from the view of its settings. A fork's differs in ``inputs``, `lens`, `clip` and `results`."""
+    """Draw Gaussians from the view of its settings. A fork's differs in ``inputs``, `lens`, `clip` and `results`."""
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Draw, and return `results`."""
         given = self.bind(args, kwargs)
-        dc = given.pop("dc", None)  # the constant harmonic, which some forks hand over apart
+        dc = given.pop("dc", None)  # the constant harmonic, which some forks pass separately
         if dc is not None and dc.numel():
             given["shs"] = dc if given["shs"] is None else torch.cat([dc, given["shs"]], 1)
         gaussians = Gaussians(**{name: given[name] for name in Gaussians._fields})
@@ -89,7 +89,7 @@ class Rasterizer(RasterizerBase):
         return Lens()
 
     def clip(self, gaussians: Gaussians) -> Optional[CompactBox]:
-        """Return what restricts Gaussians to fewer tiles, if anything does."""
+        """Return a function that restricts Gaussians to fewer tiles, or None."""
         return None
 
     def results(self, drawn: Drawn, given: Dict[str, Any]) -> Any:
@@ -105,7 +105,7 @@ class Rasterizer(RasterizerBase):
     ) -> Tensor:
         """Return radii int32 [N], 0 for what is out of sight, before anything is drawn: Scaffold-GS and its family."""
         nothing = means3D.new_zeros(len(means3D), 3)
-        with torch.no_grad():  # what is transparent has a radius, and costs no blending
+        with torch.no_grad():  # transparent Gaussians have a radius, and need no blending
             gaussians = Gaussians(means3D, nothing, nothing[:, :1], None, nothing, scales, rotations, cov3D_precomp)
             return self.draw(gaussians).radii
 
@@ -132,12 +132,12 @@ class Rasterizer(RasterizerBase):
 
 
 def given_or_none(tensor: Optional[Tensor]) -> Optional[Tensor]:
-    """Return None for what is not given: scripts pass None or an empty tensor."""
+    """Return None for a missing input: scripts pass None or an empty tensor."""
     return None if tensor is None or tensor.numel() == 0 else tensor
 
 
 def check_one_of(module: str, shs: Any, colours: Any, scales: Any, rotations: Any, cov3D: Any) -> None:
-    """Raise a LegsError unless colours and shapes are each given in exactly one way; None is what is not given."""
+    """Raise a LegsError unless colours and shapes are each given in exactly one way; None is missing."""
     if (shs is None) == (colours is None):
         raise LegsError(f"{module}: give either shs or colors_precomp")
     if (scales is None or rotations is None) == (cov3D is None) or (scales is None) != (rotations is None):

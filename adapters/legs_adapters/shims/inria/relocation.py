@@ -1,4 +1,4 @@
-"""compute_relocation of 3DGS-MCMC: the opacity and scale with which N Gaussians in one place look like one."""
+"""compute_relocation of 3DGS-MCMC: the opacity and scale at which N Gaussians in one place look like one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["compute_relocation", "relocated"]
 
 
 def relocated(opacities: Tensor, counts: Tensor) -> Tuple[Tensor, Tensor]:
-    """Return the opacities [P] and scale factors [P] of ``counts`` [P] Gaussians that look as one did.
+    """Return the opacities [P] and scale factors [P] of ``counts`` [P] Gaussians that look like the original one.
 
     Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024), equation 9.
     """

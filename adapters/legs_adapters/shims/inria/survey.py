@@ -1,7 +1,7 @@
 """Read from a codebase's source which rasterizer it expects: modules, settings, names of results.
 
-Forks of 3D Gaussian Splatting each have a rasterizer of their own, under Inria's name or another, with more settings
-and more results. Their calls say which.
+Forks of 3D Gaussian Splatting have their own rasterizers, under Inria's name or another, with more settings and more
+results. The calls show which.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Interface:
         self.calls: List[Call] = []
 
     def is_like(self, fields: Sequence[str], results: int) -> bool:
-        """Return whether the code uses no other settings than these, and unpacks so many results wherever it draws."""
+        """Return whether the code uses these settings only, and unpacks this number of results at each call."""
         known = all(field in fields for field in self.fields)
         return known and all(call.results is None or len(call.results) == results for call in self.calls)
 
@@ -53,7 +53,7 @@ class Interface:
 
 
 def survey(root: Path) -> Dict[str, Interface]:
-    """Return, by module name, what the code in ``root`` expects of the modules that have a ``GaussianRasterizer``."""
+    """Return by module name the interfaces of ``GaussianRasterizer`` that code in ``root`` expects."""
     found: Dict[str, Interface] = {}
     for name in walk(root):
         path = root / name
@@ -69,7 +69,7 @@ def survey(root: Path) -> Dict[str, Interface]:
 
 
 def _is_of(root: Path, module: str) -> bool:
-    """Return whether a module is the codebase's own Python, which needs no stand-in."""
+    """Return whether a module is the codebase's own Python, which needs no shim."""
     place = root.joinpath(*module.split("."))
     file = place.with_suffix(".py") if place.with_suffix(".py").is_file() else place / "__init__.py"
     try:
@@ -114,7 +114,7 @@ def _read(tree: ast.Module, path: str, found: Dict[str, Interface]) -> None:
 
 
 def _called(node: Any, names: Dict[str, str]) -> Optional[str]:
-    """Return the module of what is called here, if it is among ``names``."""
+    """Return the module of a callee, if it is among ``names``."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         return names.get(node.func.id)
     return None

@@ -1,7 +1,7 @@
-"""diff_gaussian_rasterization of Taming 3DGS: Inria's, with the sums by which it scores Gaussians.
+"""diff_gaussian_rasterization of Taming 3DGS: Inria's, with sums for scoring Gaussians.
 
 With ``pixel_weights`` [H, W] in the settings, four more results hold sums over the pixels of each Gaussian; without,
-they are empty. Upstream's per-pixel counts and lists, which its own code does not use, are not there.
+they are empty. Upstream's per-pixel counts and lists, which its own code does not use, are missing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ GaussianRasterizationSettings: Any = settings_type(__name__, (*SETTINGS, "pixel_
 
 
 class GaussianRasterizer(Rasterizer):
-    """Draws Gaussians from the view of its settings."""
+    """Draw Gaussians from the view of its settings."""
 
     module = "diff_gaussian_rasterization"
     inputs: Tuple[str, ...] = (*Gaussians._fields[:3], "dc", *Gaussians._fields[3:])
@@ -46,5 +46,5 @@ class GaussianRasterizer(Rasterizer):
 
 
 def module(name: str, interface: Interface) -> types.ModuleType:
-    """Return ``diff_gaussian_rasterization`` as Taming 3DGS has it."""
+    """Return ``diff_gaussian_rasterization`` of Taming 3DGS."""
     return complete(name, __doc__, GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam)

@@ -35,9 +35,9 @@ from legs_loss.reference.rasterizer import (
 __all__ = ["module"]
 
 BACKEND = "FasterGSCudaBackend"
-SQUARE = math.sqrt(-2 * math.log(MIN_ALPHA)) + 0.01  # standard deviations: past them even opaque ones are not drawn
+SQUARE = math.sqrt(-2 * math.log(MIN_ALPHA)) + 0.01  # standard deviations: beyond them even opaque ones are not drawn
 SMOOTHED = 0.1  # pixels^2: the dilation with proper antialiasing
-MOST_SAMPLES = 50  # copies of one Gaussian that relocation reckons with
+MOST_SAMPLES = 50  # copies of one Gaussian in a relocation
 
 
 class _Settings(NamedTuple):
@@ -80,7 +80,7 @@ def _draw(function: str, raw: Sequence[Tensor], settings: _Settings) -> _Forward
     depths = means @ axis[:3] + axis[3]
     inside = (depths >= settings.near_plane) & (depths <= settings.far_plane)
 
-    # The rasterizer's near plane is fixed. A world that is larger by the ratio of the two looks the same.
+    # The rasterizer's near plane is fixed: scale the world by the ratio of the two instead.
     size = NEAR / float(settings.near_plane)
     world_to_camera[:3, 3] *= size
     view = View.of(
@@ -168,7 +168,7 @@ def inference(*arguments: Any) -> Tensor:
 
 
 def pruning_scores(scores: Tensor, *arguments: Any) -> None:
-    """Add to `scores` [N], in place, how much an image depends on each Gaussian; then `forward`'s arguments.
+    """Add to `scores` [N], in place, the dependence of an image on each Gaussian; then `forward`'s arguments.
 
     That is, the sum over pixels of the squared derivative of the sum of their channels by the Gaussian's falloff there.
     Source: Speedy-Splat (Hanson et al. 2025).
@@ -227,7 +227,7 @@ def update_3d_filter(
 
 @torch.no_grad()
 def relocation_adjustment(old_opacities: Tensor, old_scales: Tensor, counts: Tensor) -> Tuple[Tensor, Tensor]:
-    """Return opacities [N, 1] and scales [N, 3] with which `counts` [N] copies look as one Gaussian did."""
+    """Return opacities [N, 1] and scales [N, 3] at which `counts` [N] copies look like one Gaussian."""
     new, ratio = relocated(old_opacities.reshape(-1), counts.reshape(-1).clamp(1, MOST_SAMPLES))
     return new[:, None], ratio[:, None] * old_scales
 
@@ -241,7 +241,7 @@ def add_noise(
     means: Tensor,
     current_lr: float,
 ) -> None:
-    """Move `means` [N, 3], in place, by samples [N, 3] shaped as each Gaussian, the more the fainter it is."""
+    """Move `means` [N, 3], in place, by samples [N, 3] from each Gaussian, larger for fainter ones."""
     axes = rotations(raw_rotations)
     along = (axes.transpose(1, 2) @ random_samples[:, :, None]) * (2 * raw_scales).exp()[:, :, None]
     moved = (axes @ along)[:, :, 0]

@@ -1,1 +1,1 @@
-"""Shims of CUDA modules: one file an upstream module, named as it is imported; see finder.py."""
+"""Shims of CUDA modules: one file per upstream module, named as it is imported; see finder.py."""

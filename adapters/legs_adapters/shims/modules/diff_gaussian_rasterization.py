@@ -2,7 +2,7 @@
 
 The interface is Inria's: settings as a named tuple, a Module that draws with them, the gradient of the image to the
 splats' centres left in ``means2D.grad``. It draws with legs_loss's reference rasterizer. Forks use the same name for
-rasterizers of their own: where the codebase expects another interface, it gets Taming 3DGS's, or one that fits it.
+rasterizers of their own: where the codebase expects another interface, it gets Taming 3DGS's, or an adapted one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GaussianRasterizationSettings: Any = settings_type(__name__)
 
 
 class GaussianRasterizer(Rasterizer):
-    """Draws Gaussians from the view of its settings; returns image and radii."""
+    """Draw Gaussians from the view of its settings; return image and radii."""
 
 
 def module(name: str, interface: Interface) -> types.ModuleType:

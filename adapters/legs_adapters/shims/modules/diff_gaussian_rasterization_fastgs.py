@@ -1,6 +1,6 @@
 """diff_gaussian_rasterization_fastgs: FastGS's rasterizer, with its compact box and its counts.
 
-Beside Inria's settings: ``mult``, the size of the compact box; ``get_flag`` and ``metric_map`` [H * W], with which the
+With Inria's settings: ``mult``, the size of the compact box; ``get_flag`` and ``metric_map`` [H * W], with which the
 third result counts, for each Gaussian, the pixels marked 1 that it is blended into (empty without the flag). The
 gradient of ``means2D`` has four columns: the last two are sums of absolute values.
 """
@@ -19,7 +19,7 @@ from legs_loss.reference.rasterizer import CompactBox, Drawn, Lens
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
 
-EVERYWHERE = 1e6  # standard deviations: no square cuts a splat off
+EVERYWHERE = 1e6  # standard deviations: the square never clips a splat
 
 GaussianRasterizationSettings: Any = settings_type(
     __name__, (*SETTINGS[:10], "mult", *SETTINGS[10:], "get_flag", "metric_map")
@@ -27,12 +27,12 @@ GaussianRasterizationSettings: Any = settings_type(
 
 
 class GaussianRasterizer(Rasterizer):
-    """Draws Gaussians from the view of its settings, each in the tiles of its compact box."""
+    """Draw Gaussians from the view of its settings, each in the tiles of its compact box."""
 
     inputs: Tuple[str, ...] = (*Gaussians._fields[:3], "dc", *Gaussians._fields[3:])
 
     def lens(self) -> Lens:
-        """Return a footprint that no square cuts off."""
+        """Return a footprint that is not clipped to a square."""
         return Lens(square=EVERYWHERE)
 
     def clip(self, gaussians: Gaussians) -> CompactBox:

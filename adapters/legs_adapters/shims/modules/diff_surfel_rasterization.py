@@ -16,7 +16,7 @@ GaussianRasterizationSettings: Any = settings_type(__name__)
 
 
 class GaussianRasterizer(RasterizerBase):
-    """Draws surfels for one camera."""
+    """Draw surfels for one camera."""
 
     def forward(self, *args: Any, **kwargs: Any) -> Tuple[Tensor, Tensor, Tensor]:
         """Return image [3, H, W], radii int32 [N], and depth, alpha, normal, median depth, distortion [7, H, W].
@@ -42,7 +42,7 @@ def rasterize_gaussians(
     cov3Ds_precomp: Optional[Tensor],
     raster_settings: Any,
 ) -> Tuple[Tensor, Tensor, Tensor]:
-    """Draw as `GaussianRasterizer`'s forward does; what is not given may be None or empty."""
+    """Draw as `GaussianRasterizer`'s forward does; missing inputs are None or empty."""
     settings = raster_settings
     sh, colours, scales, rotations, rows = (
         given_or_none(tensor) for tensor in (sh, colors_precomp, scales, rotations, cov3Ds_precomp)

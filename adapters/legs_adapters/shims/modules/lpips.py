@@ -1,6 +1,6 @@
-"""lpips: the real metric where its networks are to be had; NaN and one warning where they are not.
+"""lpips: the real metric where its networks are available; NaN and one warning where they are not.
 
-Other metrics of an evaluation stay useful then. Under the names ``lpipsPyTorch``, which forks carry with them, and
+The other metrics of an evaluation work then. Under the names ``lpipsPyTorch``, which forks carry with them, and
 ``lpips``, the package; and in the real ``torchmetrics``, which needs torchvision for it.
 """
 
@@ -26,11 +26,11 @@ def _unavailable(error: BaseException) -> None:
     global _said
     if not _said:
         _said = True
-        print(f"legs-loss: LPIPS is NaN: its networks cannot be had ({error})", file=sys.stderr, flush=True)
+        print(f"legs-loss: LPIPS is NaN: its networks are not available ({error})", file=sys.stderr, flush=True)
 
 
 def _real(name: str) -> Any:
-    """Import the real module, with the shim out of the way."""
+    """Import the real module, without the shim."""
     hook = next(found for found in sys.meta_path if isinstance(found, finder.Finder))
     kept = {key: sys.modules.pop(key) for key in list(sys.modules) if key.split(".")[0] == name}
     entry = hook.table.pop(name)
@@ -44,7 +44,7 @@ def _real(name: str) -> Any:
 
 
 def _network(real: Callable[..., nn.Module]) -> Type[nn.Module]:
-    """Return a class that is the network which ``real`` builds, or NaN."""
+    """Return a class that builds the network by ``real``, or returns NaN."""
 
     class LPIPS(nn.Module):
         """The real network, or NaN."""
@@ -91,9 +91,9 @@ def module(name: str, interface: Interface) -> types.ModuleType:
 
 
 def amend(module: types.ModuleType) -> None:
-    """Let one of torchmetrics' modules do without torchvision: its metric is the real one, its network may be NaN.
+    """Make a module of torchmetrics work without torchvision: its metric is the real one, its network may be NaN.
 
-    Where torchvision is not installed, ``torchmetrics.image`` leaves the metric out, and the metric refuses.
+    Without torchvision, ``torchmetrics.image`` omits the metric, and the metric raises an error.
     """
     if module.__name__ == "torchmetrics.image":
         metric = importlib.import_module("torchmetrics.image.lpip").LearnedPerceptualImagePatchSimilarity

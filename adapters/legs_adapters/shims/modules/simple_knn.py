@@ -18,7 +18,7 @@ NEIGHBOURS = 3
 def distCUDA2(points: Tensor) -> Tensor:
     """Return [N], the mean of the squared distances of points [N, 3] to their three nearest neighbours.
 
-    A point is no neighbour of itself, but of its copies. Source: simple-knn (Kerbl et al. 2023), which finds the same
+    A point is not its own neighbour, but its copies are. Source: simple-knn (Kerbl et al. 2023), which finds the same
     neighbours by boxes along a Morton curve; with fewer than four points it counts the missing ones as infinitely far.
     """
     from scipy.spatial import cKDTree
@@ -26,7 +26,7 @@ def distCUDA2(points: Tensor) -> Tensor:
     xyz = points.detach().to(torch.float64).cpu().numpy()
     if not len(xyz):
         return torch.zeros(0)
-    # The point itself comes back too, at distance 0: before its copies or after, which changes nothing.
+    # The point itself is found too, at distance 0: before or after its copies, with the same result.
     distances, _ = cKDTree(xyz).query(xyz, k=NEIGHBOURS + 1)
     squares = torch.from_numpy(distances[:, 1:]).square().mean(1)
     return squares.to(torch.float32).clamp_max(torch.finfo(torch.float32).max)

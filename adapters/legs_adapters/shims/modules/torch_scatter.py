@@ -1,6 +1,6 @@
 """The functions of torch_scatter that Scaffold-GS and its family use, where it is not installed.
 
-Pip compiles it. What is not here can be imported, and is a clear error where it is used.
+Pip compiles it. Other functions can be imported, and raise an error when they are used.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ REAL_FIRST = True
 def scatter_sum(
     src: Tensor, index: Tensor, dim: int = -1, out: Optional[Tensor] = None, dim_size: Optional[int] = None
 ) -> Tensor:
-    """Sums along ``dim`` of what has the same index; 0 where nothing has it."""
+    """Sum values of equal index along ``dim``; 0 for an index without values."""
     index, shape = _groups("scatter_sum", src, index, dim, out, dim_size)
     return src.new_zeros(shape).scatter_add(dim, index, src)
 
@@ -37,7 +37,7 @@ def scatter_add(
 def scatter_mean(
     src: Tensor, index: Tensor, dim: int = -1, out: Optional[Tensor] = None, dim_size: Optional[int] = None
 ) -> Tensor:
-    """Means along ``dim`` of what has the same index; 0 where nothing has it. Integers are rounded down."""
+    """Average values of equal index along ``dim``; 0 for an index without values. Integers are rounded down."""
     index, shape = _groups("scatter_mean", src, index, dim, out, dim_size)
     counts = src.new_zeros(shape).scatter_add(dim, index, torch.ones_like(src)).clamp_min(1)
     total = src.new_zeros(shape).scatter_add(dim, index, src)
@@ -47,9 +47,9 @@ def scatter_mean(
 def scatter_max(
     src: Tensor, index: Tensor, dim: int = -1, out: Optional[Tensor] = None, dim_size: Optional[int] = None
 ) -> Tuple[Tensor, Tensor]:
-    """The largest along ``dim`` of what has the same index, and where it stands, which is the first of equal ones.
+    """Return the largest of the values of equal index along ``dim``, and its position, the first of equal ones.
 
-    Where nothing has an index they are 0 and the size of ``src``.
+    For an index without values they are 0 and the size of ``src``.
     """
     index, shape = _groups("scatter_max", src, index, dim, out, dim_size)
     size = src.shape[dim]
@@ -58,7 +58,7 @@ def scatter_max(
         line = torch.arange(size).reshape([-1] + [1] * (src.dim() - 1)).transpose(0, dim)
         places = torch.where(src == largest.gather(dim, index), line, torch.full_like(line, size))
         where = torch.full(shape, size).scatter_reduce_(dim, index, places, "amin")
-    # By place, so that the gradient goes to that one alone, and to none where there is none.
+    # By position, so that only that value gets a gradient.
     edge = src.new_zeros([1 if i == dim % src.dim() else length for i, length in enumerate(src.shape)])
     return torch.cat([src, edge], dim).gather(dim, where), where
 
@@ -66,7 +66,7 @@ def scatter_max(
 def _groups(
     name: str, src: Tensor, index: Tensor, dim: int, out: Optional[Tensor], dim_size: Optional[int]
 ) -> Tuple[Tensor, Tuple[int, ...]]:
-    """The index in the shape of ``src``, and the shape of the result."""
+    """Return the index in the shape of ``src``, and the shape of the result."""
     if out is not None:
         raise MissingShim("torch_scatter", f"{name}(out=...)")
     if index.dim() == 1:

@@ -1,7 +1,7 @@
 """The few helpers of torchvision that training scripts use, for machines without it.
 
 ToTensor, ToPILImage, Compose, Resize; save_image, make_grid; reading and writing pictures. Everything else can be
-imported, and is a clear error where it is used.
+imported, and raises an error when it is used.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ BILINEAR: Any = 2  # Pillow moved the name
 
 
 def to_tensor(pic: Any) -> Tensor:
-    """[C, H, W]: floats in [0, 1] of 8-bit pictures, [H, W, C] arrays and PIL's; other types keep their values."""
+    """Convert a PIL image or an array [H, W, C] to [C, H, W]; 8-bit values to [0, 1], other types as they are."""
     array = np.array(pic, copy=True)
     array = array[:, :, None] if array.ndim == 2 else array
     tensor = torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
@@ -38,7 +38,7 @@ def to_tensor(pic: Any) -> Tensor:
 
 
 def to_pil_image(pic: Any, mode: Optional[str] = None) -> Any:
-    """A PIL image of a tensor [C, H, W], floats in [0, 1] or uint8, or of an array [H, W, C]."""
+    """Return a PIL image of a tensor [C, H, W], floats in [0, 1] or uint8, or of an array [H, W, C]."""
     if isinstance(pic, Tensor):
         pic = pic[None] if pic.dim() == 2 else pic
         pic = pic.mul(255).to(torch.uint8) if pic.is_floating_point() else pic
@@ -70,7 +70,7 @@ def make_grid(
     pad_value: float = 0.0,
     **_: Any,
 ) -> Tensor:
-    """[3, H', W']: pictures [B, C, H, W] in rows of ``nrow``, with a frame around each; one picture stays as it is."""
+    """Return images [B, C, H, W] in rows of ``nrow`` with a border, [3, H', W']; one image without a border."""
     images = torch.stack(list(tensor)) if isinstance(tensor, (list, tuple)) else tensor
     images = images[None, None] if images.dim() == 2 else images[None] if images.dim() == 3 else images
     images = images.expand(-1, 3, -1, -1) if images.shape[1] == 1 else images
@@ -90,17 +90,17 @@ def make_grid(
 
 
 def save_image(tensor: Union[Tensor, List[Tensor]], fp: Any, format: Optional[str] = None, **options: Any) -> None:
-    """Write pictures in [0, 1], as a grid if they are several, rounded to 8 bits."""
+    """Write images in [0, 1], several as a grid, rounded to 8 bits."""
     grid = make_grid(tensor, **options)
     pixels = grid.detach().mul(255).add(0.5).clamp(0, 255).permute(1, 2, 0).to("cpu", torch.uint8).numpy()
     Image.fromarray(pixels).save(fp, format=format)
 
 
-FORMATS = ("JPEG", "PNG", "GIF", "WEBP")  # what torchvision decodes
+FORMATS = ("JPEG", "PNG", "GIF", "WEBP")  # as torchvision decodes them
 
 
 class ImageReadMode(enum.Enum):
-    """The channels that are wanted of a picture."""
+    """Return an image with the requested channels."""
 
     UNCHANGED = None
     GRAY = "L"
@@ -110,7 +110,7 @@ class ImageReadMode(enum.Enum):
 
 
 def read_image(path: Any, mode: ImageReadMode = ImageReadMode.UNCHANGED, **_: Any) -> Tensor:
-    """[C, H, W] of a file, in its own type."""
+    """Read a file as [C, H, W], in its own type."""
     with Image.open(path, formats=FORMATS) as image:
         array = np.array(image if mode.value is None else image.convert(mode.value))
     array = array[:, :, None] if array.ndim == 2 else array
@@ -118,7 +118,7 @@ def read_image(path: Any, mode: ImageReadMode = ImageReadMode.UNCHANGED, **_: An
 
 
 def decode_image(input: Any, mode: ImageReadMode = ImageReadMode.UNCHANGED, **_: Any) -> Tensor:
-    """As `read_image`, of a file, or of its bytes as a tensor."""
+    """Read an image like `read_image`, from a file or from its bytes in a tensor."""
     return read_image(io.BytesIO(input.numpy().tobytes()) if isinstance(input, Tensor) else input, mode)
 
 
@@ -161,7 +161,7 @@ class Resize:
 
 
 class Compose:
-    """Transforms one after the other."""
+    """Apply transforms one after the other."""
 
     def __init__(self, transforms: Sequence[Any]) -> None:
         self.transforms: List[Any] = list(transforms)

@@ -1,7 +1,7 @@
-"""Loading checkpoints without unpickling what a stranger wrote.
+"""Load checkpoints without unpickling files of unknown origin.
 
-A bare ``torch.load`` reads tensors and plain values only. Anything else is unpickled, which can run any code, for files
-that this run wrote itself, and where the script or the user asks for it by name.
+A bare ``torch.load`` reads tensors and plain values only. Anything else is unpickled, which can run any code, only for
+files that this run wrote itself, or where the script or the user requests it explicitly.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ASKED_FOR = "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"  # torch's own switch, which it k
 
 
 class LoadsSafely:
-    """Stand-ins for ``torch.save`` and ``torch.load`` that know which files this run wrote.
+    """Replacements of ``torch.save`` and ``torch.load`` that record which files this run wrote.
 
     Args:
         save, load: torch's own.
@@ -35,21 +35,21 @@ class LoadsSafely:
         self._buffers: Any = weakref.WeakSet()
 
     def save(self, obj: Any, f: Any, *args: Any, **kwargs: Any) -> Any:
-        """Save as torch does, and remember where."""
+        """Save as torch does, and record the file."""
         result = self._save(obj, f, *args, **kwargs)
         path = _path(f)
         if path is not None:
             self._paths.add(path)
         else:
-            with contextlib.suppress(TypeError):  # of what takes no weak reference
+            with contextlib.suppress(TypeError):  # the object takes no weak reference
                 self._buffers.add(f)
         return result
 
     def load(self, f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
-        """Load to the CPU: tensors and plain values only, but from this run's own files or on request.
+        """Load to the CPU: tensors and plain values only, except from this run's own files or on request.
 
         Raises:
-            pickle.UnpicklingError: a stranger's file holds more than that.
+            pickle.UnpicklingError: another file holds more than that.
         """
         by_name = "weights_only" in kwargs or "pickle_module" in kwargs or bool(args)
         if by_name or not self._can_be_safe:
@@ -79,13 +79,13 @@ class LoadsSafely:
 
 
 def _path(f: Any) -> Any:
-    """The real path of what is saved to or loaded from; None of what is no file on disk."""
+    """Return the real path of a file that is saved or loaded; None where it is not on disk."""
     name = f if isinstance(f, (str, os.PathLike)) else getattr(f, "name", None)
     return os.path.realpath(os.fspath(name)) if isinstance(name, (str, os.PathLike)) else None
 
 
 def _plain_numbers() -> ContextManager[Any]:
-    """Let numpy's numbers through: 3DGS's checkpoints hold the extent of the scene as one."""
+    """Allow numpy's numbers: 3DGS's checkpoints hold the extent of the scene as one."""
     allow = getattr(torch.serialization, "safe_globals", None)  # torch 2.5
     if allow is None:
         return contextlib.ExitStack()

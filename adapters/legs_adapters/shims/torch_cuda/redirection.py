@@ -1,4 +1,4 @@
-"""Replace attributes of torch so that they can be put back; translate CUDA devices to the CPU."""
+"""Replace attributes of torch reversibly; translate CUDA devices to the CPU."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Redirection", "constant", "on_cpu", "redirected"]
 
 
 class Redirection:
-    """The attributes that were replaced, so that they can be put back."""
+    """The replaced attributes and their original values."""
 
     def __init__(self) -> None:
         self._replaced: List[Tuple[Any, str, Any, bool]] = []
@@ -25,13 +25,13 @@ class Redirection:
         setattr(owner, name, new)
 
     def wrap(self, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
-        """Replace an attribute by what ``make`` makes of it."""
+        """Replace an attribute by the result of ``make`` for it."""
         if hasattr(owner, name):
             old = getattr(owner, name)
             self.replace(owner, name, functools.update_wrapper(make(old), old, updated=()))
 
     def restore(self) -> None:
-        """Put everything back."""
+        """Restore all original values."""
         while self._replaced:
             owner, name, old, own = self._replaced.pop()
             if own:
@@ -47,7 +47,7 @@ class Redirection:
 
 
 def on_cpu(device: Any) -> Any:
-    """Return the CPU for a CUDA device, however it is named, and what is no CUDA device as it is."""
+    """Return the CPU for a CUDA device in any notation; anything else unchanged."""
     if isinstance(device, torch.device):
         return torch.device("cpu") if device.type == "cuda" else device
     if isinstance(device, str) and device.partition(":")[0] == "cuda":
@@ -71,5 +71,5 @@ def redirected(function: Any) -> Any:
 
 
 def constant(value: Any) -> Callable[..., Any]:
-    """Return a function that returns ``value``, whatever it is given."""
+    """Return a function that returns ``value`` for any arguments."""
     return lambda *args, **kwargs: value

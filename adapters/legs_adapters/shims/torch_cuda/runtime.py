@@ -1,4 +1,4 @@
-"""Answer torch.cuda's own functions: one idle device with the machine's memory, no graphs, no mixed precision."""
+"""Replace torch.cuda's functions: one idle device with the machine's memory, no graphs, no mixed precision."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def redirect(redirection: Redirection) -> None:
     for name in ("CUDAGraph", "graph", "make_graphed_callables"):
         redirection.wrap(cuda, name, _no_graphs)
     try:
-        # Only now: in a build for CUDA it would complain that there is no GPU.
+        # Only now: in a build for CUDA it would warn that there is no GPU.
         extension = importlib.import_module("torch.utils.cpp_extension")
     except ImportError:  # it needs setuptools
         return
@@ -108,14 +108,14 @@ def redirect(redirection: Redirection) -> None:
 
 
 class _Zeros(Dict[str, int]):
-    """Memory statistics: whatever is asked for is 0."""
+    """Memory statistics: every value is 0."""
 
     def __missing__(self, key: str) -> int:
         return 0
 
 
 def _refuse() -> None:
-    """In place of CUDA's start: whoever needs it is a function that nothing stands in for."""
+    """Replace the initialisation of CUDA: only functions without a shim need it."""
     caller = sys._getframe(1)
     module = caller.f_globals.get("__name__", "?")
     if module.partition(".")[0] == "torch":

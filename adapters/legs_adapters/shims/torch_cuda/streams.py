@@ -1,4 +1,4 @@
-"""Stand in for CUDA's events, streams and device contexts: the CPU has finished whatever it was asked."""
+"""Replace CUDA's events, streams and device contexts: work on the CPU is always finished."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Event:
         self._at = 0.0
 
     def record(self, stream: Any = None) -> None:
-        """Note the time."""
+        """Record the time."""
         self._at = time.perf_counter()
 
     def elapsed_time(self, end_event: Event) -> float:

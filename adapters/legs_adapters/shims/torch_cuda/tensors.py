@@ -91,7 +91,7 @@ def _hashable(value: Any) -> bool:
 
 
 def _own_copy(tensor: Tensor) -> Tensor:
-    # What leaves the GPU is a copy there: `kept = x.cpu()` does not change with x.
+    # A move from the GPU makes a copy: `kept = x.cpu()` does not change with x.
     return tensor.clone()
 
 
@@ -123,7 +123,7 @@ def _cpu_type(kind: Any) -> Any:
 
 
 class _Legacy(type):
-    """The type of ``torch.cuda.FloatTensor`` and the like: they make, and recognise, tensors of the CPU."""
+    """The type of ``torch.cuda.FloatTensor`` and the like: they create and match tensors of the CPU."""
 
     on_cpu: Any
 

@@ -1,4 +1,4 @@
-"""Run pools of processes as pools of threads: a process of its own would not be redirected."""
+"""Run pools of processes as pools of threads: a new process would not be redirected."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def redirect(redirection: Redirection) -> None:
     """Redirect pools of processes, and loaders whose workers are not forked."""
 
     class Executor(concurrent.futures.ThreadPoolExecutor):
-        """A pool of threads that takes a process pool's arguments."""
+        """A pool of threads with the arguments of a process pool."""
 
         def __init__(
             self,

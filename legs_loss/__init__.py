@@ -1,11 +1,10 @@
 """legs-loss: the LEGS loss for 3D Gaussian Splatting.
 
-    from legs_loss import l1_loss       # in place of the codebase's own
+    from legs_loss import l1_loss       # replaces the codebase's own
 
-See README.md for the three ways in, docs/method.md for the mathematics.
+See README.md for the three entry points, docs/method.md for the mathematics.
 
-A name is imported when it is first asked for: legs-patch, which needs none of those that compute, need not wait for
-torch.
+A name is imported on first use, so that legs-patch does not import torch.
 """
 
 import functools
@@ -81,7 +80,7 @@ class _Package(ModuleType):
         return value
 
     def __setattr__(self, name: str, value: object) -> None:
-        # Python binds a module that was imported to its name here; ssim and response are functions first.
+        # Python binds imported submodules to their names here; the names ssim and response are the functions.
         if name not in _HOMES or not isinstance(value, ModuleType):
             super().__setattr__(name, value)
 

@@ -1,3 +1,3 @@
-"""The version, alone in its file so that building the package imports nothing."""
+"""The version, in a separate file so that building the package imports nothing."""
 
 __version__ = "0.1.0"

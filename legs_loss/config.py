@@ -1,6 +1,6 @@
-"""The settings of a training run whose code is not ours: a legs.toml, the environment, the script's own arguments.
+"""The settings of a run of another codebase: legs.toml, the environment, the script's arguments.
 
-Later ones win: the preset "legs", then legs.toml, then LEGS_* variables, then :func:`legs_loss.configure`.
+Later ones take precedence: the preset "legs", then legs.toml, then LEGS_* variables, then :func:`legs_loss.configure`.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class Config:
 
     Attributes:
         spec: the weight map's settings.
-        preset: the name that the spec started from, for the line that says what is active.
+        preset: the name of the preset that the spec is derived from, for the status line.
         store: the folder of precomputed maps, or None.
-        off: the codebase's own loss, unweighted.
+        off: whether LEGS_OFF selects the codebase's own loss, unweighted.
         source: where the settings were found, in words.
-        notes: what the user should be told: a variable LEGS_* that is not known, a legs.toml that was not read.
+        notes: warnings for the user: an unknown variable LEGS_*, a legs.toml that was not read.
     """
 
     spec: WeightSpec = PRESETS["legs"]
@@ -65,14 +65,14 @@ def find_config(
     Args:
         start: a file or folder of the codebase: legs.toml is looked for there and in the folders above it, up to the
             root of its git checkout, the user's home folder, or the first legs.toml of another owner, which is not
-            read. None looks nowhere.
+            read. None: no file is searched.
         environ: in place of ``os.environ``: LEGS_PRESET, LEGS_BETA, LEGS_CURVE, LEGS_OPERATOR, LEGS_P,
             LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_SCALE, LEGS_EPS, LEGS_ERROR, LEGS_ERROR_BLUR, LEGS_OVER,
             LEGS_NOISE_FLOOR, LEGS_SMOOTH, LEGS_STORE, LEGS_OFF.
         argv: in place of ``sys.argv``: the scene after ``-s`` / ``--source_path`` is where the store is looked for.
 
     Raises:
-        LegsError: a value is unknown or out of range, or the file cannot be read; the message says where it stands.
+        LegsError: a value is unknown or out of range, or the file cannot be read; the message has the place.
     """
     environ = os.environ if environ is None else environ
     config = Config(notes=_unknown_variables(environ))
@@ -83,7 +83,7 @@ def find_config(
         if path is not None:
             config = _apply(config, _read_toml(path), str(path), path.parent)
     given = {name: "LEGS_" + name.upper() for name in _SETTINGS if environ.get("LEGS_" + name.upper())}
-    if given:  # all at once: some settings go only together
+    if given:  # all at once: some settings are valid only together
         what = f"environment variable{'s' if len(given) > 1 else ''} {', '.join(given.values())}"
         config = _apply(config, {name: environ[variable] for name, variable in given.items()}, what, Path.cwd())
     if is_off(environ):
@@ -94,13 +94,13 @@ def find_config(
 
 
 def is_off(environ: Optional[Mapping[str, str]] = None) -> bool:
-    """Return whether LEGS_OFF asks for the codebase's own loss, to the last bit.
+    """Return whether LEGS_OFF selects the codebase's own loss, to the last bit.
 
     Args:
         environ: in place of ``os.environ``.
 
     Raises:
-        LegsError: it is neither 1 nor 0 nor a word for these.
+        LegsError: it is neither 1 nor 0 nor a synonym of these.
     """
     return _is_true((os.environ if environ is None else environ).get("LEGS_OFF", ""))
 
@@ -145,7 +145,7 @@ def _typed(key: str, value: Any) -> Any:
 
 
 def _store(value: Any, base: Path) -> Optional[Path]:
-    """Return the folder that a setting names, seen from another; None where it names none."""
+    """Return the folder that a setting names, relative to another folder; None without one."""
     if value is None or value == "":
         return None
     if not isinstance(value, str) or "\0" in value:
@@ -175,7 +175,7 @@ def _unknown_variables(environ: Mapping[str, str]) -> Tuple[str, ...]:
 
 
 def _find_file(start: Path) -> Tuple[Optional[Path], str]:
-    """Return the legs.toml of a script or folder, and a note where one was found that is not to be read."""
+    """Return the legs.toml of a script or folder, and a note if one was found and not read."""
     home = Path(os.path.expanduser("~"))
     for folder in [start, *start.parents] if start.is_dir() else start.parents:
         path = folder / CONFIG_FILE
@@ -208,7 +208,7 @@ def _read_toml(path: Path) -> Dict[str, Any]:
         return tomllib.loads(read_regular(path, _LARGEST).decode("utf-8"))
     except OSError as error:
         raise LegsError(f"{path} cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # all that a parser of TOML says, and of numbers and texts in it
+    except (ValueError, RecursionError) as error:  # everything that a TOML parser raises, for numbers and texts too
         raise LegsError(f"{path} cannot be read: {error}") from None
 
 

@@ -1,7 +1,7 @@
-"""Curves: what turns a normalised response into the weight's shape, f: [0, 1] -> [0, 1].
+"""Curves: functions f of a normalised response, [0, 1] -> [0, 1], that shape the weight.
 
 The LEGS paper defines C1 as the identity and shows C2 to C5 only as a picture. The formulas of C2 to C5 are
-this project's identification of that picture, not the paper's text; docs/method.md says how it was made.
+this project's identification of that picture, not the paper's text; docs/method.md describes it.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def register_curve(name: str, function: Curve) -> None:
     """Add a curve of your own, for ``WeightSpec(curve=name)``.
 
     Args:
-        name: a new name; the built-in curves cannot be replaced, since a run that says "C3" must mean C3.
+        name: a new name; the built-in curves cannot be replaced, so that "C3" always means C3.
         function: maps a float tensor of any shape with values in [0, 1] to one of the same shape, in [0, 1].
 
     Raises:

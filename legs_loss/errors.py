@@ -1,4 +1,4 @@
-"""The one exception that this package raises for a user's mistake, and what it adds about names that were mistyped."""
+"""The exception for errors of the user, and proposals for mistyped names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["LegsError", "did_you_mean"]
 
 
 class LegsError(ValueError):
-    """Bad input: the message says what was wrong, where, and what to do; further arguments are lines that it quotes."""
+    """Invalid input: the message says what is wrong, where, and what to do; further arguments are quoted lines."""
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.args))

@@ -9,19 +9,19 @@ from legs_loss.errors import LegsError
 
 __all__ = ["as_map", "channels_first", "check_image", "check_pair", "check_values", "is_compiling", "shape_of"]
 
-# A rendering may overshoot 1 and an HDR photograph may pass it; 8-bit values are beyond all doubt.
+# A rendering may overshoot 1 and an HDR photograph may exceed it; 8-bit values are far larger.
 _SURELY_NOT_UNIT_RANGE = 16.0
 
 
 def is_compiling() -> bool:
-    """Return whether torch.compile is tracing: what reads a value from the device is skipped then."""
+    """Return whether torch.compile is tracing: checks that read values from the device are skipped then."""
     compiler = getattr(torch, "compiler", None)
     probe = getattr(compiler, "is_compiling", None)
     return bool(probe()) if probe is not None else False
 
 
 def shape_of(tensor: Tensor) -> str:
-    """Return a shape as messages print it: ``[3, 4, 5]``."""
+    """Return a shape as it is printed in messages: ``[3, 4, 5]``."""
     return str(list(tensor.shape))
 
 

@@ -1,9 +1,9 @@
-"""Two numbers of each view's response, and what they say of a whole scene: its noise and its strong contours.
+"""Two levels of each view's response, and the scene's levels computed from them: its noise and its strong contours.
 
-An image's own strongest response says little: blur weakens it, and what is left looks strong beside it; noise lifts all
-the others. Over the views of a scene the medians of two levels say more: the median response, which is the noise where
-half of an image is smooth (the estimate of wavelet shrinkage), and a high percentile, which is a strong contour. A view
-that is out of focus is then weak beside its scene, and a dead pixel, which owns the maximum, moves neither.
+The maximum response of a single image is a poor reference: blur lowers it, which raises the normalised rest; noise
+raises all other responses. The medians of two levels over the views of a scene are more robust: the median response,
+which is the noise where half of an image is smooth (the estimate of wavelet shrinkage), and a high percentile, a strong
+contour. A view out of focus is then weak relative to its scene, and a dead pixel, the maximum, changes neither level.
 
     E~ = min(max(E - noise_floor * max(m, M), 0) / (S + eps), 1)    m: the view's median, M and S: the scene's levels
 
@@ -81,14 +81,14 @@ def over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor] = Non
     if scene is None:
         scene = scene_levels(response_levels(strength, spec).reshape(-1, 2))
     scene = scene.to(strength)
-    # A texture that blur has taken away must not lower the floor: an image's counts only where it is above the scene's.
+    # A texture removed by blur must not lower the floor: an image's level counts only above the scene's.
     floor = spec.noise_floor * torch.maximum(percentile(strength, 50.0), scene[0])
     floor = floor.reshape(*floor.shape, 1, 1, 1)
     return ((strength - floor).clamp(min=0.0) / (scene[1] + spec.eps)).clamp(max=1.0)
 
 
 class RunningLevels:
-    """The levels of a scene as far as its views have been seen.
+    """The levels of a scene, over the views seen so far.
 
     Example:
         >>> seen = RunningLevels()
@@ -104,7 +104,7 @@ class RunningLevels:
         self._scene: Optional[Tensor] = None
 
     def add(self, levels: Tensor) -> None:
-        """Count a view, by its :func:`response_levels`."""
+        """Add a view, by its :func:`response_levels`."""
         self._views.append(levels)
         self._scene = None
 

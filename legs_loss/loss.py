@@ -1,4 +1,4 @@
-"""The LEGS loss: the weighted L1 term and D-SSIM, as a function and as a Module that forwards to it."""
+"""The LEGS loss: the weighted L1 term and D-SSIM, as a function and as a Module."""
 
 from __future__ import annotations
 
@@ -86,9 +86,9 @@ def legs_loss(
     Args:
         prediction: the rendering, floats in [0, 1], [C, H, W] or [B, C, H, W]; channels-last on request.
         target: the photograph of the same view, the same shape.
-        spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own to the last bit. One that is normalised over
-            the scene takes the images of this call for it; :class:`LEGSLoss` and ``l1_loss`` remember the others.
-        weight: the target's weight map, where you have it already; the spec is not used then.
+        spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own to the last bit. A spec that is normalised
+            over the scene uses the images of this call as the scene; :class:`LEGSLoss` and ``l1_loss`` use all so far.
+        weight: the target's weight map, if known; the spec is not used then.
         mask: zeroes the L1 weight where it is 0. SSIM is not masked, as in 3DGS's code.
         lambda_dssim: in [0, 1], the share of D-SSIM; 3DGS's name and value.
         padding: of SSIM, see :func:`~legs_loss.ssim`.
@@ -130,10 +130,10 @@ def legs_loss(
 
 
 class LEGSLoss(nn.Module):
-    """:func:`legs_loss` as a Module: the settings once, then the images of each step.
+    """:func:`legs_loss` as a Module: settings at construction, images at each call.
 
-    For a spec that is normalised over the scene the targets of all calls so far are the scene. A target that is seen
-    again counts again, which moves a median little.
+    For a spec that is normalised over the scene, the targets of all calls so far are the scene. Repeated targets count
+    repeatedly, which changes a median little.
 
     Args:
         spec: as for :func:`legs_loss`, like the others.

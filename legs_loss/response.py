@@ -1,4 +1,4 @@
-"""The response of a photograph to a second- or first-order operator: where its contours and thin structures are.
+"""The response of a photograph to a second- or first-order operator, large at contours and thin structures.
 
     E = || op F ||_p        normalised per image: E^ = (E - min E) / (max E - min E + eps)
 
@@ -36,7 +36,7 @@ def response(
 
     Returns:
         The image's shape with one channel, values >= 0, float32 (float64 for float64). The border is reflected
-        (the edge pixel is not repeated), so the frame of the picture is no edge. No gradient flows to the image.
+        (the edge pixel is not repeated), so the border of the image is not an edge. No gradient flows to the image.
 
     Raises:
         LegsError: not an image, or an unknown operator or norm.
@@ -54,7 +54,7 @@ def response(
     flat = channels_first(image.detach(), channels_last)
     flat = flat.to(torch.promote_types(flat.dtype, torch.float32))
     if smooth > 0.0:
-        # No operator sees a constant: without it, what rounding leaves of a flat image is exactly 0.
+        # Operators do not respond to a constant: without it, the response of a flat image is exactly 0.
         flat = gaussian_blur(flat - flat[..., :1, :1], smooth)
     single = flat.dim() == 3
     strength = _norm(_components(flat.unsqueeze(0) if single else flat, OPERATORS[operator]), p)
@@ -107,8 +107,8 @@ def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
 def _components(image: Tensor, operator: Operator) -> List[Tensor]:
     """Correlate an image [B, C, H, W] with each stencil of an operator.
 
-    Not by torch's convolution, which sums in an order of its own: here every pixel is computed by the same operations,
-    and a constant image gives exactly 0.
+    Torch's convolution is not used, since its order of summation varies: here every pixel is computed by the same
+    operations, and a constant image gives exactly 0.
     """
     padded = _with_border(image, operator.reach)
     return [_correlated(padded, stencil) for stencil in operator.stencils]

@@ -30,25 +30,25 @@ class WeightSpec:
         operator: of the response, a name of :data:`legs_loss.OPERATORS`.
         p: the norm over channels (and over a gradient's directions): 1, 2 or inf.
         curve: a registered curve's name, "C1" to "C5" or one of your own.
-        beta: in [0, 1e6], how far the strongest response lifts the weight; 0 is 3DGS's own loss.
+        beta: in [0, 1e6], the weight of the strongest response, minus 1; 0 is 3DGS's own loss.
         percentile: in (0, 100]: the response that counts as 1; 100 is the maximum, as in the paper. Stronger
             responses are clamped to 1.
-        normalise: "none", as in the paper, or "mean": each map is divided by its mean, so that it moves weight
-            between pixels without scaling the L1 term.
+        normalise: "none", as in the paper, or "mean": each map is divided by its mean, so that it changes the
+            distribution of weight, but not the scale of the L1 term.
         scale: in (0, 1e6], multiplies the map. In a loss with lambda 0.2 a map of mean 1 times 0.6 has the balance of
             L1 and SSIM of lambda 0.3; gradients, which many codebases compare with a threshold to densify, shrink
             with it.
         eps: >= 1e-30, in the normalisation's denominator.
-        error: in [0, 1], how much of the rendering's own error joins the response: the curve is applied to
+        error: in [0, 1], the share of the rendering's error in the weight: the curve is applied to
             E^ ** (1 - error) * e ** error, normalised to [0, 1], where e is the mean absolute error around a pixel. 0
-            is the paper's weight, 1 looks at the error alone. Such weights change at every step; none are stored.
+            is the paper's weight, 1 uses the error only. Such weights change at every step; none are stored.
         error_blur: >= 0, the standard deviation in pixels of the Gaussian that the error is averaged with.
         over: what the response is normalised over: "image", as in the paper, or "scene": the response that counts as 1
             is the median over views of each one's percentile, so that a photograph out of focus gets small weights
-            beside sharp ones. ``legs precompute`` knows all views; without its maps the views seen so far stand for
+            beside sharp ones. ``legs precompute`` uses all views; without its maps the views seen so far are used as
             the scene (:mod:`legs_loss.levels`).
-        noise_floor: >= 0, only over "scene": so many times the median response, the view's or the scene's, whichever is
-            larger, is taken off the response. 3 leaves little of noise.
+        noise_floor: >= 0, only over "scene": this multiple of the median response, the view's or the scene's, whichever
+            is larger, is subtracted from the response. 3 removes most noise.
         smooth: in [0, 100], the standard deviation in pixels of a Gaussian before the operator.
 
     Raises:
@@ -92,7 +92,7 @@ class WeightSpec:
         if self.over not in ("image", "scene"):
             raise LegsError(f'over must be "image" or "scene", got {self.over!r}')
         if self.over == "image" and self.noise_floor > 0.0:
-            raise LegsError('noise_floor goes with over="scene": an image by itself does not tell noise from texture')
+            raise LegsError('noise_floor goes with over="scene": a single image cannot separate noise from texture')
         if self.over == "scene" and self.error > 0.0:
             raise LegsError('weights that follow the error (error > 0) are normalised over="image" only')
 

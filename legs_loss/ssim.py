@@ -43,7 +43,7 @@ def ssim(
             channels-last on request, of one shape; or one image of a batch of one and the other without its axis, as
             3DGS's takes them.
         padding: "zeros" as in 3DGS's code, "reflect", "replicate", or "valid" (only windows inside the image). A
-            number is taken for 3DGS's third argument, ``window_size``, and what follows it for ``size_average``.
+            number is interpreted as 3DGS's third argument, ``window_size``, and the next one as ``size_average``.
         channels_last: where the channel stands.
         window_size: the window's side in pixels, odd.
         size_average: the mean over all images; False is one value an image, [B].
@@ -112,7 +112,7 @@ def d_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_
 
 
 def _ssim_map(first: Tensor, second: Tensor, padding: str, window_size: int) -> Tensor:
-    # The order of operations is 3DGS's: another one rounds differently, and beta = 0 would not be 3DGS's loss.
+    # The order of operations is 3DGS's: in another order it rounds differently, and beta = 0 would not be 3DGS's loss.
     if not isinstance(window_size, int) or window_size < 1 or window_size % 2 == 0:
         raise LegsError(f"window_size must be an odd number of pixels, got {window_size!r}")
     first, second, margin = _padded(first, second, padding, window_size)

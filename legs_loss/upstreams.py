@@ -1,4 +1,4 @@
-"""Weight the loss that a library holds, for training code that has no checkout to patch."""
+"""Weight the loss of an installed library, for training code without a checkout to patch."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _applied: Dict[str, Applied] = {}
 
 
 class Applied:
-    """Functions of a library that were replaced; `undo` puts them back, as leaving a ``with`` block does."""
+    """Replaced functions of a library; `undo`, or the end of a ``with`` block, restores them."""
 
     def __init__(self) -> None:
         self._replaced: List[Tuple[Any, str, Any]] = []
 
     def replace(self, owner: Any, name: str, new: Any) -> None:
-        """Set an attribute of a module or class, and in every module that imported the old one by name."""
+        """Set an attribute of a module or class, and in every module that imported the old value by name."""
         old = getattr(owner, name)
         places = [(owner, name)]
         if not isinstance(owner, type):
@@ -32,7 +32,7 @@ class Applied:
             setattr(place, key, new)
 
     def undo(self) -> None:
-        """Put everything back; a second time there is nothing to do."""
+        """Restore everything; a second call does nothing."""
         while self._replaced:
             setattr(*self._replaced.pop())
         for name in [name for name, applied in _applied.items() if applied is self]:
@@ -46,7 +46,7 @@ class Applied:
 
 
 def apply_to(library: str) -> Applied:
-    """Weight the photometric L1 that a library holds, in this process; ``legs_loss.apply_to_gsplat()`` is the same.
+    """Weight the photometric L1 of a library, in this process; ``legs_loss.apply_to_gsplat()`` is the same.
 
     Settings come from legs.toml and LEGS_* variables, or from :func:`legs_loss.configure`. Applied a second time it
     changes nothing and returns the same object.
@@ -56,22 +56,22 @@ def apply_to(library: str) -> Applied:
             packages register in the entry point group ``legs_loss.upstreams``.
 
     Returns:
-        What was replaced: ``.undo()``, or leaving it as a ``with`` block, puts it back.
+        The replaced functions: ``.undo()``, or the end of a ``with`` block, restores them.
 
     Raises:
-        LegsError: no such library is known, it is not installed, or it does not hold the loss that is expected.
+        LegsError: no such library is known, it is not installed, or it does not have the expected loss.
 
     Example:
         >>> apply_to("no_such_library")
         Traceback (most recent call last):
         ...
-        legs_loss.errors.LegsError: nothing is known of 'no_such_library'; known are ...
+        legs_loss.errors.LegsError: unknown library 'no_such_library'; known are ...
     """
     if library in _applied:
         return _applied[library]
     known = plugins("legs_loss.upstreams")
     if library not in known:
-        raise LegsError(f"nothing is known of {library!r}; known are {', '.join(sorted(known)) or 'none'}")
+        raise LegsError(f"unknown library {library!r}; known are {', '.join(sorted(known)) or 'none'}")
     applied = Applied()
     try:
         known[library]()(applied)
@@ -80,8 +80,8 @@ def apply_to(library: str) -> Applied:
             raise LegsError(f"{library} is not installed") from None
         if not (error.name or "").startswith(f"{library}."):
             raise
-        raise LegsError(f"this {library} does not hold the loss that is expected: {error}") from None
+        raise LegsError(f"this {library} does not have the expected loss: {error}") from None
     except AttributeError as error:
-        raise LegsError(f"this {library} does not hold the loss that is expected: {error}") from None
+        raise LegsError(f"this {library} does not have the expected loss: {error}") from None
     _applied[library] = applied
     return applied

@@ -36,10 +36,10 @@ def weight_map(
 
     Raises:
         LegsError: not an image, or (on the CPU) values that are NaN, infinite or plainly of 0..255. On other
-            devices the values are not looked at, since that would wait for the device: a NaN in the image
+            devices the values are not checked, since that would wait for the device: a NaN in the image
             makes the whole map NaN instead.
 
-    Source: the LEGS paper, its weighted loss; the reflect border and the constant image are decided here.
+    Source: the LEGS paper, its weighted loss; the reflected border and the constant image are this project's choice.
 
     Example:
         >>> dot = torch.zeros(1, 3, 3)
@@ -137,7 +137,7 @@ def error_weight_map(
             ``channels_last``.
         spec: the settings.
         channels_last: where the channel stands.
-        normalised: E^ of the target where it is known already, in the shape of the map.
+        normalised: E^ of the target if it is known, in the shape of the map.
 
     Returns:
         One value a pixel, as :func:`weight_map` returns it. It carries no gradient. A rendering without any error gets

@@ -1,6 +1,6 @@
 """The ``legs`` command. Each sub-command is one module: HELP, add_arguments(parser), run(args).
 
-It lies here, or another package registers it in the entry point group ``legs_loss.commands``.
+It is in this folder, or another package registers it in the entry point group ``legs_loss.commands``.
 """
 
 from __future__ import annotations

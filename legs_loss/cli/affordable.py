@@ -1,4 +1,4 @@
-"""The scene of trainings that a CPU does in minutes, as demo and compare take it."""
+"""The arguments of demo and compare for a scene that a CPU trains in minutes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AFFORDABLE = 70_000  # pixels a photograph
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the scene, its photographs and their size, and how many trainings run at a time."""
+    """Declare the scene, its photographs and their size, and the number of parallel trainings."""
     parser.add_argument("scene", metavar="SCENE", nargs="?", help="a COLMAP scene; default: the embedded scene")
     parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
     parser.add_argument(

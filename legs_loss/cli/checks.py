@@ -12,11 +12,11 @@ from legs_loss.system import say
 
 __all__ = ["check_resolution", "check_trainable"]
 
-_TINY = 64  # pixels: a width that was meant as a divisor
+_TINY = 64  # pixels: a smaller width was probably meant as a divisor
 
 
 def check_resolution(resolution: int, views: Sequence[View]) -> None:
-    """Check ``-r``, and warn on stderr where it was probably meant to divide, as only 1, 2, 4 and 8 do.
+    """Check ``-r``, and warn on stderr where it was probably meant as a divisor, as only 1, 2, 4 and 8 are.
 
     Raises:
         LegsError: no image has this resolution.
@@ -32,7 +32,7 @@ def check_resolution(resolution: int, views: Sequence[View]) -> None:
 
 
 def check_trainable(scene: Scene, resolution: int) -> None:
-    """Check what a training will need of a scene, from its files' heads.
+    """Check that a scene has what a training needs, from its files' headers.
 
     Raises:
         LegsError: views without pinhole cameras, no points to start from, or a bad resolution.

@@ -1,12 +1,11 @@
-"""Train several losses on a scene, some seeds each, and say what their differences are worth.
+"""Train several losses on a scene with several seeds, and report their differences with confidence intervals.
 
-Each training runs in a process of its own with one thread. An arm is LOSS[:CHANGE ...][@ARM]. LOSS is a preset
+Each training runs in a separate process with one thread. An arm is LOSS[:CHANGE ...][@ARM]. LOSS is a preset
 ("legs"), a curve ("C4"), a beta ("beta=5") or settings of a spec ("curve=C5,beta=4"). CHANGE is one of: {changes}. @ARM
-gives it the number of Gaussians that another arm has, densification by densification ("legs@3dgs"). The baseline 3dgs
-is always among the arms, and is proven unweighted first. A comparison that was interrupted goes on when it is given
-again with the same --out; more arms and seeds are added in the same way. Without SCENE it takes a small version of the
-embedded scene, which it makes first. With --upstream the arms are trained by another codebase's own script, in a copy
-of its checkout, with its own density control.
+gives it the number of Gaussians of another arm, densification by densification ("legs@3dgs"). The baseline 3dgs is
+always among the arms, and is checked to be unweighted first. Run the command again with the same --out to resume an
+interrupted comparison, or to add arms and seeds. Without SCENE it makes and uses a small version of the embedded scene.
+With --upstream another codebase's own script trains the arms, in a copy of its checkout, with its own density control.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from legs_loss.system import say
 if TYPE_CHECKING:
     from legs_loss.experiments.studies import Study
 
-HELP = "several losses on a scene, with seeds, controls and intervals"
+HELP = "train and compare several losses on a scene, with seeds, controls and intervals"
 
 # Of the embedded scene: small enough that a laptop trains the arms of a study in some minutes.
 VIEWS, WIDTH, HEIGHT = 56, 144, 108
@@ -42,19 +41,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--again",
         type=Path,
         metavar="ROW",
-        help="train one row again from its own OUT/ARM/seed-N/row.json, and show its scores then and now; the other "
-        "settings are the row's",
+        help="train one row again from its OUT/ARM/seed-N/row.json, and compare the scores; the other settings are the "
+        "row's",
     )
     what.add_argument(
         "--study",
         choices=STUDIES,
         default="main",
-        help=f"a built-in list of arms, beside the paper's numbers; default: main. "
+        help=f"a built-in list of arms, with the paper's numbers; default: main. "
         f"{'; '.join(f'{name}: {study.title}' for name, study in STUDIES.items())}",
     )
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="of each arm; default: 3")
     parser.add_argument(
-        "--first_seed", type=int, default=0, metavar="N", help="default: 0; with --seeds 1 a single row is run alone"
+        "--first_seed", type=int, default=0, metavar="N", help="default: 0; with --seeds 1 a single row is trained"
     )
     parser.add_argument(
         "-m", "--out", type=Path, default=Path("legs_compare"), metavar="DIR", help="default: legs_compare"
@@ -97,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.report.tensorboard import tensorboard_log
     from legs_loss.scenes import read_scene
 
-    set_threads(None)  # without numba there is no training: say so now
+    set_threads(None)  # fail now if numba is missing
     if args.again is not None:
         return _again(args)
     for name, least in (("seeds", 1), ("first_seed", 0), ("processes", 1)):
@@ -164,11 +163,11 @@ def _upstream(args: argparse.Namespace, study: Study) -> int:
     from legs_loss.experiments.upstream.profile import find_profile, split
 
     if args.scene is None:
-        raise LegsError("give the scene that --upstream is to be trained on")
+        raise LegsError("--upstream needs a SCENE")
     if args.scheduler is not None:
-        raise LegsError("with --upstream trainings run here, one at a time: leave --scheduler out")
+        raise LegsError("--upstream trains here, one run at a time: do not give --scheduler")
     if args.densify_grad_threshold is not None:
-        raise LegsError("with --upstream give its own option for the threshold, by --extra")
+        raise LegsError("with --upstream give the codebase's own threshold option, by --extra")
     profile = find_profile(args.upstream, args.profile)
     comparison = UpstreamComparison(
         args.upstream,

@@ -1,7 +1,7 @@
-"""Photographs to numbers and pictures: weight maps, then 3dgs, eggs, legs-l and legs trained side by side on the CPU.
+"""Compute weight maps, train 3dgs, eggs, legs-l and legs side by side on the CPU, and save a table and pictures.
 
-Without SCENE it takes the embedded scene, which it makes first. Each training runs in a process of its own with one
-thread. The table gives Gaussians beside PSNR, since more Gaussians are part of the gain.
+Without SCENE it makes and uses the embedded scene. Each training runs in a separate process with one thread. The table
+has the number of Gaussians beside PSNR, since more Gaussians are part of the gain.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.spec import PRESETS
 
     started = time.perf_counter()
-    set_threads(None)  # without numba there is no training: say so now
+    set_threads(None)  # fail now if numba is missing
     check_matplotlib()
     if args.processes < 1:
         raise LegsError(f"--processes must be at least 1, got {args.processes}")
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def table(metrics: Dict[str, Dict[str, Any]]) -> str:
-    """Return the results as text, a line a method."""
+    """Return the results as text, a line for each method."""
     from legs_loss.experiments.statistics import summarise
     from legs_loss.experiments.tables import LABELS, markdown, score_cells
 
@@ -110,7 +110,7 @@ def table(metrics: Dict[str, Dict[str, Any]]) -> str:
 
 
 def conclusion(metrics: Dict[str, Dict[str, Any]]) -> str:
-    """Return what the table does and does not say."""
+    """Return the note on how to read the table."""
     plain, legs = metrics["3dgs"], metrics["legs"]
     return (
         f"legs has {legs['gaussians'] / plain['gaussians']:.1f} times as many Gaussians as 3dgs: a larger L1 term "

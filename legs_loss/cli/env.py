@@ -1,4 +1,4 @@
-"""Say what was found on this machine, for a bug report: versions, devices, and which backend computes the loss."""
+"""Print versions, devices and the backend that computes the loss, for a bug report."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from legs_loss.system import say
 if TYPE_CHECKING:
     import torch
 
-HELP = "say what was found on this machine, for a bug report"
+HELP = "print versions, devices and the backend of the loss, for a bug report"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what was found, a line each, and return the exit code."""
+    """Print the findings, a line each, and return the exit code."""
     for name, value in _lines():
         say(f"{name:<16} {value}")
     return 0

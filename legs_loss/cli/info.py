@@ -1,6 +1,6 @@
-"""Say what a store of weight maps holds, and check every byte of it.
+"""Describe a store of weight maps, and verify its checksums.
 
-STORE is the folder that legs precompute wrote, or the scene that has it as legs_weights.
+STORE is the folder that legs precompute wrote, or a scene with the folder legs_weights.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Iterable
 
 from legs_loss.system import say
 
-HELP = "say what a store of weight maps holds, and check it"
+HELP = "describe a store of weight maps, and verify it"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _without_store(path: Path) -> str:
-    """Return the message for a folder that is no store."""
+    """Return the error message for a folder that is not a store."""
     from legs_loss.errors import LegsError
     from legs_loss.scenes import read_scene
     from legs_loss.store import MANIFEST
@@ -73,10 +73,10 @@ def _without_store(path: Path) -> str:
     try:
         views = read_scene(path).views
     except LegsError:
-        return f"{path} is no store of weight maps (it has no {MANIFEST}), and no scene"
+        return f"{path} is neither a store of weight maps (it has no {MANIFEST}) nor a scene"
     return (
         f"{path} has {len(views)} photograph(s) and no weight maps yet: legs precompute {shlex.quote(str(path))} makes "
-        "them; a store that was written elsewhere is given by its own folder"
+        "them; if the store is elsewhere, give its folder"
     )
 
 

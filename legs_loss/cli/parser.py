@@ -17,10 +17,10 @@ _FILES = {"FILE", "IMAGE", "PLY", "PNG", "SCRIPT"}
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser that knows what a mistyped choice or option may have meant."""
+    """An ArgumentParser that proposes names for mistyped choices and options."""
 
     def parse_args(self, args: Optional[Sequence[str]] = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Parse as argparse does; what no parser knows is an error of the sub-command that it was given to."""
+        """Parse as argparse does; unknown arguments are an error of the sub-command."""
         parsed, extra = self.parse_known_args(args, namespace)
         if extra:
             self._command(parsed).error(f"unrecognized arguments: {' '.join(extra)}")
@@ -38,7 +38,7 @@ class Parser(argparse.ArgumentParser):
         super().error(printable(message))
 
     def offer_completion(self) -> None:
-        """Add ``--print-completion``, which prints what a shell needs to complete this command's words."""
+        """Add ``--print-completion``, which prints a shell's completion script for this command."""
         self.add_argument(
             "--print-completion",
             action=_PrintCompletion,

@@ -1,10 +1,9 @@
 """Compute the weight maps of scenes once, for every later training.
 
 SCENE is a folder with a COLMAP model, with transforms.json, or just with images; a glob pattern of such folders; or a
-.txt file with one of these a line. The maps go to SCENE/legs_weights, where a training script that is given the scene
-finds them by itself. Give -r, -w and --images as the training will have them: a map is used only for the very image
-that it was made from. With --scheduler the scenes are shared out to the workers of a dask cluster, which must all see
-them under the same path.
+.txt file with one of these a line. The maps go to SCENE/legs_weights, where a training script on that scene finds them.
+Give -r, -w and --images as for the training: a map is used only for exactly the image that it was made from. With
+--scheduler the workers of a dask cluster compute the scenes, which must have the same paths on all of them.
 """
 
 from __future__ import annotations
@@ -87,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
-    """Check what can be checked before anything is computed; return the tasks, and their stores as they were named."""
+    """Check the arguments before anything is computed; return the tasks, and their stores as they were named."""
     from legs_loss.cli.checks import check_resolution
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import SceneTask, find_scenes, stores_of
@@ -132,7 +131,7 @@ def _make(folder: Path) -> None:
 
 
 def _say(store: Path, done: SceneDone) -> int:
-    """Print what was done of a scene; return 1 if any of it failed."""
+    """Print the result of a scene; return 1 if any of it failed."""
     from legs_loss.store import MANIFEST, WeightStore
     from legs_loss.store.sharpness import unsharp_views
 
@@ -141,21 +140,21 @@ def _say(store: Path, done: SceneDone) -> int:
         say(f"legs: skipped {view}: {reason}", sys.stderr)
     if done.alike:
         say(
-            f"legs: note: {done.alike} views share a name in 3DGS, which knows no folders and no extensions; "
-            "code that names views so will compute their weights instead",
+            f"legs: note: {done.alike} views share a name in 3DGS, which drops folders and extensions; "
+            "codebases that name views so compute their weights instead",
             sys.stderr,
         )
     unsharp = unsharp_views(WeightStore(report.store)) if (report.store / MANIFEST).is_file() else []
     if unsharp:
         say(
-            f"legs: note: {', '.join(unsharp)}: out of focus, moved or noisy beside the others, as it seems; each map "
-            "counts from its own weakest to its strongest response, so that such photographs are weighted more",
+            f"legs: note: {', '.join(unsharp)}: probably out of focus, moved or noisy beside the others; each "
+            "map is normalised by its own range, so such photographs get larger weights",
             sys.stderr,
         )
     say(f"{store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")
     if report.made and not (report.store / MANIFEST).is_file():
         say(
-            f"legs: error: a worker wrote {report.store}, which is not seen here: the file system is not shared",
+            f"legs: error: a worker wrote {report.store}, which is not visible here: the file system is not shared",
             sys.stderr,
         )
         return 1
@@ -175,7 +174,7 @@ def _say_where(tasks: Iterable[SceneTask]) -> None:
 
 
 class _Bar:
-    """One bar for the views of all scenes, wherever they are computed."""
+    """One progress bar for the views of all scenes, local and on workers."""
 
     def __init__(self, scenes: int) -> None:
         self._scenes, self._finished = scenes, 0
@@ -184,7 +183,7 @@ class _Bar:
     def __enter__(self) -> _Bar:
         from tqdm import tqdm
 
-        # With a delay nothing is shown before the first view, nor of what fails before it.
+        # With a delay, nothing is shown before the first view or for earlier failures.
         self._bar = tqdm(total=0, desc=self._title(), unit="view", delay=0.001)
         return self
 
@@ -192,14 +191,14 @@ class _Bar:
         self._bar.close()
 
     def listen(self, message: Dict[str, Any]) -> None:
-        """Take a task's news: of a task that was begun again they replace the earlier ones."""
+        """Handle a task's message; a restarted task replaces its earlier messages."""
         self._views[message["scene"]] = message["done"], message["of"]
         views = list(self._views.values())
         self._bar.total = sum(of for _, of in views)
         self._bar.update(sum(done for done, _ in views) - self._bar.n)
 
     def above(self) -> Any:
-        """Print within this without breaking the bar."""
+        """Suspend the bar for a print."""
         return self._bar.external_write_mode()
 
     def finish_one(self) -> None:

@@ -1,7 +1,7 @@
-"""Make a page of a comparison: one HTML file that needs neither a network nor anything else beside it.
+"""Make one self-contained HTML page of a comparison, which needs no network.
 
-It holds the table of scores, which sorts; PSNR by iterations and by Gaussians; for some views a slider that wipes
-between two methods, error and weight maps, and the places where two methods differ most; and all settings.
+It has a sortable table of scores; PSNR by iterations and by Gaussians; for some views a slider between two methods,
+error and weight maps, and the places where two methods differ most; and all settings.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: RUN/report.html")
     parser.add_argument("--views", nargs="+", metavar="NAME", help="or parts of names; default: three held-out views")
     parser.add_argument("--arms", nargs="+", metavar="ARM", help="default: all that are trained")
-    parser.add_argument("--scene", type=Path, metavar="DIR", help="where the scene lies, if it was moved")
+    parser.add_argument("--scene", type=Path, metavar="DIR", help="the scene's folder, if it was moved")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.report.comparison import check_matplotlib
     from legs_loss.report.html import write_report
 
-    set_threads(None)  # it draws with the CPU rasterizer: without numba, say so now
+    set_threads(None)  # it draws with the CPU rasterizer: fail now if numba is missing
     check_matplotlib()
     path = write_report(args.folder, args.output or args.folder / "report.html", args.views, args.arms, args.scene)
     say(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")

@@ -1,6 +1,6 @@
-"""Make a COLMAP scene of photographs: find where each was taken, and points of the scene.
+"""Make a COLMAP scene from photographs: camera poses and points of the scene.
 
-PHOTOS is a folder of photographs of one still scene, each overlapping its neighbours. OUT gets the undistorted
+PHOTOS is a folder of photographs of one static scene, each overlapping its neighbours. OUT gets the undistorted
 photographs in images/ and COLMAP's cameras, poses and points in sparse/0/, as 3DGS, its forks and this package's
 commands read them. Needs pycolmap: pip install "legs-loss[colmap]".
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from legs_loss.system import say
 
-HELP = "make a COLMAP scene of photographs"
+HELP = "make a COLMAP scene from photographs"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,5 +66,5 @@ def run(args: argparse.Namespace) -> int:
         f"mean reprojection error {made.error:.2f} pixels"
     )
     if made.lost:
-        say(f"legs: no camera was found for {', '.join(made.lost)}: they are left out", sys.stderr)
+        say(f"legs: no camera was found for {', '.join(made.lost)}: they are omitted", sys.stderr)
     return 1 if made.lost else 0

@@ -1,6 +1,6 @@
 """Draw a contact sheet (PNG): photograph, response and weight map of some views, and the curves.
 
-SCENE and IMAGE are computed anew; of a STORE the stored maps are drawn, beside the photographs of its scene.
+The maps of a SCENE or an IMAGE are computed; those of a STORE are drawn with the photographs of its scene.
 """
 
 from __future__ import annotations
@@ -76,14 +76,14 @@ def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor]) -> Shown:
 
 
 def _over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor]) -> np.ndarray:
-    """Normalise a response [H, W] over its scene, or by itself where that is one photograph."""
+    """Normalise a response [H, W] over its scene, or by itself for a single photograph."""
     from legs_loss.levels import over_scene
 
     return over_scene(strength[None], spec, scene)[0].numpy()
 
 
 def _levels(views: Sequence[View], spec: WeightSpec) -> Optional[Tensor]:
-    """Read all photographs for the levels of the scene, where the spec is normalised over it."""
+    """Read all photographs for the levels of the scene, if the spec is normalised over it."""
     from tqdm import tqdm
 
     from legs_loss.levels import response_levels, scene_levels
@@ -128,7 +128,7 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
 
 
 def _photograph(view: View, entry: Entry) -> Optional[np.ndarray]:
-    """Return the very image that a map was made from, None if it is missing or has changed."""
+    """Return the image that a map was made from, None if it is missing or has changed."""
     from legs_loss.errors import LegsError
     from legs_loss.scenes import image_size, load_training_image, training_size
     from legs_loss.store import fingerprint
@@ -153,7 +153,7 @@ def _choose(names: Sequence[str], chosen: Optional[Sequence[str]]) -> List[str]:
     for wanted in chosen:
         fits = [name for name in names if name == wanted] or [name for name in names if wanted in view_names(name)]
         if len(fits) != 1:
-            what = f"fits {len(fits)} views" if fits else "is no view"
+            what = f"fits {len(fits)} views" if fits else "is not a view"
             raise LegsError(f"--views: {wanted} {what}; there are {len(names)}, such as {', '.join(names[:4])}")
         found += fits
     return found

@@ -2,7 +2,7 @@
 
 SCENE is a folder with COLMAP's model (sparse/0, pinhole cameras). Every 8th view, sorted by name, is held out. Weight
 maps are taken from SCENE/legs_weights where `legs precompute` left them, else computed. The flags have 3DGS's names
-where 3DGS has them. The output folder gets point_cloud/iteration_N/point_cloud.ply, which viewers of 3DGS open,
+where they exist there. The output folder gets point_cloud/iteration_N/point_cloud.ply, which viewers of 3DGS open,
 cfg.json and metrics.json.
 """
 
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="the run's folder; default: output/SCENE-PRESET",
     )
-    parser.add_argument("--resume", action="store_true", help="go on with the run in the output folder")
+    parser.add_argument("--resume", action="store_true", help="resume the run in the output folder")
     parser.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")
     parser.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
     parser.add_argument("--threads", type=int, metavar="N", help="default: one a core")
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, or go on training, and print the scores."""
+    """Train, or resume a training, and print the scores."""
     from legs_loss.cli.checks import check_trainable
     from legs_loss.errors import LegsError
     from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, point_cloud, train
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     if args.resume:
         config = _resumed(checkpoint, given)
     elif checkpoint.exists():
-        raise LegsError(f"{out} already holds a run: go on with it (--resume), or choose another folder (--out)")
+        raise LegsError(f"{out} already holds a run: resume it (--resume), or choose another folder (--out)")
     else:
         config = TrainConfig(**given)
     scene = read_scene(args.scene, args.images)
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def set_threads(count: Optional[int]) -> None:
-    """Use so many threads for drawing, the loss and torch; None leaves numba's and torch's own choice.
+    """Set the number of threads for drawing, the loss and torch; None keeps the defaults of numba and torch.
 
     Raises:
         LegsError: not between 1 and the number of cores; or numba is missing.
@@ -144,7 +144,7 @@ def progress_bar(iterations: int, name: str, position: int = 0) -> Iterator[Call
     with tqdm(total=iterations, desc=printable(name), position=position, leave=position == 0, mininterval=0.5) as bar:
 
         def show(progress: Progress) -> None:
-            if bar.n == 0 and progress.iteration > 10:  # resumed: these iterations did not take this run's time
+            if bar.n == 0 and progress.iteration > 10:  # resumed: this run did not compute these iterations
                 bar.initial = bar.n = progress.iteration
             bar.set_postfix_str(
                 f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, {progress.gaussians} Gaussians", refresh=False
@@ -165,7 +165,7 @@ def _resumed(checkpoint: Path, given: Dict[str, Any]) -> TrainConfig:
     different = [name for name in given if wanted.as_dict()[name] != stored.get(name)]
     if different:
         raise LegsError(
-            f"{checkpoint.parent} holds a run with another {' and '.join(different)}: leave the flag out to go on with "
+            f"{checkpoint.parent} holds a run with another {' and '.join(different)}: omit the flag to resume "
             "it, or choose another folder (--out)"
         )
     return wanted

@@ -1,8 +1,8 @@
-"""Look at trained Gaussians in the browser.
+"""View trained Gaussians in the browser.
 
 PATH is a .ply of 3DGS, the output folder of a training (of legs train, 3DGS or its forks), a folder of several, as legs
-demo writes, or a comparison. Methods are switched on and off, and two are wiped against each other; with a scene, its
-cameras are shown with their photographs or weight maps. Colours do not change with the direction (degree 0).
+demo writes, or a comparison. Methods can be switched on and off, and two compared with a slider; with a scene, its
+cameras are shown with their photographs or weight maps. Colours do not depend on the direction (degree 0).
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from pathlib import Path
 
 from legs_loss.system import say
 
-HELP = "look at trained Gaussians in the browser"
+HELP = "view trained Gaussians in the browser"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     from legs_loss.spec import PRESETS
 
-    parser.add_argument("path", metavar="RUN|PLY|COMPARISON", type=Path, help="what to look at")
-    parser.add_argument("-s", "--scene", type=Path, metavar="DIR", help="the photographs; a comparison knows its own")
+    parser.add_argument("path", metavar="RUN|PLY|COMPARISON", type=Path, help="what to view")
+    parser.add_argument("-s", "--scene", type=Path, metavar="DIR", help="photographs; default: those of the comparison")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="of the weight maps; default: legs")
     parser.add_argument("--port", type=int, default=8080, metavar="N", help="default: 8080, or the next that is free")
     parser.add_argument(
-        "--host", default="127.0.0.1", metavar="ADDRESS", help="default: 127.0.0.1, this machine alone can look"
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="default: 127.0.0.1, for this machine only"
     )
 
 

@@ -1,4 +1,4 @@
-"""Experiments: arms that differ in one thing, trained side by side over several seeds, and what their differences say.
+"""Experiments: arms that differ in one setting, trained side by side with several seeds, and their differences.
 
 arms.py names an arm; weighting.py holds the weights that no spec describes; baseline.py proves that the baseline is
 unweighted; running.py trains and keeps one row an arm and seed; statistics.py compares rows; studies.py lists the

@@ -1,10 +1,10 @@
-"""An arm's name, and the training that it stands for.
+"""An arm's name, and the training that it describes.
 
     LOSS[:CHANGE ...][@ARM]
 
 LOSS is a preset ("legs"), a curve with LEGS's other settings ("C4"), a beta with them ("beta=5"), or settings of a
 WeightSpec ("curve=C3,beta=4,percentile=99"). CHANGE is one of CHANGES: "legs:shuffled". @ARM gives it the number of
-Gaussians that another arm has, densification by densification: "legs@3dgs".
+Gaussians of another arm, densification by densification: "legs@3dgs".
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CHANGES", "ArmSpec", "needed", "parse_arm", "parse_arms"]
 
-# What a change does, in the words of the help and of the tables.
+# The changes, with their descriptions for the help and the tables.
 CHANGES: Mapping[str, str] = {
     "scale": "no map: the L1 term times the loss's mean weight",
     "shuffled": "each map's pixels in random order",
@@ -39,7 +39,7 @@ CHANGES: Mapping[str, str] = {
 }
 _WEIGHTINGS = ("shuffled", "growing", "fading", "multiscale", "late", "latest")  # one of them at most
 
-LOOSE = 0.25  # of the threshold: where another arm's numbers are the limit, they are to be met
+LOOSE = 0.25  # of the threshold: low enough that another arm's numbers are reached
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class ArmSpec:
 
     @property
     def weighting(self) -> Optional[str]:
-        """Return the name of what makes its weights during the run, None where its spec does."""
+        """Return the name of the function that makes its weights during the run, None for its spec's maps."""
         return next((change for change in self.changes if change in _WEIGHTINGS), None)
 
     @property
@@ -113,9 +113,9 @@ def parse_arm(name: str) -> ArmSpec:
     if len(set(changes)) < len(changes) or sum(change in _WEIGHTINGS for change in changes) > 1:
         raise LegsError(f"{name}: give each change once, and one of {', '.join(_WEIGHTINGS)} at most")
     if "scale" in changes and len(changes) > 1:
-        raise LegsError(f"{name}: scale leaves no map for another change")
+        raise LegsError(f"{name}: scale uses no map, so no other change applies")
     if at_sign and "@" in at:
-        raise LegsError(f"{name}: the arm behind the @ has an @ of its own")
+        raise LegsError(f"{name}: the arm after @ must not contain an @")
     spec = _loss(name, loss)
     if spec.unweighted and any(change != "half" and not change.startswith("lambda=") for change in changes):
         raise LegsError(f"{name}: {loss} has no weights to change")
@@ -139,7 +139,7 @@ def parse_arms(names: Sequence[str]) -> List[ArmSpec]:
 
 
 def needed(arms: Sequence[ArmSpec]) -> List[ArmSpec]:
-    """Return the arms, and before them those whose numbers of Gaussians they take."""
+    """Return the arms, and before them those whose numbers of Gaussians they use."""
     return list(dict.fromkeys([parse_arm(arm.at) for arm in arms if arm.at is not None] + list(arms)))
 
 
@@ -166,7 +166,7 @@ def _loss(name: str, loss: str) -> WeightSpec:
         key, equals, value = part.partition("=")
         if not equals or key not in _FIELDS:
             raise LegsError(
-                f"{name}: {part!r} is no loss: give a preset ({', '.join(PRESETS)}), a curve "
+                f"{name}: {part!r} is not a loss: give a preset ({', '.join(PRESETS)}), a curve "
                 f"({', '.join(curve_names())}) or settings of a spec such as beta=5 or curve=C3,percentile=99 "
                 f"({', '.join(_FIELDS)})"
             )

@@ -1,4 +1,4 @@
-"""The proof that a comparison's baseline is 3DGS's own loss: a baseline that is weighted too makes all arms equal."""
+"""Check that a comparison's baseline is 3DGS's own loss: with a weighted baseline all arms are equal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CLOSE = 1e-4  # relative: two implementations in float32
 
 
 def prove_unweighted(views: Sequence[TrainingView], config: TrainConfig) -> Dict[str, Any]:
-    """Take the loss of every training view as the trainer takes it, and 3DGS's own by its formula, and compare.
+    """Compare the trainer's loss of every training view with 3DGS's own formula.
 
     Args:
         views: the baseline's training views, with the weight maps that its trainings would use.
@@ -37,7 +37,7 @@ def prove_unweighted(views: Sequence[TrainingView], config: TrainConfig) -> Dict
         if weight is not None and not bool((weight == 1).all()):
             raise LegsError(
                 f"the baseline is weighted: {view.name} has a weight map of mean {float(weight.mean()):.3f}: "
-                "differences from it would say nothing"
+                "differences from it would be meaningless"
             )
         # Any rendering will do: the photograph with noise has errors of all sizes.
         rendering = (view.image + 0.2 * torch.randn(view.image.shape, generator=generator)).clamp(0, 1)

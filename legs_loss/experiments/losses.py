@@ -1,4 +1,4 @@
-"""Losses for experiments, in place of the trainer's own; see :data:`legs_loss.reference.training.trainer.Loss`."""
+"""Losses for experiments, which replace the trainer's own; see :data:`legs_loss.reference.training.trainer.Loss`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The trainings of a comparison on the workers of a dask scheduler, a training a task."""
+"""Run the trainings of a comparison on the workers of a dask scheduler, one task each."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def train_on_cluster(
     on_progress: Callable[[str, Progress], None],
     on_done: Callable[[str, Dict[str, Any]], None],
 ) -> None:
-    """Train all arms on a cluster that shares the file system; the others as ``train_side_by_side`` takes them.
+    """Train all arms on a cluster that shares the file system; the other arguments are those of ``train_side_by_side``.
 
-    A training whose worker dies is gone on with by another one, from its last checkpoint.
+    If a worker dies, another one resumes its training from the last checkpoint.
 
     Raises:
-        LegsError: an arm failed; the message names it and its worker. What was trained meanwhile is kept.
+        LegsError: an arm failed; the message names it and its worker. Finished trainings are kept.
     """
     if not arms:
         return
@@ -56,7 +56,7 @@ def train_on_cluster(
 
 
 def _train(arm: Arm, tell: Listener) -> Dict[str, Any]:
-    """Train one arm on a worker; go on where another worker was when it died."""
+    """Train one arm on a worker; resume after a worker that died."""
     if not arm.scene.is_dir():
         raise LegsError(f"there is no folder {arm.scene} here: is the file system with the scene mounted?")
     if arm.out is not None:

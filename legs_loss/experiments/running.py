@@ -1,7 +1,7 @@
-"""A comparison in a folder: its settings, and one row an arm and seed, each of which can be run again alone.
+"""A comparison in a folder: its settings, and one row for each arm and seed, which can be trained again separately.
 
 OUT/comparison.json              the scene and the settings that all arms share, the proof of the baseline
-OUT/ARM/seed-N/plan.json         the row's own settings, complete: from them alone it can be trained again
+OUT/ARM/seed-N/plan.json         the row's complete settings, from which it can be trained again
 OUT/ARM/seed-N/row.json          the same with the scores, once it is trained
 OUT/ARM/seed-N/point_cloud/...   its Gaussians
 """
@@ -57,7 +57,7 @@ Row = Dict[str, Any]
 
 
 class Comparison:
-    """The comparison in a folder, new or begun.
+    """The comparison in a folder, new or existing.
 
     Args:
         scene: a COLMAP scene.
@@ -116,17 +116,17 @@ class Comparison:
         on_progress: Callable[[str, Progress], None],
         scheduler: Optional[str] = None,
     ) -> List[Row]:
-        """Train the rows that are missing, each in a process of its own with one thread; return all, seed by seed.
+        """Train the rows that are missing, each in a separate process with one thread; return all, seed by seed.
 
-        With ``scheduler``, the address of a dask scheduler, they are shared out to its workers.
+        With ``scheduler``, the address of a dask scheduler, its workers train them.
 
-        Arms that others take their numbers of Gaussians from are trained too, and before them.
+        Arms whose numbers of Gaussians others use are trained too, before them.
 
         Raises:
-            LegsError: a training failed; rows that are done stay, and the next call goes on.
+            LegsError: a training failed; finished rows are kept, and the next call resumes.
         """
         todo = [(arm, seed) for seed in seeds for arm in needed(arms)]
-        for late in (False, True):  # those with the numbers of another arm come after it
+        for late in (False, True):  # arms that use another arm's numbers are trained after it
             plans = {
                 f"{arm.name}, seed {seed}": (arm, seed)
                 for arm, seed in todo
@@ -146,7 +146,7 @@ class Comparison:
         return [row for row in rows if row is not None]
 
     def train_one(self, arm: ArmSpec, seed: int) -> Row:
-        """Train one row in this process, unless it is there already; what it takes its numbers from must be there."""
+        """Train one row in this process, unless it exists; the row whose numbers it uses must exist."""
         if self.row(arm, seed) is None:
             training = self._training(arm.name, arm, seed)
             self._finish(arm, seed, train_arm(training, lambda progress: None))
@@ -175,7 +175,7 @@ class Comparison:
             return config, None
         leader = self.row(parse_arm(arm.at), seed)
         if leader is None:
-            raise LegsError(f"{arm.name}, seed {seed}, takes its numbers from {arm.at}: train that first")
+            raise LegsError(f"{arm.name}, seed {seed}, uses the numbers of {arm.at}: train that first")
         return config, {int(iteration): int(count) for iteration, count in leader["metrics"]["growth"]}
 
     def _finish(self, arm: ArmSpec, seed: int, metrics: Dict[str, Any]) -> None:
@@ -195,7 +195,7 @@ class Comparison:
         }
         path = self.out / "comparison.json"
         keep(path, dict(settings, baseline=None), "comparison", SETTINGS, ("path", "baseline"))
-        # Anew each time: a comparison that goes on may do so with other code than it was begun with.
+        # Each time: a resumed comparison may run with newer code.
         self.proof: Dict[str, Any] = prove_unweighted(self.data.train, self.base)
         write_json(path, dict(read_json(path, SETTINGS), baseline=self.proof))
 
@@ -215,14 +215,14 @@ def read_rows(out: Path) -> Tuple[Dict[str, Any], List[Row]]:
 
 
 def scene_of(settings: Mapping[str, Any], moved: Optional[Path] = None) -> Scene:
-    """Return the scene of a comparison with these settings; ``moved`` is where it lies now.
+    """Return the scene of a comparison with these settings; ``moved`` is its new folder.
 
     Raises:
         LegsError: it is not there, or it is another scene.
     """
     root = Path(settings["path"]) if moved is None else moved
     if not root.is_dir():
-        raise LegsError(f"{root}: the scene is not there: say where it lies now (--scene)")
+        raise LegsError(f"{root}: the scene is not there: give its new folder with --scene")
     scene = read_scene(root, settings["images"])
     if identity(scene)["sha256"] != settings["scene"]["sha256"]:
         raise LegsError(f"{root}: this is not the scene of the comparison: it has other views or points")
@@ -241,7 +241,7 @@ def read_row(path: Path) -> Row:
 
 
 def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progress], None]) -> Row:
-    """Train the row of a ``row.json`` anew, from that file alone, and keep nothing; return the new row.
+    """Train the row of a ``row.json`` again, from that file only, without saving; return the new row.
 
     Raises:
         LegsError: it is no row, or its scene is not there.
@@ -253,7 +253,7 @@ def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progre
 
 
 def versions() -> Dict[str, str]:
-    """Return the versions that a result may depend on."""
+    """Return the versions of all software that a result may depend on."""
     import numba
     import torch
 
@@ -269,7 +269,7 @@ def versions() -> Dict[str, str]:
 
 
 def _code() -> str:
-    """Return a checksum of this package's sources: they change more often than its version, and rounding with them."""
+    """Return a checksum of this package's sources, which change between versions and change the rounding."""
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parents[1]
     for path in sorted(package.rglob("*.py")):
@@ -278,7 +278,7 @@ def _code() -> str:
 
 
 def _planned(name: str, plan: Mapping[str, Any], root: Path, images: Optional[str], folder: Optional[Path]) -> Arm:
-    """Return the training that a plan describes; a folder that has its checkpoint is gone on with."""
+    """Return the training that a plan describes; it resumes from a checkpoint in its folder."""
     config = TrainConfig.from_dict(plan["config"])
     return Arm(
         name,
@@ -295,7 +295,7 @@ def _planned(name: str, plan: Mapping[str, Any], root: Path, images: Optional[st
 
 
 def identity(scene: Scene) -> Dict[str, Any]:
-    """Return what tells this scene from others, wherever it lies."""
+    """Return an identification of a scene that does not depend on its folder."""
     digest = hashlib.sha256("\n".join(view.name for view in scene.views).encode())
     if scene.points is not None:
         digest.update(np.ascontiguousarray(scene.points.xyz).tobytes())
@@ -303,7 +303,7 @@ def identity(scene: Scene) -> Dict[str, Any]:
 
 
 def keep(path: Path, values: Dict[str, Any], what: str, names: Sequence[str], free: Sequence[str] = ()) -> None:
-    """Write values, or find the same there already; those of the names in ``free`` may differ."""
+    """Write values, or check them against an existing file; those of the names in ``free`` may differ."""
     if not path.is_file():
         write_json(path, values)
         return
@@ -313,7 +313,7 @@ def keep(path: Path, values: Dict[str, Any], what: str, names: Sequence[str], fr
     ]
     if different:
         raise LegsError(
-            f"{path}: this {what} was begun with another {', '.join(different)}: choose another folder (--out), "
+            f"{path}: this {what} was started with another {', '.join(different)}: choose another folder (--out), "
             "or give the settings that it has"
         )
 
@@ -330,7 +330,7 @@ def read_json(path: Path, names: Sequence[str]) -> Dict[str, Any]:
     """Return the values of a JSON file of a comparison that must have these names.
 
     Raises:
-        LegsError: it cannot be read, or is damaged; the message names what of it.
+        LegsError: it cannot be read, or is damaged; the message names the part.
     """
     try:
         values = json.loads(read_regular(path, _LARGEST).decode("utf-8"))
@@ -345,5 +345,5 @@ def read_json(path: Path, names: Sequence[str]) -> Dict[str, Any]:
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Write values to a JSON file, all at once."""
+    """Write values to a JSON file, atomically."""
     write_whole(path, (json.dumps(values, indent=1) + "\n").encode(), folders=True)

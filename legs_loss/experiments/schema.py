@@ -1,6 +1,6 @@
-"""The schema of a comparison's files, checked where they are read and nowhere else.
+"""The schema of a comparison's files, checked when they are read.
 
-A comparison's folder may come from somebody else: names in it become paths and words on a page.
+A comparison's folder may come from somebody else, and names in it become paths and text on a page.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from legs_loss.reference.training.config import TrainConfig
 
 __all__ = ["PLAN", "ROW", "SETTINGS", "what_is_wrong"]
 
-# What the files must hold to be of use.
+# The required contents of the files.
 SETTINGS = ("scene", "path", "images", "base", "baseline")
 PLAN = ("arm", "seed", "config", "weighting", "loss", "caps")
 ROW = (*PLAN, "versions", "metrics")
@@ -23,7 +23,7 @@ _LARGEST = 1 << 63
 
 
 def what_is_wrong(values: Any, names: Iterable[str]) -> Optional[str]:
-    """Return the name of what is missing in a file's content or is none of its kind; None where all is well.
+    """Return the name of a value that is missing or invalid in a file; None where the file is valid.
 
     Args:
         values: what the file holds.
@@ -81,7 +81,7 @@ def _pair(value: Any) -> bool:
 
 
 def _config(value: Any) -> bool:
-    """Return whether its own class takes the settings, and each is of the kind that it has there."""
+    """Return whether the class accepts the settings, and each has the type of its field."""
     return _alike(TrainConfig.from_dict(value).as_dict(), TrainConfig().as_dict())
 
 

@@ -1,4 +1,4 @@
-"""The tables of a comparison, as Markdown that reads well in a terminal too."""
+"""The tables of a comparison, as Markdown that is readable in a terminal."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def markdown(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 
 def label(arm: str) -> str:
-    """Return how a table names an arm: "C1" is the same training as "legs-l", and both names are told."""
+    """Return the name of an arm in tables, with both names where "C1" is the same training as "legs-l"."""
     name = parse_arm(arm).name
     return name if name == arm else f"{arm} ({name})"
 
@@ -101,7 +101,7 @@ DIFFERENCES: Mapping[str, Tuple[str, str]] = {
 
 
 def differences_table(rows: Rows, study: Study) -> str:
-    """Return each arm's differences from what it is measured against, with their intervals."""
+    """Return each arm's differences from its reference arm, with their intervals."""
     if study.alike:
         return _pairs_table(rows, study)
     lines = []
@@ -120,7 +120,7 @@ def differences_table(rows: Rows, study: Study) -> str:
 
 
 def _pairs_table(rows: Rows, study: Study) -> str:
-    """Of each score: how far any two of the arms differ at most, and how many of the differences pass for clear."""
+    """Return for each score the largest difference of two arms, and the number of clear differences."""
     lines = []
     for column, (split, score) in DIFFERENCES.items():
         pairs = combinations([parse_arm(arm).name for arm in study.arms], 2)
@@ -134,7 +134,7 @@ def _pairs_table(rows: Rows, study: Study) -> str:
 
 
 def paper_text(rows: Rows, study: Study) -> str:
-    """Return what the paper says beside what was measured here."""
+    """Return the paper's values beside the measured ones."""
     lines = [study.paper_says]
     gains = {arm: difference(rows, parse_arm(arm).name, BASELINE, "train") for arm in study.paper or ()}
     known = {arm: gain for arm, gain in gains.items() if gain is not None}
@@ -146,13 +146,13 @@ def paper_text(rows: Rows, study: Study) -> str:
 
 
 def study_text(rows: Rows, study: Study) -> str:
-    """Return a study's tables and what the paper says."""
+    """Return a study's tables and the paper's statements."""
     parts = [f"## {study.title}", scores_table(rows, study.arms), differences_table(rows, study)]
     return "\n\n".join([*parts, paper_text(rows, study)])
 
 
 def again_text(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return a row's scores as they were and as they are when it is trained again, and whether they are the same."""
+    """Return a row's scores before and after it was trained again, and whether they are equal."""
     lines = [[when, *score_cells(*summarise([row])[2:])] for when, row in (("then", then), ("now", now))]
     same = _scores_agree(then, now) and all(
         then["metrics"][name] == now["metrics"][name] for name in ("gaussians", "growth")
@@ -163,8 +163,8 @@ def again_text(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     changed = [name for name, value in now["versions"].items() if then["versions"].get(name) != value]
     told = ", ".join(f"{name} ({then['versions'].get(name)}, now {now['versions'][name]})" for name in changed)
     return text + (
-        f"Not the same. What differs: {told or 'the processor, it seems'}. Another rounding grows in a training "
-        "until it has moved the scores; --study noise shows how far."
+        f"Not the same. Different: {told or 'probably the processor'}. A rounding difference grows in a training "
+        "until it changes the scores; --study noise shows how far."
     )
 
 

@@ -24,7 +24,7 @@ SCALES = (1, 2, 4)  # the photograph's own size, a half and a quarter of it
 
 
 def shuffled(views: List[TrainingView], config: TrainConfig) -> Weigh:
-    """Return each map's pixels in random order, another a view and a seed: the same weights without their places."""
+    """Return each map's pixels in random order, different for each view and seed: the same weights, displaced."""
     generator = torch.Generator().manual_seed(1_000_003 + config.seed)
     maps = [_shuffle(view.weight, generator) for view in views]
     return lambda index, done, rendering: maps[index]

@@ -1,8 +1,8 @@
-"""Choose the code that computes the loss: torch, or a backend where one is installed and works.
+"""Choose the code that computes the loss: torch, or a backend that is installed and works.
 
-A backend is tried once before it is used, on a small image against torch. One that is not installed is passed over in
-silence; one that fails, then or later, is named once on stderr; torch does the work then.
-``LEGS_BACKEND=torch|numba|cuda`` forces one; what that one does not take is torch's all the same.
+A backend is tested once before its first use, on a small image against torch. One that is not installed is skipped
+silently; one that fails, then or later, is reported once on stderr, and torch is used instead.
+``LEGS_BACKEND=torch|numba|cuda`` forces one; images that it does not support are computed by torch.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Finding(NamedTuple):
 
     Attributes:
         backend: None where it is not used.
-        installed: whether its package is there at all.
-        reason: in words.
+        installed: whether its package is installed.
+        reason: why it is, or is not, used.
     """
 
     backend: Optional[Backend]
@@ -78,7 +78,7 @@ def backend_for(device: torch.device) -> str:
 
 
 def finding(name: str, device: torch.device) -> Finding:
-    """Return what the trial of a backend on a device gave; it is run once a process."""
+    """Return the result of a backend's trial on a device, which runs once per process."""
     key = f"{name} {device.type}"
     if key not in _findings:
         with _lock:
@@ -193,20 +193,20 @@ def _fused(
         return None
     except (LegsError, MemoryError, _OUT_OF_MEMORY):
         raise
-    except Exception as error:  # a size or type that its trial did not meet
+    except Exception as error:  # a size or type that its trial did not cover
         _record(backend.name, prediction.device, Finding(None, True, _in_words(error)))
         return None
 
 
 def _ready_backend(device: torch.device) -> Optional[Backend]:
     if is_capturing(device) and not _tried(device):
-        return None  # a trial waits for the device, which a capture does not survive
+        return None  # a trial waits for the device, which would break a capture
     name = backend_for(device)
     return None if name == "torch" else finding(name, device).backend
 
 
 def is_capturing(device: torch.device) -> bool:
-    """Return whether what is launched on a device now is recorded into a CUDA graph."""
+    """Return whether launches on a device are being recorded into a CUDA graph."""
     probe = getattr(torch.cuda, "is_current_stream_capturing", None)
     return device.type == "cuda" and probe is not None and bool(probe())
 
@@ -237,13 +237,13 @@ def _map(values: Optional[Tensor], target: Tensor, channels_last: bool, name: st
 
 
 def _plain_tensors(prediction: Tensor, *constants: Optional[Tensor]) -> bool:
-    """Return whether the values are plainly in memory, and a gradient flows to the prediction only."""
+    """Return whether the values are in plain memory, and only the prediction needs a gradient."""
     given = [tensor for tensor in constants if isinstance(tensor, Tensor)]
     return not any(tensor.requires_grad for tensor in given) and not any(map(_is_special, (prediction, *given)))
 
 
 def _is_special(tensor: Tensor) -> bool:
-    """Return whether this is a subclass, or what torch.func wraps."""
+    """Return whether this is a subclass of Tensor, or wrapped by torch.func."""
     if type(tensor) not in (Tensor, torch.nn.Parameter):
         return True
     functorch = getattr(torch._C, "_functorch", None)
@@ -267,16 +267,16 @@ def _try(name: str, device: torch.device) -> Finding:
 
         backend = importlib.import_module(_KNOWN[name][0]).BACKEND
         threads = torch.get_num_threads()
-        with torch.inference_mode(False):  # the first call may be an evaluation's; the trial needs gradients
+        with torch.inference_mode(False):  # the first call may be in an evaluation; the trial needs gradients
             problem = difference_from_torch(backend, device)
         torch.set_num_threads(threads)  # numba's first parallel loop sets OpenMP's number, which is torch's too
-    except Exception as error:  # whatever a broken install, compiler or driver raises
+    except Exception as error:  # anything that a broken install, compiler or driver raises
         return Finding(None, True, _in_words(error))
     return Finding(None if problem else backend, True, problem or "its trial agreed with torch")
 
 
 def _missing(name: str) -> Optional[str]:
-    """Say why a backend is none for this installation."""
+    """Return why a backend cannot be used in this installation."""
     if name == "cuda":
         return None if torch.version.cuda else "this torch is built without CUDA"
     if importlib.util.find_spec(name) is None:
@@ -298,7 +298,7 @@ def _in_words(error: Exception) -> str:
 
 def _after_fork() -> None:
     global _forked
-    _forked = True  # the threads of numba did not come along; using them would end the process
+    _forked = True  # numba's threads do not exist in a forked process; using them would crash it
 
 
 if hasattr(os, "register_at_fork"):

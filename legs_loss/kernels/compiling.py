@@ -8,8 +8,8 @@ from typing import Any, Callable
 import numba
 
 # No NaN or infinity arises from checked input. Sums keep their order, and a * b + c is rounded twice unless the code
-# says otherwise: where the compiler may choose, the process that compiles and the next one, which loads what was
-# compiled, can differ in the last bit.
+# says otherwise: if the compiler may choose, the process that compiles and a later one that loads the cached code can
+# differ in the last bit.
 FAST = {"nnan", "ninf", "nsz"}
 
 

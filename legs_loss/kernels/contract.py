@@ -1,7 +1,7 @@
 """The contract of a backend: what it declares, and the operations that it offers. torch is the reference.
 
-A backend never meets what it did not declare: backends.py hands that to torch. So no kernel needs a branch for "any
-other curve", which would compute something else without a word.
+A backend never gets a case that it did not declare: backends.py uses torch for it. So no kernel needs a branch for "any
+other curve", which would silently compute something else.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["Backend", "NotNow", "Weights"]
 
 
 class NotNow(Exception):
-    """An operation cannot be launched now, as in a capture that loading its kernel would break: torch does it once."""
+    """An operation cannot be launched now, since loading its kernel would break a capture: torch computes it once."""
 
 
 class Weights(NamedTuple):

@@ -98,7 +98,7 @@ class _FusedLoss(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_output: Tensor) -> Tuple[Optional[Tensor], None]:
-        # The gradient is handed over, not copied; a second backward of a retained graph makes it anew.
+        # The gradient is passed on, not copied; a second backward of a retained graph recomputes it.
         gradient, ctx.gradient = ctx.gradient, None
         if gradient is None:
             gradient = ctx.compute(True)[1]

@@ -1,9 +1,9 @@
 """Pillow's default resampling of a colour photograph, on the CPU: the same pixels, in a quarter of the time.
 
-A map has to fit the image that the training makes with Pillow, to the last bit, so this repeats Pillow's arithmetic:
+A map must be of exactly the image that the training makes with Pillow, so this repeats Pillow's arithmetic:
 cubic weights in units of 2^-22, a pass along the rows and then one along the columns, each rounded to 8 bits. (Source
-of the formulas: src/libImaging/Resample.c of Pillow.) Other builds of Pillow round otherwise, and since version 13
-images of some shapes are reduced along the columns first; so :func:`resized_as` asks before it believes.
+of the formulas: src/libImaging/Resample.c of Pillow.) Other builds of Pillow round differently, and since version 13
+images of some shapes are reduced along the columns first; so :func:`resized_as` compares once before it is used.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ _Loss = Callable[[Tensor], Tensor]
 
 
 def difference_from_torch(backend: Backend, device: torch.device) -> Optional[str]:
-    """Run each operation of a backend on a small image; say what is wrong with the first wrong result.
+    """Run each operation of a backend on a small image; describe the first wrong result.
 
     The image has two tiles each way, where tiles are small. The reference is in float64, since a GPU's convolutions in
     float32 may be tf32's.

@@ -1,4 +1,4 @@
-"""Weight maps of many scenes: a scene a task, here or on a cluster that shares the file system."""
+"""Weight maps of many scenes: one task for each, here or on a cluster with a shared file system."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SceneDone(NamedTuple):
 
 
 def find_scenes(given: Sequence[str]) -> List[Path]:
-    """Return the scenes that are meant by folders, glob patterns, and .txt files with one of these a line.
+    """Return the scenes of folders, glob patterns, and .txt files with one of these per line.
 
     Relative lines of a file are relative to the file. Empty lines and lines that begin with # say nothing.
 

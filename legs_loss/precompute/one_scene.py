@@ -48,18 +48,18 @@ def precompute(
 
     Args:
         scene: from :func:`~legs_loss.scenes.read_scene`.
-        out: the store's folder, ``legs_weights`` in the scene by default, where a training script finds it by itself.
-            Maps already there are kept: one store holds many sizes and operators.
+        out: the store's folder, ``legs_weights`` in the scene by default, where a training script finds it.
+            Existing maps are kept: one store holds many sizes and operators.
         spec: its operator, p, eps and smooth are used, and where it normalises over the scene its percentile; every
             curve, beta and noise floor can be made from the result.
-        resolution: 3DGS's ``-r``, as the training will have it.
+        resolution: 3DGS's ``-r``, as for the training.
         white_background: 3DGS's ``-w``, likewise.
         workers: processes; 1 computes in this one. With more, a script needs its ``if __name__ == "__main__"``.
         progress: show a bar on stderr.
         on_progress: called after each view with the number of views that are done, and of all.
 
     Returns:
-        What was made, kept and skipped. A photograph that cannot be read is skipped, not raised.
+        The maps that were made, kept and skipped. A photograph that cannot be read is skipped, not raised.
 
     Raises:
         LegsError: the store cannot be written or is damaged; bad settings.

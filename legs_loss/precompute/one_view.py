@@ -45,7 +45,7 @@ class Result(NamedTuple):
 
 
 def make(job: Job, task: Task) -> Result:
-    """Make the map of a view; whatever goes wrong is in the result."""
+    """Make the map of a view; errors are in the result."""
     view = task.view
     try:
         source = os.stat(str(view.path))
@@ -70,7 +70,7 @@ def make(job: Job, task: Task) -> Result:
         entry = Entry(fingerprint=fingerprint(image), **wanted, **levels)
         try:
             return Result(view.name, stage(job.staging, entry, made))
-        except OSError as error:  # a full disk, a folder that went away: no later view fares better
+        except OSError as error:  # a full disk, a missing folder: all later views would fail too
             return Result(view.name, unwritable=error.strerror or str(error))
     except LegsError as error:
         return Result(view.name, problem=str(error))

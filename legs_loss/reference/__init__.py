@@ -1,4 +1,4 @@
-"""A complete small 3D Gaussian Splatting on the CPU: what the loss is developed against and measured with.
+"""A complete small 3D Gaussian Splatting on the CPU, to develop and measure the loss.
 
 from legs_loss.reference import Gaussians, rasterize
 """

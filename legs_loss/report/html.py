@@ -1,4 +1,4 @@
-"""A comparison as one HTML page that needs nothing else: tables that sort, plots, a slider between methods, crops."""
+"""A comparison as one self-contained HTML page: sortable tables, plots, a slider between methods, crops."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def write_report(
         path: of the page.
         views: names of the views to show, or parts of names; default: three of those held out.
         arms: default: all that have rows.
-        scene: where the scene lies now, if it was moved.
+        scene: the scene's folder, if it was moved.
 
     Returns:
         ``path``.

@@ -113,7 +113,7 @@ def _legend(axes: Any, count: int) -> None:
 def _svg(figure: Any, salt: str, says: str) -> str:
     """Return the figure as an <svg> element.
 
-    ``says`` is what a screen reader calls it; ``salt`` keeps its ids apart from those of the page's other figures.
+    ``says`` is its label for screen readers; ``salt`` makes its ids unique on the page.
     """
     from matplotlib import rc_context
 

@@ -1,4 +1,4 @@
-"""Text on a picture: names of a stranger's files hold what matplotlib would set as mathematics, or cannot draw."""
+"""Text on a picture: escape file names that matplotlib would typeset as mathematics, or cannot draw."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["label"]
 
 
 def label(name: str) -> str:
-    r"""Return a name as matplotlib is to draw it, letter by letter.
+    r"""Return a name escaped for matplotlib, which draws it literally.
 
     >>> print(label("a$b\x07.png"))
     a\$b\x07.png

@@ -1,4 +1,4 @@
-"""Write pictures as a whole or not at all: a sheet that was cut off looks like a sheet."""
+"""Write pictures atomically: a truncated sheet would look complete."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The course of trainings as TensorBoard shows it: loss, PSNR and the number of Gaussians by iterations."""
+"""Log trainings to TensorBoard: loss, PSNR and the number of Gaussians by iterations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The drop-in ``l1_loss`` that a training script calls in place of the codebase's own.
+"""The drop-in ``l1_loss``, which replaces the codebase's own in a training script.
 
 It weights only a prediction that is being trained on; under ``no_grad`` it is the plain mean, so that reported metrics
 do not change. call.py is the call, checked, and the loss that it gives; sources.py finds its weights in memo.py, in
@@ -40,25 +40,25 @@ def l1_loss(
         prediction: the rendering, [C, H, W], [B, C, H, W], or with more axes in front, as the views of several
             scenes [B, V, C, H, W]; channels-last on request. Where it requires no gradient (evaluation,
             ``no_grad``) the result is ``torch.abs(prediction - target).mean()``, unweighted.
-        target: the photograph as this step supervises it, the same shape; of [C, H, W] beside [1, C, H, W] both are
-            taken for a batch of one, as ``torch.abs(prediction - target)`` takes them.
+        target: the photograph of this step, the same shape; [C, H, W] beside [1, C, H, W] are both a batch of one,
+            as in ``torch.abs(prediction - target)``.
         view: the name of the view, or its number (for a batch: one a view), if the target is that view's own stored
-            image. It lets maps from ``legs precompute`` be used; they are used only where the target's fingerprint says
-            that they were made from it. On the CPU a stored map is found by the fingerprint alone.
+            image. It enables maps from ``legs precompute``, which are used only where the target's fingerprint
+            shows that they were made from it. On the CPU a stored map is found by the fingerprint alone.
         mask: one value a pixel, zeroes the weight where it is 0.
         channels_last: where the channel stands.
         reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.
-        own: the codebase's own L1 of (prediction, target), where that is more than a mean: what it makes of the
-            difference (a mask, another mean) it makes of the weighted difference: it is given the target, and a
-            prediction moved away from it by the weight. Unweighted it is called as it is.
+        own: the codebase's own L1 of (prediction, target), where it is more than a mean: its mask or reduction is then
+            applied to the weighted difference. It is called with the target and a prediction whose difference from it
+            is scaled by the weight; without a weight, with the prediction itself.
 
     Returns:
-        A scalar, or what ``reduction`` or ``own`` say. With beta 0 or LEGS_OFF it is
+        A scalar, or the result of ``reduction`` or ``own``. With beta 0 or LEGS_OFF it is
         ``torch.abs(prediction - target).mean()``, or ``own(prediction, target)``, to the last bit.
 
     Raises:
-        LegsError: shapes that do not fit (both are named), images that lie the other way around than
-            ``channels_last`` says, on the CPU a target with NaN or infinity,
+        LegsError: shapes that do not fit (both are named), images whose layout contradicts
+            ``channels_last``, on the CPU a target with NaN or infinity,
             a setting in legs.toml or LEGS_* that is out of range.
 
     Example:
@@ -83,7 +83,7 @@ def l1_loss(
 
 
 def _compiled(call: Call) -> Tensor:
-    """Return the loss as torch.compile traces it: without a memory, the weight becomes part of the graph."""
+    """Return the loss for torch.compile: without a memo, the weight is part of the graph."""
     spec = None if thread.unweighted or not call.trains() else spec_to_compile(version[0])
     if spec is None:
         return call.plain()
@@ -101,13 +101,13 @@ def _compiled(call: Call) -> Tensor:
 
 
 def unweighted(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Return a function that calls another, in which ``l1_loss`` is meanwhile plain, as with LEGS_OFF.
+    """Return a function that calls another one in which ``l1_loss`` is not weighted, as with LEGS_OFF.
 
-    For a loss that compares a rendering with its photograph in one call and with another rendering in the next: in that
-    one nothing is to be weighted. Only this thread is concerned, and only until the call returns or raises.
+    For a loss that compares a rendering with its photograph in one call and with another rendering in the next, where
+    nothing is to be weighted. It affects this thread only, until the call returns or raises.
 
     Args:
-        function: what is to be called, a module too.
+        function: the function or module to call.
 
     Example:
         >>> def photometric(image, gt_image):

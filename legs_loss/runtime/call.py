@@ -1,4 +1,4 @@
-"""One call of `l1_loss`: its arguments, checked once, and the loss that they give with and without a weight."""
+"""One call of `l1_loss`: its arguments, checked once, and its loss with and without a weight."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Call(NamedTuple):
     shape: Optional[Sequence[int]] = None
 
     def check_options(self) -> None:
-        """Check what does not depend on the images; these are checked by :meth:`aligned`, once they need a weight.
+        """Check the options; the images are checked by :meth:`aligned`, when they need a weight.
 
         Raises:
             LegsError: an unknown reduction, or options that exclude one another.
@@ -57,7 +57,7 @@ class Call(NamedTuple):
         Axes in front of a batch's are folded into it; beside a batch of one image, an image is a batch of one.
 
         Raises:
-            LegsError: shapes or devices that do not fit, or channels that lie where ``channels_last`` does not say.
+            LegsError: shapes or devices that do not fit, or a layout that contradicts ``channels_last``.
         """
         call = self
         if isinstance(self.target, Tensor) and isinstance(self.prediction, Tensor):
@@ -89,7 +89,7 @@ class Call(NamedTuple):
         return [str(name) for name in names]
 
     def is_mean(self) -> bool:
-        """Return whether only the mean is asked for: a backend needs no weight map in memory for it."""
+        """Return whether only the mean is requested: a backend needs no weight map in memory for it."""
         return self.own is None and self.reduction == "mean"
 
     def plain(self) -> Tensor:

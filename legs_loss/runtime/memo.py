@@ -1,13 +1,13 @@
 """Weight maps in memory, or the two numbers that make one, bounded, each valid only for the target it was made from.
 
-The weight belongs to the target, not to the name of a view: a codebase may shift, shrink or composite a view's target
-from one step to the next, and a wrong weight never fails loudly. So a map is remembered under what the target *is*:
+The key is the target, not the name of a view: a codebase may shift, resize or composite a view's target from one step
+to the next, and a wrong weight raises no error. So the key of a map is:
 
 - on the CPU, its bytes (a SHA-256 of them): memory that numpy shares can change without torch noticing;
 - on a device, where reading the bytes would wait for it, the tensor itself: the same storage, the same view of it,
-  still alive, and never written to since (torch counts in-place writes; only one through ``.data`` escapes it). A
-  target that is uploaded anew each step is a new tensor, so its weight is computed anew. On another CUDA stream it is
-  computed anew, too: what one stream is still writing, or has let go of, no other may read.
+  still alive, and not written to since (torch counts in-place writes, except through ``.data``). A target that is
+  uploaded at each step is a new tensor, so its weight is recomputed. On another CUDA stream it is recomputed, too: a
+  stream may not read memory that another one is still writing or has freed.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ _OVERHEAD = 1 << 10  # bytes of an entry beside its values: key, tensor, bookkee
 class WeightMemo:
     """A mapping from targets to weight maps, or to ranges of responses, that takes at most ``limit`` bytes.
 
-    When it is full, a map that was never asked for again makes room; where there is none, nothing is kept and the
-    caller computes. (Training visits every view once an epoch: evicting the least recently used would evict each map
+    When it is full, a map that was never used again is evicted; if there is none, nothing is stored and the caller
+    computes. (Training visits every view once an epoch: evicting the least recently used would evict each map
     just before its next use.)
 
     Args:
@@ -58,12 +58,12 @@ class WeightMemo:
         return len(self._entries)
 
     def recall(self, target: Tensor, make: Callable[[], Tensor], form: Hashable = None) -> Tensor:
-        """Return what is remembered of this target; or make it, and remember it if the target can be known again.
+        """Return the value of this target; or make it, and store it if the target can be identified later.
 
         Args:
             target: the image.
             make: makes its weight map, or the range of its response.
-            form: what is made, if there are several kinds; each is remembered by itself.
+            form: the kind of value, if there are several; each is stored separately.
         """
         found = _key(target)
         if found is None:
@@ -93,7 +93,7 @@ class WeightMemo:
         return None if target.device.type == "cpu" else self._owner_of_memory(target, key)
 
     def _owner_of_memory(self, target: Tensor, key: Hashable) -> weakref.ref[Tensor]:
-        # A key that names memory must die with it: the allocator hands the same address to the next tensor.
+        # A key that is an address is dropped with its tensor: the allocator reuses addresses.
         memo = weakref.ref(self)
 
         def forget(_: object) -> None:
@@ -125,10 +125,10 @@ def _size(weight: Tensor) -> int:
 
 
 class _Entry:
-    """An entry of the memo; of a large map of the CPU it has the bytes, in pages of their own.
+    """An entry of the memo; a large map of the CPU is stored as bytes in separate pages.
 
-    A tensor that is kept on the heap lies among the temporaries that it was made from, and what they leave does not fit
-    the next ones: a memo of such tensors took twice what it counted.
+    A tensor that stays on the heap is surrounded by the temporaries of its computation, which fragments the heap: a
+    memo of such tensors took twice the memory that it counted.
     """
 
     __slots__ = ("_dtype", "_shape", "_values", "owner", "size", "used")
@@ -182,5 +182,5 @@ def _current_stream(device: torch.device) -> Optional[int]:
 
 
 def _storage_owner(target: Tensor) -> Tensor:
-    # `camera.original_image[:3]` is a new tensor every step; what stays is the one it is a view of.
+    # `camera.original_image[:3]` is a new tensor every step; its base tensor is not.
     return target if target._base is None else target._base

@@ -1,8 +1,8 @@
 """Find the weight of a target: in the memo, in the store, or from the target itself, in this order.
 
-The memo knows a target that it can prove to be the same as before. The store is used for the very image that its map
-was made from, which the target's fingerprint tells. For all others the target itself is asked: a backend wants two
-numbers of it, the least response and the span; torch wants the map.
+The memo has targets that are provably unchanged. The store is used for exactly the image that its map was made from, by
+the target's fingerprint. In all other cases the weight is computed: a backend needs two numbers of the target, the
+least response and the span; torch needs the map.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = ["Counts", "WeightSource"]
 
 @dataclass
 class Counts:
-    """Counts of this process's calls of ``l1_loss``, and of where its weights came from.
+    """Counts of this process's calls of ``l1_loss``, and of the sources of the weights.
 
     Attributes:
         weighted: calls that trained with a weight.
@@ -65,7 +65,7 @@ class WeightSource:
         self._seen: RunningLevels = RunningLevels()
 
     def weights(self, call: Call) -> Weights:
-        """Return the weights of a call's target, and count where each of them came from."""
+        """Return the weights of a call's target, and count their sources."""
         names = call.view_names()
         images = [call.target] if call.target.dim() == 3 else [call.target[i] for i in range(len(names))]
         found = [self._weight(image, name, call) for image, name in zip(images, names)]
@@ -87,8 +87,8 @@ class WeightSource:
     def _weight(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
         """Return an image's weight map [1, H, W] (channels-last [H, W, 1]), or the range that makes it, [1, 2].
 
-        Where weights follow the rendering's error it is E^, all that is known of them before; where they are normalised
-        over the scene it is E, since the scene's levels change with each view that is seen.
+        For weights that follow the rendering's error it is E^, their constant part; for weights normalised over the
+        scene it is E, since the scene's levels change with each new view.
         """
         counts = self._counts
         if is_capturing(image.device):
@@ -96,7 +96,7 @@ class WeightSource:
             counts.computed += 1
             return self._computed(image, call, again=True)
         if call.is_mean() and image.device.type == "cpu" and self.config.store is None:
-            # Here to know an image again, by a SHA-256 of its bytes, takes longer than to compute its range.
+            # Here a SHA-256 of an image's bytes takes longer than its range.
             found = fused_range(image, self.config.spec, call.channels_last)
             if found is not None:
                 counts.computed += 1

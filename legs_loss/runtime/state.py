@@ -1,4 +1,4 @@
-"""The state of this process's run: its settings, found once, where its weights come from, what it counted and said."""
+"""The state of this process's run: its settings, the sources of its weights, its counts and its messages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Run:
             self.say_once(note, note)
 
     def say_once(self, kind: str, message: str) -> None:
-        """Print a line on stderr, the first time that this kind of thing happens; of "active" only rank 0 does."""
+        """Print a line on stderr, once for each kind of message; "active" only on rank 0."""
         if kind not in self._said:
             self._said.add(kind)
             if kind == "active" and not is_first_process():
@@ -53,7 +53,7 @@ class Run:
             say(f"legs-loss: {message}", sys.stderr)
 
     def say_what_is_used(self) -> None:
-        """Print, once, the settings and where the weights of the first step came from: after it, so that it is true."""
+        """Print, once, the settings and the sources of the first step's weights, when they are known."""
         if "active" in self._said:
             return
         spec = self.config.spec
@@ -74,18 +74,18 @@ class _Thread(threading.local):
     """The number of calls of `unweighted` functions that a thread is in."""
 
     def __init__(self) -> None:
-        self.unweighted = 0  # on the instance: torch.compile does not ask again what the class says
+        self.unweighted = 0  # on the instance: torch.compile does not read class attributes again
 
 
 counted: Counts = Counts()
 thread: _Thread = _Thread()
-version: List[int] = [0]  # how often the settings were replaced; what was compiled before is compiled anew
+version: List[int] = [0]  # how often the settings were replaced; compiled code is recompiled then
 _run: Optional[Run] = None
 _lock = threading.RLock()
 
 
 def current_run() -> Run:
-    """Return this process's run; its settings are found at the first call."""
+    """Return this process's run; its settings are read at the first call."""
     global _run
     if _run is None:
         with _lock:
@@ -95,7 +95,7 @@ def current_run() -> Run:
 
 
 def spec_to_compile(version: int) -> Optional[WeightSpec]:
-    """Return the spec that a compiled call weights with, None for a plain one."""
+    """Return the spec of a compiled call, None without a weight."""
     config = current_run().config
     return config.spec if config.active else None
 
@@ -106,7 +106,7 @@ spec_to_compile._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def reset() -> None:
-    """Begin anew, as a new process would: the next call finds the settings again, and nothing is counted yet."""
+    """Reset to the state of a new process: the next call reads the settings again, and all counts are 0."""
     global _run
     with _lock:
         _run = None
@@ -115,7 +115,7 @@ def reset() -> None:
 
 
 def reset_counts() -> None:
-    """Count from nothing."""
+    """Reset the counts."""
     vars(counted).update(vars(Counts()))
 
 

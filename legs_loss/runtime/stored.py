@@ -1,4 +1,4 @@
-"""The weight of an image from the store of a run, for the very image that a map was made from."""
+"""Find the weight of an image in the store of a run, for exactly the image that a map was made from."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class StoredWeights:
         return weight.movedim(0, -1) if channels_last else weight
 
     def scene_levels(self, pixels: int) -> Optional[Tensor]:
-        """Return the levels of all the store's views of so many pixels, None where it does not have them."""
+        """Return the levels of all the store's views of this size, None where it lacks them."""
         store = self._open()
         if store is not None and pixels not in self._levels:
             self._levels[pixels] = store.scene_levels(self._config.spec, pixels)
@@ -85,7 +85,7 @@ class StoredWeights:
         height, width = image.shape[1:]
         named = None if view is None else store.find(view, height, width, self._config.spec)
         if image.device.type != "cpu":
-            # A fingerprint waits for the device: once a view. A target that is a new tensor at each step is computed.
+            # A fingerprint waits for the device, so it is computed once per view; new tensors are recomputed.
             if named is None:
                 reason = "the call names no view (view=)" if view is None else f"it has no map of view {view!r}"
                 self._say_once(

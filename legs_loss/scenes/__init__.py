@@ -32,13 +32,13 @@ __all__ = [
 def read_scene(path: Union[str, Path], images: Optional[str] = None) -> Scene:
     """Read a scene: COLMAP's layout, transforms.json, or any folder of images.
 
-    What the folder is follows 3DGS: ``sparse/`` makes it a COLMAP scene, and else
+    The kind of scene follows 3DGS: ``sparse/`` makes it a COLMAP scene, otherwise
     ``transforms_train.json`` or ``transforms.json`` one with transforms. ``images`` names the
     folder of the photographs, in the scene or as a path ("images" by default); a scene with
     transforms names its files itself.
 
     Raises :class:`LegsError` when there is nothing to read or a file of the scene is damaged.
-    A photograph that is missing is found out when it is loaded.
+    A missing photograph is an error when it is loaded.
     """
     root = Path(path)
     if not root.is_dir():
@@ -58,7 +58,7 @@ def _read_scene(root: Path, images: Optional[str]) -> Scene:
 
 
 def _images_folder(root: Path, images: str) -> Tuple[Path, str]:
-    """Return the folder of the photographs and what goes before their names."""
+    """Return the folder of the photographs and the prefix of their names."""
     folder = root / images  # pathlib keeps an absolute ``images`` as it is
     if not folder.is_dir():
         if not os.path.isdir(images):

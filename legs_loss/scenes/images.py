@@ -1,4 +1,4 @@
-"""Photographs as 3DGS's own loader hands them to the training: the same size, the same pixels.
+"""Photographs as 3DGS's own loader prepares them for the training: the same size, the same pixels.
 
 Source of the rules: utils/camera_utils.py, utils/general_utils.py and scene/dataset_readers.py of 3DGS.
 """
@@ -30,8 +30,8 @@ __all__ = [
 
 WIDEST = 1600  # pixels; 3DGS shrinks wider photographs to this unless -r says otherwise
 STRIP_PIXELS = 1 << 16
-# Pillow looks at a file's first bytes, not at its name, and some of what it knows is handed to another program: an EPS
-# to Ghostscript. These are decoded in this process; HEIF where pillow-heif is installed and registered.
+# Pillow identifies files by content, and runs other programs for some formats: Ghostscript for EPS. These formats are
+# decoded in this process; HEIF where pillow-heif is installed and registered.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM", "TGA", "GIF", "JPEG2000", "AVIF", "HEIF")
 
 
@@ -83,7 +83,7 @@ def load_training_image(
             Elsewhere its alpha is resized with it and dropped: 3DGS never multiplies the target's colour by alpha.
         resolution: see :func:`training_size`.
         white_background: 3DGS's ``-w``, for ``composited`` views: white in place of black.
-        resize: what stands in for :func:`resized_pixels` and gives the same.
+        resize: an equivalent of :func:`resized_pixels`.
 
     Returns:
         uint8 [H, W, C], C = 3, or 1 for a gray photograph; uint16 for a gray one of 16 bits (16-bit colour is read
@@ -130,10 +130,10 @@ def image_tensor(image: np.ndarray) -> Tensor:
 
 @contextmanager
 def open_image(path: Path) -> Iterator[Any]:
-    """Open a photograph with Pillow, in one of :data:`FORMATS`; the one place that opens images of a user's.
+    """Open a photograph with Pillow, in one of :data:`FORMATS`; all images of the user are opened here.
 
     Raises:
-        LegsError: whatever goes wrong while it is open; the message names the file.
+        LegsError: for any error while it is open; the message names the file.
     """
     from PIL import Image
 

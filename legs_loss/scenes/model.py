@@ -97,7 +97,7 @@ class Scene:
 
 
 def view_names(view: str) -> Iterator[str]:
-    """Yield every name that a view may be asked for by.
+    """Yield every name that identifies a view.
 
     They are the trailing parts of its path, with the extension, without it, and up to the first dot of the file's
     name, which is 3DGS's name of the view.

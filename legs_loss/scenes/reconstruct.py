@@ -1,6 +1,6 @@
-"""Photographs -> a COLMAP scene: where each was taken and some points of the scene, by pycolmap.
+"""Reconstruct a COLMAP scene from photographs by pycolmap: camera poses and points.
 
-What COLMAP's own programs do one after the other, with 3DGS's layout as the result: undistorted photographs in images/,
+It runs the steps of COLMAP's own programs, and writes 3DGS's layout: undistorted photographs in images/,
 pinhole cameras, poses and points in sparse/0/.
 """
 
@@ -34,7 +34,7 @@ class Reconstructed(NamedTuple):
         folder: the scene.
         placed, lost: the names of the photographs whose camera was found, and of the others.
         points: the number of points.
-        error: the mean distance in pixels from where a point was seen to where it is drawn.
+        error: the mean reprojection error in pixels.
     """
 
     folder: Path
@@ -56,7 +56,7 @@ def reconstruct(
 
     Args:
         photographs: a folder of photographs, all of one scene; folders within it are looked at too.
-        out: the scene's folder, which must not exist yet. It appears when it is whole.
+        out: the scene's folder, which must not exist yet. It is created when it is complete.
         max_size: pixels of the longer side: features are looked for, and photographs written, at this size at most.
         overlap: compare each photograph with so many that follow it by name, for frames of a video; None compares all
             with all.
@@ -96,7 +96,7 @@ def _pycolmap() -> Any:
         raise LegsError('reconstruction needs pycolmap: pip install "legs-loss[colmap]"') from None
     if not hasattr(pycolmap, "match_image_pairs"):
         raise LegsError('this pycolmap is too old: pip install --upgrade "legs-loss[colmap]"')
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # what failed is said in our own words
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # failures are reported by this module
     pycolmap.set_random_seed(0)
     return pycolmap
 

@@ -1,11 +1,11 @@
-"""Weight maps on disk, or rather what every curve and beta can be made from: normalised responses.
+"""Stores of normalised responses on disk, from which the weight maps of every curve and beta are made.
 
 A store is a folder: ``manifest.json`` and one ``.npy`` a view, size and operator, float16 [H, W]. A map of 1 is exact;
 elsewhere float16 rounds E^ by at most 2^-12, and small values by at most 1 part in 2048.
 
-Readers open the manifest and nothing else; it is replaced as a whole, so they need no lock. Writers stage maps in a
-folder of their own and move them in, with the manifest, under a lock: whatever the manifest does not list is a leftover
-of a writer that was killed, and the next writer sweeps it.
+Readers open only the manifest, which is replaced atomically, so they need no lock. Writers stage maps in a
+folder of their own and move them in, with the manifest, under a lock: a file that the manifest does not list is a
+leftover of a killed writer, and the next writer deletes it.
 """
 
 from __future__ import annotations

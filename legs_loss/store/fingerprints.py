@@ -1,4 +1,4 @@
-"""Tell whether a training image is the one that a map was made from."""
+"""Identify the training image that a map was made from."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["fingerprint"]
 
 
 def fingerprint(image: Union[Tensor, np.ndarray]) -> str:
-    """Return a short name of an image's values: two images have the same one only where they have the same map.
+    """Return a hash of an image's values: images with different maps have different hashes.
 
-    Values that are whole 255ths, as those of 8-bit photographs are, count as such however they were divided; values
-    that are whole 65535ths likewise; an image with any other value has a name by its float32 values, to the last bit.
+    Values that are multiples of 1/255, as in 8-bit photographs, are hashed as integers, independent of their rounding;
+    multiples of 1/65535 likewise; an image with any other value is hashed by its float32 values, to the last bit.
 
     Args:
         image: floats in [0, 1], [C, H, W], on any device; or uint8 or uint16 [H, W, C].

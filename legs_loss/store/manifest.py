@@ -1,7 +1,7 @@
-"""The list of a store's maps: what it holds of which view, checked where it is read and nowhere else.
+"""The manifest of a store: the list of its maps, checked when it is read.
 
-It is JSON, a line an entry, sorted, under its own checksum: whatever byte is changed, it would not be written like
-this. A checksum tells damage, not malice, so every field is checked as well.
+It is JSON, one sorted line per entry, with a checksum: any changed byte is detected. A checksum detects damage, not
+malice, so every field is checked as well.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _CHECKSUM = re.compile(r"[0-9a-f]{64}")
 
 
 class DamagedStoreError(LegsError):
-    """A store's files are not those that were written to it."""
+    """A file of a store is damaged or missing."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from legs_loss.system import read_regular
 __all__ = ["is_intact", "read_map", "stage", "write_parts"]
 
 _PIECE = 1 << 20  # bytes; for larger ones Linux may look for larger free pages, which took six times as long
-_HEAD = 4096  # bytes of an .npy before its array: a stranger's file of gigabytes is not read
+_HEAD = 4096  # bytes of an .npy before its array: a larger header is not read
 _REPAIR = "run legs precompute again to repair it"
 
 
@@ -35,7 +35,7 @@ def read_map(folder: Path, entry: Entry) -> np.ndarray:
 
 
 def _checked_map(path: Path, data: bytes, entry: Entry) -> np.ndarray:
-    """Return the array of an .npy file, which a stranger may have written, if it can be a normalised response."""
+    """Return the array of an .npy file of unknown origin, if it is a valid normalised response."""
     file = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(file)

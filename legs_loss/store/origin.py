@@ -1,6 +1,6 @@
 """Find a store's photographs: by a note beside the maps, where a store is not in its scene's folder.
 
-The note only says where to look. Whoever reads it compares fingerprints before a photograph is taken for a map's own.
+The note is only a hint: its readers compare fingerprints before they use a photograph as a map's source.
 """
 
 from __future__ import annotations

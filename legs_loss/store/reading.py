@@ -43,7 +43,7 @@ class WeightStore:
         self.path: Path = Path(path)
         if not os.path.lexists(str(self.path / MANIFEST)):
             raise LegsError(
-                f"{self.path} is no store of weight maps: it has no {MANIFEST} (legs precompute writes one)"
+                f"{self.path} is not a store of weight maps: it has no {MANIFEST} (legs precompute writes one)"
             )
         self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in read_manifest(self.path)}
         self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
@@ -60,7 +60,7 @@ class WeightStore:
 
         Args:
             view: the photograph's path in the scene or the last parts of it, with or without the extension, or up to
-                the first dot as 3DGS names views. A name that fits two stored views gets None: it is never guessed.
+                the first dot as 3DGS names views. A name that fits two stored views returns None: it is ambiguous.
             height: of the training image in pixels.
             width: likewise.
             spec: what its response is made with counts; for one that is normalised over the scene, the entry must

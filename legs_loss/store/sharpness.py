@@ -1,12 +1,12 @@
-"""Views whose photograph is out of focus, moved or noisy beside the others of its scene, as their maps show it.
+"""Find views whose photograph is out of focus, moved or noisy compared with its scene, from their maps.
 
-A normalised response E^ counts from an image's weakest to its strongest response. In a sharp photograph few pixels come
-near the strongest; blur weakens the strongest, noise lifts all others, and the mean of E^ rises with either. So the
-views that LEGS weights most as a whole are named here.
+A normalised response E^ is relative to an image's weakest and strongest response. In a sharp photograph few pixels are
+near the strongest; blur lowers the strongest, noise raises all others, and either raises the mean of E^. So the views
+with the largest mean weight are reported here.
 
-Of maps that are to be normalised over their scene (``legs precompute --preset legs-robust``) more is known: a
-photograph that moved or is out of focus has weak contours beside the others, a noisy one a strong median. That finds
-motion too, which weakens all of a photograph alike.
+Maps that are normalised over their scene (``legs precompute --preset legs-robust``) have more data: a photograph that
+moved or is out of focus has weaker contours than the others, a noisy one a larger median. This also finds motion, which
+lowers all responses of a photograph alike.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from legs_loss.store import Entry, WeightStore
 
 __all__ = ["LEAST", "mean_responses", "outliers", "unsharp_views"]
 
-LEAST = 5  # views: of fewer nobody can say which is the odd one
+LEAST = 5  # views: fewer have no outliers
 DEVIATIONS = 4.0  # of a normal distribution, from the median
-FACTOR = 1.5  # and at least so many times the median: views that are nearly alike have no odd one
+FACTOR = 1.5  # and at least this multiple of the median: nearly equal views have no outliers
 
 
 def outliers(means: Mapping[str, float]) -> List[str]:

@@ -1,4 +1,4 @@
-"""Write maps to a store so that a writer may be killed at any moment, and may meet others."""
+"""Write maps to a store, safe against kills at any moment and against concurrent writers."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["StoreWriter"]
 
 
 class StoreWriter:
-    """Writes to a store, beside other writers; a context manager.
+    """Write to a store, concurrently with other writers; a context manager.
 
-    A map is staged (from any process) and takes its place with :meth:`commit`. A writer that is killed loses what it
-    had not committed and nothing else.
+    A map is staged (from any process) and moved into the store by :meth:`commit`. A killed writer loses only what it
+    had not committed.
 
     Args:
         path: the folder, made if it is missing.
@@ -64,7 +64,7 @@ class StoreWriter:
             entries = {entry.key: entry for entry in self.entries()}
             before = {entry.file for entry in entries.values()}
             for entry in staged:
-                # Here, not where it was written: nobody waits for the disk but who commits.
+                # Here, not at the write: only the commit waits for the disk.
                 _sync(self.staging / entry.file)
                 os.replace(str(self.staging / entry.file), str(self.path / entry.file))
                 entries[entry.key] = entry

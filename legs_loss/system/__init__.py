@@ -1,6 +1,6 @@
-"""Files, locks, processes, signals, the terminal, installed packages: all that is asked of the machine.
+"""Files, locks, processes, signals, the terminal, installed packages: the interface to the machine.
 
-Nothing here knows of images or losses, and nothing imports torch. ``executors`` is imported by its own name.
+The modules are independent of images and losses, and do not import torch. ``executors`` is imported by its name.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Ctrl-C over steps that belong together, and in processes that this one starts: held back, never lost."""
+"""Delay Ctrl-C over steps that belong together, and in child processes; it is never lost."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _RAISES = hasattr(signal, "raise_signal")  # from Python 3.8 on
 
 @contextmanager
 def kept_from_children() -> Iterator[None]:
-    """Hold Ctrl-C back while processes are started: they never get one, this process gets it right afterwards.
+    """Delay Ctrl-C while processes are started: they never get it, this process gets it right afterwards.
 
-    Where signals cannot be held back, on Windows, it is ignored meanwhile.
+    On Windows, where signals cannot be delayed, it is ignored meanwhile.
     """
     if hasattr(signal, "pthread_sigmask"):
         _ensure_tracker()  # started by the first process, it would let signals through again
@@ -45,7 +45,7 @@ def _ensure_tracker() -> None:
 
 @contextmanager
 def noted() -> Iterator[Callable[[], bool]]:
-    """Only note Ctrl-C meanwhile: yield what says whether it was struck.
+    """Record Ctrl-C instead of raising it: yield a function that returns whether it was pressed.
 
     Elsewhere than in the main thread, which alone gets Ctrl-C, or where it is ignored, nothing is done.
     """
@@ -63,7 +63,7 @@ def noted() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Hold Ctrl-C back over a few steps that belong together; it strikes right after them."""
+    """Delay Ctrl-C over a few steps that belong together; it is raised right after them."""
     struck: Callable[[], bool] = bool
     try:
         with noted() as struck:

@@ -1,4 +1,4 @@
-"""Tell which of a run's processes this is, so that what concerns the whole run is said once."""
+"""Find the rank of this process, so that messages about the whole run are printed once."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Run tasks in this process, or on the workers of a dask scheduler. Both are concurrent.futures' Executor.
 
-A task is a function of a module with its arguments. One that has news takes ``tell``, which hands a message (numbers,
-strings, lists, dicts) to whoever waits. Workers must see the files that a task names: the file system is shared.
+A task is a function of a module with its arguments. A task that reports progress takes ``tell``, which sends a message
+(numbers, strings, lists, dicts) to the caller. Workers need access to the task's files: the file system is shared.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PATIENCE = 30  # seconds for a scheduler to answer, and for its first worker
 
 @contextmanager
 def executor(scheduler: Optional[str], listen: Listener) -> Iterator[Tuple[Executor, Listener]]:
-    """Yield what runs tasks, and their ``tell``: this process one after the other, or a dask scheduler's workers.
+    """Yield an executor and the ``tell`` of its tasks: this process one after the other, or a dask scheduler's workers.
 
     Args:
         scheduler: a dask scheduler's address ("tcp://host:8786"); None for this process.

@@ -1,4 +1,4 @@
-"""Read files that may be anything (a pipe, a device, far too large), and write files as a whole or not at all."""
+"""Read files of any kind safely (pipes, devices, huge files), and write files atomically."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ def read_regular(path: PathLike, limit: int) -> bytes:
 
 
 def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]], folders: bool = False) -> None:
-    """Write a file as a whole or not at all: beside it first, on the disk, then into its place.
+    """Write a file atomically: to a temporary file beside it, flushed to the disk, then renamed.
 
-    What was there stays until then. A link is replaced, not followed. What a killed process leaves is ``NAME.part``,
+    An existing file stays until then. A link is replaced, not followed. What a killed process leaves is ``NAME.part``,
     which the next write of the file replaces.
 
     Args:

@@ -16,11 +16,11 @@ from legs_loss.errors import LegsError
 __all__ = ["FileLock", "HeldError", "is_held"]
 
 _POLL = 0.02  # seconds
-_FAR = 1 << 30  # where Windows locks one byte, which can then be read by nobody else: behind all text
+_FAR = 1 << 30  # the byte that Windows locks, and no other process can read: after all text
 
 
 class HeldError(LegsError):
-    """Another process holds the lock, and did not let go in time."""
+    """Another process holds the lock, and did not release it in time."""
 
 
 class FileLock:
@@ -29,7 +29,7 @@ class FileLock:
     Args:
         path: the file, made where it is missing, never through a link.
         wait: how many seconds to wait for another holder; None waits for ever.
-        note: who holds it, written to the file for the one who waits.
+        note: the holder, written to the file for waiting processes.
         remove: delete the file on release.
 
     Raises:
@@ -63,7 +63,7 @@ class FileLock:
                 raise
 
     def release(self) -> None:
-        """Let the next one in."""
+        """Release the lock."""
         if self._remove and os.name == "posix":  # elsewhere an open file cannot be deleted: an empty one stays
             os.unlink(self._path)
         os.close(self._descriptor)

@@ -1,4 +1,4 @@
-"""Print what may be printed: names and lines of a stranger's files can hold what a terminal obeys."""
+"""Print safely: names and lines of foreign files can contain terminal control sequences."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\
 
 
 def printable(text: str, lines: bool = False) -> str:
-    r"""Return a text with what a terminal would obey, and no file can hold, written as an escape.
+    r"""Return a text with control sequences and unencodable characters escaped.
 
     Args:
         text: what is to be printed.
-        lines: it has several lines. Elsewhere a line feed is one of a name, which could pass for a line of a report.
+        lines: whether it has several lines; else a line feed is escaped, since it could look like a line of a report.
 
     Example:
         >>> print(printable("train\x1b[2J\nall is well.py"))
@@ -28,7 +28,7 @@ def printable(text: str, lines: bool = False) -> str:
 
 
 def never_fail_to_print() -> None:
-    """Let the process print what its terminal's encoding lacks, as escapes: a name is no reason to end."""
+    """Print characters that the terminal's encoding lacks as escapes, instead of raising an error."""
     for stream in (sys.stdout, sys.stderr):
         reconfigure = getattr(stream, "reconfigure", None)  # what stands in for them in tests and notebooks has none
         if reconfigure is not None:
@@ -36,12 +36,12 @@ def never_fail_to_print() -> None:
 
 
 def say(text: object, stream: Optional[TextIO] = None, end: str = "\n", lines: bool = False) -> None:
-    """Print to stdout, or another stream, what a terminal may be shown (:func:`printable`); at once."""
+    """Print to stdout, or another stream, after :func:`printable`, and flush."""
     print(printable(str(text), lines), file=stream, end=end, flush=True)
 
 
 def say_error(command: str, error: Exception) -> None:
-    """Print on stderr that a command ends with an error: its message on one line, then what it quotes, if anything."""
+    """Print a command's error to stderr: its message on one line, then the quoted lines, if any."""
     message, *quoted = error.args or ("",)
     say(f"{command}: error: {message}", sys.stderr)
     for text in quoted:

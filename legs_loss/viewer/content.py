@@ -1,4 +1,4 @@
-"""Read what a folder or a .ply shows: the Gaussians of each method, and the scene that they were trained on."""
+"""Read the content of a folder or a .ply: the Gaussians of each method, and the scene that they were trained on."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Content(NamedTuple):
 
 
 def find_content(path: Path, scene: Optional[Path] = None) -> Content:
-    """Return what a path holds.
+    """Return the content of a path.
 
     Args:
         path: a .ply of 3DGS; the output folder of a training (``legs train``, 3DGS and its forks); a folder of several

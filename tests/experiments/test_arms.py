@@ -67,7 +67,7 @@ def test_names_of_arms() -> None:
         ("legs:fading:shuffled", "one of"),
         ("legs:scale:mean1", "scale"),
         ("3dgs:shuffled", "no weights to change"),
-        ("legs@legs@3dgs", "an @ of its own"),
+        ("legs@legs@3dgs", "must not contain an @"),
         ("legs@", "no loss"),
     ],
 )

@@ -148,7 +148,7 @@ def test_another_comparison_in_the_folder_is_refused(tiny_scene: Path, tmp_path:
     Comparison(tiny_scene, BASE, tmp_path)
     with pytest.raises(LegsError, match=r"begun with another base.iterations"):
         Comparison(tiny_scene, replace(BASE, iterations=50), tmp_path)
-    with pytest.raises(LegsError, match="takes its numbers from 3dgs: train that first"):
+    with pytest.raises(LegsError, match="uses the numbers of 3dgs: train that first"):
         Comparison(tiny_scene, BASE, tmp_path).train_one(parse_arm("legs@3dgs"), 0)
     with pytest.raises(LegsError, match="none of this comparison's rows is trained yet"):
         read_rows(tmp_path)

@@ -60,11 +60,11 @@ def test_a_profile_is_found_by_what_a_checkout_has(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("name = 3", "name is not what it should be"),
+        ("name = 3", "name has an invalid value"),
         ('extends = "4dgs"', "no built-in profile '4dgs'"),
         ('extends = "3dgs"\nrender_all = "x"', "unknown setting 'render_all'"),
         ('name = "a"', "missing"),
-        ('extends = "3dgs"\ntrain = "train.py"', "train is not what it should be"),
+        ('extends = "3dgs"\ntrain = "train.py"', "train has an invalid value"),
         ('extends = "3dgs"\nrenders = { train = "a" }', "renders must have train and test"),
         ('extends = "3dgs"\nthreshold = [{ words = "--x", value = 1.0 }]', "a threshold has words with"),
         ("name = ", "cannot be read"),
@@ -89,7 +89,7 @@ def test_thresholds_that_the_user_gives_are_those_that_are_scaled() -> None:
 
 
 def test_words_that_no_one_fills_in() -> None:
-    with pytest.raises(LegsError, match=r"{scenes} is not known here"):
+    with pytest.raises(LegsError, match=r"{scenes} is unknown"):
         fill("train.py -s {scenes}", {"scene": "a"})
 
 
@@ -184,7 +184,7 @@ def test_what_cannot_be_compared_is_refused(compared, tmp_path: Path, capsys: py
     new = [*words, "-m", str(tmp_path / "new")]
     for change, says in (
         (["--arms", "legs:shuffled"], "needs the package's own trainer"),
-        (["--gaussians", "100"], "has no words for gaussians"),
+        (["--gaussians", "100"], "has no option for gaussians"),
         (["--profile", "3dgs-mcmc"], "give it with --gaussians"),
         (["--profile", "3dgs-mcmc", "--gaussians", "1"], "give more with --gaussians, not 1"),
         (["--densify_grad_threshold", "1"], "by --extra"),

@@ -136,14 +136,14 @@ class TestErrors:
 
     def test_a_version_without_that_loss(self, library):
         library({"gsplat/__init__.py": ""})  # as gsplat 1.5.3
-        with pytest.raises(LegsError, match=r"this gsplat does not hold the loss that is expected: .*gsplat\.losses"):
+        with pytest.raises(LegsError, match=r"this gsplat does not have the expected loss: .*gsplat\.losses"):
             legs_loss.apply_to_gsplat()
         library({"gsplat/losses.py": ""})
-        with pytest.raises(LegsError, match=r"this gsplat does not hold the loss that is expected: .*l1_loss"):
+        with pytest.raises(LegsError, match=r"this gsplat does not have the expected loss: .*l1_loss"):
             legs_loss.apply_to_gsplat()
 
     def test_a_name_that_nobody_registered(self):
-        with pytest.raises(LegsError, match=r"nothing is known of 'gsplatt'; known are gsplat, nerfstudio"):
+        with pytest.raises(LegsError, match=r"unknown library 'gsplatt'; known are gsplat, nerfstudio"):
             legs_loss.apply_to("gsplatt")
         with pytest.raises(AttributeError):
             legs_loss.apply_to_gsplatt  # noqa: B018

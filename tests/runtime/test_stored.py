@@ -117,7 +117,7 @@ class TestStore:
         configure("legs", store=tmp_path / "nowhere")
         l1_loss(torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8), view="a")
         assert counts().computed == 1
-        assert "is no store of weight maps" in capsys.readouterr().err
+        assert "is not a store of weight maps" in capsys.readouterr().err
 
 
 class TestCapture:

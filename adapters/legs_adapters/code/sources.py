@@ -86,7 +86,7 @@ def read_files(root: Path, exclude: Sequence[str]) -> Files:
     """Read the Python files of a checkout, except for excluded ones."""
     own, excluded = own_and_excluded(root, exclude)
     over = largest_over({path: size for path, size in _sizes(root, own).items() if size <= LARGEST}, READ)
-    why = f"too large: all files have more than {READ >> 20} MiB together; exclude some with --exclude"
+    why = f"too large: all files have more than {READ >> 20} MiB together; leave others out by --exclude"
     read = [Unreadable(path, why) if path in over else read_source(root, path) for path in own]
     unreadable = [source for source in read if isinstance(source, Unreadable)]
     sizes = _sizes(root, [*excluded, *(source.path for source in unreadable)])

@@ -1,4 +1,4 @@
-"""A comparison whose arms a codebase trains: the same folder, rows and tables as one of the package's own trainer.
+"""A comparison whose arms are trained by a codebase: with the same folder, rows and tables as the own trainer's.
 
 OUT/upstream/                     the copy of the checkout that all trainings run in
 OUT/comparison.json               the scene, the settings that all arms share, the profile
@@ -34,7 +34,7 @@ CHANGES = ("scale", "mean1")  # of arms: what a codebase can be told by the sett
 
 
 class UpstreamComparison:
-    """The comparison in a folder, new or begun.
+    """The comparison in a folder, new or existing.
 
     Args:
         root: a checkout of the codebase; nothing is written there.
@@ -98,7 +98,7 @@ class UpstreamComparison:
         self._mean_weights: Dict[WeightSpec, float] = {}
 
     def check(self, arms: Sequence[ArmSpec]) -> None:
-        """Raise a LegsError for an arm that a codebase cannot be told to train, before anything is trained."""
+        """Raise a LegsError for an arm that a codebase cannot train, before anything is trained."""
         for arm in arms:
             other = [change for change in arm.changes if change not in CHANGES]
             if other:
@@ -119,7 +119,7 @@ class UpstreamComparison:
         """Train the rows that are missing, one after the other; return all, seed by seed.
 
         Raises:
-            LegsError: a training failed; rows that are done stay, and the next call goes on.
+            LegsError: a training failed; finished rows are kept, and the next call resumes.
         """
         self.check(arms)
         rows = []
@@ -135,7 +135,7 @@ class UpstreamComparison:
         return rows
 
     def spec_of(self, arm: ArmSpec) -> WeightSpec:
-        """Return the settings that the drop-in is given for an arm."""
+        """Return the settings of the drop-in for an arm."""
         if "scale" not in arm.changes:
             return arm.spec
         return WeightSpec(beta=0.0, scale=self.mean_weight(arm.spec))
@@ -151,7 +151,7 @@ class UpstreamComparison:
         return self._mean_weights[spec]
 
     def _prove(self, row: Row) -> None:
-        """Write down what shows that the baseline is the codebase's own loss."""
+        """Record the evidence that the baseline is the codebase's own loss."""
         proof = {name: row["metrics"][name] for name in ("weighted_calls", "plain_calls")}
         path = self.out / "comparison.json"
         write_json(path, dict(read_json(path, ("scene", "upstream")), baseline=proof))

@@ -1,9 +1,9 @@
-"""Run one script of a codebase with a seed of our own, and report what was weighted.
+"""Run one script of a codebase with a given seed, and report what was weighted.
 
     python -m legs_loss.experiments.upstream.launch REPORT SEED [--cpu] SCRIPT ...
 
-3DGS and its forks set their seeds to 0 in their code. Here whatever seed a script sets is moved by SEED, so that runs
-with the same SEED agree and others differ; with 0 the script has its own. The report is written when the script ends.
+3DGS and its forks set their seeds to 0 in their code. Here a multiple of SEED is added to every seed that is set,
+so that runs with the same SEED agree and others differ; 0 keeps the script's own. The report is written at the end.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ STRIDE = 1_000_003  # between the seeds of two runs: a script that counts its se
 
 
 def move_seeds(seed: int) -> None:
-    """From here on, seed every generator with what is asked for plus a multiple of ``seed``."""
+    """Add a multiple of ``seed`` to every seed that is set from now on."""
     import numpy as np
     import torch
 
@@ -29,7 +29,7 @@ def move_seeds(seed: int) -> None:
 
         return seeded
 
-    # A script that sets no seed has one all the same.
+    # For scripts that set no seed.
     for module, name, limit in (
         (random, "seed", 1 << 63),
         (np.random, "seed", 1 << 32),
@@ -44,7 +44,7 @@ def move_seeds(seed: int) -> None:
 
 
 def main(report: str, seed: str, *words: str) -> int:
-    """Run the script by `legs run`, and write the report, whatever happens."""
+    """Run the script by `legs run`, and write the report, also after an error."""
     from legs_loss.cli import main as legs
 
     move_seeds(int(seed))

@@ -20,7 +20,7 @@ _LARGEST = 1 << 20  # bytes of a profile
 
 @dataclass(frozen=True)
 class Threshold:
-    """An option that says from which gradient on Gaussians are added: its words with {value}, and its usual value."""
+    """The option for the densification threshold: its words with {value}, and its default value."""
 
     words: str
     value: float
@@ -43,12 +43,12 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Profile:
-    """A codebase's own commands. Each command is a script of the checkout and its words, with places to fill in.
+    """A codebase's own commands. A command is a script of the checkout and its arguments, with placeholders.
 
     Attributes:
         name: the codebase's.
         files: those that a checkout of it has.
-        text: a file's name, and what stands in it: what tells this codebase from others with the same files.
+        text: a file's name, and a text in it that distinguishes this codebase from others with the same files.
         iterations: of a training that is not told how many.
         train: commands, of which the last one trains. {scene}, {output} and {name} (of the run) are filled in.
         images, resolution: words for a folder of photographs {images} and 3DGS's -r {resolution}; "" where it has none.
@@ -87,7 +87,7 @@ class Profile:
 
 
 def read_profile(path: Path) -> Profile:
-    """Read a profile; what it does not say is that of the built-in one which it ``extends``, if any.
+    """Read a profile; missing settings are those of the built-in profile that it ``extends``, if any.
 
     Raises:
         LegsError: it cannot be read, or something in it is missing, unknown or of the wrong kind.
@@ -109,7 +109,7 @@ def find_profile(root: Path, asked: Optional[str] = None) -> Profile:
     if asked is not None:
         return read_profile(built_in.get(asked, Path(asked)))
     fitting = [profile for profile in map(read_profile, built_in.values()) if profile.fits(root)]
-    # A fork of 3DGS has 3DGS's options too: the fork's own profile says more.
+    # A fork of 3DGS has 3DGS's options too: the fork's own profile is more specific.
     fitting = [profile for profile in fitting if profile.name != "3dgs"] or fitting
     if len(fitting) != 1:
         found = " and ".join(profile.name for profile in fitting) or "none"
@@ -132,7 +132,7 @@ def _profile(path: Path, values: Dict[str, Any]) -> Profile:
         if name not in kinds:
             raise LegsError(f"{path}: unknown setting {name!r}; there are {', '.join(kinds)}")
         if not _is(value, kinds[name]):
-            raise LegsError(f"{path}: {name} is not what it should be: {value!r}")
+            raise LegsError(f"{path}: {name} has an invalid value: {value!r}")
     missing = [field.name for field in fields(Profile) if field.name not in values and not _has_default(field)]
     if missing:
         raise LegsError(f"{path}: {', '.join(missing)} missing")
@@ -150,14 +150,14 @@ def _profile(path: Path, values: Dict[str, Any]) -> Profile:
 
 
 def fill(words: str, places: Mapping[str, Any]) -> List[str]:
-    """Return words with their places filled in, as a command has them; what is filled in is never split.
+    """Return words with their placeholders replaced; replaced values are never split.
 
     >>> fill("train.py -s {scene} --lr {value:.2g}", {"scene": "my scene", "value": 0.00123})
     ['train.py', '-s', 'my scene', '--lr', '0.0012']
     """
     unknown = sorted(set(re.findall(r"{(\w+)", words)) - set(places))
     if unknown:
-        raise LegsError(f"{words!r}: {{{unknown[0]}}} is not known here; there are {', '.join(sorted(places))}")
+        raise LegsError(f"{words!r}: {{{unknown[0]}}} is unknown; there are {', '.join(sorted(places))}")
     parts = split(words)
     try:
         return [word.format(**places) for word in parts]
@@ -166,10 +166,10 @@ def fill(words: str, places: Mapping[str, Any]) -> List[str]:
 
 
 def split(words: str) -> List[str]:
-    """Return words as a shell would part them.
+    """Split words as a shell does.
 
     Raises:
-        LegsError: a quotation has no end.
+        LegsError: a quotation is not closed.
     """
     try:
         return shlex.split(words)

@@ -1,4 +1,4 @@
-"""One row: a codebase's script trains in a copy of its checkout and draws its views, which are scored as all others."""
+"""One row: a codebase's script trains in a copy of its checkout and draws its views, which are scored here."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from legs_loss.system import read_regular
 
 __all__ = ["Checkout", "copy_checkout", "gaussians_in", "read_picture", "train_and_score"]
 
-# What a copy of a checkout can do without.
+# Files that are not copied.
 UNNEEDED = (".git", "__pycache__", "node_modules", "output", "outputs")
 _LARGEST = 256 << 20  # bytes of a step's report
 
@@ -67,7 +67,7 @@ class Checkout:
             words = getattr(self.profile, {"iterations": "shorter", "gaussians": "number"}.get(option, option))
             if value is not None:
                 if not words:
-                    raise LegsError(f"the profile {self.profile.name} has no words for {option}")
+                    raise LegsError(f"the profile {self.profile.name} has no option for {option}")
                 commands[-1] += fill(words, {option: value, **more})
         commands[-1] += self.extra
         if factor != 1.0:
@@ -80,7 +80,7 @@ class Checkout:
         return [threshold.given(self.extra) or threshold.value for threshold in self.profile.threshold]
 
     def results(self, output: Path) -> Path:
-        """Return where a run lies: the newest, where its codebase adds the time to its name."""
+        """Return the folder of a run: the newest, if its codebase adds the time to its name."""
         if not self.profile.results:
             return output
         pattern = self.profile.results.format(name=_run_name(output))
@@ -113,14 +113,14 @@ def _is_patched(path: Path) -> bool:
 
 
 def _unneeded(folder: str, names: List[str]) -> Set[str]:
-    """Return what is not copied of a folder: what tools wrote, and pipes, sockets and devices."""
+    """Return what is not copied of a folder: tool output, and pipes, sockets and devices."""
     kinds = {name: stat.S_IFMT(os.lstat(os.path.join(folder, name)).st_mode) for name in names}
     odd = {name for name, kind in kinds.items() if kind not in (stat.S_IFREG, stat.S_IFDIR, stat.S_IFLNK)}
     return odd | set(shutil.ignore_patterns(*UNNEEDED)(folder, names))
 
 
 def train_and_score(checkout: Checkout, spec: WeightSpec, seed: int, folder: Path, factor: float) -> Dict[str, Any]:
-    """Train, draw and score one row; return its metrics. What is done stays done when it is called again.
+    """Train, draw and score one row; return its metrics. A repeated call skips finished steps.
 
     Raises:
         LegsError: a command failed, or the baseline was weighted, or an arm was not.
@@ -130,7 +130,7 @@ def train_and_score(checkout: Checkout, spec: WeightSpec, seed: int, folder: Pat
     commands = checkout.commands(output, factor)
     report = _once(checkout, "train", commands, spec, seed, folder)
     if spec.unweighted and report["weighted"]:
-        raise LegsError(f"{folder}: the baseline was weighted in {report['weighted']} calls: it is no baseline")
+        raise LegsError(f"{folder}: the baseline was weighted in {report['weighted']} calls: it is not a baseline")
     if not spec.unweighted and not report["weighted"]:
         raise LegsError(f"{folder}: nothing was weighted: `legs-patch --check {checkout.root}` says why")
     results = checkout.results(output)
@@ -160,7 +160,7 @@ def train_and_score(checkout: Checkout, spec: WeightSpec, seed: int, folder: Pat
 
 
 def gaussians_in(cloud: Path) -> int:
-    """Return the number of Gaussians that the header of a .ply tells."""
+    """Return the number of Gaussians in the header of a .ply."""
     with open(str(cloud), "rb") as file:
         for _, line in zip(range(200), file):
             if line.startswith(b"element vertex"):
@@ -169,14 +169,14 @@ def gaussians_in(cloud: Path) -> int:
 
 
 def _run_name(output: Path) -> str:
-    """Return a name for a run whose codebase has a folder of its own for all runs: ARM-seed-N."""
+    """Return the name of a run, for codebases with one folder for all runs: ARM-seed-N."""
     return "-".join(output.parts[-3:-1])
 
 
 def _once(
     checkout: Checkout, step: str, commands: Sequence[Sequence[str]], spec: WeightSpec, seed: int, folder: Path
 ) -> Dict[str, Any]:
-    """Run a step's commands unless they are done, and return the report of the last; a step is done by its report."""
+    """Run a step's commands unless its report exists, and return the report of the last command."""
     done = folder / f"{step}.json"
     if done.is_file():
         try:
@@ -185,7 +185,7 @@ def _once(
         except (OSError, ValueError, AttributeError, RecursionError):
             raise LegsError(f"{done}: this file is damaged: delete it and run the comparison again") from None
         if known != [list(map(str, words)) for words in commands]:
-            raise LegsError(f"{done}: this was done by other commands: choose another folder (--out)")
+            raise LegsError(f"{done}: this was made by other commands: choose another folder (--out)")
         return kept
     part = folder / f"{step}.json.part"
     log = folder / f"{step}.log"

@@ -27,7 +27,7 @@ def cache_folder(environment: Mapping[str, str] = os.environ, platform: str = sy
 
 
 class BinaryCache:
-    """A folder of compiled kernels. What cannot be read or written is as if it were not there.
+    """A folder of compiled kernels. Files that cannot be read or written are ignored.
 
     Args:
         folder: is made when something is kept; None keeps nothing.

@@ -1,7 +1,7 @@
 """The operations on a GPU: the loss and its gradient in one pass, differentiable, without waiting for the device.
 
 The loss is a scalar, so its gradient is known as soon as the images are: the forward pass computes both, and backward
-multiplies by the gradient that arrives, which the kernel reads on the device (and where it is 1 leaves all as it is).
+multiplies by the incoming gradient, which the kernel reads on the device (and changes nothing where it is 1).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Shares(NamedTuple):
 def fused_loss(modules: Modules, prediction: Tensor, target: Tensor, weights: Weights, shares: Shares) -> Tensor:
     """Return a loss of images [C, H, W] or [B, C, H, W], differentiable once in the prediction; float32.
 
-    Images of two types are computed in float32, which is what the half one becomes.
+    Images of two different types are computed in float32.
     """
     if prediction.dtype != target.dtype:
         prediction, target = prediction.float(), target.float()
@@ -80,7 +80,7 @@ class _FusedLoss(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_output: Tensor) -> Tuple[Optional[Tensor], ...]:
-        # The gradient is handed over, not copied; a second backward of a retained graph makes it anew.
+        # The gradient is passed on, not copied; a second backward of a retained graph recomputes it.
         gradient, ctx.gradient = ctx.gradient, None
         if gradient is None:
             gradient = _loss_and_gradient(ctx.inputs, True)[1]
@@ -158,7 +158,7 @@ def _add_weights(task: Task, modules: Modules, y: Tensor, weights: Weights, spec
 
 
 def _scaled(modules: Modules, gradient: Tensor, step: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return the gradient times what arrives in backward, rounded once, to the prediction's type."""
+    """Return the gradient times the incoming gradient of backward, rounded once, in the prediction's type."""
     step = step.to(torch.float32).contiguous()
     scaled = gradient if dtype == torch.float32 else torch.empty_like(gradient, dtype=dtype)
     task = Task(gradient=gradient.data_ptr(), scaled=scaled.data_ptr(), step=step.data_ptr(), count=gradient.numel())

@@ -1,7 +1,7 @@
 """Gaussians to an image: the readable oracle, the compiled rasterizer that must agree with it, and their one entry.
 
-`rasterize` is the entry for 3DGS's own rasterizer; `draw` is the one for forks that change or return more. What needs
-numba is imported when it is first asked for.
+`rasterize` is the entry for 3DGS's own rasterizer; `draw` is the one for forks that change or return more. Modules that
+need numba are imported on first use.
 """
 
 from __future__ import annotations

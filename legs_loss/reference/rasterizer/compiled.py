@@ -35,7 +35,7 @@ class Tensors(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """All that drawing leaves behind: for the way back, and for who wants to know more of it.
+    """The intermediate results of a drawing, for the backward pass and for further results.
 
     A slot is a strip in a Gaussian's box of strips; an entry, one that it reaches, sorted by strip and depth.
     """
@@ -142,7 +142,7 @@ def draw(
 
 def attach(drawing: Drawing, tensors: Tensors) -> Tuple[Tensor, Tensor]:
     """Return a drawing as image [3, H, W] and radii int32 [N], with the gradient to the tensors it was drawn from."""
-    # A colour is 1 / C0 of its constant harmonic, as the way back sees it.
+    # A colour is 1 / C0 of its constant harmonic, for the backward pass.
     sh = tensors.sh if tensors.colours is None else tensors.colours[:, None] / SH_C0
     return _Attach.apply(*tensors[:4], sh, tensors.covariances, tensors.viewspace, drawing)
 
@@ -160,10 +160,10 @@ class _Attach(torch.autograd.Function):
         viewspace: Optional[Tensor],
         drawing: Drawing,
     ) -> Tuple[Tensor, Tensor]:
-        # The image that is handed out may be changed in place; the one of the way back may not.
+        # The returned image may be changed in place; the one for the backward pass may not.
         image, radii = torch.from_numpy(drawing.image.copy()), torch.from_numpy(drawing.radii)
         ctx.mark_non_differentiable(radii)
-        # So that torch sees if an input is changed, and lets go of the drawing's arrays when the way back is done.
+        # So that torch detects changed inputs, and frees the drawing's arrays after the backward pass.
         large = [name for name, value in drawing._asdict().items() if isinstance(value, np.ndarray) and name != "radii"]
         arrays = (torch.from_numpy(getattr(drawing, name)) for name in large)
         ctx.save_for_backward(means, scales, quaternions, opacities, sh, covariances, *arrays)

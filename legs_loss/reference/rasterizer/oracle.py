@@ -1,4 +1,4 @@
-"""The rasterizer written to be read: plain torch, autograd, any floating type. The fast one is checked against it.
+"""The reference rasterizer: plain torch, autograd, any floating type. The fast one is tested against it.
 
 Each function below is one step of 3D Gaussian Splatting's forward pass; docs/rasterizer.md has the formulas. The
 gradient is autograd's, but for the two places where 3DGS's own differs from the derivative, marked "as upstream".
@@ -29,7 +29,7 @@ from legs_loss.reference.conventions import (
 
 
 class Splats(NamedTuple):
-    """Gaussians as the image sees them."""
+    """Gaussians projected to the image."""
 
     centres: Tensor  # [N, 2] pixels; a pixel's centre has integer coordinates
     conics: Tensor  # [N, 3]: A, B, C of the inverse covariance [[A, B], [B, C]]

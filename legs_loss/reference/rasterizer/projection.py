@@ -117,7 +117,7 @@ def _shapes(count, intrinsics, pose, dilation, state):
 
 @compiled()
 def _covariances(count, intrinsics, pose, dilation, state):
-    """Project means and covariances to those in the image. What was handed in need be no covariance."""
+    """Project means and covariances to those in the image. The input may be any matrix."""
     intrinsics, pose = numbers(intrinsics, pose)
     for j in range(np.uint64(count)):
         x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)

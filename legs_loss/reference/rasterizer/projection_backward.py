@@ -1,4 +1,4 @@
-"""The gradient's way back from splats to Gaussians (projection.py), a block of them at a time."""
+"""The backward pass from splats to Gaussians (projection.py), a block of them at a time."""
 
 # mypy: ignore-errors
 # (numba infers the types, by its own rules: arrays of float32, or of float64 for geometry, and of integers)

@@ -1,4 +1,4 @@
-"""One signature for the two rasterizers: the numba one that trains, and the torch one that is read."""
+"""One signature for the two rasterizers: the fast one with numba, and the reference with torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw surfels in plain torch, written to be read: autograd, any floating type.
+"""Draw surfels in plain torch, as a reference: autograd, any floating type.
 
 A surfel is a disc with a Gaussian falloff in its own coordinates (u, v). A 3x3 homography T takes (u, v, 1) to
 (x w, y w, w): the pixel (x, y) and the depth w. The ray through a pixel is met with the disc exactly, by inverting T

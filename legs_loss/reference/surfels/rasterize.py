@@ -1,4 +1,4 @@
-"""Draw surfels with one of two rasterizers: the numba one that trains, and the torch one that is read."""
+"""Draw surfels with one of two rasterizers: the fast one with numba, or the reference with torch."""
 
 from __future__ import annotations
 

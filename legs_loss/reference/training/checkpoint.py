@@ -1,4 +1,4 @@
-"""The state of a training on disk, as plain arrays: nothing is ever unpickled."""
+"""The state of a training on disk, as plain arrays without pickled objects."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_checkpoint(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:
 
 
 def read_state(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:
-    """Read a checkpoint that a training goes on from: its arrays and its facts, all there and of one size.
+    """Read a checkpoint to resume a training: its arrays and its facts, complete and of one size.
 
     Raises:
         LegsError: there is none, or it is no training's state.
@@ -79,7 +79,7 @@ _GAUSSIANS: Dict[str, Tuple[Any, ...]] = {
 
 
 def _what_is_wrong(arrays: Mapping[str, np.ndarray], facts: Any) -> Optional[str]:
-    """Say what of a checkpoint cannot be a training's state; None where all of it can."""
+    """Return why a checkpoint is not a training's state; None where it is valid."""
     if not isinstance(facts, dict):
         return "its facts are none"
     for name, kinds in FACTS.items():

@@ -1,4 +1,4 @@
-"""The views of a scene as the trainer takes them: photographs and weight maps in memory, every 8th view held out."""
+"""The views of a scene for the trainer: photographs and weight maps in memory, every 8th view held out."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from legs_loss.weights import weight_from_response, weight_map, weight_maps, wei
 
 __all__ = ["Dataset", "TrainingView", "extent", "load_dataset", "load_view", "pinhole_camera", "split_views"]
 
-HOLD_OUT = 8  # every so manieth view, sorted by name, as in the field
+HOLD_OUT = 8  # every 8th view, sorted by name, as usual for 3DGS
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +76,8 @@ def load_dataset(
         spec: of the weight maps; with beta 0 there are none.
         resolution: 3DGS's ``-r``.
         white_background: what alpha is laid on, where the loader does so.
-        store: a store of weight maps; default: ``legs_weights`` in the scene folder, if it is there. A map is taken
-            from it only for the very image it was made from, else it is computed.
+        store: a store of weight maps; default: ``legs_weights`` in the scene folder, if it is there. A map is used
+            only for exactly the image that it was made from, else it is computed.
         weights: explicit maps [1, H, W] by view name, in place of the spec's: for experiments.
         worse: a third of the training views is degraded (:mod:`.degrade`): for experiments.
 

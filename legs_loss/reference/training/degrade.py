@@ -1,4 +1,4 @@
-"""Training views out of focus, moved or noisy, as careless photographs are: for experiments.
+"""Degrade training views, out of focus, moved or noisy: for experiments.
 
 Every third training view is degraded, in turn by one of KINDS, the same ones whatever the seed of a run; held-out views
 stay as they are.

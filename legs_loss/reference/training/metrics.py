@@ -1,6 +1,6 @@
 """The metrics of a rendering, each one record: trainings, rows, tables, plots and the HTML page go through METRICS.
 
-To add a metric, add a record. A row that was trained before has none of it, and is shown so.
+To add a metric, add a record. Rows that were trained before show it as missing.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["METRICS", "Metric", "left_out", "mean_scores", "psnr", "score", "str
 
 
 class Metric(NamedTuple):
-    """A number that says how near a rendering is to its photograph.
+    """A measure of the difference of a rendering and its photograph.
 
     Attributes:
         key: its name in rows and files.
@@ -29,9 +29,9 @@ class Metric(NamedTuple):
         compute: (rendering, photograph), each [3, H, W] in [0, 1], to the value.
         differences: the splits for which `legs compare` tells differences between arms in the terminal; the HTML page
             tells all.
-        available: whether what it needs is installed; None for one that needs nothing. Rows lack what was not, and
-            tables leave a column out that no row has.
-        needs: what makes it available, in words.
+        available: whether its requirements are installed; None without requirements. Rows lack unavailable metrics, and
+            tables omit columns that no row has.
+        needs: how to make it available, in words.
         least_side: the pixels that the shorter side of an image must have; rows of smaller images lack it.
     """
 

@@ -1,4 +1,4 @@
-"""Metrics of what an eye would say, by the packages of the extra [metrics]: FLIP, GMSD, HaarPSI; and LPIPS.
+"""Perceptual metrics, by the packages of the extra [metrics]: FLIP, GMSD, HaarPSI; and LPIPS.
 
 Each is computed where its package is installed, and left out elsewhere. Nothing is downloaded: LPIPS counts as
 installed where the weights of its VGG lie in torch's own cache.

@@ -1,4 +1,4 @@
-"""Several trainings at once, each in a process of its own with one thread: the fair and the fast way to compare."""
+"""Run several trainings at once, each in a separate process with one thread: a fair and fast comparison."""
 
 from __future__ import annotations
 

@@ -121,10 +121,10 @@ def train(
         config: the settings.
         out: a folder for the checkpoint, ``cfg.json``, ``metrics.json`` and 3DGS's own
             ``point_cloud/iteration_N/point_cloud.ply``; None keeps everything in memory.
-        resume: go on from the checkpoint in ``out``; with the same arguments the result is bit-equal to that of an
+        resume: resume from the checkpoint in ``out``; with the same arguments the result is bit-equal to that of an
             uninterrupted run.
-        store: where weight maps come from, see :func:`load_dataset`.
-        weights: explicit maps instead, likewise.
+        store: the store of the weight maps, see :func:`load_dataset`.
+        weights: explicit maps instead, see there.
         checkpoint_every: iterations between checkpoints. Another one is written on Ctrl-C.
         on_progress: called every 10 iterations.
         weighting: makes weights that change during the run, in place of the maps: for experiments.
@@ -166,7 +166,7 @@ def train(
 
 
 class _Run:
-    """A training between two iterations: everything that the next one depends on."""
+    """The state of a training between two iterations."""
 
     def __init__(self, data: Dataset, config: TrainConfig, adam: Adam) -> None:
         self.data, self.config, self.adam = data, config, adam
@@ -240,7 +240,7 @@ class _Run:
     ) -> None:
         """Run to the last iteration."""
         started = _clocks() - self.clocks
-        with noted() as interrupted:  # not between two updates that belong together
+        with noted() as interrupted:  # not between two dependent updates
             while self.iteration < self.config.iterations:
                 self.step()
                 self.clocks = _clocks() - started

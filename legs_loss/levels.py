@@ -24,7 +24,7 @@ from legs_loss.spec import WeightSpec
 
 __all__ = ["RunningLevels", "levels_of", "over_scene", "percentile", "response_levels", "scene_levels"]
 
-_REMEMBERED = 4096  # views; a target that is a new tensor at each step counts anew
+_REMEMBERED = 4096  # views; a target that is a new tensor at each step is counted again
 
 
 def response_levels(strength: Tensor, spec: WeightSpec) -> Tensor:

@@ -1,6 +1,6 @@
 """The operators of a response, by name: their stencils as numbers, and their help texts.
 
-To add an operator, add a record. A kernel that does not declare it (``kernels/``) leaves it to torch.
+To add an operator, add a record. Kernels (``kernels/``) that do not declare it use torch.
 """
 
 from __future__ import annotations

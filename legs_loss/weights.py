@@ -159,7 +159,7 @@ def error_weight_map(
 
 
 def curved(normalised: Tensor, spec: WeightSpec) -> Tensor:
-    """Return the weight map of a response that is normalised and clamped already, as the spec says."""
+    """Return the weight map of a response that is normalised and clamped already, by the spec."""
     weight = 1.0 + spec.beta * curve(spec.curve)(normalised)
     if spec.normalise == "mean":
         weight = weight / weight.mean(_pixels(weight), keepdim=True)

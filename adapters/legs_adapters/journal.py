@@ -65,7 +65,7 @@ class Journal:
 
     @classmethod
     def read(cls, root: Path) -> Journal:
-        """Read a checkout's journal, whoever wrote it; an empty one where there is none.
+        """Read a checkout's journal, of any author; an empty one if there is no file.
 
         Raises:
             LegsError: it cannot be read, or names files that legs-patch never writes.

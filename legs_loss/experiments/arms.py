@@ -44,7 +44,7 @@ LOOSE = 0.25  # of the threshold: low enough that another arm's numbers are reac
 
 @dataclass(frozen=True)
 class ArmSpec:
-    """An arm as its name says it."""
+    """An arm, parsed from its name."""
 
     name: str
     spec: WeightSpec

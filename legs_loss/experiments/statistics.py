@@ -33,7 +33,7 @@ class Column(NamedTuple):
     format: of a value.
     value: of a row's metrics; NaN where the row lacks it.
     middle: of values over seeds, in place of the mean.
-    spread: whether the standard deviation over seeds is told.
+    spread: whether the standard deviation over seeds is shown.
     metric: the split and the key in METRICS, where it is a metric's.
     """
 
@@ -67,7 +67,7 @@ COLUMNS: Tuple[Column, ...] = (
     *_metric_columns("train"),
     *_metric_columns("test"),
     Column("Gaussians", ",.0f", lambda metrics: metrics["gaussians"]),
-    # A machine's first row compiles the kernels, which is no iteration's time: hence the median.
+    # A machine's first row compiles the kernels, outside of any iteration: hence the median.
     Column("ms an iteration", ".0f", _milliseconds, np.median, spread=False),
     Column("mean weight", ".2f", lambda metrics: metrics.get("mean_weight", math.nan), spread=False),
 )
@@ -89,7 +89,7 @@ class Difference(NamedTuple):
 
     mean: over views, each view's mean over seeds.
     low, high: the ends of its 95% interval, see :func:`interval`.
-    seeds: the mean over views of each seed alone: from a few seeds no interval knows well how they scatter.
+    seeds: the mean over views of each seed: with few seeds, no interval estimates their spread well.
     """
 
     mean: float

@@ -1,4 +1,4 @@
-"""The built-in studies: which arms they train, which differences they look at, and what the paper has beside them.
+"""The built-in studies: their arms, the differences that are reported, and the paper's values.
 
 Of the paper this project knows the text and one table, the training PSNR by curve on Tanks & Temples; its gain over
 3DGS; and that C1 is above C5 in SSIM there. Nothing else is quoted as the paper's.

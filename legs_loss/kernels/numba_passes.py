@@ -1,4 +1,4 @@
-"""Passes over whole images: the response of every pixel, and what the weights of a view need of it."""
+"""Passes over whole images: the response of every pixel, and the extremes for a view's weights."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def map_of_responses(image: np.ndarray, spec: WeightSpec) -> Tuple[np.ndarray, n
 
 
 def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
-    """Return of each view of float32 [B, C, H, W] what its weights need, as float32 [B, 4].
+    """Return the extremes of each view of float32 [B, C, H, W], as float32 [B, 4].
 
     The least and the greatest response; a pixel's largest magnitude; 0, or NaN where a pixel is NaN or infinite.
     """

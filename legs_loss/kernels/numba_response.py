@@ -55,7 +55,7 @@ _FOUR, _EIGHT = np.float32(4.0), np.float32(8.0)
 
 
 class Shape(NamedTuple):
-    """The shape of images that lie in one row of memory, [views, channels, height, width]."""
+    """The shape of contiguous images, [views, channels, height, width]."""
 
     views: int
     channels: int

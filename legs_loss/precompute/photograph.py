@@ -27,7 +27,7 @@ def normalised_map(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
 
 
 def normalised_map_and_levels(image: np.ndarray, spec: WeightSpec) -> Tuple[np.ndarray, Dict[str, Any]]:
-    """Return E^ of a photograph, and what its entry says besides where it is to be normalised over its scene."""
+    """Return E^ of a photograph, and the entry's further values for a normalisation over the scene."""
     strength = response_map(image, spec)
     if spec.over == "image":
         return _normalised(strength, spec)[0], {}
@@ -61,7 +61,7 @@ def _normalised(strength: torch.Tensor, spec: WeightSpec) -> Tuple[np.ndarray, f
     span = high - low + spec.eps
     height, width = strength.shape
     normalised = np.empty((height, width), np.float16)  # numpy asks for large pages; torch does not
-    for rows in row_strips(height, width):  # in place: what is allocated anew has to be mapped anew
+    for rows in row_strips(height, width):  # in place: new memory would have to be mapped
         torch.from_numpy(normalised[rows]).copy_(strength[rows].sub_(low).div_(span))
     return normalised, float(low), float(span)
 

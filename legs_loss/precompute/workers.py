@@ -1,4 +1,4 @@
-"""Share views out to processes, each with one photograph in memory at a time."""
+"""Distribute views to processes, each with one photograph in memory at a time."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class _Worker:
         theirs.close()
 
     def end(self, patience: float = 0.0) -> None:
-        """Close its pipe, at which it ends by itself once it is idle; after some seconds of patience it is killed."""
+        """Close its pipe, which ends it when it is idle; after some seconds it is killed."""
         self.connection.close()
         self.process.join(patience)
         self.process.terminate()
@@ -92,7 +92,7 @@ class _Worker:
 def _kept_blocks() -> Iterator[None]:
     """Let Pillow, in processes started meanwhile, keep the memory of a photograph for the next.
 
-    Mapping it anew took a quarter of the decoding. What the user has set stays.
+    Mapping new memory took a quarter of the decoding. The user's own settings are kept.
     """
     if any(name in os.environ for name in _PILLOW):
         yield
@@ -106,9 +106,9 @@ def _kept_blocks() -> Iterator[None]:
 
 
 def _work(connection: Any, job: Job, compiles: bool) -> None:
-    """Make maps; first, where the first of them takes compiled code that has to be compiled, only that.
+    """Make maps; if the first one needs code that is not compiled yet, only compile it.
 
-    The compiler keeps nearly 200 MB to itself, so None is sent then: another process is to load what this one compiled.
+    The compiler keeps nearly 200 MB, so None is sent then, and another process loads the compiled code.
     """
     torch.set_num_threads(1)
     try:

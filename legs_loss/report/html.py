@@ -104,7 +104,7 @@ def _page(
 
     text = Path(__file__).with_name("html_page.html").read_text(encoding="utf-8")
     script = text.rpartition("<script>")[2].partition("</script>")[0]
-    # What is given to the page is escaped, all but what was made of escaped parts and says so (Markup).
+    # All values on the page are escaped, except Markup, which is made of escaped parts.
     template = Environment(autoescape=True).from_string(text)
     base = settings["base"]
     seeds = sorted({row["seed"] for row in rows})

@@ -14,7 +14,7 @@ __all__ = ["save_figure", "save_png"]
 
 
 def save_figure(figure: Any, path: Union[str, Path], dpi: int) -> None:
-    """Write a figure of matplotlib; the name's ending says the format.
+    """Write a figure of matplotlib; the name's suffix selects the format.
 
     Raises:
         LegsError: matplotlib does not know the format, or the file cannot be written.

@@ -28,7 +28,7 @@ def read_folder(root: Path, images: Path, prefix: str) -> Scene:
                 views.append(View(f"{prefix}{path.relative_to(images).as_posix()}", path))
     if not views:
         raise LegsError(
-            f"{images} is no scene: it has no sparse/ of COLMAP, no transforms.json and "
+            f"{images} is not a scene: it has no sparse/ of COLMAP, no transforms.json and "
             f"no images ({', '.join(SUFFIXES)})"
         )
     return Scene(root, "folder", tuple(sorted(views, key=lambda view: view.name)))

@@ -169,7 +169,7 @@ def row_strips(height: int, width: int) -> Iterator[slice]:
 
 
 def _pixels(image: Any) -> np.ndarray:
-    """Return an image's values without its alpha, [H, W, C]; in strips: Pillow copies what it hands over thrice."""
+    """Return an image's values without its alpha, [H, W, C]; in strips: Pillow copies values three times."""
     width, height = image.size
     pixels = np.empty((height, width, 1 if image.mode == "L" else 3), np.uint8)
     for rows in row_strips(height, width):

@@ -41,8 +41,8 @@ def read_transforms(root: Path) -> Scene:
     """Read a scene whose views are listed in JSON.
 
     A frame's intrinsics are its own, else the file's; ``file_path`` may lack its extension. A
-    distorted camera leaves ``View.camera`` None, and so does an image whose size cannot be found
-    out. A file listed twice keeps its first split. Raises :class:`LegsError` when a file is
+    distorted camera leaves ``View.camera`` None, and so does an image of unknown
+    size. A file listed twice keeps its first split. Raises :class:`LegsError` when a file is
     damaged.
     """
     views: Dict[str, View] = {}
@@ -54,7 +54,7 @@ def read_transforms(root: Path) -> Scene:
             raise LegsError(f"{file} cannot be read: {error.strerror}") from None
         except _WRONG as error:
             message = f"no {error}" if isinstance(error, KeyError) else error
-            raise LegsError(f"{file} is damaged or is no file of camera poses: {message}") from None
+            raise LegsError(f"{file} is damaged or is not a file of camera poses: {message}") from None
     return Scene(root, "transforms", tuple(sorted(views.values(), key=lambda view: view.name)))
 
 
@@ -112,7 +112,7 @@ def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
     else:
         try:
             width, height = image_size(image)
-        except LegsError:  # the loader will say what is wrong with it
+        except LegsError:  # the loader will report the error
             return None
     if "fl_x" in intrinsics:
         fx = float(intrinsics["fl_x"])

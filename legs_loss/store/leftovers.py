@@ -1,4 +1,4 @@
-"""Find and remove what killed writers left in a store."""
+"""Find and remove the leftovers of killed writers in a store."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOCK = ".lock"  # in the store, held over each change; in a staging folder, held
 
 
 def leftovers(folder: Path, entries: Iterable[Entry]) -> List[Path]:
-    """Return what killed writers left in a store: maps of no entry, and staging folders that no one holds."""
+    """Return the leftovers of killed writers in a store: maps without an entry, and unlocked staging folders."""
     listed = {entry.file for entry in entries}
     return [
         path

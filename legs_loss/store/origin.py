@@ -1,4 +1,4 @@
-"""Find a store's photographs: by a note beside the maps, where a store is not in its scene's folder.
+"""Find a store's photographs, by a note beside the maps for a store outside of its scene's folder.
 
 The note is only a hint: its readers compare fingerprints before they use a photograph as a map's source.
 """
@@ -34,7 +34,7 @@ def note_scene(store: Path, scene: Scene) -> None:
 
 
 def scene_of_store(store: Path) -> Optional[Scene]:
-    """Return the scene that a store was made from: the one it notes, else the folder it lies in; None if there is none.
+    """Return the scene of a store: the one in its note, else the folder that contains it; None without one.
 
     Args:
         store: the store's folder.

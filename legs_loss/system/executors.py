@@ -120,7 +120,7 @@ class _Topic(NamedTuple):
 
 
 def _on_worker(version: str, function: Callable[..., Any], arguments: Tuple[Any, ...], named: Dict[str, Any]) -> Any:
-    """Run a task; whatever goes wrong names the worker."""
+    """Run a task; errors name the worker."""
     from distributed import get_worker
 
     worker = get_worker()

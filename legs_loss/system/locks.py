@@ -54,7 +54,7 @@ class FileLock:
                     os.close(self._descriptor)
                     continue
                 if note:
-                    with contextlib.suppress(OSError):  # on a full disk it is a lock all the same
+                    with contextlib.suppress(OSError):  # on a full disk the lock works without a note
                         os.ftruncate(self._descriptor, 0)
                         os.write(self._descriptor, note.encode("utf-8", "backslashreplace"))
                 return
@@ -96,7 +96,7 @@ _PREAD = hasattr(os, "pread")
 
 
 def _open(path: str) -> int:
-    if os.path.islink(path):  # for Windows; elsewhere the flag says it without a race
+    if os.path.islink(path):  # for Windows; elsewhere the flag checks it without a race
         raise OSError(errno.ELOOP, "a link, which is not followed", path)
     flags = os.O_RDWR | os.O_CREAT
     for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY", "O_NOINHERIT"):

@@ -1,4 +1,4 @@
-"""Find what other packages add to legs-loss: entry points, by group and name.
+"""Find the extensions of other packages: entry points, by group and name.
 
 - ``legs_loss.commands``: sub-commands of ``legs``, each a module like those in legs_loss/cli.
 - ``legs_loss.upstreams``: libraries that hold a loss, each a function that weights it (:func:`legs_loss.apply_to`).
@@ -12,7 +12,7 @@ __all__ = ["plugins"]
 
 
 def plugins(group: str) -> Dict[str, Callable[[], Any]]:
-    """Return what is registered in a group, by name: functions that import it and return it.
+    """Return the entry points of a group by name, as functions that import and return the object.
 
     >>> sorted(plugins("no.such.group"))
     []

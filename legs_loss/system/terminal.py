@@ -30,7 +30,7 @@ def printable(text: str, lines: bool = False) -> str:
 def never_fail_to_print() -> None:
     """Print characters that the terminal's encoding lacks as escapes, instead of raising an error."""
     for stream in (sys.stdout, sys.stderr):
-        reconfigure = getattr(stream, "reconfigure", None)  # what stands in for them in tests and notebooks has none
+        reconfigure = getattr(stream, "reconfigure", None)  # replacements in tests and notebooks have none
         if reconfigure is not None:
             reconfigure(errors="backslashreplace")
 

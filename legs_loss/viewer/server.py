@@ -1,4 +1,4 @@
-"""The page: a viser server with the methods' splats, switches, a wipe between two of them, and the cameras."""
+"""The page: a viser server with the methods' splats, switches, a slider between two of them, and the cameras."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class _Methods:
             self.draw(client)
 
     def draw(self, client: Any) -> None:
-        """Show what the switches say."""
+        """Show the selected methods."""
         wiping = self.wiping is not None and self.wiping.value and client is not None
         sides = {self.left.value: True, self.right.value: False} if wiping else {}
         with self.server.atomic():
@@ -142,7 +142,7 @@ class _Cameras:
         return handle
 
     def draw(self) -> None:
-        """Show what the dropdown says."""
+        """Show the selection of the dropdown."""
         for view, handle in zip(self.views, self.handles):
             handle.visible = self.what.value != "none"
             handle.image = self._picture(view) if self.what.value in ("photograph", "weight map") else None

@@ -1,4 +1,4 @@
-"""Gaussians as viser draws them, and which of them lie left of a line on the screen."""
+"""Gaussians as viser draws them, and a test which of them are left of a line on the screen."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Splats(NamedTuple):
 
 
 def splats(gaussians: Gaussians) -> Splats:
-    """Return what viser draws of Gaussians. Colours are those of degree 0: they do not change with the direction."""
+    """Return Gaussians for viser. Colours are of degree 0: they do not depend on the direction."""
     axes = rotations(gaussians.quaternions) * gaussians.scales[:, None, :]
     colours = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
     parts = (gaussians.means, axes @ axes.transpose(1, 2), colours, gaussians.opacities)

@@ -71,7 +71,7 @@ RENDER = RENDERERS | word_set(
 RESULT = word_set("output outputs")  # of anything, not only of a renderer
 LAID_OVER = word_set("mask masks valid weight weights diff error errors")
 WHICH = word_set("first second third last left right front back")  # of several of a kind
-OF_PICTURES = word_set("sky sh shs prior time dx dy")  # a mask, say, where nothing says that it is a picture
+OF_PICTURES = word_set("sky sh shs prior time dx dy")  # a mask, for example, unless something shows that it is an image
 STEPS_OR_DYNAMIC = word_set("dx dy")  # steps from pixel to pixel, or render_dy: the dynamic part
 PICTURES = word_set("image images img imgs photo photos frame frames")
 LIT_BY = word_set("light lights")
@@ -139,9 +139,9 @@ SCORING = word_set(
     "score scores scoring importance densify densification prune pruning sensitivity sample sampling error"
 )
 TRACKING = word_set("tracking track tracker localize localization relocalize relocalization")  # SLAM
-MAPPING = word_set("mapping map mapper")  # a class that tracks and maps says nothing of one method
+MAPPING = word_set("mapping map mapper")  # a class that tracks and maps does not decide for its methods
 
-# -- what a text speaks of
+# -- words in texts
 
 # Files of Gaussian splatting, and of those the ones that cannot be about meshes.
 SPLATS = re.compile(r"splat|gaussians|gaussian_?(model|render|scene|raster)|diff_\w*raster|3dgs|surfel", re.I)

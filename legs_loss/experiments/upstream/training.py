@@ -207,7 +207,7 @@ def _once(
 
 
 def _environment(spec: WeightSpec, seed: int) -> Dict[str, str]:
-    """Return the environment of a script whose loss has this spec, wherever a legs.toml may lie."""
+    """Return the environment of a script whose loss has this spec, independent of any legs.toml."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
     environment.update({f"LEGS_{field.name.upper()}": str(getattr(spec, field.name)) for field in fields(spec)})
     environment.update(LEGS_OFF="1" if spec.unweighted else "0", PYTHONHASHSEED=str(seed))

@@ -1,4 +1,4 @@
-"""Loading and launching: the CUDA driver's own functions, called through ctypes, in the context that torch uses."""
+"""Load and launch kernels: the CUDA driver's functions, called through ctypes, in torch's context."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["CudaDriver", "DriverError", "load_library"]
 
 
 class DriverError(Exception):
-    """The CUDA driver refused; the message names the function and its reason."""
+    """The CUDA driver returned an error; the message names the function and the reason."""
 
 
 def load_library(platform: str = sys.platform) -> Any:

@@ -88,7 +88,7 @@ class Task(ctypes.Structure):
         self.views, self.channels, self.height, self.width = images.shape
 
     def weigh(self, spec: WeightSpec) -> None:
-        """Set what the weights of a spec need but for the range."""
+        """Set the parameters of a spec's weights except the range."""
         _, self.side, self.middle = STENCILS[spec.operator]
         self.curve, self.beta, self.eps = CURVES.get(spec.curve, 0), spec.beta, spec.eps
 
@@ -101,7 +101,7 @@ def variant_of(dtype: torch.dtype, spec: Optional[WeightSpec]) -> Variant:
 
 
 def addressable(images: Tensor) -> Tensor:
-    """Return images [B, C, H, W] whose planes the kernels can address: as they are, but for huge strides."""
+    """Return images [B, C, H, W] whose planes the kernels can address: copies only for huge strides."""
     _, _, row, column = images.stride()
     reach = (images.shape[2] - 1) * row + (images.shape[3] - 1) * column
     return images if max(row, column, reach) <= _MOST else images.contiguous()

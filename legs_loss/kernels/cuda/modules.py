@@ -1,4 +1,4 @@
-"""A kernel by its name and variant: from memory, from the disk, or compiled now."""
+"""Get a kernel by its name and variant: from memory, from the disk cache, or compiled."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ _BUILTINS = re.compile(r"(libnvrtc-builtins(-[0-9a-f]+)?\.so\.[0-9.]+|nvrtc-buil
 
 
 class NotFound(Exception):
-    """There is no NVRTC; the message says where it was looked for."""
+    """NVRTC was not found; the message says where it was searched."""
 
 
 class CompilerError(Exception):
@@ -37,7 +37,7 @@ class Compiled(NamedTuple):
 
 
 def candidates(folders: Iterable[Path], major: str, platform: str = sys.platform) -> Iterator[Path]:
-    """Yield the NVRTC libraries that lie in folders, those of a major version of CUDA only where the name says it.
+    """Yield the NVRTC libraries in folders, by name for a major version of CUDA.
 
     Args:
         folders: torch's ``lib`` folder, then those that hold packages named ``nvidia``.

@@ -32,7 +32,7 @@ KINDS: Dict[Any, _Vector] = {types.float32: float8, types.int32: integer8}
 
 
 def intrinsic(function: Any) -> Any:
-    """Make of a function, which says what LLVM is to do, one to be called: numba's decorator, typed."""
+    """Make a callable from a function that generates LLVM code: numba's decorator, typed."""
     return extending.intrinsic(function)
 
 

@@ -51,7 +51,7 @@ class CompactBox:
     ) -> None:
         """Take the rows outside the boxes from the slots, and the radii of Gaussians that enter no tile."""
         _clip(splats, self.opacities, self.mult, tiles, boxes, slots, firsts, reached, radii)
-        # A Gaussian that reaches no pixel's centre is visible, to FastGS, if it enters a tile all the same.
+        # For FastGS a Gaussian that reaches no pixel's centre is visible if it enters a tile.
         faint = np.nonzero((slots == 0) & (radii > 0))[0]
         opacities = self.opacities[faint, 0].astype(np.float64)
         radii[faint[~_touches(splats[faint, :5], opacities, self.mult, tiles)]] = 0
@@ -59,7 +59,7 @@ class CompactBox:
 
 @compiled()
 def _crossings(a, b, c, disc, t, u0, v0, at):
-    """Return the two v at which the ellipse crosses the line u = at; a belongs to u, c to v."""
+    """Return the two v at which the ellipse crosses the line u = at; c is the coefficient of v."""
     h = at - u0
     root = math.sqrt(max(disc * h * h + t * c, 0.0))
     return (-b * h - root) / c + v0, (-b * h + root) / c + v0

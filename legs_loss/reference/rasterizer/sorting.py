@@ -47,7 +47,7 @@ def sort_entries(
 ) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where each strip's entries begin [strips + 1], the entries [E, 3] by strip and then depth, and the bands.
 
-    Of the bands [B, 2], the fullest first, to be dealt out to the workers in turn: the first strip, and the one past
+    Of the bands [B, 2], the fullest first, to be distributed to the workers: the first strip, and the one past
     the last.
 
     Raises:

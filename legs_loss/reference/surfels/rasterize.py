@@ -12,7 +12,7 @@ from legs_loss.reference.surfels.model import Surfels, SurfelView
 
 __all__ = ["rasterize_surfels"]
 
-OTHERS = 7  # channels beside the image's
+OTHERS = 7  # channels in addition to the image's
 
 
 def rasterize_surfels(surfels: Surfels, view: SurfelView, backend: str = "numba") -> Tuple[Tensor, Tensor, Tensor]:

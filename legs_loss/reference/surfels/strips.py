@@ -322,7 +322,7 @@ def render_backward(workers, work, background, pictures, g_image, g_others, sums
 
 @compiled(fastmath=CAREFUL)
 def matters(g_others, others):
-    """Return whether a gradient to the other channels says anything where a disc is drawn."""
+    """Return whether the other channels have a nonzero gradient where a disc is drawn."""
     for v in range(g_others.shape[1]):
         for u in range(g_others.shape[2]):
             if others[1, v, u] != _ZERO:

@@ -1,4 +1,4 @@
-"""Adam in one pass over memory, eight numbers at a time: LLVM makes no vectors of a loop over five arrays."""
+"""Adam in one pass over memory, eight numbers at a time: LLVM does not vectorise a loop over five arrays."""
 
 from __future__ import annotations
 

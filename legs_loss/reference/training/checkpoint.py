@@ -25,7 +25,7 @@ def read_checkpoint(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:
     """Return what :func:`write_checkpoint` wrote.
 
     Raises:
-        LegsError: there is none, or the file is damaged.
+        LegsError: it is missing or damaged.
     """
     try:
         with open_regular(path) as raw, np.load(raw, allow_pickle=False) as file:
@@ -47,7 +47,7 @@ def read_state(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:
     """Read a checkpoint to resume a training: its arrays and its facts, complete and of one size.
 
     Raises:
-        LegsError: there is none, or it is no training's state.
+        LegsError: it is missing, or it is not a training's state.
     """
     arrays, facts = read_checkpoint(path)
     wrong = _what_is_wrong(arrays, facts)

@@ -95,7 +95,7 @@ class TrainConfig:
         """Return the settings that :meth:`as_dict` gave; ``spec`` may also be a preset's name.
 
         Raises:
-            LegsError: they are none.
+            LegsError: they are invalid.
         """
         try:
             spec = values["spec"]
@@ -105,7 +105,7 @@ class TrainConfig:
         except LegsError:
             raise
         except (KeyError, TypeError, ValueError) as error:
-            raise LegsError(f"these are no settings of a training: {error}") from None
+            raise LegsError(f"these are not settings of a training: {error}") from None
 
     @property
     def weights(self) -> WeightSpec:

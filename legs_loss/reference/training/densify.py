@@ -112,8 +112,8 @@ def _split(parents: Gaussians, generator: torch.Generator) -> Gaussians:
 def prunable(gaussians: Gaussians, extent: float, large_too: bool) -> Tensor:
     """Return which Gaussians, bool [N], are all but transparent or (``large_too``) wider than a tenth of the extent.
 
-    3DGS also means to prune what covers more than 20 pixels of a screen; its code forgets the radii just before it
-    looks at them, so that it never does, and neither does this.
+    3DGS also intends to prune Gaussians larger than 20 pixels on a screen; its code resets the radii just before that
+    test, so that it never does, and neither does this.
     """
     transparent = gaussians.opacities.detach()[:, 0] < MIN_OPACITY
     if not large_too:

@@ -123,4 +123,4 @@ def _work(connection: Connection, arm: Arm) -> None:
         except (LegsError, OSError) as error:  # a full disk is no fault of the code either
             connection.send(str(error))
     except OSError:
-        pass  # the parent was killed: nobody listens, and what is saved is gone on with
+        pass  # the parent was killed: the training resumes from its files

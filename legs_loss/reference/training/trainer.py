@@ -362,7 +362,7 @@ def _rasterize(
 
 
 def step_weight(weight: Optional[Tensor], view: TrainingView, config: TrainConfig) -> Optional[Tensor]:
-    """Return what multiplies the L1 term of a view whose weight map is ``weight``; None where nothing does."""
+    """Return the factor of the L1 term of a view whose weight map is ``weight``; None without one."""
     if config.l1_scale == 1.0:
         return weight
     return config.l1_scale * (torch.ones_like(view.image[:1]) if weight is None else weight)

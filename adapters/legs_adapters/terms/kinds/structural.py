@@ -36,7 +36,7 @@ class Structural(Form):
 
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
-        """Find a call of a function that is named as an SSIM, whatever it computes."""
+        """Find a call of a function that is named as an SSIM; what it computes is checked later."""
         inner = call_name(call.func) if isinstance(call.func, cst.Call) else ""  # SSIM()(image, gt)
         if not STRUCTURAL.search(call_name(call) or inner):
             return None

@@ -68,7 +68,7 @@ def test_names_of_arms() -> None:
         ("legs:scale:mean1", "scale"),
         ("3dgs:shuffled", "no weights to change"),
         ("legs@legs@3dgs", "must not contain an @"),
-        ("legs@", "no loss"),
+        ("legs@", "is not a loss"),
     ],
 )
 def test_wrong_names_are_explained(name: str, says: str) -> None:

@@ -70,7 +70,7 @@ def test_rows_are_complete_and_can_be_run_alone(tiny_scene: Path, tmp_path: Path
     assert again_text(read_row(path), now).endswith("The same to the last digit.")
     assert sorted(out.rglob("*")) == before
     now["versions"]["torch"], now["metrics"]["gaussians"] = "9.9", 1
-    assert f"What differs: torch ({torch.__version__}, now 9.9)." in again_text(read_row(path), now)
+    assert f"Different: torch ({torch.__version__}, now 9.9)." in again_text(read_row(path), now)
     # Given again, nothing is trained.
     del told[:]
     assert comparison.train(arms, [0, 1], 2, lambda name, progress: told.append(name)) == rows
@@ -146,7 +146,7 @@ def test_where_nothing_can_be_written(tiny_scene: Path, tmp_path: Path, capsys: 
 
 def test_another_comparison_in_the_folder_is_refused(tiny_scene: Path, tmp_path: Path) -> None:
     Comparison(tiny_scene, BASE, tmp_path)
-    with pytest.raises(LegsError, match=r"begun with another base.iterations"):
+    with pytest.raises(LegsError, match=r"started with another base.iterations"):
         Comparison(tiny_scene, replace(BASE, iterations=50), tmp_path)
     with pytest.raises(LegsError, match="uses the numbers of 3dgs: train that first"):
         Comparison(tiny_scene, BASE, tmp_path).train_one(parse_arm("legs@3dgs"), 0)

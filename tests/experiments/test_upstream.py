@@ -174,7 +174,7 @@ def test_done_rows_stay_and_others_are_added(compared, capsys: pytest.CaptureFix
     changed = {path.parent.parent.name for path, time in kept.items() if path.stat().st_mtime_ns != time}
     assert changed == {"legs"}
     assert main([*words, "--iterations", "31"]) == 2
-    assert "begun with another" in capsys.readouterr().err
+    assert "started with another" in capsys.readouterr().err
     assert main(["report", str(folder / "out")]) == 0
 
 

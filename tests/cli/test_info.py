@@ -51,4 +51,4 @@ class TestInfo:
     def test_no_store(self, tmp_path):
         done = legs("info", tmp_path)
         assert done.returncode == 2
-        assert "is no store" in done.stderr
+        assert "is neither a store" in done.stderr

@@ -85,7 +85,7 @@ class TestShow:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (["{scene}", "--views", "absent"], "absent is no view; there are 6, such as images/0.png"),
+            (["{scene}", "--views", "absent"], "absent is not a view; there are 6, such as images/0.png"),
             (["{store}", "--preset", "eggs"], "has no maps for this preset"),
             (["{scene}/nothing"], "there is no file or folder"),
             (["{scene}/sparse/0/images.bin"], "not an image"),

@@ -146,7 +146,7 @@ def test_mistakes_on_the_command_line(tiny_scene: Path, tmp_path: Path, capsys: 
         (("-r", "-3"), "resolution must be"),
         (("--threads", "0"), "--threads must be between 1 and"),
         (("--checkpoint_every", "0"), "--checkpoint_every"),
-        (("--store", str(tmp_path)), "no store"),
+        (("--store", str(tmp_path)), "not a store"),
     ):
         assert mistaken("train", str(tiny_scene), "--out", str(tmp_path / "run"), *flags) == 2, flags
         assert message in capsys.readouterr().err

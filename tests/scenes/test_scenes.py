@@ -314,7 +314,7 @@ class TestFolder:
         assert [view.name for view in read_scene(tmp_path, "images_2").views] == ["images_2/a.png"]
 
     def test_nothing_to_read(self, tmp_path):
-        with pytest.raises(LegsError, match="is no scene"):
+        with pytest.raises(LegsError, match="is not a scene"):
             read_scene(tmp_path)
         with pytest.raises(LegsError, match="no folder"):
             read_scene(tmp_path / "absent")

@@ -209,7 +209,7 @@ class TestDamage:
 
     def test_no_store(self, tmp_path):
         for path in (tmp_path, tmp_path / "absent"):
-            with pytest.raises(LegsError, match="no store"):
+            with pytest.raises(LegsError, match="not a store"):
                 WeightStore(path)
 
     def test_a_folder_that_cannot_be_made(self, tmp_path):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple, Union
 
-from legs_adapters.code.limits import ASKED, ASKED_TOGETHER, pieces
+from legs_adapters.code.limits import ASKED, ASKED_TOGETHER, over_the_limits, pieces
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.sources import Source
@@ -28,6 +28,7 @@ __all__ = ["find"]
 
 _Entry = Tuple[Place, Union[Site, Left, Problem]]
 
+_DEFINITION = re.compile(r"^[ \t]*(?:async[ \t]+)?def\b", re.M)
 _MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|\bunweighted\(")
 
 
@@ -45,8 +46,33 @@ def find(
         unread: by path, the text of files that are ignored or cannot be read.
         ssim: find the SSIM terms, too.
     """
-    found = _Finder(Analysis.of(sources, unread), by_hand).run()
+    every = list(sources)
+    over = {source.path: why for source, why in ((source, _long_function(source.text)) for source in every) if why}
+    texts = {source.path: source.text for source in every if source.path in over}
+    analysis = Analysis.of([source for source in every if source.path not in over], {**(unread or {}), **texts})
+    for path, why in over.items():
+        analysis.program.give_up(path, why)
+    found = _Finder(analysis, by_hand).run()
     return with_ssims(found, by_hand) if ssim else found
+
+
+def _long_function(text: str) -> str:
+    """Return why a file is not analysed, or "": a function over the limit, found in the text before it is parsed."""
+    if not _too_often(text) or over_the_limits(text):  # the second is reported where the file is parsed
+        return ""
+    return next(filter(None, map(_too_often, _DEFINITION.split(text))), "")
+
+
+def _too_often(text: str) -> str:
+    """Return why a function of this text is not analysed, or "": the time for each place grows with the whole text."""
+    if _asked(text) <= ASKED:
+        return ""
+    return f"a function of {pieces(text)} words and signs speaks of an L1 {len(_MAY_HAVE_L1.findall(text))} times"
+
+
+def _asked(text: str) -> int:
+    places = len(_MAY_HAVE_L1.findall(text))
+    return places * pieces(text) if places else 0
 
 
 class _Finder:
@@ -113,11 +139,10 @@ class _Finder:
         """Return why a function is not looked at, or "": what each of its places takes grows with all of it."""
         if function.parent is not None and function.text is function.parent.text:
             return ""  # that one was asked
-        places = len(_MAY_HAVE_L1.findall(function.text))
-        asked = places * pieces(function.text)
-        if asked > ASKED:
-            return f"a function of {pieces(function.text)} words and signs speaks of an L1 {places} times"
-        self.asked += asked
+        why = _too_often(function.text)
+        if why:
+            return why
+        self.asked += _asked(function.text)
         return "too many places speak of an L1 in all files: leave others out" if self.asked > ASKED_TOGETHER else ""
 
     def _entries(self, function: Function) -> Iterator[_Entry]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from legs_loss.runtime import state
 from legs_loss.scenes import Camera, PointCloud, write_colmap
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,3 +63,12 @@ def legs(*arguments, **options):
 def without_times(metrics):
     """Return a run's metrics without those that differ from run to run."""
     return {name: value for name, value in metrics.items() if not name.endswith("seconds")}
+
+
+def start_run(monkeypatch, folder):
+    """Begin a training run of its own: no settings from outside, started in an empty folder."""
+    for name in [name for name in os.environ if name.startswith("LEGS_")]:
+        monkeypatch.delenv(name)
+    state.reset()
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    monkeypatch.chdir(folder)

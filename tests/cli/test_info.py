@@ -2,22 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
-
 from legs_loss.precompute import precompute
 from legs_loss.scenes import read_scene
 from legs_loss.store import WeightStore
-from tests.support import colmap_scene, legs
-
-
-@pytest.fixture
-def scene(tmp_path):
-    return colmap_scene(tmp_path / "scene", names=[f"{i}.png" for i in range(6)])
-
-
-@pytest.fixture
-def store(scene):
-    return precompute(read_scene(scene)).store
+from tests.support import legs
 
 
 class TestInfo:

@@ -7,23 +7,11 @@ import pytest
 from PIL import Image
 
 from legs_loss.errors import LegsError
-from legs_loss.precompute import precompute
 from legs_loss.report.sheet import Shown, save_sheet
-from legs_loss.scenes import read_scene
 from legs_loss.spec import PRESETS, WeightSpec
-from tests.support import colmap_scene, legs, legs_environment, photograph, save
+from tests.support import legs, legs_environment, photograph, save
 
 pytest.importorskip("matplotlib")
-
-
-@pytest.fixture
-def scene(tmp_path):
-    return colmap_scene(tmp_path / "scene", names=[f"{i}.png" for i in range(6)])
-
-
-@pytest.fixture
-def store(scene):
-    return precompute(read_scene(scene)).store
 
 
 def colours(path):

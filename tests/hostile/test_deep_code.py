@@ -42,7 +42,7 @@ CASES = {
     "900 kB of literal": ("x = [" + "1.25, " * 150_000 + "]", "more than 250000 words and signs"),
     "130,000 statements": ("a\n" * 130_000, "more than 250000 words and signs"),
     "2,000 terms": ("def f(a, b):\n" + "    x = l1_loss(a, b)\n" * 2000, "words and signs speaks of an L1 2000 times"),
-    "9,000 trained terms": (
+    "3,000 trained terms": (
         "def f(a, b):\n" + "    l1 = l1_loss(render(a)['render'], b.original_image); l1.backward()\n" * 3000,
         "words and signs speaks of an L1 9000 times",
     ),

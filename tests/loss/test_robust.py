@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 
 import numpy as np
 import pytest
@@ -27,6 +25,7 @@ from legs_loss.spec import PRESETS
 from legs_loss.store import MANIFEST, WeightStore
 from legs_loss.store.manifest import read_manifest
 from legs_loss.weights import weight_from_response, weight_maps
+from tests.support import start_run
 
 ROBUST = PRESETS["legs-robust"]
 SIZE = (48, 64)
@@ -35,11 +34,7 @@ SIZE = (48, 64)
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch, tmp_path):
     """Each test is a run of its own, started in an empty folder."""
-    for name in [name for name in os.environ if name.startswith("LEGS_")]:
-        monkeypatch.delenv(name)
-    state.reset()
-    monkeypatch.setattr(sys, "argv", ["train.py"])
-    monkeypatch.chdir(tmp_path)
+    start_run(monkeypatch, tmp_path)
     yield
     state.reset()
 

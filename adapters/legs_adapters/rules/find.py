@@ -46,10 +46,14 @@ def find(
         unread: by path, the text of files that are ignored or cannot be read.
         ssim: find the SSIM terms, too.
     """
-    every = list(sources)
-    over = {source.path: why for source, why in ((source, _long_function(source.text)) for source in every) if why}
-    texts = {source.path: source.text for source in every if source.path in over}
-    analysis = Analysis.of([source for source in every if source.path not in over], {**(unread or {}), **texts})
+    read, searched, over = [], dict(unread or {}), {}
+    for source in sources:
+        why = _long_function(source.text)
+        if why:
+            searched[source.path], over[source.path] = source.text, why
+        else:
+            read.append(source)
+    analysis = Analysis.of(read, searched)
     for path, why in over.items():
         analysis.program.give_up(path, why)
     found = _Finder(analysis, by_hand).run()
@@ -71,6 +75,7 @@ def _too_often(text: str) -> str:
 
 
 def _asked(text: str) -> int:
+    """Return how much is analysed for a text: its words and signs, once for each place that speaks of an L1."""
     places = len(_MAY_HAVE_L1.findall(text))
     return places * pieces(text) if places else 0
 

@@ -16,6 +16,7 @@ from legs_loss.cli import main
 from legs_loss.experiments.upstream.profile import PROFILES, fill, find_profile, read_profile
 from legs_loss.experiments.upstream.training import Checkout, copy_checkout
 from tests.experiments.miniature import write_miniature
+from tests.patcher.support import files
 
 pytest.importorskip("libcst")
 pytest.importorskip("numba")
@@ -148,7 +149,27 @@ def test_every_arm_is_trained_by_the_codebases_own_script(compared) -> None:
         assert metrics["3dgs@legs"]["gaussians"] == pytest.approx(metrics["legs"]["gaussians"], rel=0.01)
         assert metrics["legs:scale"]["mean_weight"] == pytest.approx(metrics["legs"]["mean_weight"])
         assert found["3dgs@legs", seed]["upstream"]["threshold_factor"] < 1
+    begun = [(folder / "out" / "3dgs-at-legs" / f"seed-{seed}" / "factor-0.5").is_dir() for seed in (0, 1)]
+    assert begun == [True, False]  # the second search begins where the first ended
     assert found["3dgs", 0]["metrics"]["train"] != found["3dgs", 1]["metrics"]["train"]  # the script's seed is always 0
+
+
+@pytest.mark.slow
+def test_without_a_gpu_the_ssim_of_every_arm_is_the_packages(tiny_scene: Path, tmp_path: Path) -> None:
+    profile = write_miniature(tmp_path / "miniature", tiny_scene)
+    script = tmp_path / "miniature" / "train.py"
+    lines = script.read_text().splitlines()
+    first = lines.index("def ssim(img1, img2):")
+    script.write_text("\n".join([*lines[:first], "from loss_utils import ssim", *lines[first + 3 :], ""]))
+    (script.parent / "loss_utils.py").write_text(files("ssim_beside_l1_fused")["utils/loss_utils.py"])
+    words = ["compare", str(tiny_scene), "--upstream", str(script.parent), "--profile", str(profile), "--cpu"]
+    words += ["--arms", "legs", "--seeds", "1", "-r", "24", "--iterations", "30", "-m", str(tmp_path / "out")]
+    assert main(words) == 0
+    for arm in ("3dgs", "legs"):
+        log = (tmp_path / "out" / arm / "seed-0" / "train.log").read_text()
+        assert "is computed by legs_loss.ssim in this run" in log
+    weighted = [json.loads((tmp_path / "out" / arm / "seed-0" / "train.json").read_text()) for arm in ("3dgs", "legs")]
+    assert [report["weighted"] for report in weighted] == [0, 30]
 
 
 @pytest.mark.slow

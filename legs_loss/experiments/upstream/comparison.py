@@ -164,10 +164,12 @@ class UpstreamComparison:
         if arm.at is None:
             tell(f"{arm.name}, seed {seed}")
             return self._row(arm, seed, spec, 1.0, train_and_score(self.checkout, spec, seed, folder, 1.0))
-        leader, own = self.row(parse_arm(arm.at), seed), self._plain(arm, seed)
+        leader = self.row(parse_arm(arm.at), seed)
         assert leader is not None  # trained before, see `needed`
         wanted = leader["metrics"]["gaussians"]
-        tried: List[Tuple[float, int]] = [] if own is None else [(1.0, own["metrics"]["gaussians"])]
+        # The search begins at the same loss's own number, and at what the seed before needed.
+        known = [row for row in (self._plain(arm, seed), self.row(arm, seed - 1)) if row is not None]
+        tried = [(float(row["upstream"]["threshold_factor"]), int(row["metrics"]["gaussians"])) for row in known]
         best: Optional[Tuple[float, Dict[str, Any]]] = None
         for _ in range(TRIALS):
             factor = next_factor(tried, wanted)
@@ -184,7 +186,7 @@ class UpstreamComparison:
         return self._row(arm, seed, spec, best[0], best[1])
 
     def _plain(self, arm: ArmSpec, seed: int) -> Optional[Row]:
-        """Return the row of the same loss at its own number, where it is there: a first point for the search."""
+        """Return the row of the same loss at its own number, where it is there."""
         return self.row(replace(arm, name=arm.name.partition("@")[0], at=None), seed)
 
     def _row(self, arm: ArmSpec, seed: int, spec: WeightSpec, factor: float, metrics: Dict[str, Any]) -> Row:

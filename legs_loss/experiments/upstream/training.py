@@ -40,7 +40,7 @@ class Checkout:
         scene: the scene's folder.
         images, resolution, iterations, gaussians: as the user gave them; None leaves the codebase's own.
         extra: words for every training.
-        cpu: without a GPU, by `legs run --cpu`.
+        cpu: without a GPU, by `legs run --cpu --ssim`: every arm, the baseline too, has its SSIM from `legs_loss.ssim`.
     """
 
     root: Path
@@ -192,7 +192,7 @@ def _once(
     for words in commands:
         part.unlink() if part.exists() else None
         prefix = [sys.executable, "-m", "legs_loss.experiments.upstream.launch", str(part.resolve()), str(seed)]
-        words = [*prefix, *(["--cpu"] if checkout.cpu else []), *words]
+        words = [*prefix, *(["--cpu", "--ssim"] if checkout.cpu else []), *words]
         with open(str(log), "ab") as said:
             code = subprocess.run(
                 words, cwd=str(checkout.root), env=_environment(spec, seed), stdout=said, stderr=said,
@@ -210,7 +210,7 @@ def _environment(spec: WeightSpec, seed: int) -> Dict[str, str]:
     """Return the environment of a script whose loss has this spec, independent of any legs.toml."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
     environment.update({f"LEGS_{field.name.upper()}": str(getattr(spec, field.name)) for field in fields(spec)})
-    environment.update(LEGS_OFF="1" if spec.unweighted else "0", PYTHONHASHSEED=str(seed))
+    environment["PYTHONHASHSEED"] = str(seed)
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     return environment
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from legs_loss import LegsError, legs_loss, ssim
+from legs_loss import LegsError, ssim
 
 __all__ = ["fused_ssim"]
 
@@ -16,8 +15,6 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
     ``padding``: "same" is 3DGS's zero padding; "valid" leaves the border of 5 pixels out. Source: fused-ssim
     (Mallick et al. 2024).
     """
-    if padding == "same" and img1.dtype == torch.float32:
-        return 1 - legs_loss(img1, img2, "3dgs", lambda_dssim=1.0)
     if padding not in ("same", "valid"):
         raise LegsError(f'fused_ssim: padding must be "same" or "valid", got {padding!r}')
     return ssim(img1, img2.detach(), padding="zeros" if padding == "same" else "valid")

@@ -13,7 +13,7 @@ import pytest
 
 from legs_loss import LegsError
 from legs_loss.cli import main
-from legs_loss.experiments.upstream.profile import PROFILES, fill, find_profile, read_profile
+from legs_loss.experiments.upstream.profile import PROFILES, Edit, fill, find_profile, read_profile
 from legs_loss.experiments.upstream.training import Checkout, copy_checkout
 from tests.experiments.miniature import write_miniature
 from tests.patcher.support import files
@@ -31,7 +31,8 @@ def test_built_in_profiles_are_whole(path: Path) -> None:
     assert bool(profile.threshold) != bool(profile.number)  # densifies by a threshold, or to a fixed number
     checkout = Checkout(Path("copy"), profile, Path("my scene"), iterations=1000, extra=["--more"])
     command = checkout.commands(Path("out/legs/seed-0/output"), 0.5)[-1]
-    assert any("my scene" in word for word in command) and "--more" in command
+    told = [*command, *(edit.new.replace("{scene}", "my scene") for edit in profile.edit)]
+    assert any("my scene" in word for word in told) and "--more" in command
     assert any("1000" in word for word in command)
     for threshold in profile.threshold:
         assert f"{0.5 * threshold.value:.6g}" in " ".join(command)
@@ -40,9 +41,8 @@ def test_built_in_profiles_are_whole(path: Path) -> None:
 def test_what_a_framework_reads_as_python_is_quoted() -> None:
     checkout = Checkout(Path("copy"), read_profile(PROFILES / "fastergs.toml"), Path("my scene"), iterations=1000)
     values = dict(word.split("=", 1) for word in checkout.commands(Path("3dgs/seed-0/output"), 1.0)[-1] if "=" in word)
-    assert ast.literal_eval(values["DATASET.PATH"]) == "my scene"
     assert ast.literal_eval(values["TRAINING.MODEL_NAME"]) == "3dgs-seed-0"
-    assert {type(ast.literal_eval(value)) for value in values.values()} == {str, int, bool, type(None)}
+    assert {type(ast.literal_eval(value)) for value in values.values()} == {str, int, bool}
 
 
 def test_a_profile_is_found_by_what_a_checkout_has(tmp_path: Path) -> None:
@@ -68,6 +68,9 @@ def test_a_profile_is_found_by_what_a_checkout_has(tmp_path: Path) -> None:
         ('extends = "3dgs"\ntrain = "train.py"', "train has an invalid value"),
         ('extends = "3dgs"\nrenders = { train = "a" }', "renders must have train and test"),
         ('extends = "3dgs"\nthreshold = [{ words = "--x", value = 1.0 }]', "a threshold has words with"),
+        ('extends = "3dgs"\nthreshold = [{ words = "{value}" }]', "in threshold each table has words, value"),
+        ('extends = "3dgs"\nedit = [{ file = "a", old = "b", new = 3 }]', "in edit each table has file, old, new"),
+        ('extends = "3dgs"\nedit = ["a"]', "edit has an invalid value"),
         ("name = ", "cannot be read"),
         ("name = " + "[" * 100_000, "cannot be read"),
         ("name = " + "9" * 5_000, "cannot be read|name is not what it should be"),
@@ -110,8 +113,22 @@ def test_a_checkout_is_copied_without_what_is_no_file(tmp_path: Path) -> None:
     (root / "lost").symlink_to("nowhere")
     for name in ("pipe", "pipe.py"):
         os.mkfifo(str(root / name))
-    copy_checkout(root, tmp_path / "copy")
+    copy_checkout(root, tmp_path / "copy", tmp_path)
     assert sorted(os.listdir(str(tmp_path / "copy"))) == [".git", "folder.py", "lost", "train.py"]
+
+
+def test_a_copy_has_the_edits_of_its_profile(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "garden.yaml").write_text("PATH: dataset/garden\nSTEP: 8\n")
+    edits = [Edit("garden.yaml", "PATH: dataset/garden", "PATH: '{scene}'")]
+    copy_checkout(root, tmp_path / "copy", Path("/my scene"), edits)
+    assert (tmp_path / "copy/garden.yaml").read_text() == "PATH: '/my scene'\nSTEP: 8\n"
+    assert (root / "garden.yaml").read_text() == "PATH: dataset/garden\nSTEP: 8\n"
+    for edit in (Edit("garden.yaml", "PATH: elsewhere", ""), Edit("other.yaml", "PATH", "")):
+        with pytest.raises(LegsError, match=f"{edit.file}: the profile edits '{edit.old}', which is not there"):
+            copy_checkout(root, tmp_path / "new", Path("/my scene"), [edit])
+        assert not list(tmp_path.glob("new*"))
 
 
 # A comparison

@@ -12,7 +12,7 @@ from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 from legs_loss.errors import LegsError
 from legs_loss.system import read_regular
 
-__all__ = ["PROFILES", "Profile", "Threshold", "fill", "find_profile", "read_profile", "split"]
+__all__ = ["PROFILES", "Edit", "Profile", "Threshold", "fill", "find_profile", "read_profile", "split"]
 
 PROFILES = Path(__file__).with_name("profiles")
 _LARGEST = 1 << 20  # bytes of a profile
@@ -42,6 +42,15 @@ class Threshold:
 
 
 @dataclass(frozen=True)
+class Edit:
+    """A text of a file that is replaced in the copy of the checkout; {scene} in the new one is filled in."""
+
+    file: str
+    old: str
+    new: str
+
+
+@dataclass(frozen=True)
 class Profile:
     """A codebase's own commands. A command is a script of the checkout and its arguments, with placeholders.
 
@@ -60,6 +69,7 @@ class Profile:
         renders, truths: by "train" and "test", the folders of the drawn views and of their photographs, as patterns.
         cloud: the .ply of the Gaussians, as a pattern.
         threshold: the options that the control of the number of Gaussians changes, all by one factor.
+        edit: what no option says, for codebases whose scripts read some settings from a file alone.
     """
 
     name: str
@@ -77,6 +87,7 @@ class Profile:
     number: str = ""
     results: str = ""
     threshold: Tuple[Threshold, ...] = ()
+    edit: Tuple[Edit, ...] = ()
 
     def fits(self, root: Path) -> bool:
         """Return whether a checkout is of this codebase."""
@@ -140,13 +151,21 @@ def _profile(path: Path, values: Dict[str, Any]) -> Profile:
         if set(values[name]) != {"train", "test"}:
             raise LegsError(f"{path}: {name} must have train and test")
     made: Dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-    thresholds = []
-    for one in values.get("threshold", ()):
-        if set(one) != {"words", "value"} or "{value}" not in str(one["words"]) or not _is(one["value"], "float"):
-            raise LegsError(f"{path}: a threshold has words with {{value}}, and a value: {one!r}")
-        thresholds.append(Threshold(one["words"], float(one["value"])))
-    made["threshold"] = tuple(thresholds)
+    made["threshold"] = _tables(path, Threshold, values.get("threshold", ()))
+    made["edit"] = _tables(path, Edit, values.get("edit", ()))
+    for threshold in made["threshold"]:
+        if "{value}" not in threshold.words:
+            raise LegsError(f"{path}: a threshold has words with {{value}}: {threshold.words!r}")
     return Profile(**made)
+
+
+def _tables(path: Path, kind: Any, given: Sequence[Dict[str, Any]]) -> Tuple[Any, ...]:
+    """Return the tables of a list in a profile as objects of a kind."""
+    kinds = {field.name: str(field.type) for field in fields(kind)}
+    for one in given:
+        if set(one) != set(kinds) or not all(_is(one[name], kinds[name]) for name in kinds):
+            raise LegsError(f"{path}: in {kind.__name__.lower()} each table has {', '.join(kinds)}: {one!r}")
+    return tuple(kind(**one) for one in given)
 
 
 def fill(words: str, places: Mapping[str, Any]) -> List[str]:
@@ -188,7 +207,7 @@ def _is(value: Any, kind: str) -> bool:
         return isinstance(value, str)
     if kind.startswith("Mapping"):
         return isinstance(value, dict) and all(isinstance(one, str) for one in value.values())
-    each = dict if "Threshold" in kind else str
+    each = str if "str" in kind else dict
     return isinstance(value, list) and all(isinstance(one, each) for one in value)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from legs_loss.errors import LegsError
-from legs_loss.experiments.upstream.profile import Profile, fill
+from legs_loss.experiments.upstream.profile import Edit, Profile, fill
 from legs_loss.reference.training.densify import Schedule
 from legs_loss.reference.training.metrics import mean_scores, score
 from legs_loss.scenes import open_image
@@ -90,22 +90,37 @@ class Checkout:
         return found[-1]
 
 
-def copy_checkout(root: Path, copy: Path) -> None:
-    """Copy a codebase to where its trainings may write.
+def copy_checkout(root: Path, copy: Path, scene: Path, edits: Sequence[Edit] = ()) -> None:
+    """Copy a codebase to where its trainings may write, with a profile's edits.
 
     Raises:
-        LegsError: it is no folder, or is patched already: its baseline would be too.
+        LegsError: it is no folder, or is patched already: its baseline would be too; or a text to edit is not there.
     """
     if not root.is_dir():
         raise LegsError(f"there is no folder {root}: give a checkout of the codebase")
     patched = next((path for path in sorted(root.rglob("*.py")) if _is_patched(path)), None)
     if patched is not None or (root / ".legs-patch.json").exists():
         raise LegsError(f"{patched or root} is patched already, so there is no baseline: legs-patch {root} --undo")
+    edited = _edited(root, scene, edits)
     part = copy.with_name(copy.name + ".part")
     shutil.rmtree(str(part), ignore_errors=True)
     shutil.copytree(str(root), str(part), symlinks=True, ignore=_unneeded)
     (part / ".git").mkdir()  # it ends here: what lies above is not looked at
+    for file, text in edited.items():
+        (part / file).write_text(text, encoding="utf-8")
     os.replace(str(part), str(copy))
+
+
+def _edited(root: Path, scene: Path, edits: Sequence[Edit]) -> Dict[str, str]:
+    """Return the texts of the files that a profile edits, by their names."""
+    texts: Dict[str, str] = {}
+    for edit in edits:
+        file = root / edit.file
+        text = texts.get(edit.file) or (file.read_text(encoding="utf-8") if file.is_file() else "")
+        if edit.old not in text:
+            raise LegsError(f"{file}: the profile edits {edit.old!r}, which is not there")
+        texts[edit.file] = text.replace(edit.old, edit.new.replace("{scene}", str(scene)))
+    return texts
 
 
 def _is_patched(path: Path) -> bool:

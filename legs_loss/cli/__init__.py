@@ -35,6 +35,9 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     except KeyboardInterrupt:
         say("legs: interrupted", sys.stderr)
         return 130
+    except MemoryError as error:
+        say(f"legs: error: not enough memory{f' ({error})' if str(error) else ''}", sys.stderr)
+        return 2
     except BrokenPipeError:  # `legs ... | head`: the reader left, which is no error of ours
         sys.stderr.close()
         return 0

@@ -17,9 +17,11 @@ import pytest
 from legs_loss import LegsError
 from legs_loss.cli import main
 from legs_loss.reference.ply import read_ply
-from legs_loss.reference.training.checkpoint import read_checkpoint, write_checkpoint
+from legs_loss.reference.training import checkpoint
+from legs_loss.reference.training.checkpoint import LOCK, read_checkpoint, write_checkpoint
 from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, train
 from legs_loss.scenes import Scene, read_scene
+from legs_loss.system import FileLock
 from tests.reference.training import SHORT, assert_equal, run_until_killed
 
 pytest.importorskip("numba")
@@ -153,6 +155,28 @@ def test_mistakes_on_the_command_line(tiny_scene: Path, tmp_path: Path, capsys: 
     assert mistaken("train", str(tmp_path / "nowhere")) == 2
     assert "no folder" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_two_trainings_in_one_folder(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoint, "WAIT", 0.1)
+    (tmp_path / "run").mkdir()
+    with FileLock(tmp_path / "run" / LOCK, note="process 7", remove=True):
+        for resume in (False, True):
+            with pytest.raises(LegsError, match=r"another training writes there \(process 7\)"):
+                train(scene, SHORT, out=tmp_path / "run", resume=resume)
+    assert list((tmp_path / "run").iterdir()) == []
+    (tmp_path / "run" / LOCK).mkdir()  # no lock is to be had: it trains all the same
+    train(scene, replace(SHORT, iterations=2), out=tmp_path / "run")
+    (tmp_path / "run" / LOCK).rmdir()
+    train(scene, replace(SHORT, iterations=2), out=tmp_path / "run", resume=True)
+    assert not (tmp_path / "run" / LOCK).exists()
+
+
+def test_a_size_that_no_memory_holds_is_one_line(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert main(["train", str(tiny_scene), "--out", str(tmp_path / "run"), "-r", "999999999"]) == 2
+    assert "legs: error: not enough memory" in capsys.readouterr().err
 
 
 def wait_for(path: Path, process: subprocess.Popen[bytes], newer_than: Optional[float] = None) -> None:

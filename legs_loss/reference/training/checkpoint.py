@@ -1,18 +1,24 @@
-"""The state of a training on disk, as plain arrays without pickled objects."""
+"""The state of a training on disk, as plain arrays without pickled objects, in a folder of its own."""
 
 from __future__ import annotations
 
 import json
+import os
+import platform
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Dict, Mapping, Optional, Tuple
+from typing import Any, Dict, Iterator, Mapping, Optional, Tuple
 
 import numpy as np
 import torch
 
 from legs_loss.errors import LegsError
-from legs_loss.system import open_regular, write_whole
+from legs_loss.system import FileLock, HeldError, open_regular, write_whole
 
-__all__ = ["read_checkpoint", "read_state", "write_checkpoint"]
+__all__ = ["LOCK", "alone_in", "read_checkpoint", "read_state", "write_checkpoint"]
+
+LOCK = ".lock"  # in a run's folder, held while it is trained
+WAIT = 10.0  # seconds for the lock: the processes of a comparison that was killed end a little later than it
 
 
 def write_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
@@ -107,3 +113,29 @@ def _what_is_wrong(arrays: Mapping[str, np.ndarray], facts: Any) -> Optional[str
     except (RuntimeError, TypeError) as error:
         return str(error).splitlines()[0]
     return None
+
+
+@contextmanager
+def alone_in(folder: Optional[Path], make: bool) -> Iterator[None]:
+    """Hold a run's folder: two trainings in one would overwrite each other's checkpoints.
+
+    Raises:
+        LegsError: another training holds it.
+    """
+    lock: Optional[FileLock] = None
+    if folder is not None and make:
+        folder.mkdir(parents=True, exist_ok=True)
+    if folder is not None and folder.is_dir():
+        try:
+            note = f"process {os.getpid()} on {platform.node()}"
+            lock = FileLock(folder / LOCK, wait=WAIT, note=note, remove=True)
+        except HeldError as error:
+            raise LegsError(f"{folder}: another training writes there ({error}): choose another folder") from None
+        except OSError:  # a file system without locks, or without room: what is written next says so
+            pass
+    try:
+        yield
+    finally:
+        if lock is not None:
+            with suppress(OSError):
+                lock.release()

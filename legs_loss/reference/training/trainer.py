@@ -23,7 +23,7 @@ from legs_loss.reference.gaussians import Gaussians
 from legs_loss.reference.ply import write_ply
 from legs_loss.reference.rasterizer import Rendering, rasterize
 from legs_loss.reference.training.adam import Adam, position_rate
-from legs_loss.reference.training.checkpoint import read_state, write_checkpoint
+from legs_loss.reference.training.checkpoint import alone_in, read_state, write_checkpoint
 from legs_loss.reference.training.config import Loss, TrainConfig, Weigh, Weighting, default_threshold
 from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, load_dataset
 from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
@@ -136,7 +136,8 @@ def train(
             run's time; None: only at the end.
 
     Raises:
-        LegsError: the scene cannot be trained on, numba is missing, or the checkpoint does not fit.
+        LegsError: the scene cannot be trained on, numba is missing, the checkpoint does not fit, or another training
+            writes to ``out``.
         KeyboardInterrupt: Ctrl-C, after the checkpoint.
     """
     maps = config.weights if config.weights.error == 0.0 else WeightSpec(beta=0.0)
@@ -144,25 +145,23 @@ def train(
     if weighting is None and config.weights.error > 0.0:
         weighting = by_error
     folder = None if out is None else Path(out)
-    if resume:
-        if folder is None:
-            raise LegsError("there is nothing to resume from without an output folder")
-        run = _Run.restore(data, config, folder / CHECKPOINT)
-    else:
-        run = _Run.begin(data, config, scene)
-    run.step_loss, run.caps, run.evaluate_every = loss, caps, evaluate_every
-    run.weigh = None if weighting is None else weighting(data.train, config)
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        _write_json(folder / "cfg.json", config.as_dict())
-        if not resume:
-            run.save(folder / CHECKPOINT)
-    run.go(folder, checkpoint_every, on_progress)
-    metrics = run.metrics()
-    if folder is not None:
-        write_ply(point_cloud(folder, config), run.adam.gaussians)
-        _write_json(folder / "metrics.json", metrics)
-    return Result(run.adam.gaussians, metrics)
+    if resume and folder is None:
+        raise LegsError("there is nothing to resume from without an output folder")
+    begun = None if resume else _Run.begin(data, config, scene)
+    with alone_in(folder, make=not resume):
+        run = begun if begun is not None else _Run.restore(data, config, Path(out or ".") / CHECKPOINT)
+        run.step_loss, run.caps, run.evaluate_every = loss, caps, evaluate_every
+        run.weigh = None if weighting is None else weighting(data.train, config)
+        if folder is not None:
+            _write_json(folder / "cfg.json", config.as_dict())
+            if not resume:
+                run.save(folder / CHECKPOINT)
+        run.go(folder, checkpoint_every, on_progress)
+        metrics = run.metrics()
+        if folder is not None:
+            write_ply(point_cloud(folder, config), run.adam.gaussians)
+            _write_json(folder / "metrics.json", metrics)
+        return Result(run.adam.gaussians, metrics)
 
 
 class _Run:

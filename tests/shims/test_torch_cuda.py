@@ -315,6 +315,30 @@ class TestRuntime:
         assert scaler.scale(product.sum()).item() == 8
         assert not scaler.is_enabled()
 
+    def test_adam_takes_its_fused_step(self):
+        start, gradients = np.array([1.0, -2.0, 0.5]), np.random.RandomState(0).randn(3, 3)
+        parameter = torch.nn.Parameter(torch.tensor(start, dtype=torch.float32))
+        optimizer = torch.optim.Adam([{"params": [parameter], "lr": 0.1}], lr=0.0, eps=1e-15)
+        first = second = np.zeros(3)
+        for step, gradient in enumerate(gradients, 1):
+            parameter.grad = torch.tensor(gradient, dtype=torch.float32)
+            optimizer.step()
+            first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
+            start = start - 0.1 * (first / (1 - 0.9**step)) / np.sqrt(second / (1 - 0.999**step))
+        assert parameter.detach().numpy() == pytest.approx(start, rel=1e-5)
+        old = tuple(map(int, torch.__version__.split(".")[:2])) < (2, 4)
+        assert optimizer.param_groups[0].get("fused") is (None if old else True)
+
+    @needs_new
+    def test_an_adam_that_a_script_chose_stays(self):
+        class Own(torch.optim.Adam):
+            pass
+
+        parameter = torch.nn.Parameter(torch.zeros(2))
+        assert not torch.optim.Adam([parameter], foreach=False).param_groups[0]["fused"]
+        assert not Own([parameter]).param_groups[0]["fused"]
+        assert not torch.optim.Adam([torch.nn.Parameter(torch.zeros(2) * 1j)]).param_groups[0]["fused"]
+
     def test_scripts_for_the_compiler_run_as_they_are(self):
         assert torch.jit.script(square) is square
 

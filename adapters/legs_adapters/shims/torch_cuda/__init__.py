@@ -7,7 +7,7 @@ object, since torch._dynamo identifies objects by identity.
 
 from __future__ import annotations
 
-from legs_adapters.shims.torch_cuda import devices, runtime, tensors, workers
+from legs_adapters.shims.torch_cuda import devices, optimisers, runtime, tensors, workers
 from legs_adapters.shims.torch_cuda.redirection import Redirection
 
 __all__ = ["Redirection", "redirect"]
@@ -16,6 +16,6 @@ __all__ = ["Redirection", "redirect"]
 def redirect() -> Redirection:
     """Replace CUDA until the result's ``restore()``."""
     redirection = Redirection()
-    for part in (tensors, devices, runtime, workers):
+    for part in (tensors, devices, runtime, workers, optimisers):
         part.redirect(redirection)
     return redirection

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,7 @@ def test_built_in_profiles_are_whole(path: Path) -> None:
     assert bool(profile.threshold) != bool(profile.number)  # densifies by a threshold, or to a fixed number
     checkout = Checkout(Path("copy"), profile, Path("my scene"), iterations=1000, extra=["--more"])
     command = checkout.commands(Path("out/legs/seed-0/output"), 0.5)[-1]
-    told = [*command, *(edit.new.replace("{scene}", "my scene") for edit in profile.edit)]
+    told = [*command, *(edit.new for edit in profile.edits(Path("my scene")))]
     assert any("my scene" in word for word in told) and "--more" in command
     assert any("1000" in word for word in command)
     for threshold in profile.threshold:
@@ -113,7 +114,7 @@ def test_a_checkout_is_copied_without_what_is_no_file(tmp_path: Path) -> None:
     (root / "lost").symlink_to("nowhere")
     for name in ("pipe", "pipe.py"):
         os.mkfifo(str(root / name))
-    copy_checkout(root, tmp_path / "copy", tmp_path)
+    copy_checkout(root, tmp_path / "copy")
     assert sorted(os.listdir(str(tmp_path / "copy"))) == [".git", "folder.py", "lost", "train.py"]
 
 
@@ -121,13 +122,14 @@ def test_a_copy_has_the_edits_of_its_profile(tmp_path: Path) -> None:
     root = tmp_path / "root"
     root.mkdir()
     (root / "garden.yaml").write_text("PATH: dataset/garden\nSTEP: 8\n")
-    edits = [Edit("garden.yaml", "PATH: dataset/garden", "PATH: '{scene}'")]
-    copy_checkout(root, tmp_path / "copy", Path("/my scene"), edits)
+    edit = Edit("garden.yaml", "PATH: dataset/garden", "PATH: '{scene}'")
+    profile = replace(read_profile(PROFILES / "3dgs.toml"), edit=(edit,))
+    copy_checkout(root, tmp_path / "copy", profile.edits(Path("/my scene")))
     assert (tmp_path / "copy/garden.yaml").read_text() == "PATH: '/my scene'\nSTEP: 8\n"
     assert (root / "garden.yaml").read_text() == "PATH: dataset/garden\nSTEP: 8\n"
     for edit in (Edit("garden.yaml", "PATH: elsewhere", ""), Edit("other.yaml", "PATH", "")):
         with pytest.raises(LegsError, match=f"{edit.file}: the profile edits '{edit.old}', which is not there"):
-            copy_checkout(root, tmp_path / "new", Path("/my scene"), [edit])
+            copy_checkout(root, tmp_path / "new", [edit])
         assert not list(tmp_path.glob("new*"))
 
 

@@ -91,7 +91,7 @@ class UpstreamComparison:
         keep(self.out / "comparison.json", settings, "comparison", tuple(settings), ("path", "baseline"))
         copy = self.out / "upstream"
         if not copy.is_dir():
-            copy_checkout(root, copy, Path(scene).resolve(), profile.edit)
+            copy_checkout(root, copy, profile.edits(Path(scene).resolve()))
         self.checkout: Checkout = Checkout(
             copy.resolve(), profile, Path(scene).resolve(), images, resolution, iterations, gaussians, extra, cpu
         )

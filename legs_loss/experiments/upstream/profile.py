@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
@@ -43,7 +43,7 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Edit:
-    """A text of a file that is replaced in the copy of the checkout; {scene} in the new one is filled in."""
+    """A text of a file that is replaced in the copy of the checkout; in a profile {scene} stands in the new one."""
 
     file: str
     old: str
@@ -95,6 +95,10 @@ class Profile:
             (root / name).is_file() and words in (root / name).read_text(encoding="utf-8", errors="replace")
             for name, words in self.text.items()
         )
+
+    def edits(self, scene: Path) -> List[Edit]:
+        """Return the edits for a scene."""
+        return [replace(edit, new=edit.new.replace("{scene}", str(scene))) for edit in self.edit]
 
 
 def read_profile(path: Path) -> Profile:

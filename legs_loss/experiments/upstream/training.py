@@ -90,8 +90,8 @@ class Checkout:
         return found[-1]
 
 
-def copy_checkout(root: Path, copy: Path, scene: Path, edits: Sequence[Edit] = ()) -> None:
-    """Copy a codebase to where its trainings may write, with a profile's edits.
+def copy_checkout(root: Path, copy: Path, edits: Sequence[Edit] = ()) -> None:
+    """Copy a codebase to where its trainings may write, and edit texts of the copy.
 
     Raises:
         LegsError: it is no folder, or is patched already: its baseline would be too; or a text to edit is not there.
@@ -101,7 +101,7 @@ def copy_checkout(root: Path, copy: Path, scene: Path, edits: Sequence[Edit] = (
     patched = next((path for path in sorted(root.rglob("*.py")) if _is_patched(path)), None)
     if patched is not None or (root / ".legs-patch.json").exists():
         raise LegsError(f"{patched or root} is patched already, so there is no baseline: legs-patch {root} --undo")
-    edited = _edited(root, scene, edits)
+    edited = _edited(root, edits)
     part = copy.with_name(copy.name + ".part")
     shutil.rmtree(str(part), ignore_errors=True)
     shutil.copytree(str(root), str(part), symlinks=True, ignore=_unneeded)
@@ -111,15 +111,15 @@ def copy_checkout(root: Path, copy: Path, scene: Path, edits: Sequence[Edit] = (
     os.replace(str(part), str(copy))
 
 
-def _edited(root: Path, scene: Path, edits: Sequence[Edit]) -> Dict[str, str]:
-    """Return the texts of the files that a profile edits, by their names."""
+def _edited(root: Path, edits: Sequence[Edit]) -> Dict[str, str]:
+    """Return the edited texts of files, by the files' names."""
     texts: Dict[str, str] = {}
     for edit in edits:
         file = root / edit.file
         text = texts.get(edit.file) or (file.read_text(encoding="utf-8") if file.is_file() else "")
         if edit.old not in text:
             raise LegsError(f"{file}: the profile edits {edit.old!r}, which is not there")
-        texts[edit.file] = text.replace(edit.old, edit.new.replace("{scene}", str(scene)))
+        texts[edit.file] = text.replace(edit.old, edit.new)
     return texts
 
 

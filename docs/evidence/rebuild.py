@@ -1,4 +1,4 @@
-"""Rebuild docs/evidence.md's tables and plots from the rows beside this file.
+"""Rebuild the tables and plots of docs/evidence.md and of evidence/codebases.md from the rows beside this file.
 
     python docs/evidence/rebuild.py                           # tables and plots, from the .json files beside it
     python docs/evidence/rebuild.py --take OUT docs/evidence/NAME.json    # first: the rows of a `legs compare` folder
@@ -17,7 +17,7 @@ from typing import Any, List, Tuple
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import read_rows
-from legs_loss.experiments.statistics import pooled_difference, summarise_all
+from legs_loss.experiments.statistics import pooled_difference, summarise_all, times_gaussians
 from legs_loss.experiments.studies import STUDIES, Study
 from legs_loss.experiments.tables import (
     DIFFERENCES,
@@ -26,12 +26,13 @@ from legs_loss.experiments.tables import (
     markdown,
     paper_text,
     scores_table,
+    times_cell,
     with_values,
 )
 from legs_loss.reference.training.metrics import METRICS
 
 HERE = Path(__file__).resolve().parent
-TEXT = HERE.parent / "evidence.md"
+TEXTS = (HERE.parent / "evidence.md", HERE / "codebases.md")
 PICTURES = HERE.parent / "pictures"
 SCENES = ("fox", "embedded")
 DIGITS = 6
@@ -106,8 +107,9 @@ def _pooled(scenes: List[str], study: Study) -> str:
         found = [pooled_difference(rows, name, reference or name, *place) for place in DIFFERENCES.values()]
         if reference is not None and found[0] is not None:
             cells = [difference_cell(each, key) for each, (_, key) in zip(found, DIFFERENCES.values())]
-            lines.append([f"{name} − {reference}", *cells])
-    return markdown(*with_values([f"over {len(scenes)} captures", *DIFFERENCES], lines))
+            times = [times_cell(times_gaussians(one, name, reference) or 1.0) for one in rows]
+            lines.append([f"{name} − {reference}", *cells, ", ".join(times) if len(set(times)) > 1 else times[0]])
+    return markdown(*with_values([f"over {len(scenes)} captures", *DIFFERENCES, "Gaussians"], lines))
 
 
 def _weights(scene: str) -> str:
@@ -141,7 +143,8 @@ def main(words: List[str]) -> None:
         taken: Tuple[str, ...] = tuple(words[1:3])
         take(Path(taken[0]), Path(taken[1]))
         words = words[3:]
-    TEXT.write_text(tables(TEXT.read_text(encoding="utf-8")), encoding="utf-8")
+    for text in TEXTS:
+        text.write_text(tables(text.read_text(encoding="utf-8")), encoding="utf-8")
     plots()
 
 

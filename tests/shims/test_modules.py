@@ -120,6 +120,14 @@ class TestOthers:
         assert found.item() == pytest.approx(wanted.item(), abs=1e-5)
         close(gradient, first.grad, 1e-3)
 
+    def test_fused_ssim_is_the_same_with_legs_off(self, monkeypatch):
+        # `legs-patch --verify` compares the unpatched losses with those of LEGS_OFF=1, to the last bit.
+        first, second = torch.rand(2, 1, 3, 30, 40).unbind(0)
+        first.requires_grad_(True)
+        on = fused_ssim.fused_ssim(first, second)
+        monkeypatch.setenv("LEGS_OFF", "1")
+        assert torch.equal(fused_ssim.fused_ssim(first, second), on)
+
     def test_sparse_adam_moves_what_is_visible(self):
         parameter = torch.nn.Parameter(torch.ones(4, 2))
         optimizer = SparseGaussianAdam([{"params": [parameter], "lr": 0.1}], lr=0.0, eps=1e-15)

@@ -133,6 +133,19 @@ def test_a_copy_has_the_edits_of_its_profile(tmp_path: Path) -> None:
         assert not list(tmp_path.glob("new*"))
 
 
+def test_an_edit_never_follows_a_link_out_of_the_copy(tmp_path: Path) -> None:
+    own = tmp_path / "method"
+    own.mkdir()
+    (own / "garden.yaml").write_text("PATH: dataset/garden\n")
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "Method").symlink_to(own)
+    with pytest.raises(LegsError, match="a link leads the edit of the profile out of the copy"):
+        copy_checkout(root, tmp_path / "copy", [Edit("Method/garden.yaml", "dataset/garden", "elsewhere")])
+    assert (own / "garden.yaml").read_text() == "PATH: dataset/garden\n"
+    assert not list(tmp_path.glob("copy*"))
+
+
 # A comparison
 
 

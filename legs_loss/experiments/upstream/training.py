@@ -94,7 +94,8 @@ def copy_checkout(root: Path, copy: Path, edits: Sequence[Edit] = ()) -> None:
     """Copy a codebase to where its trainings may write, and edit texts of the copy.
 
     Raises:
-        LegsError: it is no folder, or is patched already: its baseline would be too; or a text to edit is not there.
+        LegsError: it is no folder, or is patched already: its baseline would be too; or a text to edit is not there, or
+            not in the copy.
     """
     if not root.is_dir():
         raise LegsError(f"there is no folder {root}: give a checkout of the codebase")
@@ -106,21 +107,24 @@ def copy_checkout(root: Path, copy: Path, edits: Sequence[Edit] = ()) -> None:
     shutil.rmtree(str(part), ignore_errors=True)
     shutil.copytree(str(root), str(part), symlinks=True, ignore=_unneeded)
     (part / ".git").mkdir()  # it ends here: what lies above is not looked at
-    for file, text in edited.items():
-        (part / file).write_text(text, encoding="utf-8")
+    for file, content in edited.items():
+        if part.resolve() not in (part / file).resolve().parents:
+            shutil.rmtree(str(part))
+            raise LegsError(f"{root / file}: a link leads the edit of the profile out of the copy: put the file there")
+        (part / file).write_bytes(content)
     os.replace(str(part), str(copy))
 
 
-def _edited(root: Path, edits: Sequence[Edit]) -> Dict[str, str]:
-    """Return the edited texts of files, by the files' names."""
-    texts: Dict[str, str] = {}
+def _edited(root: Path, edits: Sequence[Edit]) -> Dict[str, bytes]:
+    """Return the edited files' contents, by the files' names."""
+    contents: Dict[str, bytes] = {}
     for edit in edits:
         file = root / edit.file
-        text = texts.get(edit.file) or (file.read_text(encoding="utf-8") if file.is_file() else "")
-        if edit.old not in text:
+        content = contents.get(edit.file) or (file.read_bytes() if file.is_file() else b"")
+        if edit.old.encode() not in content:
             raise LegsError(f"{file}: the profile edits {edit.old!r}, which is not there")
-        texts[edit.file] = text.replace(edit.old, edit.new)
-    return texts
+        contents[edit.file] = content.replace(edit.old.encode(), edit.new.encode())
+    return contents
 
 
 def _is_patched(path: Path) -> bool:

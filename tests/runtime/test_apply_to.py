@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import sys
 import textwrap
 
@@ -12,8 +11,8 @@ import torch
 
 import legs_loss
 from legs_loss import LegsError, weight_map
-from legs_loss.runtime import state
 from tests.patcher.test_nerfstudio import FAKE as NERFSTUDIO
+from tests.support import start_run
 
 GSPLAT = {
     "gsplat/__init__.py": "",
@@ -30,11 +29,7 @@ GSPLAT = {
 @pytest.fixture
 def library(tmp_path, monkeypatch):
     """Write a package to a folder on sys.path; everything is forgotten afterwards."""
-    for name in [name for name in os.environ if name.startswith("LEGS_")]:
-        monkeypatch.delenv(name)
-    state.reset()
-    monkeypatch.setattr(sys, "argv", ["train.py"])
-    monkeypatch.chdir(tmp_path)
+    start_run(monkeypatch, tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     before = set(sys.modules)
 

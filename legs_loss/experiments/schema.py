@@ -118,7 +118,18 @@ def _metrics(value: Any) -> bool:
 
 
 def _upstream(value: Any) -> bool:
-    return isinstance(value, dict) and ("pictures" not in value or _of_names(_text)(value["pictures"]))
+    """Return whether what a row, or a comparison's settings, say of a codebase is valid."""
+    row = {"profile": _text, "threshold_factor": _number, "pictures": _of_names(_text)}
+    settings = {
+        "profile": _text,
+        "resolution": _optional(lambda number: type(number) is int),
+        "iterations": _optional(_count),
+        "gaussians": _optional(_count),
+        "extra": _each(_text),
+        "cpu": lambda flag: type(flag) is bool,
+    }
+    whole: Dict[str, Callable[[Any], bool]] = row if "threshold_factor" in value else settings
+    return all(fits(value[name]) for name, fits in whole.items()) and isinstance(value.get("commands", {}), dict)
 
 
 _FIELDS: Dict[str, Callable[[Any], bool]] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import math
 import shlex
 from dataclasses import replace
@@ -226,9 +227,12 @@ def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> str:
         "scene": f"{scene['name']}: {scene['views']} views, sha256 {scene['sha256']}",
         "proof of the baseline": _proof(proof),
     }
-    if "upstream" in settings:
-        shared.update({f"upstream {name}": str(value) for name, value in settings["upstream"].items()})
-    shared.update({name: str(base[name]) for name in base if name not in ("spec", "seed", "max_gaussians")})
+    if "upstream" in settings:  # the other settings are the package's own trainer's
+        own = {**settings["upstream"], "iterations": base["iterations"]}
+        for name, value in own.items():
+            shared[f"upstream {name}"] = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    else:
+        shared.update({name: str(base[name]) for name in base if name not in ("spec", "seed", "max_gaussians")})
     versions = {name: sorted({str(row["versions"].get(name)) for row in rows}) for name in rows[0]["versions"]}
     shared.update(
         {f"version of {name}" if name != "machine" else name: ", ".join(each) for name, each in versions.items()}
@@ -252,12 +256,15 @@ def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[i
     words = ["legs", "compare", settings["scene"]["name"], "--arms", *(arm for arm in arms if arm != BASELINE)]
     if seeds[0] != 0:
         words += ["--first_seed", str(seeds[0])]
-    words += ["--seeds", str(len(seeds)), "-r", str(base["resolution"]), "--iterations", str(base["iterations"])]
+    words += ["--seeds", str(len(seeds))]
+    words += ["--images", settings["images"]] if settings["images"] is not None else []
+    own = settings.get("upstream", base)
+    for flag, name in (("-r", "resolution"), ("--iterations", "iterations")):
+        words += [flag, str(own[name])] if own[name] is not None else []
     if "upstream" in settings:
-        own = settings["upstream"]
         words += ["--upstream", "CHECKOUT", "--profile", own["profile"], *(["--cpu"] if own["cpu"] else [])]
         words += ["--gaussians", str(own["gaussians"])] if own["gaussians"] is not None else []
-        words += ["--extra", " ".join(map(shlex.quote, own["extra"]))] if own["extra"] else []
+        words += ["--extra=" + " ".join(map(shlex.quote, own["extra"]))] if own["extra"] else []
         return " ".join(shlex.quote(word) for word in [*words, "--out", run.name])
     words += ["--densify_grad_threshold", f"{base['densify_grad_threshold']!r}", "--out", run.name]
     return " ".join(shlex.quote(word) for word in words)

@@ -43,7 +43,9 @@ ROW = [
     (["metrics", "views"], {"train": {}}),
     (["metrics", "growth"], [["a", 1]]),
     (["metrics", "history"], [{}]),
-    (["upstream"], {"pictures": {"a.png": 7}}),
+    (["upstream"], {"profile": "3dgs", "threshold_factor": 1.0, "pictures": {"a.png": 7}}),
+    (["upstream"], {"profile": "3dgs", "threshold_factor": "1", "pictures": {}}),
+    (["upstream"], []),
 ]
 
 
@@ -72,6 +74,18 @@ def test_a_row(place, value, compared):
     finally:
         path.write_text(good)
     assert len(read_rows(compared)[1]) == 1
+
+
+@pytest.mark.parametrize("value", [{}, {"profile": "3dgs"}, {"extra": [7]}])
+def test_what_settings_say_of_a_codebase(value, compared):
+    path = compared / "comparison.json"
+    good = path.read_text()
+    path.write_text(json.dumps(dict(json.loads(good), upstream=value)))
+    try:
+        with pytest.raises(LegsError, match=r"comparison.json: this file is damaged \(upstream\)"):
+            read_rows(compared)
+    finally:
+        path.write_text(good)
 
 
 @pytest.mark.parametrize(

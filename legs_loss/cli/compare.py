@@ -166,6 +166,8 @@ def _upstream(args: argparse.Namespace, study: Study) -> int:
         raise LegsError("--upstream needs a SCENE")
     if args.scheduler is not None:
         raise LegsError("--upstream trains here, one run at a time: do not give --scheduler")
+    if args.tensorboard is not None:
+        raise LegsError("--upstream trains by the codebase's own script: do not give --tensorboard")
     if args.densify_grad_threshold is not None:
         raise LegsError("with --upstream give the codebase's own threshold option, by --extra")
     profile = find_profile(args.upstream, args.profile)

@@ -230,21 +230,28 @@ def scene_of(settings: Mapping[str, Any], moved: Optional[Path] = None) -> Scene
 
 
 def read_row(path: Path) -> Row:
-    """Return the row of a ``row.json``.
+    """Return the row of a ``row.json`` that can be trained again.
 
     Raises:
-        LegsError: it is no row.
+        LegsError: it is no row, or a codebase's own script trained it.
     """
     if path.name != "row.json" or not path.is_file():
         raise LegsError(f"{path}: there is no row here: a row is COMPARISON/ARM/seed-N/row.json")
-    return read_json(path, ROW)
+    row = read_json(path, ROW)
+    if "upstream" in row:
+        raise LegsError(
+            f"{path}: a codebase's own script trained this row, and only rows of the package's own trainer are trained "
+            "again from their file: give the comparison's command with another folder (--out), --first_seed "
+            f"{row['seed']} --seeds 1"
+        )
+    return row
 
 
 def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progress], None]) -> Row:
     """Train the row of a ``row.json`` again, from that file only, without saving; return the new row.
 
     Raises:
-        LegsError: it is no row, or its scene is not there.
+        LegsError: as for :func:`read_row`, or its scene is not there.
     """
     row = read_row(path)
     settings = read_json(path.resolve().parents[2] / "comparison.json", SETTINGS)

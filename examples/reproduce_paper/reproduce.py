@@ -78,7 +78,7 @@ def command(args: argparse.Namespace, profile: str, root: Path, dataset: str, na
             words += ["--images", extra[at + 1]]
             del extra[at : at + 2]
     elif profile == "fastergs" and dataset == "mipnerf360":
-        extra = [f"DATASET.IMAGE_SCALE_FACTOR={0.5 if name in INDOOR else 0.25}"]
+        words += ["-r", "2" if name in INDOOR else "4"]
     return words + (["--extra=" + " ".join(map(shlex.quote, extra))] if extra else [])
 
 

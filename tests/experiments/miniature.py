@@ -68,10 +68,11 @@ def training(args):
         points += int((gradient > args.densify_grad_threshold).sum())
         optimizer.step()
         optimizer.zero_grad()
-    cloud = os.path.join(args.model_path, "point_cloud", f"iteration_{args.iterations}", "point_cloud.ply")
-    os.makedirs(os.path.dirname(cloud))
-    with open(cloud, "w") as file:
-        file.write(f"ply\\nformat ascii 1.0\\nelement vertex {points}\\nend_header\\n")
+        if iteration in (7, args.iterations):  # as 3DGS saves at 7000 and at 30000
+            cloud = os.path.join(args.model_path, "point_cloud", f"iteration_{iteration}", "point_cloud.ply")
+            os.makedirs(os.path.dirname(cloud))
+            with open(cloud, "w") as file:
+                file.write(f"ply\\nformat ascii 1.0\\nelement vertex {points}\\nend_header\\n")
     torch.save([picture.detach() for picture in pictures], os.path.join(args.model_path, "pictures.pt"))
 
 

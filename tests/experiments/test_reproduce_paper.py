@@ -30,7 +30,7 @@ def test_each_codebase_and_scene_is_one_comparison(tmp_path: Path) -> None:
     assert "--images" not in find["3dgs", "truck"]
     assert find["fastgs", "truck"].endswith("'--extra=--grad_abs_thresh 0.0008'")
     assert "--images images_4" in find["fastgs", "garden"] and "'--extra=--dense 0.01'" in find["fastgs", "garden"]
-    assert "--extra=DATASET.IMAGE_SCALE_FACTOR=0.25" in find["fastergs", "garden"]
+    assert find["fastergs", "garden"].endswith(" -r 4") and find["fastergs", "room"].endswith(" -r 2")
     assert "-m reproduced/fastergs/truck" in find["fastergs", "truck"]
 
 

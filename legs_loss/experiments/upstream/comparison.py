@@ -9,9 +9,10 @@ OUT/ARM/seed-N/factor-X/          a trial of the control of the number of Gaussi
 
 from __future__ import annotations
 
+import json
 import math
 import os
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
@@ -19,10 +20,11 @@ from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import ArmSpec, needed, parse_arm
 from legs_loss.experiments.running import BASELINE, Row, identity, keep, read_json, versions, write_json
 from legs_loss.experiments.upstream.profile import Profile
-from legs_loss.experiments.upstream.training import Checkout, copy_checkout, train_and_score
+from legs_loss.experiments.upstream.training import Checkout, check_copy, copy_checkout, train_and_score
+from legs_loss.reference.training.checkpoint import alone_in
 from legs_loss.reference.training.dataset import load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
-from legs_loss.scenes import Scene, read_scene
+from legs_loss.scenes import Scene, read_scene, training_size
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_maps
 
@@ -44,7 +46,8 @@ class UpstreamComparison:
         images, resolution, iterations, gaussians, extra, cpu: as for :class:`Checkout`.
 
     Raises:
-        LegsError: the checkout is patched, the scene cannot be read, or the folder holds another comparison.
+        LegsError: the checkout is patched, the scene cannot be read, the profile or the settings cannot be used, or the
+            folder holds another comparison, or one of another checkout.
     """
 
     def __init__(
@@ -71,7 +74,13 @@ class UpstreamComparison:
                 f"{profile.name} starts with the scene's {points:,} points and grows: give more with --gaussians, "
                 f"not {gaussians:,}"
             )
-        base = TrainConfig(spec=BASELINE, iterations=iterations or profile.iterations, resolution=resolution or -1)
+        size = 1 if profile.scales else -1  # the codebase's own, for the mean weights
+        base = TrainConfig(
+            spec=BASELINE,
+            iterations=profile.iterations if iterations is None else iterations,
+            resolution=size if resolution is None else resolution,
+        )
+        training_size(1 << 20, 1 << 20, base.resolution)
         settings = {
             "scene": identity(self.scene),
             "path": str(Path(scene).resolve()),
@@ -80,6 +89,7 @@ class UpstreamComparison:
             "baseline": None,
             "upstream": {
                 "profile": profile.name,
+                "commands": json.loads(json.dumps(asdict(profile))),
                 "resolution": resolution,
                 "iterations": iterations,
                 "gaussians": gaussians,
@@ -88,13 +98,17 @@ class UpstreamComparison:
             },
         }
         self.base = base
-        keep(self.out / "comparison.json", settings, "comparison", tuple(settings), ("path", "baseline"))
-        copy = self.out / "upstream"
-        if not copy.is_dir():
-            copy_checkout(root, copy, profile.edits(Path(scene).resolve()))
+        copy, edits = self.out / "upstream", profile.edits(Path(scene).resolve(), resolution)
         self.checkout: Checkout = Checkout(
             copy.resolve(), profile, Path(scene).resolve(), images, resolution, iterations, gaussians, extra, cpu
         )
+        self.checkout.check()
+        path = self.out / "comparison.json"
+        with alone_in(self.out, make=True):
+            if path.is_file():  # else it is written last: a checkout that cannot be copied leaves none
+                keep(path, settings, "comparison", tuple(settings), ("path", "baseline"))
+            check_copy(root, copy, edits) if copy.is_dir() else copy_checkout(root, copy, edits)
+            keep(path, settings, "comparison", tuple(settings), ("path", "baseline"))
         self._mean_weights: Dict[WeightSpec, float] = {}
 
     def check(self, arms: Sequence[ArmSpec]) -> None:
@@ -127,8 +141,10 @@ class UpstreamComparison:
             for arm in needed([parse_arm(BASELINE), *arms]):
                 row = self.row(arm, seed)
                 if row is None:
-                    row = self._train(arm, seed, tell)
-                    write_json(self._folder(arm, seed) / "row.json", row)
+                    folder = self._folder(arm, seed)
+                    with alone_in(folder, make=True):
+                        row = self.row(arm, seed) or self._train(arm, seed, tell)  # another may have trained it since
+                        write_json(folder / "row.json", row)
                 if arm.name == BASELINE and seed == seeds[0]:
                     self._prove(row)
                 rows.append(row)
@@ -154,7 +170,9 @@ class UpstreamComparison:
         """Record the evidence that the baseline is the codebase's own loss."""
         proof = {name: row["metrics"][name] for name in ("weighted_calls", "plain_calls")}
         path = self.out / "comparison.json"
-        write_json(path, dict(read_json(path, ("scene", "upstream")), baseline=proof))
+        settings = read_json(path, ("scene", "upstream", "baseline"))
+        if settings["baseline"] != proof:
+            write_json(path, dict(settings, baseline=proof))
 
     def _folder(self, arm: ArmSpec, seed: int) -> Path:
         return self.out / arm.folder / f"seed-{seed}"

@@ -4,14 +4,18 @@
 
 3DGS and its forks set their seeds to 0 in their code. Here a multiple of SEED is added to every seed that is set,
 so that runs with the same SEED agree and others differ; 0 keeps the script's own. The report is written at the end.
+It ends when the comparison that started it does, however that was killed.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import random
 import sys
+import threading
 import time
+import zlib
 from pathlib import Path
 from typing import Any, Callable, List
 
@@ -24,8 +28,9 @@ def move_seeds(seed: int) -> None:
     import torch
 
     def moved(function: Callable[..., Any], limit: int) -> Callable[..., Any]:
-        def seeded(value: Any = 0, *args: Any, **kwargs: Any) -> Any:
-            return function((int(value) + seed * STRIDE) % limit, *args, **kwargs)
+        def seeded(*args: Any, **kwargs: Any) -> Any:
+            given = [*args[:1], *(kwargs.pop(name) for name in ("a", "seed") if name in kwargs), None][0]
+            return function((_number(given) + seed * STRIDE) % limit, *args[1:], **kwargs)
 
         return seeded
 
@@ -34,6 +39,7 @@ def move_seeds(seed: int) -> None:
         (random, "seed", 1 << 63),
         (np.random, "seed", 1 << 32),
         (torch, "manual_seed", 1 << 63),
+        (torch.random, "manual_seed", 1 << 63),
         (torch.cuda, "manual_seed", 1 << 63),
         (torch.cuda, "manual_seed_all", 1 << 63),
     ):
@@ -43,10 +49,26 @@ def move_seeds(seed: int) -> None:
             function(0)
 
 
+def _number(given: Any) -> int:
+    """Return a seed as a number: 0 for none, a checksum for what is no number."""
+    try:
+        return 0 if given is None else int(given)
+    except (TypeError, ValueError):
+        return zlib.crc32(repr(given).encode())
+
+
+def _end_with(parent: int) -> None:
+    """End this process once its parent has: at once, since nobody reads what it would still write."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
+
+
 def main(report: str, seed: str, *words: str) -> int:
     """Run the script by `legs run`, and write the report, also after an error."""
     from legs_loss.cli import main as legs
 
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     move_seeds(int(seed))
     started = time.perf_counter(), time.process_time()
     try:

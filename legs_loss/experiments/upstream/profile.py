@@ -43,7 +43,7 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Edit:
-    """A text of a file that is replaced in the copy of the checkout; in a profile {scene} stands in the new one."""
+    """A text of a file that is replaced in the copy of the checkout; in a profile ``new`` has {scene} and {scale}."""
 
     file: str
     old: str
@@ -69,7 +69,8 @@ class Profile:
         renders, truths: by "train" and "test", the folders of the drawn views and of their photographs, as patterns.
         cloud: the .ply of the Gaussians, as a pattern.
         threshold: the options that the control of the number of Gaussians changes, all by one factor.
-        edit: what no option says, for codebases whose scripts read some settings from a file alone.
+        edit: what no option says, for codebases whose scripts read some settings from a file alone. {scene} is filled
+            in, and {scale}: -r as a factor, null for 1. With {scale} there are -r 1, 2, 4 and 8, and 1 is the default.
     """
 
     name: str
@@ -96,9 +97,17 @@ class Profile:
             for name, words in self.text.items()
         )
 
-    def edits(self, scene: Path) -> List[Edit]:
-        """Return the edits for a scene."""
-        return [replace(edit, new=edit.new.replace("{scene}", str(scene))) for edit in self.edit]
+    @property
+    def scales(self) -> bool:
+        """Return whether the size of the photographs is told by an edit."""
+        return any("{scale}" in edit.new for edit in self.edit)
+
+    def edits(self, scene: Path, resolution: Optional[int] = None) -> List[Edit]:
+        """Return the edits for a scene and 3DGS's -r."""
+        scale = "null" if resolution in (None, 1) else repr(1.0 / (resolution or 1))
+        return [
+            replace(edit, new=edit.new.replace("{scale}", scale).replace("{scene}", str(scene))) for edit in self.edit
+        ]
 
 
 def read_profile(path: Path) -> Profile:
@@ -122,7 +131,10 @@ def find_profile(root: Path, asked: Optional[str] = None) -> Profile:
     """
     built_in = {path.stem: path for path in sorted(PROFILES.glob("*.toml"))}
     if asked is not None:
-        return read_profile(built_in.get(asked, Path(asked)))
+        path = built_in.get(asked, Path(asked))
+        if not path.exists():
+            raise LegsError(f"{asked} is no file, nor a built-in profile ({', '.join(built_in)})")
+        return read_profile(path)
     fitting = [profile for profile in map(read_profile, built_in.values()) if profile.fits(root)]
     # A fork of 3DGS has 3DGS's options too: the fork's own profile is more specific.
     fitting = [profile for profile in fitting if profile.name != "3dgs"] or fitting
@@ -151,6 +163,9 @@ def _profile(path: Path, values: Dict[str, Any]) -> Profile:
     missing = [field.name for field in fields(Profile) if field.name not in values and not _has_default(field)]
     if missing:
         raise LegsError(f"{path}: {', '.join(missing)} missing")
+    for name in ("train", "render"):
+        if not values[name]:
+            raise LegsError(f"{path}: {name} must have a command")
     for name in ("renders", "truths"):
         if set(values[name]) != {"train", "test"}:
             raise LegsError(f"{path}: {name} must have train and test")

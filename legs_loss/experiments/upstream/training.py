@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import shutil
 import stat
 import subprocess
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Sequence, Set
+from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence, Set
 
 import numpy as np
 import torch
@@ -23,10 +25,11 @@ from legs_loss.scenes import open_image
 from legs_loss.spec import WeightSpec
 from legs_loss.system import read_regular
 
-__all__ = ["Checkout", "copy_checkout", "gaussians_in", "read_picture", "train_and_score"]
+__all__ = ["Checkout", "check_copy", "copy_checkout", "gaussians_in", "read_picture", "train_and_score"]
 
-# Files that are not copied.
+# Files that are not copied; and what a folder of installed packages has in it, which is not either.
 UNNEEDED = (".git", "__pycache__", "node_modules", "output", "outputs")
+INSTALLED = ("pyvenv.cfg", "conda-meta")
 _LARGEST = 256 << 20  # bytes of a step's report
 
 
@@ -65,8 +68,12 @@ class Checkout:
             ("gaussians", self.gaussians, {}),
         ):
             words = getattr(self.profile, {"iterations": "shorter", "gaussians": "number"}.get(option, option))
+            named = re.findall(rf"(\S+)[ =]\{{{option}\}}", words)[:1]
+            there = [word for word in self.extra if re.split("[ =]", word)[0] in (*named, f"--{option}")]
+            if there:
+                raise LegsError(f"--extra has {there[0]}: give --{option} outside of it, so that the comparison knows")
             if value is not None:
-                if not words:
+                if not words and not (option == "resolution" and self.profile.scales):
                     raise LegsError(f"the profile {self.profile.name} has no option for {option}")
                 commands[-1] += fill(words, {option: value, **more})
         commands[-1] += self.extra
@@ -75,37 +82,59 @@ class Checkout:
                 commands[-1] += fill(threshold.words, {"value": f"{factor * usual:.6g}"})
         return commands
 
+    def drawing(self, output: Path, results: Path) -> List[List[str]]:
+        """Return the commands that draw the views of a run."""
+        places = {"output": output, "results": results, "name": _run_name(output)}
+        return [fill(words, places) for words in self.profile.render]
+
+    def check(self) -> None:
+        """Raise a LegsError, before anything is trained, for what no run of these settings and this profile can do."""
+        if self.profile.scales and self.resolution not in (None, 1, 2, 4, 8):
+            raise LegsError(f"{self.profile.name} divides the photographs' size: give -r 1, 2, 4 or 8")
+        output = self.root / "ARM" / "seed-0" / "output"
+        self.commands(output, 0.5)
+        self.drawing(output, output)
+        for pattern in (*self.profile.renders.values(), *self.profile.truths.values(), self.profile.cloud):
+            _found(output, pattern)
+        if self.profile.results:
+            _found(output, self._pattern(output))
+
     def thresholds(self) -> List[float]:
         """Return the thresholds that the control of the number scales: those in ``extra``, else the codebase's own."""
         return [threshold.given(self.extra) or threshold.value for threshold in self.profile.threshold]
 
     def results(self, output: Path) -> Path:
         """Return the folder of a run: the newest, if its codebase adds the time to its name."""
-        if not self.profile.results:
-            return output
-        pattern = self.profile.results.format(name=_run_name(output))
-        found = sorted(self.root.glob(pattern))
-        if not found:
-            raise LegsError(f"the training left nothing in {self.root / pattern}")
-        return found[-1]
+        return _only(self.root, self._pattern(output)) if self.profile.results else output
+
+    def _pattern(self, output: Path) -> str:
+        return fill(shlex.quote(self.profile.results), {"name": _run_name(output)})[0]
 
 
 def copy_checkout(root: Path, copy: Path, edits: Sequence[Edit] = ()) -> None:
     """Copy a codebase to where its trainings may write, and edit texts of the copy.
 
+    The comparison's own folder, which may lie in the checkout, and environments of Python are left out.
+
     Raises:
         LegsError: it is no folder, or is patched already: its baseline would be too; or a text to edit is not there, or
-            not in the copy.
+            not in the copy; or a file cannot be read.
     """
     if not root.is_dir():
         raise LegsError(f"there is no folder {root}: give a checkout of the codebase")
-    patched = next((path for path in sorted(root.rglob("*.py")) if _is_patched(path)), None)
+    patched = next((path for path in _scripts(root, copy) if _is_patched(path)), None)
     if patched is not None or (root / ".legs-patch.json").exists():
         raise LegsError(f"{patched or root} is patched already, so there is no baseline: legs-patch {root} --undo")
     edited = _edited(root, edits)
     part = copy.with_name(copy.name + ".part")
     shutil.rmtree(str(part), ignore_errors=True)
-    shutil.copytree(str(root), str(part), symlinks=True, ignore=_unneeded)
+    try:
+        shutil.copytree(
+            str(root), str(part), symlinks=True, ignore=lambda folder, names: _unneeded(folder, names, copy)
+        )
+    except shutil.Error as error:
+        source, _, why = error.args[0][0]
+        raise LegsError(f"{source} cannot be copied: {why}") from None
     (part / ".git").mkdir()  # it ends here: what lies above is not looked at
     for file, content in edited.items():
         if part.resolve() not in (part / file).resolve().parents:
@@ -113,6 +142,25 @@ def copy_checkout(root: Path, copy: Path, edits: Sequence[Edit] = ()) -> None:
             raise LegsError(f"{root / file}: a link leads the edit of the profile out of the copy: put the file there")
         (part / file).write_bytes(content)
     os.replace(str(part), str(copy))
+
+
+def check_copy(root: Path, copy: Path, edits: Sequence[Edit] = ()) -> None:
+    """Check that a copy, in which a comparison goes on, is of this checkout as it is now.
+
+    Raises:
+        LegsError: it is of another one.
+    """
+    if not root.is_dir():
+        raise LegsError(f"there is no folder {root}: give the checkout, or its copy, {copy}")
+    edited = {os.path.normpath(edit.file) for edit in edits}
+    for path in _scripts(root, copy):
+        name = str(path.relative_to(root))
+        there = copy / name
+        if path.is_file() and name not in edited and not (there.is_file() and there.read_bytes() == path.read_bytes()):
+            raise LegsError(
+                f"{path}: the comparison was started with another checkout, in which this file differs: choose another "
+                f"folder (--out), or go on with the copy of it: --upstream {copy}"
+            )
 
 
 def _edited(root: Path, edits: Sequence[Edit]) -> Dict[str, bytes]:
@@ -131,11 +179,23 @@ def _is_patched(path: Path) -> bool:
     return path.is_file() and b"import legs_loss" in path.read_bytes()
 
 
-def _unneeded(folder: str, names: List[str]) -> Set[str]:
-    """Return what is not copied of a folder: tool output, and pipes, sockets and devices."""
-    kinds = {name: stat.S_IFMT(os.lstat(os.path.join(folder, name)).st_mode) for name in names}
+def _scripts(root: Path, copy: Path) -> Iterator[Path]:
+    """Yield the Python files of what is copied of a checkout, links too."""
+    for folder, folders, names in os.walk(str(root)):
+        unneeded = _unneeded(folder, folders, copy)
+        folders[:] = sorted(name for name in folders if name not in unneeded)
+        yield from (Path(folder, name) for name in sorted(names) if name.endswith(".py"))
+
+
+def _unneeded(folder: str, names: List[str], copy: Path) -> Set[str]:
+    """Return what is not copied of a folder: tool output, installed packages, pipes, sockets, devices, the copy."""
+    paths = {name: os.path.join(folder, name) for name in names}
+    kinds = {name: stat.S_IFMT(os.lstat(path).st_mode) for name, path in paths.items()}
     odd = {name for name, kind in kinds.items() if kind not in (stat.S_IFREG, stat.S_IFDIR, stat.S_IFLNK)}
-    return odd | set(shutil.ignore_patterns(*UNNEEDED)(folder, names))
+    own = {os.path.realpath(str(path)) for path in (copy.parent, copy, copy.with_name(copy.name + ".part"))}
+    left = {name for name, path in paths.items() if os.path.realpath(path) in own}
+    left |= {name for name, path in paths.items() if any(os.path.exists(os.path.join(path, one)) for one in INSTALLED)}
+    return odd | left | set(shutil.ignore_patterns(*UNNEEDED)(folder, names))
 
 
 def train_and_score(checkout: Checkout, spec: WeightSpec, seed: int, folder: Path, factor: float) -> Dict[str, Any]:
@@ -147,15 +207,17 @@ def train_and_score(checkout: Checkout, spec: WeightSpec, seed: int, folder: Pat
     folder.mkdir(parents=True, exist_ok=True)
     output = folder.resolve() / "output"
     commands = checkout.commands(output, factor)
+    if not (folder / "train.json").is_file():
+        shutil.rmtree(str(output), ignore_errors=True)  # what a killed training left
     report = _once(checkout, "train", commands, spec, seed, folder)
     if spec.unweighted and report["weighted"]:
         raise LegsError(f"{folder}: the baseline was weighted in {report['weighted']} calls: it is not a baseline")
+    if spec.unweighted and not report["plain"]:
+        raise LegsError(f"{folder}: no call of its loss was counted: `legs-patch --check {checkout.root}` says why")
     if not spec.unweighted and not report["weighted"]:
         raise LegsError(f"{folder}: nothing was weighted: `legs-patch --check {checkout.root}` says why")
     results = checkout.results(output)
-    places = {"output": output, "results": results, "name": _run_name(output)}
-    draw = [fill(words, places) for words in checkout.profile.render]
-    _once(checkout, "render", draw, WeightSpec(beta=0.0), 0, folder)
+    _once(checkout, "render", checkout.drawing(output, results), WeightSpec(beta=0.0), 0, folder)
     renders, truths = (
         {split: _only(results, patterns[split]) for split in ("train", "test")}
         for patterns in (checkout.profile.renders, checkout.profile.truths)
@@ -240,10 +302,20 @@ def _tail(log: Path) -> str:
 
 
 def _only(folder: Path, pattern: str) -> Path:
-    found = sorted(folder.glob(pattern))
+    """Return what a pattern finds: the last, if there are several, of iteration_7000 and iteration_30000 the second."""
+    found = _found(folder, pattern)
     if not found:
         raise LegsError(f"the codebase's script left nothing in {folder / pattern}")
-    return found[-1]
+    return max(
+        found, key=lambda path: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", str(path))]
+    )
+
+
+def _found(folder: Path, pattern: str) -> List[Path]:
+    try:
+        return list(folder.glob(pattern))
+    except (ValueError, NotImplementedError, IndexError):
+        raise LegsError(f"{pattern!r} is no pattern of files: see pathlib.Path.glob") from None
 
 
 def _scores(renders: Path, truths: Path, split: str) -> Dict[str, Mapping[str, float]]:

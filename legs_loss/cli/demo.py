@@ -100,13 +100,13 @@ def run(args: argparse.Namespace) -> int:
 def table(metrics: Dict[str, Dict[str, Any]]) -> str:
     """Return the results as text, a line for each method."""
     from legs_loss.experiments.statistics import summarise
-    from legs_loss.experiments.tables import LABELS, markdown, score_cells
+    from legs_loss.experiments.tables import LABELS, markdown, score_cells, with_values
 
     lines = []
     for name, values in metrics.items():
         summary = summarise([{"arm": name, "metrics": values}])
         lines.append([name, *score_cells(summary.mean, summary.spread), f"{values['seconds']:.0f} s"])
-    return markdown(["method", *LABELS, "time"], lines)
+    return markdown(*with_values(["method", *LABELS, "time"], lines))
 
 
 def conclusion(metrics: Dict[str, Dict[str, Any]]) -> str:

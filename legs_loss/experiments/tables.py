@@ -157,7 +157,7 @@ def again_text(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     same = _scores_agree(then, now) and all(
         then["metrics"][name] == now["metrics"][name] for name in ("gaussians", "growth")
     )
-    text = f"{then['arm']}, seed {then['seed']}\n\n{markdown(['', *LABELS], lines)}\n\n"
+    text = f"{then['arm']}, seed {then['seed']}\n\n{markdown(*with_values(['', *LABELS], lines))}\n\n"
     if same:
         return text + "The same to the last digit."
     changed = [name for name, value in now["versions"].items() if then["versions"].get(name) != value]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from legs_loss import LegsError
+from legs_loss.cli.demo import table as demo_table
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.statistics import difference, interval, pooled_difference, summarise, times_gaussians
 from legs_loss.experiments.studies import STUDIES
@@ -131,8 +132,15 @@ def test_tables_by_hand() -> None:
     for split in ("train", "test"):
         older["metrics"][split] = {"psnr": 25.0, "ssim": 0.5}
         older["metrics"]["views"][split] = {view: {"psnr": value, "ssim": 0.5} for view, value in plain.items()}
-    cells = [cell.strip() for cell in scores_table([older], ["eggs"]).splitlines()[-1].split("|")]
-    assert cells[2:8] == ["25.00", "0.5000", "25.00", "0.5000", "–", "–"]
+    heads, _, cells = (re.split(r" *\| *", line) for line in scores_table([older], ["eggs"]).splitlines())
+    shown = dict(zip(heads, cells))
+    assert [shown[f"{split} {score}"] for split in ("train", "held-out") for score in ("PSNR", "SSIM")] == [
+        "25.00",
+        "0.5000",
+        "25.00",
+        "0.5000",
+    ]
+    assert (shown["strongest 10%"], shown["the rest"]) == ("–", "–")
     assert difference([*rows, older], "eggs", "3dgs", "test", "psnr_strong") is None
     newer = row_of("eggs", 0, plain)
     for row in (older, newer):
@@ -140,7 +148,9 @@ def test_tables_by_hand() -> None:
     newer["metrics"]["views"]["train"] = older["metrics"]["views"]["train"]
     for scores in newer["metrics"]["views"]["test"].values():
         scores["ssim"] = 0.5
-    assert again_text(older, newer).endswith("The same to the last digit.")  # of the metrics that both have
+    again = again_text(older, newer)
+    assert again.endswith("The same to the last digit.")  # of the metrics that both have
+    assert "strongest 10%" in again and "LPIPS" not in again + demo_table({"eggs": dict(newer["metrics"], seconds=1.0)})
     differences = differences_table(rows, STUDIES["main"])
     # Only over the seeds that both have.
     assert times_gaussians([*rows, row_of("3dgs", 2, plain, 900)], "legs", "3dgs") == 2.5

@@ -43,6 +43,11 @@ def expected(texts):
     return marks
 
 
+def without_marks(text):
+    """Return a file's text without the comments that say what must become of a line."""
+    return "".join(line for line in text.splitlines(True) if not _MARK.match(line))
+
+
 def checkout(folder, texts, git=False):
     """Write a codebase to a folder, on request as a git checkout, and return the folder."""
     for path, text in texts.items():

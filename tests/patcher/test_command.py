@@ -9,7 +9,7 @@ import subprocess
 import pytest
 from legs_adapters.cli import main
 
-from tests.patcher.support import PATCHED, SITE, checkout, files, legs_patch, snapshot
+from tests.patcher.support import PATCHED, SITE, checkout, files, legs_patch, snapshot, without_marks
 from tests.support import ROOT
 
 
@@ -56,6 +56,16 @@ class TestCommandLine:
         assert undone.returncode == 0
         assert "restored train.py" in undone.stdout
         assert snapshot(root) == before
+
+    def test_the_documents_show_the_real_diff_and_report(self, tmp_path, run):
+        texts = {path: without_marks(text) for path, text in files("runnable_train_script_weighted").items()}
+        texts["train.py"] = texts["train.py"].partition("\n")[2]  # the line that says whose script it is
+        root = checkout(tmp_path / "my_gs", texts)
+        page = (ROOT / "docs" / "patching.md").read_text(encoding="utf-8")
+        diff = "\n".join(line.rstrip() for line in run("--diff", root).stdout.splitlines())
+        assert f"$ legs-patch --diff my_gs\n{diff}\n```" in page
+        report = run("--check", root).stdout.partition("would change")[0]
+        assert f"$ legs-patch my_gs\n{report}" in page
 
     def test_the_settings_reach_the_run(self, tmp_path, run):
         root = checkout(tmp_path, files("inria"))

@@ -107,7 +107,8 @@ def test_every_module_of_the_core_has_its_floor() -> None:
 
 @pytest.mark.parametrize("folder", sorted({path.parent for path in CORE.rglob("*.py")}), ids=lambda path: path.name)
 def test_a_folder_of_the_core_has_about_a_dozen_modules(folder: Path) -> None:
-    assert len([path for path in folder.glob("*.py") if not path.name.startswith("_")]) <= 13
+    most = 20 if folder.name == "cli" else 13  # a file a command, read by itself
+    assert len([path for path in folder.glob("*.py") if not path.name.startswith("_")]) <= most
 
 
 def is_own(module: str) -> bool:

@@ -184,9 +184,11 @@ class TestOthers:
         network = lpips._network(lambda power, scale=1: Distance(power, scale))(2, scale=3)
         assert network(torch.ones(2, 3, 4, 4), torch.zeros(2, 3, 4, 4)).tolist() == [3, 3]
 
-    def test_every_shim_can_be_built_under_its_name(self):
+    def test_every_shim_can_be_built_under_its_name_and_is_documented(self):
+        page = (ROOT / "docs" / "cpu.md").read_text(encoding="utf-8")
         for name, shim in table_for().items():
             assert build(name, shim).__name__ == name
+            assert f"`{name}" in page
         for name in finder.AMENDED.values():
             assert importlib.import_module(f"legs_adapters.shims.modules.{name}").amend
 

@@ -107,8 +107,7 @@ def test_every_module_of_the_core_has_its_floor() -> None:
 
 @pytest.mark.parametrize("folder", sorted({path.parent for path in CORE.rglob("*.py")}), ids=lambda path: path.name)
 def test_a_folder_of_the_core_has_about_a_dozen_modules(folder: Path) -> None:
-    most = 20 if folder.name == "cli" else 13  # a file a command, read by itself
-    assert len([path for path in folder.glob("*.py") if not path.name.startswith("_")]) <= most
+    assert len([path for path in folder.glob("*.py") if not path.name.startswith("_")]) <= 13
 
 
 def is_own(module: str) -> bool:

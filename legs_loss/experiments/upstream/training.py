@@ -302,7 +302,7 @@ def _tail(log: Path) -> str:
 
 
 def _only(folder: Path, pattern: str) -> Path:
-    """Return what a pattern finds: the last, if there are several, of iteration_7000 and iteration_30000 the second."""
+    """Return the last path that a pattern finds, by the numbers in it: iteration_30000 after iteration_7000."""
     found = _found(folder, pattern)
     if not found:
         raise LegsError(f"the codebase's script left nothing in {folder / pattern}")

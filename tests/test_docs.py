@@ -38,6 +38,12 @@ def test_a_path_of_the_project_that_a_page_names_is_there(page: Path) -> None:
     assert [path for path in sorted(named) if not any(ROOT.glob(path.rstrip("/")))] == []
 
 
+def test_readme_fits_a_screen_or_two() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.split()) <= 700
+    assert (text.count("!["), len(re.findall(r"^\| --- ", text, re.M))) == (1, 1)  # one picture, one table
+
+
 def test_the_map_has_every_folder_of_the_core_and_of_the_adapters() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     packages = [*(ROOT / "legs_loss").iterdir(), *(ROOT / "adapters/legs_adapters").iterdir()]

@@ -81,7 +81,7 @@ def test_readme_with_an_address_shows_its_pictures(tree, tmp_path):
     head, readme = metadata(copy, tmp_path / "out")
     tag = f"v{legs_loss.__version__}"
     pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", readme)
-    assert len(pictures) >= 2
+    assert pictures
     for address in pictures:
         start = f"https://example.org/legs/legs-loss/raw/{tag}/"
         assert address.startswith(start)

@@ -1,20 +1,19 @@
 """The operations on a GPU: the loss and its gradient in one pass, differentiable, without waiting for the device.
 
-The loss is a scalar, so its gradient is known as soon as the images are: the forward pass computes both, and backward
-multiplies by the incoming gradient, which the kernel reads on the device (and changes nothing where it is 1).
+Backward multiplies by the incoming gradient, which the kernel reads on the device (and changes nothing where it is 1).
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Optional, Tuple
+from typing import Any, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from legs_loss.kernels.contract import Weights
 from legs_loss.kernels.cuda.launch import THREADS, Task, addressable, chunks_of, strip_of, variant_of
 from legs_loss.kernels.cuda.modules import Modules
+from legs_loss.kernels.differentiable import differentiable
 from legs_loss.spec import WeightSpec
 
 __all__ = ["Shares", "fused_loss", "response_range"]
@@ -37,8 +36,19 @@ def fused_loss(modules: Modules, prediction: Tensor, target: Tensor, weights: We
         prediction, target = prediction.float(), target.float()
     if prediction.dim() == 3:
         prediction, target = prediction.unsqueeze(0), target.unsqueeze(0)
-    wanted = prediction.requires_grad and torch.is_grad_enabled()
-    return _FusedLoss.apply(prediction, target.detach(), modules, weights, shares, wanted)
+    settings = weights._replace(map=None, mask=None, range=None)
+
+    def compute(wanted: bool, image: Tensor, constants: Sequence[Optional[Tensor]]) -> Tuple[Tensor, Optional[Tensor]]:
+        images, map_, mask, found = constants
+        assert images is not None
+        given = settings._replace(map=map_, mask=mask, range=found)
+        return _loss_and_gradient(modules, image, images.detach(), given, shares, wanted)
+
+    def scale(gradient: Tensor, step: Tensor) -> Tensor:
+        return _scaled(modules, gradient, step, dtype)
+
+    dtype = prediction.dtype
+    return differentiable(prediction, (target, weights.map, weights.mask, weights.range), compute, scale)
 
 
 def response_range(modules: Modules, target: Tensor, spec: WeightSpec) -> Tensor:
@@ -60,43 +70,9 @@ def response_range(modules: Modules, target: Tensor, spec: WeightSpec) -> Tensor
     return result
 
 
-class _Inputs(NamedTuple):
-    modules: Modules
-    prediction: Tensor
-    target: Tensor
-    weights: Weights
-    shares: Shares
-
-
-class _FusedLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, prediction: Tensor, target: Tensor, modules: Modules, weights: Weights, shares: Shares, wanted: bool
-    ) -> Tensor:
-        ctx.inputs = _Inputs(modules, prediction.detach(), target, weights, shares)
-        loss, ctx.gradient = _loss_and_gradient(ctx.inputs, wanted)
-        return loss
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_output: Tensor) -> Tuple[Optional[Tensor], ...]:
-        # The gradient is passed on, not copied; a second backward of a retained graph recomputes it.
-        gradient, ctx.gradient = ctx.gradient, None
-        if gradient is None:
-            gradient = _loss_and_gradient(ctx.inputs, True)[1]
-            assert gradient is not None
-        return (
-            _scaled(ctx.inputs.modules, gradient, grad_output, ctx.inputs.prediction.dtype),
-            None,
-            None,
-            None,
-            None,
-            None,
-        )
-
-
-def _loss_and_gradient(inputs: _Inputs, wanted: bool) -> Tuple[Tensor, Optional[Tensor]]:
-    modules, prediction, target, weights, shares = inputs
+def _loss_and_gradient(
+    modules: Modules, prediction: Tensor, target: Tensor, weights: Weights, shares: Shares, wanted: bool
+) -> Tuple[Tensor, Optional[Tensor]]:
     x, y = addressable(prediction), addressable(target)
     device, spec = x.device, weights.spec if shares.l1 else None
     term = "l1" if shares.ssim == 0.0 else ("loss" if shares.l1 else "ssim")

@@ -1,0 +1,63 @@
+"""A loss whose gradient is known as soon as its value is, as one node of autograd's graph.
+
+The loss is a scalar, so its gradient needs nothing of what comes after it but a factor: a backend computes both in
+one pass over the images, and backward only scales.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Callable, Optional, Sequence, Tuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+__all__ = ["Compute", "Scale", "differentiable"]
+
+# Whether the gradient is wanted, the prediction and the constants -> the loss, and the gradient or None.
+Compute = Callable[[bool, Tensor, Sequence[Optional[Tensor]]], Tuple[Tensor, Optional[Tensor]]]
+# The gradient, which may be overwritten, and the factor that arrives in backward -> their product.
+Scale = Callable[[Tensor, Tensor], Tensor]
+
+
+def differentiable(prediction: Tensor, constants: Sequence[Optional[Tensor]], compute: Compute, scale: Scale) -> Tensor:
+    """Return a loss, differentiable once in the prediction.
+
+    The first backward uses the gradient of the forward pass. A second one of a retained graph computes it anew, from
+    tensors that autograd has saved: as everywhere in torch it raises a RuntimeError where one of them was changed in
+    place meanwhile, or where the graph was not retained.
+
+    Args:
+        prediction: what the loss is differentiated in.
+        constants: every other tensor that it depends on; None stands for one that is absent.
+        compute: makes the loss and its gradient from them, detached.
+        scale: applies the factor that arrives in backward.
+    """
+    wanted = prediction.requires_grad and torch.is_grad_enabled()
+    return _FusedLoss.apply(prediction, wanted, compute, scale, *constants)
+
+
+class _FusedLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, prediction: Tensor, wanted: bool, compute: Compute, scale: Scale, *constants: Optional[Tensor]
+    ) -> Tensor:
+        loss, gradient = compute(wanted, prediction.detach(), constants)
+        if wanted:
+            ctx.compute, ctx.scale, ctx.gradient = compute, scale, gradient
+            ctx.save_for_backward(prediction, *map(_counted, constants))
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_output: Tensor) -> Tuple[Optional[Tensor], ...]:
+        gradient, ctx.gradient = ctx.gradient, None  # it is passed on, not copied
+        if gradient is None:
+            prediction, *constants = ctx.saved_tensors
+            gradient = ctx.compute(True, prediction.detach(), constants)[1]
+        return (ctx.scale(gradient, grad_output), *[None] * (len(ctx.needs_input_grad) - 1))
+
+
+def _counted(constant: Optional[Tensor]) -> Optional[Tensor]:
+    """Return a tensor whose changes autograd can count: of one that was made in inference mode, a copy."""
+    return constant.clone() if constant is not None and constant.is_inference() else constant

@@ -35,8 +35,8 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.viewer.server import serve
 
     content = find_content(args.path, args.scene)
-    server = serve(content, args.preset, args.host, args.port)
-    say(f"{', '.join(content.methods)}: http://{args.host}:{server.get_port()} (Ctrl-C ends)")
+    server, address = serve(content, args.preset, args.host, args.port)
+    say(f"{', '.join(content.methods)}: {address} (Ctrl-C ends)")
     try:
         while True:
             time.sleep(1)

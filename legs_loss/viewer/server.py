@@ -12,6 +12,7 @@ from legs_loss.reference.ply import read_ply
 from legs_loss.scenes import View, image_tensor, load_training_image
 from legs_loss.spec import as_spec
 from legs_loss.viewer.content import Content
+from legs_loss.viewer.guard import Guard, check_address
 from legs_loss.viewer.splats import Splats, left_of, splats
 
 __all__ = ["serve"]
@@ -21,8 +22,8 @@ _PICTURE = 160  # pixels: the width of a camera's picture
 _WIPE_SECONDS = 0.15
 
 
-def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port: int = 8080) -> Any:
-    """Start the server and return it; it runs in threads of its own until it is stopped.
+def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port: int = 8080) -> Tuple[Any, str]:
+    """Start the server; return it and the address to open. It runs in threads of its own until it is stopped.
 
     Args:
         content: from :func:`~legs_loss.viewer.content.find_content`.
@@ -30,22 +31,41 @@ def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port:
         host, port: where it listens; the next free port is taken if this one is in use.
 
     Raises:
-        LegsError: viser is missing, or a .ply cannot be read.
+        LegsError: viser is missing, a .ply cannot be read, or the address is none of this machine's.
     """
-    try:
-        import viser
-    except ImportError:
-        raise LegsError("legs view needs viser: pip install 'legs-loss[view]'") from None
+    check_address(host, port)
     loaded = {name: splats(read_ply(path)) for name, path in content.methods.items()}
-    server = viser.ViserServer(host=host, port=port, verbose=False)
-    server.gui.configure_theme(control_layout="collapsible", dark_mode=False)
+    server, address = _start(host, port)
+    server.gui.configure_theme(control_layout="collapsible", dark_mode=False, show_share_button=False)
     server.gui.add_markdown(f"### {content.title}")
     _Methods(server, loaded)
     if content.scene is not None:
         _Cameras(server, content, preset)
     else:
         _look_at_all(server, loaded)
-    return server
+    return server, address
+
+
+def _start(host: str, port: int) -> Tuple[Any, str]:
+    """Start an empty server that answers the address returned and nothing else."""
+    try:
+        import viser
+    except ImportError:
+        raise LegsError("legs view needs viser: pip install 'legs-loss[view]'") from None
+
+    class Unshared(viser.ViserServer):  # type: ignore[misc]
+        """viser without its public tunnel, for which any client may ask."""
+
+        def request_share_url(self, verbose: bool = True) -> None:
+            """Share nothing."""
+
+    guard = Guard(host)
+    with guard.before_every_handshake():
+        server = Unshared(host=host, port=port, verbose=False)
+    if not guard.on:
+        server.stop()
+        raise LegsError(f"viser {viser.__version__} would answer requests of any page: pip install 'legs-loss[view]'")
+    return server, guard.address(server.get_port())
 
 
 class _Methods:

@@ -137,9 +137,9 @@ class TestBrowser:
     def test_cameras_show_photographs_and_weight_maps(self, page, runs, tiny_scene):
         from legs_loss.viewer.server import serve
 
-        server = serve(find_content(runs / "red", tiny_scene), port=free_port())
+        server, address = serve(find_content(runs / "red", tiny_scene), port=free_port())
         try:
-            page.goto(f"http://127.0.0.1:{server.get_port()}")
+            page.goto(address)
             page.wait_for_selector("text=red: 400 Gaussians", timeout=60_000)
             shots = [self.shot(page)]
             for what in ("photograph", "weight map"):
@@ -157,9 +157,9 @@ class TestBrowser:
     def test_methods_are_drawn_toggled_and_wiped(self, page, runs):
         from legs_loss.viewer.server import serve
 
-        server = serve(find_content(runs), port=free_port())
+        server, address = serve(find_content(runs), port=free_port())
         try:
-            page.goto(f"http://127.0.0.1:{server.get_port()}")
+            page.goto(address)
             page.wait_for_selector("text=green: 400 Gaussians", timeout=60_000)
             self.until(page, lambda: self.shares(page)[1] > 0.1 and self.shares(page)[0] < 0.02)
             page.get_by_text("red: 400 Gaussians").click()

@@ -4,7 +4,7 @@
     python -m benchmarks.corpus CHECKOUTS plans.json            # after it: plan, and print what differs
     python -m benchmarks.corpus CHECKOUTS plans.json --sites    # only what is edited counts, no word of a report
 
-A plan is the report of `legs-patch --check --json`: call sites with view and layout, what was left and why, problems.
+A plan is the report of `legs-patch --check --json`: call sites, what was left and why, problems.
 Nothing is written to a checkout. Each is planned in a process of its own, which is killed at the limit.
 Exit codes: 0 nothing differs, or saved; 1 a plan differs; 2 bad usage.
 """
@@ -158,7 +158,7 @@ def changes(key: str, old: Any, new: Any) -> None:
 
 
 def edits(found: Plan) -> Plan:
-    """Return a plan's edits: call sites with view and layout, the lines of problems, the exit code."""
+    """Return a plan's edits: call sites, the lines of problems, the exit code."""
 
     def places(key: str, *names: str) -> List[List[Any]]:
         return sorted(([entry.get(name) for name in names] for entry in found.get(key, [])), key=str)
@@ -166,7 +166,7 @@ def edits(found: Plan) -> Plan:
     return {
         "exit": found.get("exit"),
         "error": found.get("error"),
-        "sites": places("sites", "file", "line", "column", "view", "channels_last"),
+        "sites": places("sites", "file", "line", "column", "channels_last"),
         "problems": places("problems", "file", "line"),
     }
 

@@ -1,7 +1,7 @@
 """Turn sites into edits of spans of text. Text outside of the spans is not changed, not even a space.
 
     Ll1 = l1_loss(image, gt_image)
-    Ll1 = legs_loss.l1_loss(image, gt_image, view=viewpoint_cam.image_name)
+    Ll1 = legs_loss.l1_loss(image, gt_image)
 
     loss += photometric(image, other_image.detach(), opt)
     loss += legs_loss.unweighted(photometric)(image, other_image.detach(), opt)
@@ -81,7 +81,7 @@ def _site_edits(text: Text, site: Site, package: str) -> List[Edit]:
     """Return the edits of one site, and of the reads of its error map that keep the plain one."""
     form = site.form.moved(on_one_line(site.form.selection))
     where = f"{site.path}:{site.line}"
-    writing = Writing(package, site.swapped, on_one_line(site.selection), site.channels_last, site.view.text, where)
+    writing = Writing(package, site.swapped, on_one_line(site.selection), site.channels_last, where)
     plain = on_one_line(text.of(form.node, True)) if site.aside else ""
     return [*form.edits(text, writing), *(text.replace(*text.span(read, True), plain) for read in site.aside)]
 

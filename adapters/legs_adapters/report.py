@@ -23,7 +23,7 @@ def as_table(plan: Plan) -> str:
     rows: List[Tuple[str, int, str, str]] = []
     found = plan.findings
     for site in found.sites:
-        rows.append((site.path, site.line, "patched", site.form.said(site.view)))
+        rows.append((site.path, site.line, "patched", site.why))
     for kept, site in found.kept.items():
         why = f"{kept.reason}: {kept.function} is weighted at {site.path}:{site.line}, in this call it is not"
         rows.append((kept.path, kept.line, "plain", why))
@@ -61,8 +61,6 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
                 "column": site.column,
                 "function": site.function,
                 "code": one_line(site.form.node),
-                "view": site.view.text,
-                "view_reason": site.view.reason,
                 "channels_last": site.channels_last,
                 **({} if site.form.weighs else {"term": "ssim"}),
             }

@@ -85,7 +85,7 @@ def test_a_change_of_one_checkout_is_named(trees: Path, tmp_path: Path) -> None:
 
 
 def test_words_count_only_without_sites(trees: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    site = {"file": "train.py", "line": 9, "column": 15, "view": None, "channels_last": False}
+    site = {"file": "train.py", "line": 9, "column": 15, "channels_last": False}
     old = {"a": {"exit": 1, "sites": [site], "left": [{"file": "b.py", "line": 3, "why": "depth"}], "problems": []}}
     new = {"a": {**old["a"], "left": [{"file": "b.py", "line": 3, "why": "evaluation"}]}, "b": {"exit": 2}}
     assert corpus.compare(old, {"a": new["a"]}, sites=True) == 0

@@ -40,10 +40,7 @@ class TestCommandLine:
 
         done = legs_patch(root, "--preset", "legs-l", "--beta", "4")
         assert done.returncode == 0, done.stderr
-        assert (
-            "patched               view=viewpoint_cam.image_name: viewpoint_cam.original_image, untouched\n"
-            in done.stdout
-        )
+        assert "patched               gt_image is the photograph\n" in done.stdout
         assert "legs-patch --undo" in done.stdout
         assert 'preset = "legs-l"' in (root / "legs.toml").read_text()
         assert "\nbeta = 4.0" in (root / "legs.toml").read_text()
@@ -101,7 +98,7 @@ class TestCommandLine:
         assert run("--diff", "--partial", root).returncode == 1
         partial = run("--partial", root)
         assert partial.returncode == 1
-        assert "legs_loss.l1_loss(image, cam.original_image, view=cam.image_name)" in (root / "train.py").read_text()
+        assert "legs_loss.l1_loss(image, cam.original_image)" in (root / "train.py").read_text()
         assert "l1_loss(image_a, image_b)" in (root / "train.py").read_text()
 
     def test_partial_does_not_call_a_tree_patched_of_which_nothing_could_be_decided(self, tmp_path, run):
@@ -191,7 +188,7 @@ class TestCommandLine:
         done = run("--site", f"train.py:{line}", root)
         assert done.returncode == 0, done.stderr
         text = (root / "train.py").read_text()
-        assert "loss1 = legs_loss.l1_loss(image, gt_image, view=cam.image_name, own=loss_func)\n" in text
+        assert "loss1 = legs_loss.l1_loss(image, gt_image, own=loss_func)\n" in text
         assert text.count("own=") == 1
         assert run("--undo", root).returncode == 0
         assert snapshot(root) == before

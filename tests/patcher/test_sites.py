@@ -94,7 +94,7 @@ def test_a_value_with_very_many_ways_to_come_about_is_followed_once(tmp_path):
     before, line, after = texts["train.py"].partition("        gt_image = viewpoint_cam.original_image.cuda()\n")
     texts["train.py"] = before + branches + line + after
     found = plan(checkout(tmp_path, texts))
-    assert [site.view.text for site in found.findings.sites] == ["viewpoint_cam.image_name"]
+    assert [site.why for site in found.findings.sites] == ["gt_image is the photograph"]
 
 
 def test_functions_that_call_each_other_are_each_looked_into_once(tmp_path, monkeypatch):

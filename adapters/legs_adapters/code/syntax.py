@@ -13,7 +13,6 @@ import libcst as cst
 __all__ = [
     "arguments",
     "attribute_chain",
-    "brief",
     "call_name",
     "children",
     "code",
@@ -50,12 +49,6 @@ def code(node: cst.CSTNode) -> str:
 def one_line(node: cst.CSTNode) -> str:
     """Return a node's source text on one line."""
     return " ".join(code(node).split())
-
-
-def brief(node: cst.CSTNode) -> str:
-    """Return a node's source text on one line, cut at 60 characters: for a message."""
-    text = one_line(node)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def dotted(node: cst.CSTNode) -> Optional[str]:

@@ -1,1 +1,1 @@
-"""The field's words: what an expression depicts, whether it was rendered, and which view it belongs to."""
+"""The field's words: what an expression depicts, and whether it was rendered."""

@@ -84,15 +84,11 @@ OF_PHOTOGRAPHS = (
     | HELD_IN
     | word_set("blur blurred blurry sharp hdr ldr nir infrared raw patch crop face head hand hands lips")
 )
-STORED_IMAGES = word_set("original_image image gt_image rgb original_rgb img image_tensor")  # attributes of cameras
 PICKING = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
 MASKED = word_set("mask masked")  # of a function that takes a mask beside two pictures
 STATISTICS = word_set("histc histogram bincount entropy gram moments")  # of a picture, no picture
 MATCHED = word_set("match matching matched equalize equalized")  # histogram_matching(image, photo) is a picture
 LOADING = word_set("load read get open fetch")
-RESIZING = word_set("interpolate resize downsample avg")
-SHIFTING = word_set("offset shift shifted warp translate roll")
-NO_PHOTOGRAPHS = WARPED | word_set("virtual pseudo fake")  # what cameras without a photograph are called
 OF_DIFFUSION = word_set("guidance_scale negative_prompt num_inference_steps strength")  # arguments where it paints
 PERCEPTUAL = word_set("vgg perceptual lpips gram")
 

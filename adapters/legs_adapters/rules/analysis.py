@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Iterable, Mapping, Optional, Pattern
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
 from legs_adapters.lexicon.depiction import Meanings
-from legs_adapters.lexicon.views import Views
 from legs_adapters.rules.purpose import Purposes
 from legs_adapters.rules.splats import Splats
 from legs_adapters.tensors.backward import Training
@@ -35,7 +34,6 @@ class Analysis:
         prospects: which text can lead to an L1.
         training: what its backward passes depend on.
         meanings: what its expressions depict.
-        views: whose images its targets are.
         forms: its L1 expressions.
         purposes: the purposes of its backward passes.
         splats: which of its functions are about Gaussian splatting.
@@ -47,7 +45,6 @@ class Analysis:
         self.prospects: Prospects = Prospects(texts, speaks) if speaks is not None else Prospects(texts)
         self.training: Training = Training(self.program, self.prospects.of)
         self.meanings: Meanings = Meanings(self.program, self.training)
-        self.views: Views = Views(self.program)
         self.forms: Forms = Forms(L1Functions(self.program, self.prospects))
         self.purposes: Purposes = Purposes(self.program, self.training)
         self.splats: Splats = Splats(self.program, self.training)

@@ -9,7 +9,6 @@ from typing import Iterator, List, Sequence, Set, Tuple, Union
 
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
-from legs_adapters.lexicon.views import View
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import SSIM, first
 from legs_adapters.rules.rule import Term
@@ -79,9 +78,9 @@ class _Finder:
             references = self.analysis.program.resolve(function, form.call.func)
             self.left.append((Left.at(function, place, evidence), {r.target for r in references}))
         elif self._is_free(function, place):
-            view = View(None, self.analysis.ssims.proof(function, form).reason)
+            why = self.analysis.ssims.proof(function, form).reason
             stands = (function.module.path, place.line, place.column, place.last_line)
-            self.sites.append(Site(*stands, form, False, "", False, view, function))
+            self.sites.append(Site(*stands, form, False, "", False, why, function))
         else:
             self.left.append((Left.at(function, place, "not chosen"), set()))
 

@@ -12,7 +12,6 @@ from legs_adapters.code.parsing import Place
 from legs_adapters.code.syntax import arguments, code, one_line, same, walk_expressions
 from legs_adapters.lexicon.masks import is_rows, picked_from
 from legs_adapters.lexicon.meaning import swapped
-from legs_adapters.lexicon.views import View
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import AMBIGUOUS, DEFINITION, HUBER, ORDER, RULES, UNREAD, first, first_of_call
 from legs_adapters.rules.rule import CallOfTerm, Term
@@ -91,10 +90,10 @@ class Verdicts:
             return self.problem(function, form, place, f"{one_line(form.node)} has other uses than the loss", flipped)
         last = self._is_channels_last(function, prediction, target, form.node)
         last = last or (picked is not None and lies_last(function, picked[0]))
-        view = self.analysis.views.of(function, target, form.call)
         stands = (function.module.path, place.line, place.column, place.last_line)
         kept = tuple(self._kept(function, use, other.reason) for use, other in others)
-        return Site(*stands, form, flipped, pair.selection + form.selection, last, view, function, aside, kept)
+        selection, why = pair.selection + form.selection, self._why(function, target)
+        return Site(*stands, form, flipped, selection, last, why, function, aside, kept)
 
     def of_any(self, function: Function, form: Form, place: Place) -> Left | Problem:
         """Return the verdict on a call whose function is chosen by settings: a problem, unless a rule applies."""
@@ -122,10 +121,10 @@ class Verdicts:
 
     @staticmethod
     def callable(function: Function, form: Form) -> Site:
-        """Return a callback as a site: the view of its call is not known."""
+        """Return a callback as a site."""
         place = function.place(form.node)
         stands = (function.module.path, place.line, place.column, place.line)
-        return Site(*stands, form, False, "", False, View(None, "a callable has no view"), function)
+        return Site(*stands, form, False, "", False, "passed by name", function)
 
     @staticmethod
     def _kept(function: Function, use: Use, purpose: str) -> Kept:
@@ -161,6 +160,13 @@ class Verdicts:
             for other in (target, *others)
         )
         return any(lie)
+
+    def _why(self, function: Function, target: cst.BaseExpression) -> str:
+        """Return what shows that a side is the photograph."""
+        name = one_line(target)
+        if self.analysis.meanings.origin(function, target).role == "target":
+            return f"{name} is the photograph"
+        return f"{name} is a parameter" if function.is_parameter(target) else f"{name} is the photograph by its name"
 
     def problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
         """Return a form as a problem, with the advice for the manual edit."""

@@ -10,7 +10,6 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Unreadable
-from legs_adapters.lexicon.views import View
 from legs_adapters.terms.form import Form
 
 __all__ = ["Decider", "Evidence", "Findings", "Kept", "Left", "Line", "Problem", "Site"]
@@ -49,7 +48,7 @@ class Site(NamedTuple):
         selection: the index by a mask that both arguments carry, as written with its brackets, and the one that a named
             difference of them is taken with; empty without.
         channels_last: the images are [H, W, C].
-        view: the verdict on ``view=``.
+        why: what is known of it, in words.
         scope: the function that it stands in.
         aside: other reads of the same error map, which keep the plain map.
         kept: calls of that function that are not the loss.
@@ -63,7 +62,7 @@ class Site(NamedTuple):
     swapped: bool
     selection: str
     channels_last: bool
-    view: View
+    why: str
     scope: Function
     aside: Tuple[cst.Name, ...] = ()
     kept: Tuple[Kept, ...] = ()

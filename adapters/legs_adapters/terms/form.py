@@ -10,7 +10,6 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import one_line
 from legs_adapters.lexicon.masks import without_rows
-from legs_adapters.lexicon.views import View
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text
 from legs_adapters.terms.writing import Writing
@@ -86,10 +85,6 @@ class Form:
             LegsError: the term has to be weighted by hand.
         """
         raise NotImplementedError(type(self).__name__)
-
-    def said(self, view: View) -> str:
-        """Return the report's text for the edited term."""
-        return f"view={view.text}: {view.reason}" if view.text else f"no view=: {view.reason}"
 
     def advice(self, writing: Writing, rows: bool) -> str:
         """Return the advice for a manual edit; ``rows`` where the images are lists of pixels."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Optional, Sequence, Tuple, TypeVar
+from typing import NamedTuple, Sequence, Tuple, TypeVar
 
 import libcst as cst
 
@@ -24,7 +24,6 @@ class Writing(NamedTuple):
         swapped: whether the target is the first of the two sides.
         selection: the index by a mask that both images carry, with its brackets; empty without.
         channels_last: whether the images are [H, W, C].
-        view: the expression that names the view, if one does.
         where: the file and line, for errors.
     """
 
@@ -32,7 +31,6 @@ class Writing(NamedTuple):
     swapped: bool = False
     selection: str = ""
     channels_last: bool = False
-    view: Optional[str] = None
     where: str = ""
 
     def ordered(self, first: _Side, second: _Side) -> Tuple[_Side, _Side]:
@@ -50,8 +48,7 @@ class Writing(NamedTuple):
             as_map: whether the unreduced map is asked for.
             own: the codebase's own L1, where it is more than a mean.
         """
-        parts = [] if self.view is None else [f"view={self.view}"]
-        parts += ["channels_last=True"] if self.channels_last else []
+        parts = ["channels_last=True"] if self.channels_last else []
         parts += ['reduction="none"'] if as_map else []
         parts += [f"own={own}"] if own else []
         return "".join(f", {part}" for part in parts)

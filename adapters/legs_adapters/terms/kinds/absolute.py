@@ -24,7 +24,7 @@ class Absolute(Form):
 
     Example:
         before: loss = torch.abs(image - gt_image).mean()
-        after: loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name)
+        after: loss = legs_loss.l1_loss(image, gt_image)
     """
 
     order = 10

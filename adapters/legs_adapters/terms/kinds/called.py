@@ -29,7 +29,7 @@ class Called(Form):
 
     Example:
         before: loss = l1_loss(image, gt_image)
-        after: loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name)
+        after: loss = legs_loss.l1_loss(image, gt_image)
     """
 
     order = 50

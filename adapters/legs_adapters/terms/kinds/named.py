@@ -24,7 +24,7 @@ class Named(Form):
 
     Example:
         before: diff = image - gt_image; loss = diff.abs().mean()
-        after: diff = image - gt_image; loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name)
+        after: diff = image - gt_image; loss = legs_loss.l1_loss(image, gt_image)
     """
 
     order = 30

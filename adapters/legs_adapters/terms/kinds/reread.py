@@ -20,7 +20,7 @@ class Reread(Form):
 
     Example:
         before: error = torch.abs(image - gt_image); seen = error.detach() > 0.1; loss = error.mean(); log(seen)
-        after: loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name, reduction="none").mean(); log(seen)
+        after: loss = legs_loss.l1_loss(image, gt_image, reduction="none").mean(); log(seen)
     """
 
     @classmethod

@@ -9,7 +9,6 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import arguments, call_name, constant
-from legs_adapters.lexicon.views import View
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.ssim import STRUCTURAL
@@ -58,10 +57,6 @@ class Structural(Form):
             sides = ", ".join(on_one_line(text.of(side, True)) for side in (self.first, self.second))
             edits.append(text.replace(start, end, sides + residue(text.between(start, end))))
         return edits
-
-    def said(self, view: View) -> str:
-        """Return why the edit keeps the value: whose SSIM it is."""
-        return view.reason
 
     def _advice(self, writing: Writing, prediction: str, target: str, rows: bool) -> str:
         return f"{writing.package}.ssim({prediction}, {target})"

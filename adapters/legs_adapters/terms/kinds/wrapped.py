@@ -23,7 +23,7 @@ class Wrapped(Form):
 
     Example:
         before: loss = abs((image - gt_image) * 2).mean()
-        after: loss = legs_loss.l1_loss(image, gt_image, view=cam.image_name, own=lambda a, b: abs((a - b) * 2)).mean()
+        after: loss = legs_loss.l1_loss(image, gt_image, own=lambda a, b: abs((a - b) * 2)).mean()
     """
 
     order = 20

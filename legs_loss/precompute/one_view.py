@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Dict, NamedTuple, Optional, Sequence
 
 from legs_loss.errors import LegsError
-from legs_loss.precompute.photograph import normalised_map_and_levels, resized
+from legs_loss.precompute.photograph import normalised_map_and_levels
 from legs_loss.scenes import View, image_size, load_training_image, training_size
 from legs_loss.spec import WeightSpec
 from legs_loss.store import Entry, fingerprint, is_intact, stage
@@ -65,7 +65,7 @@ def make(job: Job, task: Task) -> Result:
         }
         if any(wanted.items() <= vars(entry).items() and is_intact(job.store, entry) for entry in task.known):
             return Result(view.name)
-        image = load_training_image(view, job.resolution, job.white_background, resized)
+        image = load_training_image(view, job.resolution, job.white_background)
         made, levels = normalised_map_and_levels(image, job.spec)
         entry = Entry(fingerprint=fingerprint(image), **wanted, **levels)
         try:

@@ -13,10 +13,10 @@ from legs_loss.levels import response_levels
 from legs_loss.operators import OPERATORS
 from legs_loss.response import response
 from legs_loss.scenes import image_tensor
-from legs_loss.scenes.images import resized_pixels, row_strips
+from legs_loss.scenes.images import row_strips
 from legs_loss.spec import WeightSpec
 
-__all__ = ["compiled_anew", "compiles", "normalised_map", "normalised_map_and_levels", "resized", "response_map"]
+__all__ = ["compiled_anew", "compiles", "normalised_map", "normalised_map_and_levels", "response_map"]
 
 _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 
@@ -66,17 +66,6 @@ def _normalised(strength: torch.Tensor, spec: WeightSpec) -> Tuple[np.ndarray, f
     return normalised, float(low), float(span)
 
 
-def resized(image: Any, size: Tuple[int, int]) -> np.ndarray:
-    """Return what :func:`resized_pixels` returns, by compiled code where that is worth it."""
-    width, height = image.size
-    shrinks = 8 <= size[0] < width and size[1] <= height
-    if image.mode == "RGB" and shrinks and compiles(3 * width * height):
-        from legs_loss.kernels.numba_resize import resized_as
-
-        return resized_as(resized_pixels, image, size)
-    return resized_pixels(image, size)
-
-
 def compiles(values: int) -> bool:
     """Return whether numba is there, and worth loading for so many values of a photograph."""
     return values >= _WORTH_COMPILING and backend_for(torch.device("cpu")) == "numba"
@@ -85,14 +74,11 @@ def compiles(values: int) -> bool:
 def compiled_anew(spec: WeightSpec) -> bool:
     """Load the compiled code by a small picture, and say whether any of it was not on disk yet."""
     from numba.core import event
-    from PIL import Image
 
     from legs_loss.kernels.numba_passes import photograph_response
-    from legs_loss.kernels.numba_resize import resized as resize
     from legs_loss.kernels.numba_response import supports_response
 
     with event.install_recorder("numba:compile") as compiled:
-        small = resize(Image.new("RGB", (64, 64)), (32, 32))
         if supports_response(spec):
-            photograph_response(small, spec)
+            photograph_response(np.zeros((32, 32, 3), np.uint8), spec)
     return bool(compiled.buffer)

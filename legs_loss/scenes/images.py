@@ -8,7 +8,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Callable, Iterator, Tuple
+from typing import Any, Iterator, Tuple
 
 import numpy as np
 import torch
@@ -69,12 +69,7 @@ def resized_pixels(image: Any, size: Tuple[int, int]) -> np.ndarray:
     return _pixels(image if image.size == size else image.resize(size))
 
 
-def load_training_image(
-    view: View,
-    resolution: int = -1,
-    white_background: bool = False,
-    resize: Callable[[Any, Tuple[int, int]], np.ndarray] = resized_pixels,
-) -> np.ndarray:
+def load_training_image(view: View, resolution: int = -1, white_background: bool = False) -> np.ndarray:
     """Return a view's photograph as 3DGS's loader makes it: read, laid on a background, resized.
 
     Args:
@@ -83,7 +78,6 @@ def load_training_image(
             Elsewhere its alpha is resized with it and dropped: 3DGS never multiplies the target's colour by alpha.
         resolution: see :func:`training_size`.
         white_background: 3DGS's ``-w``, for ``composited`` views: white in place of black.
-        resize: an equivalent of :func:`resized_pixels`.
 
     Returns:
         uint8 [H, W, C], C = 3, or 1 for a gray photograph; uint16 for a gray one of 16 bits (16-bit colour is read
@@ -102,7 +96,7 @@ def load_training_image(
         else:
             mode = _colour_mode(image)
             prepared = image if image.mode == mode else image.convert(mode)
-        return resize(prepared, size)
+        return resized_pixels(prepared, size)
 
 
 def image_size(path: Path) -> Tuple[int, int]:

@@ -23,8 +23,8 @@ from legs_loss.kernels.simd.arithmetic import (
     square_root,
     where,
 )
-from legs_loss.kernels.simd.lanes import halves_added, lane, shifted, total, totals, without_fourths
-from legs_loss.kernels.simd.memory import load, load_bytes, prefetch, store, store_bytes
+from legs_loss.kernels.simd.lanes import lane, shifted, total, totals
+from legs_loss.kernels.simd.memory import load, prefetch, store
 from legs_loss.kernels.simd.vectors import LANES
 
 __all__ = [
@@ -35,10 +35,8 @@ __all__ = [
     "as_integers",
     "at_least",
     "equal",
-    "halves_added",
     "lane",
     "load",
-    "load_bytes",
     "maximum",
     "minimum",
     "multiply_add",
@@ -48,9 +46,7 @@ __all__ = [
     "splat",
     "square_root",
     "store",
-    "store_bytes",
     "total",
     "totals",
     "where",
-    "without_fourths",
 ]

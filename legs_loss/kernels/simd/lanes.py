@@ -7,9 +7,9 @@ from numba import types
 from numba.core.errors import RequireLiteralValue
 
 from legs_loss.kernels.compiling import inlined
-from legs_loss.kernels.simd.vectors import INTEGERS, LANES, float8, integer8, intrinsic
+from legs_loss.kernels.simd.vectors import INTEGERS, LANES, float8, intrinsic
 
-__all__ = ["halves_added", "lane", "shifted", "total", "totals", "without_fourths"]
+__all__ = ["lane", "shifted", "total", "totals"]
 
 
 @intrinsic
@@ -27,28 +27,6 @@ def shifted(typingctx, a, b, count):  # type: ignore[no-untyped-def]
         return builder.shuffle_vector(args[0], args[1], ir.Constant(INTEGERS, lanes))
 
     return float8(float8, float8, types.IntegerLiteral(count)), generate
-
-
-@intrinsic
-def halves_added(typingctx, a, b):  # type: ignore[no-untyped-def]
-    """Return four values, a's lower half plus its upper, then b's, of two integer vectors."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        lower, upper = ([half + k for half in (start, LANES + start) for k in range(4)] for start in (0, 4))
-        return builder.add(*(builder.shuffle_vector(*args, ir.Constant(INTEGERS, half)) for half in (lower, upper)))
-
-    return integer8(integer8, integer8), generate
-
-
-@intrinsic
-def without_fourths(typingctx, a):  # type: ignore[no-untyped-def]
-    """Return of two times four values the first three each, side by side, and two more of no meaning."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        nothing = ir.Constant(INTEGERS, ir.Undefined)
-        return builder.shuffle_vector(args[0], nothing, ir.Constant(INTEGERS, [0, 1, 2, 4, 5, 6, 7, 7]))
-
-    return integer8(integer8), generate
 
 
 @intrinsic

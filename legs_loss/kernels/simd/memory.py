@@ -8,9 +8,9 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from legs_loss.kernels.simd.vectors import INTEGERS, KINDS, LANES, integer8, intrinsic
+from legs_loss.kernels.simd.vectors import KINDS, LANES, intrinsic
 
-__all__ = ["load", "load_bytes", "prefetch", "store", "store_bytes"]
+__all__ = ["load", "prefetch", "store"]
 
 _BYTES = ir.VectorType(ir.IntType(8), LANES)
 
@@ -43,19 +43,6 @@ def load(typingctx, array, index):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def load_bytes(typingctx, array, index):  # type: ignore[no-untyped-def]
-    """Return array[index : index + 8] of a contiguous uint8 array as eight int32. Nothing checks the bounds."""
-    if not (_is_row(array, types.uint8) and isinstance(index, types.Integer)):
-        return None
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        values = builder.load(_address(context, builder, sig.args[0], _BYTES, *args), align=1)
-        return builder.zext(values, INTEGERS)
-
-    return integer8(array, types.intp), generate
-
-
-@intrinsic
 def store(typingctx, array, index, value):  # type: ignore[no-untyped-def]
     """Set array[index : index + 8]. Nothing checks the bounds."""
     kind = _vector_of(array)
@@ -67,20 +54,6 @@ def store(typingctx, array, index, value):  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
 
     return types.void(array, types.intp, kind), generate
-
-
-@intrinsic
-def store_bytes(typingctx, array, index, value):  # type: ignore[no-untyped-def]
-    """Set array[index : index + 8] of a contiguous uint8 array to the low bytes of int32. Nothing checks the bounds."""
-    if not (_is_row(array, types.uint8) and isinstance(index, types.Integer) and value == integer8):
-        return None
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        bytes_ = builder.trunc(args[2], _BYTES)
-        builder.store(bytes_, _address(context, builder, sig.args[0], _BYTES, *args[:2]), align=1)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, integer8), generate
 
 
 @intrinsic

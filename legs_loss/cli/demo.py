@@ -10,7 +10,7 @@ import argparse
 import json
 import os
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Dict, List
 
@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.errors import LegsError
     from legs_loss.precompute import precompute
     from legs_loss.reference.embedded import write_embedded_scene
+    from legs_loss.reference.training.checkpoint import CHECKPOINT
     from legs_loss.reference.training.side_by_side import Arm, train_side_by_side
     from legs_loss.reference.training.trainer import TrainConfig
     from legs_loss.report.comparison import check_matplotlib
@@ -76,6 +77,9 @@ def run(args: argparse.Namespace) -> int:
         )
         for name in METHODS
     ]
+    for arm in arms:  # of an earlier demo, which this one replaces
+        with suppress(FileNotFoundError):
+            (out / arm.name / CHECKPOINT).unlink()
     with ExitStack() as stack:
         bars = {
             arm.name: stack.enter_context(progress_bar(args.iterations, f"{arm.name:>6}", position))

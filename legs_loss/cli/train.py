@@ -74,7 +74,8 @@ def run(args: argparse.Namespace) -> int:
     """Train, or resume a training, and print the scores."""
     from legs_loss.cli.checks import check_trainable
     from legs_loss.errors import LegsError
-    from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, point_cloud, train
+    from legs_loss.reference.training.checkpoint import CHECKPOINT, check_new
+    from legs_loss.reference.training.trainer import TrainConfig, point_cloud, train
     from legs_loss.report.tensorboard import tensorboard_log
     from legs_loss.scenes import read_scene
 
@@ -87,9 +88,8 @@ def run(args: argparse.Namespace) -> int:
         raise LegsError(f"--checkpoint_every must be at least 1, got {args.checkpoint_every}")
     if args.resume:
         config = _resumed(checkpoint, given)
-    elif checkpoint.exists():
-        raise LegsError(f"{out} already holds a run: resume it (--resume), or choose another folder (--out)")
     else:
+        check_new(out)  # and again when it begins: another may have begun meanwhile
         config = TrainConfig(**given)
     scene = read_scene(args.scene, args.images)
     check_trainable(scene, config.resolution)

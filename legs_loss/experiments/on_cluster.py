@@ -9,7 +9,7 @@ from typing import Any, Callable, Dict, Sequence
 
 from legs_loss.errors import LegsError
 from legs_loss.reference.training.side_by_side import Arm, train_arm
-from legs_loss.reference.training.trainer import CHECKPOINT, Progress
+from legs_loss.reference.training.trainer import Progress
 from legs_loss.system.executors import Listener, executor, in_the_order_they_end
 
 __all__ = ["train_on_cluster"]
@@ -56,13 +56,11 @@ def train_on_cluster(
 
 
 def _train(arm: Arm, tell: Listener) -> Dict[str, Any]:
-    """Train one arm on a worker; resume after a worker that died."""
+    """Train one arm on a worker."""
     if not arm.scene.is_dir():
         raise LegsError(f"there is no folder {arm.scene} here: is the file system with the scene mounted?")
-    if arm.out is not None:
-        if not arm.out.is_dir():
-            raise LegsError(f"there is no folder {arm.out} here: is the file system for the results mounted?")
-        arm = arm._replace(resume=arm.resume or (arm.out / CHECKPOINT).is_file())
+    if arm.out is not None and not arm.out.is_dir():
+        raise LegsError(f"there is no folder {arm.out} here: is the file system for the results mounted?")
     due = 0.0
 
     def on_progress(progress: Progress) -> None:

@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import platform
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Callable, Dict, Iterator, List, Mapping, Optional, Sequence, Tuple
@@ -26,9 +27,10 @@ from legs_loss.experiments.losses import LOSSES
 from legs_loss.experiments.on_cluster import train_on_cluster
 from legs_loss.experiments.schema import PLAN, ROW, SETTINGS, what_is_wrong
 from legs_loss.experiments.weighting import WEIGHTINGS
+from legs_loss.reference.training.checkpoint import CHECKPOINT, alone_in
 from legs_loss.reference.training.dataset import Dataset, load_dataset
 from legs_loss.reference.training.side_by_side import Arm, train_arm, train_side_by_side
-from legs_loss.reference.training.trainer import CHECKPOINT, Progress, TrainConfig, default_threshold, step_loss
+from legs_loss.reference.training.trainer import Progress, TrainConfig, default_threshold, step_loss
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
 from legs_loss.system import read_regular, write_whole
@@ -182,9 +184,11 @@ class Comparison:
         folder = self.folder(arm, seed)
         if arm.name == BASELINE and metrics["mean_weight"] != 1.0:
             raise LegsError(f"the baseline was trained with weights of mean {metrics['mean_weight']}")
-        row = dict(read_json(folder / "plan.json", PLAN), versions=versions(), metrics=metrics)
-        write_json(folder / "row.json", row)
-        (folder / CHECKPOINT).unlink()
+        if self.row(arm, seed) is None:  # another comparison in this folder may have trained it, too
+            row = dict(read_json(folder / "plan.json", PLAN), versions=versions(), metrics=metrics)
+            write_json(folder / "row.json", row)
+        with suppress(FileNotFoundError):
+            (folder / CHECKPOINT).unlink()
 
     def _begin(self) -> None:
         settings = {
@@ -194,7 +198,8 @@ class Comparison:
             "base": replace(self.base, densify_grad_threshold=self.threshold).as_dict(),
         }
         path = self.out / "comparison.json"
-        keep(path, dict(settings, baseline=None), "comparison", SETTINGS, ("path", "baseline"))
+        with alone_in(self.out, make=True):
+            keep(path, dict(settings, baseline=None), "comparison", SETTINGS, ("path", "baseline"))
         # Each time: a resumed comparison may run with newer code.
         self.proof: Dict[str, Any] = prove_unweighted(self.data.train, self.base)
         write_json(path, dict(read_json(path, SETTINGS), baseline=self.proof))
@@ -297,7 +302,7 @@ def _planned(name: str, plan: Mapping[str, Any], root: Path, images: Optional[st
         loss=step_loss if plan["loss"] is None else LOSSES[plan["loss"]],
         caps=None if plan["caps"] is None else {int(iteration): int(count) for iteration, count in plan["caps"]},
         evaluate_every=max(1, config.iterations // EVALUATIONS),
-        resume=folder is not None and (folder / CHECKPOINT).is_file(),
+        resume=None,
     )
 
 

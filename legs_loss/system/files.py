@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
+import secrets
 import stat
+import time
 from typing import BinaryIO, Callable, Union
 
 from legs_loss.errors import LegsError
@@ -13,6 +16,7 @@ from legs_loss.errors import LegsError
 __all__ = ["open_regular", "read_regular", "write_whole"]
 
 PathLike = Union[str, "os.PathLike[str]"]
+_ABANDONED = 3600.0  # seconds since the last byte
 
 
 def open_regular(path: PathLike) -> BinaryIO:
@@ -58,8 +62,8 @@ def read_regular(path: PathLike, limit: int) -> bytes:
 def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]], folders: bool = False) -> None:
     """Write a file atomically: to a temporary file beside it, flushed to the disk, then renamed.
 
-    An existing file stays until then. A link is replaced, not followed. What a killed process leaves is ``NAME.part``,
-    which the next write of the file replaces.
+    Several processes may write one file at once: it is always one's whole. An existing file stays until then. A link is
+    replaced, not followed. What a killed process leaves, ``NAME.xxxxxxxx.part``, a write after an hour removes.
 
     Args:
         path: the file.
@@ -70,24 +74,37 @@ def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]]
         LegsError: it cannot be written; the message says why.
     """
     name = os.fspath(path)
-    part = name + ".part"
+    part = f"{name}.{secrets.token_hex(4)}.part"
     try:
         if folders:
             os.makedirs(os.path.dirname(name) or ".", exist_ok=True)
         if os.path.lexists(name) and not (os.path.isfile(name) or os.path.islink(name)):
             raise OSError(errno.EINVAL, "a folder, a pipe, a socket or a device is there", name)
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(part)
+        _sweep(name)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-        with os.fdopen(os.open(part, flags, 0o666), "wb") as file:
-            try:
+        descriptor = os.open(part, flags, 0o666)
+        try:
+            with os.fdopen(descriptor, "wb") as file:
                 data(file) if callable(data) else file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
-            except BaseException:
-                with contextlib.suppress(OSError):  # what does not fit is not left to take room
-                    os.unlink(part)
-                raise
-        os.replace(part, name)
+            os.replace(part, name)
+        except BaseException:
+            with contextlib.suppress(OSError):  # what does not fit is not left to take room
+                os.unlink(part)
+            raise
     except OSError as error:
         raise LegsError(f"cannot write {name}: {error.strerror or error}") from None
+
+
+def _sweep(name: str) -> None:
+    """Remove what killed writers of a file left, by its age: a younger one may be of a writer that lives."""
+    folder, base = os.path.split(name)
+    pattern = re.compile(re.escape(base) + r"\.[0-9a-f]{8}\.part")
+    with contextlib.suppress(OSError), os.scandir(folder or ".") as entries:
+        for entry in entries:
+            if not pattern.fullmatch(entry.name):
+                continue
+            with contextlib.suppress(OSError):  # another may have removed it meanwhile
+                if time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED:
+                    os.unlink(entry.path)

@@ -34,7 +34,7 @@ class FileLock:
 
     Raises:
         HeldError: it is held; the message is the holder's note.
-        OSError: the file cannot be made, or is a link, a pipe or a folder.
+        OSError: the file cannot be made, or is a link (of either kind), a pipe or a folder.
     """
 
     def __init__(
@@ -102,10 +102,13 @@ def _open(path: str) -> int:
     for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY", "O_NOINHERIT"):
         flags |= getattr(os, name, 0)
     descriptor = os.open(path, flags, 0o666)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise OSError(errno.EINVAL, "not a regular file but a pipe, a socket or a device", path)
-    return descriptor
+    found = os.fstat(descriptor)
+    if stat.S_ISREG(found.st_mode) and found.st_nlink <= 1:
+        return descriptor
+    os.close(descriptor)
+    if found.st_nlink > 1:  # the note would overwrite that file
+        raise OSError(errno.EMLINK, "a hard link to another file", path)
+    raise OSError(errno.EINVAL, "not a regular file but a pipe, a socket or a device", path)
 
 
 def _is_same(descriptor: int, path: str) -> bool:

@@ -53,7 +53,7 @@ def _start(host: str, port: int) -> Tuple[Any, str]:
     except ImportError:
         raise LegsError("legs view needs viser: pip install 'legs-loss[view]'") from None
 
-    class Unshared(viser.ViserServer):  # type: ignore[misc]
+    class Unshared(viser.ViserServer):
         """viser without its public tunnel, for which any client may ask."""
 
         def request_share_url(self, verbose: bool = True) -> None:

@@ -26,8 +26,9 @@ pytest.importorskip("scipy")
 
 from legs_loss.experiments.running import Comparison, read_row, read_rows, train_again
 from legs_loss.reference.training import trainer
+from legs_loss.reference.training.checkpoint import CHECKPOINT
 from legs_loss.reference.training.side_by_side import train_arm
-from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, train
+from legs_loss.reference.training.trainer import TrainConfig, train
 from legs_loss.scenes import read_scene
 from tests.experiments.support import BASE
 from tests.support import without_times

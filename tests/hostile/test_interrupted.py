@@ -160,6 +160,8 @@ def _drive(what, name, scene, folder):
         ended, said, _ = _fork(arguments(out), lambda: os.kill(os.getpid(), number), at, str(out))
         page = out / "report.html"
         assert not page.exists() or page.read_text(encoding="utf-8").rstrip().endswith("</html>"), "half a page"
+        for part in out.rglob("*.part"):  # as if it had been killed long ago; a young one may be a living writer's
+            os.utime(str(part), (0, 0))
         again = arguments(out)
         if what == "train" and (out / "checkpoint.npz").exists():
             again = ["train", scene, "--out", str(out), "--resume", "--threads", "1", "--checkpoint_every", "5"]

@@ -1,14 +1,17 @@
-"""Two legs-patch at once, Ctrl-C at any line, and the remains of a killed one: real processes, whatever the timing."""
+"""Two writers of a file, two trainings, two legs-patch at once; Ctrl-C at any line; the remains of what was killed."""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from legs_adapters.checkout import replace
 from legs_adapters.cli import main
@@ -16,7 +19,15 @@ from legs_adapters.journal import JOURNAL
 from legs_adapters.plan import plan, write
 from legs_adapters.undo import undo
 
+from legs_loss.experiments.running import read_json, read_rows, write_json
+from legs_loss.reference.gaussians import Gaussians
+from legs_loss.reference.ply import read_ply, write_ply
+from legs_loss.reference.training.checkpoint import read_checkpoint, write_checkpoint
+from legs_loss.report.saving import save_png
+from legs_loss.scenes import Camera, PointCloud, View, load_training_image, read_scene, write_colmap
+from legs_loss.system import write_whole
 from tests.patcher.support import checkout, legs_patch, snapshot
+from tests.support import legs_command, legs_environment
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork, to start at the same moment")
 
@@ -302,8 +313,11 @@ def as_nobody(arguments):
 
 
 def test_a_lock_that_is_a_link_or_a_pipe_is_refused(tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("mine\n")
     for name, make in (
         ("link", lambda path: path.symlink_to(tmp_path / "outside")),
+        ("hard link", lambda path: os.link(str(precious), str(path))),
         ("pipe", lambda path: os.mkfifo(path)),
     ):
         root = checkout(tmp_path / name, SOURCES)
@@ -314,6 +328,7 @@ def test_a_lock_that_is_a_link_or_a_pipe_is_refused(tmp_path):
         assert ".legs-patch.lock" in done.stderr
         assert time.monotonic() - began < 60
         assert not (tmp_path / "outside").exists()
+        assert precious.read_text() == "mine\n"
         assert {path: data for path, data in snapshot(root).items() if path in PLAIN} == PLAIN
 
 
@@ -325,3 +340,126 @@ def test_a_staging_folder_that_is_a_link_is_refused(tmp_path):
     assert done.returncode == 2
     assert ".legs-patch.tmp is a link" in done.stderr
     assert (outside / "precious").read_text() == "mine\n"
+
+
+def some_gaussians(size):
+    points = np.random.RandomState(size).rand(size, 3).astype(np.float32)
+    return Gaussians.from_points(points, np.full((size, 3), 9, np.uint8), 1)
+
+
+def colmap(root, size):
+    camera = Camera(40, 30, 50.0, 51.0, 20.0, 15.0, np.eye(4))
+    points = PointCloud(np.zeros((size, 3), np.float32), np.zeros((size, 3), np.uint8))
+    write_colmap(root, {f"{number}.png": camera for number in range(size)}, points)
+
+
+SIZES = (3, 700)  # of what two processes write at once: the end of the large file is missed if the small one goes first
+GAUSSIANS = {size: some_gaussians(size) for size in SIZES}
+PIXELS = {size: np.random.RandomState(0).randint(0, 255, (size, 9, 3)).astype(np.uint8) for size in SIZES}
+# By the format: its writer of a size, and its reader, which returns the size.
+WRITERS = {
+    "row": (
+        lambda root, size: write_json(root / "row.json", {"n": list(range(size))}),
+        lambda root: len(read_json(root / "row.json", ())["n"]),
+    ),
+    "Gaussians": (
+        lambda root, size: write_ply(root / "g.ply", GAUSSIANS[size]),
+        lambda root: len(read_ply(root / "g.ply")),
+    ),
+    "checkpoint": (
+        lambda root, size: write_checkpoint(root / "c.npz", {"a": np.zeros(size)}, {"n": size}),
+        lambda root: len(read_checkpoint(root / "c.npz")[0]["a"]),
+    ),
+    "picture": (
+        lambda root, size: save_png(PIXELS[size], root / "a.png"),
+        lambda root: load_training_image(View("a.png", root / "a.png")).shape[0],
+    ),
+    "scene": (colmap, lambda root: len(read_scene(root).points.xyz)),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_200_pairs_of_each_writer(name, tmp_path):
+    write, read = WRITERS[name]
+    (tmp_path / "images").mkdir()
+    write(tmp_path, SIZES[0])
+    children = []
+    for size in SIZES:
+        child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                for _ in range(200):
+                    write(tmp_path, size)
+                code = 0
+            finally:
+                os._exit(code)
+        children.append(child)
+    reads, codes = [], []
+    while len(codes) < len(children):
+        reads.append(read(tmp_path))
+        done, status = os.waitpid(-1, os.WNOHANG)
+        codes += [status] if done in children else []
+    assert codes == [0, 0]
+    assert set(reads) <= set(SIZES)
+    assert len(reads) > 10
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_what_a_killed_writer_left_goes_after_an_hour(tmp_path):
+    path, others = tmp_path / "a[1].json", tmp_path / "b.json.01234567.part"
+    young, old = tmp_path / "a[1].json.01234567.part", tmp_path / "a[1].json.89abcdef.part"
+    for part in (young, old, others):
+        part.write_text("half")
+    for part in (old, others):
+        os.utime(str(part), (time.time() - 3700,) * 2)
+    write_whole(path, b"whole")
+    assert sorted(tmp_path.iterdir()) == sorted([path, young, others])
+    assert (path.read_bytes(), path.stat().st_mode & 0o777) == (b"whole", 0o666 & ~umask())
+
+
+def umask():
+    old = os.umask(0)
+    os.umask(old)
+    return old
+
+
+def at_once(*commands):
+    """Run ``legs`` several times at the same moment; return each one's exit code and words."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    running = [subprocess.Popen(legs_command(*words), env=legs_environment(), **pipes) for words in commands]
+    results = [(one.communicate(timeout=600)[0], one.returncode) for one in running]
+    assert not any("Traceback" in said for said, _ in results), results
+    return results
+
+
+SHORT = ["--iterations", 20, "-r", 2]
+
+
+def test_two_trainings_at_once_make_one_run(tiny_scene, tmp_path):
+    pytest.importorskip("numba")
+    out = tmp_path / "run"
+    results = at_once(*[["train", tiny_scene, "--out", out, "--threads", 1, *SHORT, "--seed", seed] for seed in (1, 2)])
+    assert sorted(code for _, code in results) == [0, 2], results
+    refused = next(said for said, code in results if code)
+    assert "already holds a run" in refused or "another training writes there" in refused
+    seed = 1 if results[0][1] == 0 else 2
+    assert json.loads((out / "cfg.json").read_text())["seed"] == seed
+    assert read_checkpoint(out / "checkpoint.npz")[1]["config"]["seed"] == seed
+    assert not list(out.rglob("*.part"))
+
+
+@pytest.mark.slow
+def test_two_comparisons_at_once(tiny_scene, tmp_path):
+    pytest.importorskip("numba")
+    command = ["compare", tiny_scene, "--arms", "legs", "--processes", 1, "--seeds", 1, *SHORT]
+    out = tmp_path / "same"
+    for said, code in at_once([*command, "--out", out], [*command, "--out", out]):
+        assert code == 0 or "another training writes there" in said, said
+    assert [row["arm"] for row in read_rows(out)[1]] == ["3dgs", "legs"]
+    assert not list(out.rglob("*.part"))
+    assert not list(out.rglob("checkpoint.npz"))
+    out = tmp_path / "other"
+    results = at_once([*command, "--out", out], [*command, "--out", out, "--iterations", 21])
+    assert sorted(code for _, code in results) == [0, 2], results
+    assert "was started with another base.iterations" in next(said for said, code in results if code)

@@ -18,8 +18,8 @@ from legs_loss import LegsError
 from legs_loss.cli import main
 from legs_loss.reference.ply import read_ply
 from legs_loss.reference.training import checkpoint
-from legs_loss.reference.training.checkpoint import LOCK, read_checkpoint, write_checkpoint
-from legs_loss.reference.training.trainer import CHECKPOINT, TrainConfig, train
+from legs_loss.reference.training.checkpoint import CHECKPOINT, LOCK, read_checkpoint, write_checkpoint
+from legs_loss.reference.training.trainer import TrainConfig, train
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.system import FileLock
 from tests.reference.training import SHORT, assert_equal, run_until_killed

@@ -23,7 +23,7 @@ from legs_loss.reference.training.densify import Schedule
 from legs_loss.reference.training.metrics import mean_scores, score
 from legs_loss.scenes import open_image
 from legs_loss.spec import WeightSpec
-from legs_loss.system import read_regular
+from legs_loss.system import read_regular, write_whole
 
 __all__ = ["Checkout", "check_copy", "copy_checkout", "gaussians_in", "read_picture", "train_and_score"]
 
@@ -282,8 +282,8 @@ def _once(
         if code != 0 or not part.is_file():
             raise LegsError(f"the codebase's script ended with exit code {code}; its log: {log}", _tail(log))
     report = dict(json.loads(part.read_text(encoding="utf-8")), commands=[list(map(str, words)) for words in commands])
-    part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    os.replace(str(part), str(done))
+    write_whole(done, (json.dumps(report, indent=1) + "\n").encode())
+    part.unlink()
     return report
 
 

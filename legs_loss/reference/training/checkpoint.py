@@ -15,8 +15,9 @@ import torch
 from legs_loss.errors import LegsError
 from legs_loss.system import FileLock, HeldError, open_regular, write_whole
 
-__all__ = ["LOCK", "alone_in", "read_checkpoint", "read_state", "write_checkpoint"]
+__all__ = ["CHECKPOINT", "LOCK", "alone_in", "check_new", "read_checkpoint", "read_state", "write_checkpoint"]
 
+CHECKPOINT = "checkpoint.npz"
 LOCK = ".lock"  # in a run's folder, held while it is trained
 WAIT = 10.0  # seconds for the lock: the processes of a comparison that was killed end a little later than it
 
@@ -115,16 +116,29 @@ def _what_is_wrong(arrays: Mapping[str, np.ndarray], facts: Any) -> Optional[str
     return None
 
 
+def check_new(folder: Path) -> None:
+    """Check that a folder holds no run, finished or not.
+
+    Raises:
+        LegsError: it does.
+    """
+    if (folder / CHECKPOINT).exists():
+        raise LegsError(f"{folder} already holds a run: resume it (--resume), or choose another folder (--out)")
+
+
 @contextmanager
 def alone_in(folder: Optional[Path], make: bool) -> Iterator[None]:
     """Hold a run's folder: two trainings in one would overwrite each other's checkpoints.
 
     Raises:
-        LegsError: another training holds it.
+        LegsError: another training holds it, or it cannot be made.
     """
     lock: Optional[FileLock] = None
     if folder is not None and make:
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise LegsError(f"cannot write {folder}: {error.strerror or error}") from None
     if folder is not None and folder.is_dir():
         try:
             note = f"process {os.getpid()} on {platform.node()}"

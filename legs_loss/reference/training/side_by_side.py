@@ -31,7 +31,7 @@ class Arm(NamedTuple):
     loss: Loss = step_loss
     caps: Optional[Mapping[int, int]] = None
     evaluate_every: Optional[int] = None
-    resume: bool = False
+    resume: Optional[bool] = False
 
 
 def train_side_by_side(

@@ -23,7 +23,7 @@ from legs_loss.reference.gaussians import Gaussians
 from legs_loss.reference.ply import write_ply
 from legs_loss.reference.rasterizer import Rendering, rasterize
 from legs_loss.reference.training.adam import Adam, position_rate
-from legs_loss.reference.training.checkpoint import alone_in, read_state, write_checkpoint
+from legs_loss.reference.training.checkpoint import CHECKPOINT, alone_in, check_new, read_state, write_checkpoint
 from legs_loss.reference.training.config import Loss, TrainConfig, Weigh, Weighting, default_threshold
 from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, load_dataset
 from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
@@ -49,8 +49,6 @@ __all__ = [
     "step_weight",
     "train",
 ]
-
-CHECKPOINT = "checkpoint.npz"
 
 
 class Progress(NamedTuple):
@@ -104,7 +102,7 @@ def train(
     scene: Scene,
     config: TrainConfig,
     out: Optional[Union[str, Path]] = None,
-    resume: bool = False,
+    resume: Optional[bool] = False,
     store: Optional[Path] = None,
     weights: Optional[Mapping[str, Tensor]] = None,
     checkpoint_every: int = 500,
@@ -122,7 +120,7 @@ def train(
         out: a folder for the checkpoint, ``cfg.json``, ``metrics.json`` and 3DGS's own
             ``point_cloud/iteration_N/point_cloud.ply``; None keeps everything in memory.
         resume: resume from the checkpoint in ``out``; with the same arguments the result is bit-equal to that of an
-            uninterrupted run.
+            uninterrupted run. None: where there is one.
         store: the store of the weight maps, see :func:`load_dataset`.
         weights: explicit maps instead, see there.
         checkpoint_every: iterations between checkpoints. Another one is written on Ctrl-C.
@@ -136,8 +134,8 @@ def train(
             run's time; None: only at the end.
 
     Raises:
-        LegsError: the scene cannot be trained on, numba is missing, the checkpoint does not fit, or another training
-            writes to ``out``.
+        LegsError: the scene cannot be trained on, numba is missing, the checkpoint does not fit, another training
+            writes to ``out``, or a run is there and ``resume`` is False.
         KeyboardInterrupt: Ctrl-C, after the checkpoint.
     """
     maps = config.weights if config.weights.error == 0.0 else WeightSpec(beta=0.0)
@@ -149,7 +147,11 @@ def train(
         raise LegsError("there is nothing to resume from without an output folder")
     begun = None if resume else _Run.begin(data, config, scene)
     with alone_in(folder, make=not resume):
-        run = begun if begun is not None else _Run.restore(data, config, Path(out or ".") / CHECKPOINT)
+        if folder is not None and resume is None:
+            resume = (folder / CHECKPOINT).is_file()
+        elif folder is not None and not resume:
+            check_new(folder)
+        run = begun if not resume and begun is not None else _Run.restore(data, config, Path(out or ".") / CHECKPOINT)
         run.step_loss, run.caps, run.evaluate_every = loss, caps, evaluate_every
         run.weigh = None if weighting is None else weighting(data.train, config)
         if folder is not None:

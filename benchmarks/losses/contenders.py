@@ -101,7 +101,7 @@ def weightings(target: Tensor) -> Contenders:
     """Return each way to the weights of a photograph as a function."""
     found: Contenders = {"weight_map": lambda: weight_map(target, LEGS)}
     if not target.is_cuda and finding("numba", target.device).backend is not None:
-        from legs_loss.kernels.numba_passes import extremes
+        from legs_loss.kernels.numba_response import extremes
 
         batch = target.unsqueeze(0).numpy()
         found["its extremes by numba (all the kernel keeps)"] = lambda: extremes(batch, LEGS)

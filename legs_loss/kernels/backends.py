@@ -38,7 +38,7 @@ __all__ = [
 
 # A backend: the module whose BACKEND it is, and the type of the devices it is for.
 _KNOWN = {
-    "numba": ("legs_loss.kernels.numba_backend", "cpu"),
+    "numba": ("legs_loss.kernels.numba_loss", "cpu"),
     "cuda": ("legs_loss.kernels.cuda.backend", "cuda"),
 }
 BACKENDS = ("torch", *_KNOWN)
@@ -104,7 +104,7 @@ def fused_loss(
 
     The arguments are checked as a pair already; maps and masks are in any shape that ``legs_loss`` takes.
     """
-    unweighted = weights.map is None and (weights.spec is None or weights.spec.unweighted)
+    unweighted = weights.map is weights.mask is None and (weights.spec is None or weights.spec.unweighted)
     if padding != "zeros" or lambda_dssim == 0.0 or (unweighted and not _forced()):
         return None  # unweighted it is 3DGS's own loss, to the last bit
     return _fused(
@@ -217,16 +217,18 @@ def _tried(device: torch.device) -> bool:
 
 def _resolved(backend: Backend, weights: Weights, target: Tensor, channels_last: bool, with_maps: bool) -> Weights:
     """Return weights as the backend takes them: maps channels first, and no spec that it does not know."""
-    spec, map_, range_ = weights.spec, weights.map, weights.range
+    spec, range_ = weights.spec, weights.range
+    map_ = _map(weights.map, target, channels_last, "weight")
     if spec is not None and spec.unweighted:
         spec = None
     if spec is not None and not backend.makes_weights_of(spec):
-        map_ = weight_map(target, spec, channels_last) if with_maps else None
+        made = _map(weight_map(target, spec, channels_last), target, channels_last, "weight") if with_maps else None
+        map_ = made if map_ is None or made is None else map_.to(made.dtype) * made
         spec = range_ = None
     return Weights(
         spec,
         range_,
-        _map(map_, target, channels_last, "weight"),
+        map_,
         _map(weights.mask, target, channels_last, "mask"),
         weights.renormalise,
     )

@@ -21,15 +21,19 @@ class NotNow(Exception):
 
 
 class Weights(NamedTuple):
-    """The weight of a pixel, in one of three forms. With none of them given it is 1.
+    """The weight of a pixel: the product of what is given, 1 where nothing is. No gradient flows to any of it.
+
+    With a weight W and a mask M, and D the mean over channels of the absolute difference, the weighted L1 is
+    sum(M * W * D) / sum(M) over the pixels where ``renormalise`` is set, and mean(M * W * D) where not. Its gradient is
+    exactly 0 where M * W is. SSIM has no weight.
 
     Attributes:
-        spec: the weight is made from the target by this spec; never beside ``map``.
+        spec: a factor that is made from the target by this spec.
         range: what :meth:`Backend.response_range` returned for these targets and this spec, [B, 2]. Without it the
             backend makes it, in a pass of its own over the target.
-        map: the weight itself, one value a pixel, [1, H, W] or [B, 1, H, W].
-        mask: a factor of the weight in the same shapes, bool or floats in [0, 1].
-        renormalise: divide the weighted L1 by the mask's mean.
+        map: a factor, one value a pixel, floats, [1, H, W] or [B, 1, H, W].
+        mask: a factor in the same shapes, bool or floats in [0, 1]: how much a pixel counts.
+        renormalise: divide the weighted L1 by the mask's mean (at least the least normal float32).
     """
 
     spec: Optional[WeightSpec] = None

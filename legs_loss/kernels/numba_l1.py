@@ -6,55 +6,44 @@ import numpy as np
 from numba import prange
 
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.numba_response import Piece
+from legs_loss.kernels.numba_tiles import error_row
 from legs_loss.kernels.numba_weights import weights_of_row
-from legs_loss.kernels.simd import LANES, absolute, load, multiply_add, sign, splat, store, total
 
 __all__ = ["ROWS", "all_strips"]
 
 ROWS = 16  # of a strip
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
 @compiled(parallel=True, fastmath=False)
-def all_strips(images, source, gradient, sums):  # type: ignore[no-untyped-def]
+def all_strips(images, source, scale, gradient, sums):  # type: ignore[no-untyped-def]
     """Compute the weighted L1 strip by strip, and its gradient if that has a size.
 
     Args:
         images: an Images.
         source: a WeightSource.
+        scale: of the gradient.
         gradient: float32 [B * C * H * W], or empty.
-        sums: float64 [B * strips], zeros: the weighted absolute error of each strip is added.
+        sums: float64 [B * strips]: the weighted absolute error of each strip is written.
     """
-    strips = sums.size // images.views
-    scale = _ONE / np.float32(images.x.size)
+    strips, width = sums.size // images.views, images.width
     for task in prange(sums.size):
         view, strip = task // strips, task % strips
-        weights = np.empty(images.width + LANES if source.kind > 0 else 0, np.float32)
+        weights, errors = np.empty(width, np.float32), np.zeros(width, np.float32)
         for row in range(strip * ROWS, min((strip + 1) * ROWS, images.height)):
-            weights_of_row(images, source, Piece(view, row, 0, images.width), weights, 0)
+            weights_of_row(images, source, view, row, 0, width, weights)
             for channel in range(images.channels):
-                at = ((view * images.channels + channel) * images.height + row) * images.width
-                sums[task] += _row(images.x, images.y, at, images.width, weights, scale, gradient)
+                at = ((view * images.channels + channel) * images.height + row) * width
+                x, y = images.x[at : at + width], images.y[at : at + width]
+                error_row(x, y, weights, errors)
+                if gradient.size > 0:
+                    _gradient_row(x, y, weights, scale, gradient[at : at + width])
+        total = 0.0
+        for j in range(width):
+            total += errors[j]
+        sums[task] = total
 
 
 @compiled(fastmath=False)
-def _row(x, y, at, width, weights, scale, gradient):  # type: ignore[no-untyped-def]
-    """Return the sum of a row's weighted errors, of x[at:] and y[at:]; write the row of the gradient."""
-    wanted, weighted = gradient.size > 0, weights.size > 0
-    scales, one, sums = splat(scale), splat(_ONE), splat(_ZERO)
-    whole = width - width % LANES
-    for j in range(0, whole, LANES):
-        difference = load(x, at + j) - load(y, at + j)
-        weight = load(weights, j) if weighted else one
-        sums = multiply_add(weight, absolute(difference), sums)
-        if wanted:
-            store(gradient, at + j, scales * weight * sign(difference))
-    result = total(sums)
-    for j in range(whole, width):
-        gap = x[at + j] - y[at + j]
-        factor = weights[j] if weighted else _ONE
-        result += factor * abs(gap)
-        if wanted:
-            gradient[at + j] = scale * factor * np.sign(gap)
-    return result
+def _gradient_row(x, y, weight, scale, out):  # type: ignore[no-untyped-def]
+    for j in range(x.size):
+        out[j] = scale * weight[j] * (np.float32(x[j] > y[j]) - np.float32(x[j] < y[j]))

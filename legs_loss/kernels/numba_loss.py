@@ -1,42 +1,62 @@
-"""The loss, or its L1 term alone, and the gradient in one pass over the images, on the CPU."""
+"""The numba backend: the loss, its L1 term or SSIM, and the gradient in one pass over the images, on the CPU."""
 
 from __future__ import annotations
 
-from typing import Optional, Sequence, Tuple, Union
+from typing import FrozenSet, Optional, Sequence, Tuple, Union
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.kernels.compiling import ONE_AT_A_TIME
+from legs_loss.kernels.compiling import threads_of_torch
+from legs_loss.kernels.contract import Backend, Weights
 from legs_loss.kernels.differentiable import differentiable
 from legs_loss.kernels.numba_l1 import ROWS, all_strips
+from legs_loss.kernels.numba_response import NORMS, STENCILS
 from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles
-from legs_loss.kernels.numba_weights import Images, WeightSource, images_of, source_of, supports
+from legs_loss.kernels.numba_weights import CURVES, Images, WeightSource, images_of, response_range, source_of
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
 
-__all__ = ["fused_l1", "fused_loss"]
+__all__ = ["BACKEND", "fused_loss"]
 
-Weight = Union[Tensor, WeightSpec, None]
+
+class _NumbaBackend(Backend):
+    name = "numba"
+    offers: FrozenSet[str] = frozenset({"loss", "l1", "ssim"})
+    operators: FrozenSet[str] = frozenset(STENCILS)
+    norms: FrozenSet[float] = frozenset(NORMS)
+    curves: FrozenSet[str] = frozenset(CURVES)
+
+    def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
+        return response_range(target, spec)
+
+    def loss(self, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
+        return _differentiable(prediction, target, weights, lambda_dssim)
+
+    def weighted_l1(self, prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
+        return _differentiable(prediction, target, weights, 0.0)
+
+    def ssim(self, prediction: Tensor, target: Tensor) -> Tensor:
+        return 1.0 - _differentiable(prediction, target, Weights(), 1.0)
+
+
+BACKEND: Backend = _NumbaBackend()
 
 
 def fused_loss(
     prediction: Tensor,
     target: Tensor,
-    weight: Weight = None,
+    weight: Union[Tensor, WeightSpec, None] = None,
     lambda_dssim: float = 0.2,
-    ranges: Optional[Tensor] = None,
 ) -> Tensor:
     """Return (1 - lambda) * L_w + lambda * (1 - SSIM), as :func:`legs_loss.legs_loss` with zero padding.
 
     Args:
         prediction: on the CPU, [C, H, W] or [B, C, H, W]; what is not float32 is converted.
         target: the same shape; no gradient flows to it.
-        weight: [1, H, W] or [B, 1, H, W]; a spec computes it from the target (without a map in memory where
-            :func:`supports` says so); None is 1 everywhere.
+        weight: [1, H, W] or [B, 1, H, W]; a spec computes it from the target; None is 1 everywhere.
         lambda_dssim: the share of D-SSIM.
-        ranges: [B, 2], with a spec: what ``response_range`` returned for the target.
 
     Returns:
         A scalar, differentiable once in the prediction. It repeats bit for bit, whatever the number of threads.
@@ -44,56 +64,47 @@ def fused_loss(
     Raises:
         LegsError: a spec, and a target with NaN, infinity or plainly of 0..255.
     """
-    spec, inputs = _inputs(target, weight, ranges)
-
-    def compute(wanted: bool, image: Tensor, constants: Sequence[Optional[Tensor]]) -> Tuple[Tensor, Optional[Tensor]]:
-        images, source = _read(image, constants, spec)
-        gradient = np.empty(images.x.size if wanted else 0, np.float32)
-        down, across = -(-images.height // TILE_HEIGHT), -(-images.width // TILE_WIDTH)
-        sums = np.zeros((images.views * down * across, 2))
-        with ONE_AT_A_TIME:
-            all_tiles(images, down, across, np.float32(lambda_dssim), source, gradient, sums)
-        absolute_error, similarity = sums.sum(0) / images.x.size
-        loss = (1.0 - lambda_dssim) * absolute_error + lambda_dssim * (1.0 - similarity)
-        return image.new_tensor(loss), torch.from_numpy(gradient).reshape(image.shape) if wanted else None
-
-    return differentiable(prediction.float(), inputs, compute, _scaled)
-
-
-def fused_l1(prediction: Tensor, target: Tensor, weight: Weight = None, ranges: Optional[Tensor] = None) -> Tensor:
-    """Return the weighted L1 term, as :func:`legs_loss.weighted_l1`; arguments and result as for :func:`fused_loss`."""
-    spec, inputs = _inputs(target, weight, ranges)
-
-    def compute(wanted: bool, image: Tensor, constants: Sequence[Optional[Tensor]]) -> Tuple[Tensor, Optional[Tensor]]:
-        images, source = _read(image, constants, spec)
-        gradient = np.empty(images.x.size if wanted else 0, np.float32)
-        sums = np.zeros(images.views * -(-images.height // ROWS))
-        with ONE_AT_A_TIME:
-            all_strips(images, source, gradient, sums)
-        loss = float(sums.sum()) / images.x.size
-        return image.new_tensor(loss), torch.from_numpy(gradient).reshape(image.shape) if wanted else None
-
-    return differentiable(prediction.float(), inputs, compute, _scaled)
-
-
-def _inputs(
-    target: Tensor, weight: Weight, ranges: Optional[Tensor]
-) -> Tuple[Optional[WeightSpec], Sequence[Optional[Tensor]]]:
-    """Return the spec whose weights are made here, if it is one, and the constants: target, map and range."""
-    if isinstance(weight, WeightSpec):
-        if supports(weight):
-            return weight, (target, None, ranges)
+    if isinstance(weight, WeightSpec) and not BACKEND.makes_weights_of(weight):
         weight = weight_map(target, weight)
-    return None, (target, weight, None)
+    weights = Weights(spec=weight) if isinstance(weight, WeightSpec) else Weights(map=weight)
+    return BACKEND.loss(prediction, target, weights, lambda_dssim)
 
 
-def _read(
-    image: Tensor, constants: Sequence[Optional[Tensor]], spec: Optional[WeightSpec]
-) -> Tuple[Images, WeightSource]:
-    target, stored, ranges = constants
-    assert target is not None
-    images = images_of(image, target)
-    return images, source_of(stored if spec is None else spec, target, images, ranges)
+def _differentiable(prediction: Tensor, target: Tensor, weights: Weights, share: float) -> Tensor:
+    def compute(wanted: bool, image: Tensor, constants: Sequence[Optional[Tensor]]) -> Tuple[Tensor, Optional[Tensor]]:
+        target, map_, mask, found = constants
+        assert target is not None
+        images = images_of(image, target)
+        source = source_of(weights._replace(map=map_, mask=mask, range=found), target, images)
+        covered = 1.0
+        if weights.renormalise and mask is not None:
+            covered = max(float(mask.float().mean()), torch.finfo(torch.float32).tiny)
+        gradient = np.empty(images.x.size if wanted else 0, np.float32)
+        loss = (_l1_alone if share == 0.0 else _l1_and_ssim)(images, source, share, covered, gradient)
+        return image.new_tensor(loss), torch.from_numpy(gradient).reshape(image.shape) if wanted else None
+
+    constants = (target, weights.map, weights.mask, weights.range)
+    return differentiable(prediction.float(), constants, compute, _scaled)
+
+
+def _l1_and_ssim(images: Images, source: WeightSource, share: float, covered: float, gradient: np.ndarray) -> float:
+    down, across = -(-images.height // TILE_HEIGHT), -(-images.width // TILE_WIDTH)
+    sums, size = np.zeros((images.views * down * across, 2)), images.x.size
+    scales = (
+        np.float32((1.0 - share) / size / covered),
+        np.float32(-2.0 * share / size),
+    )  # SSIM's, of halves of slopes
+    with threads_of_torch():
+        all_tiles(images, down, across, scales, source, gradient, sums)
+    absolute_error, similarity = sums.sum(0) / size
+    return float((1.0 - share) * absolute_error / covered + share * (1.0 - similarity))
+
+
+def _l1_alone(images: Images, source: WeightSource, share: float, covered: float, gradient: np.ndarray) -> float:
+    sums, size = np.empty(images.views * -(-images.height // ROWS)), images.x.size
+    with threads_of_torch():
+        all_strips(images, source, np.float32(1.0 / size / covered), gradient, sums)
+    return float(sums.sum()) / size / covered
 
 
 def _scaled(gradient: Tensor, factor: Tensor) -> Tensor:

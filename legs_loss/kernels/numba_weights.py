@@ -1,28 +1,30 @@
-"""The images of a call and the weights of their pixels, as the compiled functions take them."""
+"""The images of a call and the weights of their pixels, as the compiled functions take them.
+
+A weight map made from the target need not exist in memory: two numbers do, the least and the greatest response of the
+view. With them the weights are made row by row where they are used, from pixels that are in the cache already.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Optional, Union
+from typing import NamedTuple, Optional
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, shape_of
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.numba_passes import extremes
-from legs_loss.kernels.numba_response import (
-    CURVES,
-    Operator,
-    Shape,
-    Weighting,
-    operator_of,
-    supports_response,
-    weight_row,
-)
+from legs_loss.kernels.contract import Weights
+from legs_loss.kernels.numba_response import Operator, Shape, extremes, operator_of, response_row
 from legs_loss.spec import WeightSpec
 
-__all__ = ["Images", "WeightSource", "images_of", "response_range", "source_of", "supports", "weights_of_row"]
+__all__ = ["CURVES", "Images", "WeightSource", "images_of", "response_range", "source_of", "weights_of_row"]
+
+# C5 needs a sine; it and curves of the user's own are applied by torch, to a map.
+CURVES = {"C1": 1, "C2": 2, "C3": 3, "C4": 4}
+
+_ONE, _TWO, _THREE = np.float32(1.0), np.float32(2.0), np.float32(3.0)
 
 
 class Images(NamedTuple):
@@ -40,27 +42,24 @@ class Images(NamedTuple):
 
 
 class WeightSource(NamedTuple):
-    """The source of weights: none (kind 0), a map (1), or the target (2).
+    """The source of weights: the product of what is there.
 
-    stored: kind 1: float32 [height * width] for all views, or [views * height * width].
-    ranges: kind 2: float32 [views, 2]: the least response, and the greatest less the least plus eps.
-    stencil, side, middle, norm: kind 2: an Operator's; a parallel loop takes no group in a group.
-    curve, beta: kind 2: of the weight.
+    curve: of the weight that is made from the target; 0 makes none.
+    beta: of that weight.
+    ranges: float32 [views, 2]: the least response, and the reciprocal of the greatest less the least plus eps.
+    stencil, side, middle, norm: an Operator's; a parallel loop takes no group in a group.
+    map, mask: float32 [height * width] for all views, or [views * height * width], or empty.
     """
 
-    kind: int
-    stored: np.ndarray
+    curve: int
+    beta: np.float32
     ranges: np.ndarray
     stencil: int
     side: np.float32
     middle: np.float32
     norm: int
-    curve: int
-    beta: np.float32
-
-
-_EMPTY, _ZERO = np.empty(0, np.float32), np.float32(0.0)
-_NONE = WeightSource(0, _EMPTY, _EMPTY.reshape(0, 2), 0, _ZERO, _ZERO, 0, 0, _ZERO)
+    map: np.ndarray
+    mask: np.ndarray
 
 
 def images_of(prediction: Tensor, target: Tensor) -> Images:
@@ -70,63 +69,80 @@ def images_of(prediction: Tensor, target: Tensor) -> Images:
     return Images(_flat(prediction), _flat(target), views, channels, height, width)
 
 
-def supports(spec: WeightSpec) -> bool:
-    """Return whether the weights of a spec can be made here; other specs' are made by torch, as a map."""
-    known = WeightSpec(operator=spec.operator, p=spec.p, curve=spec.curve, beta=spec.beta, eps=spec.eps)
-    return spec == known and supports_response(spec) and spec.curve in CURVES
-
-
-def source_of(
-    weight: Union[Tensor, WeightSpec, None], target: Tensor, images: Images, ranges: Optional[Tensor] = None
-) -> WeightSource:
+def source_of(weights: Weights, target: Tensor, images: Images) -> WeightSource:
     """Return where the weights come from.
 
-    Args:
-        weight: a map [1, H, W] or [B, 1, H, W], a spec that is supported, or None.
-        target: the images' target.
-        ranges: what :func:`response_range` returned for it; None computes it.
-
     Raises:
-        LegsError: a map that does not fit; a spec, and a target with NaN, infinity or plainly of 0..255.
+        LegsError: a map or mask that does not fit; a spec, and a target with NaN, infinity or plainly of 0..255.
     """
-    if weight is None:
-        return _NONE
-    if isinstance(weight, WeightSpec):
-        found = response_range(target, weight) if ranges is None else ranges.numpy().copy()
-        found[:, 1] += np.float32(weight.eps)
-        return WeightSource(2, _EMPTY, found, *operator_of(weight), CURVES[weight.curve], np.float32(weight.beta))
-    stored, pixels = _flat(weight), images.height * images.width
-    if stored.size not in (pixels, images.views * pixels):
-        raise LegsError(f"weight {shape_of(weight)} does not fit images {shape_of(target)}")
-    return _NONE._replace(kind=1, stored=stored)
+    spec = weights.spec or WeightSpec()
+    found = np.empty((0, 2), np.float32)
+    if weights.spec is not None:
+        found = (response_range(target, spec) if weights.range is None else weights.range).numpy().copy()
+        found[:, 1] = _ONE / (found[:, 1] + np.float32(spec.eps))
+    curve = 0 if weights.spec is None else CURVES[spec.curve]
+    factors = (
+        _factor(values, name, images, target) for values, name in ((weights.map, "weight"), (weights.mask, "mask"))
+    )
+    return WeightSource(curve, np.float32(spec.beta), found, *operator_of(spec), *factors)
 
 
-def response_range(target: Tensor, spec: WeightSpec) -> np.ndarray:
+def _factor(values: Optional[Tensor], name: str, images: Images, target: Tensor) -> np.ndarray:
+    if values is None:
+        return np.empty(0, np.float32)
+    flat, pixels = _flat(values), images.height * images.width
+    if flat.size not in (pixels, images.views * pixels):
+        raise LegsError(f"{name} {shape_of(values)} does not fit images {shape_of(target)}")
+    return flat
+
+
+def response_range(target: Tensor, spec: WeightSpec) -> Tensor:
     """Return of each view of [C, H, W] or [B, C, H, W] the least response, and the greatest less the least, [B, 2].
 
     Raises:
         LegsError: a target with NaN, infinity or plainly of 0..255.
     """
     found = extremes(_flat(target).reshape(-1, *target.shape[-3:]), spec)
-    if not (found[:, 2].max() <= 1.0 and found[:, 3].sum() == 0.0):
-        check_values(target)  # overshoots are fine; it raises for what is not
-    return np.stack([found[:, 0], found[:, 1] - found[:, 0]], 1)
+    if found[:, 2].sum() != 0.0:  # or NaN; overshoots are fine
+        check_values(target)
+    return torch.from_numpy(np.stack([found[:, 0], found[:, 1] - found[:, 0]], 1))
 
 
 @compiled(fastmath=False)
-def weights_of_row(images, source, piece, out, at):  # type: ignore[no-untyped-def]
-    """Write the weights of a Piece of a row to out[at:], rounded up to whole vectors."""
-    height, width = images.height, images.width
-    if source.kind == 1:
-        one_for_all = source.stored.size == height * width
-        row = (piece.row if one_for_all else piece.view_index * height + piece.row) * width
-        out[at : at + piece.right - piece.left] = source.stored[row + piece.left : row + piece.right]
-    elif source.kind == 2:
+def weights_of_row(images, source, view, row, left, right, out):  # type: ignore[no-untyped-def]
+    """Write the weights of the pixels left <= j < right of a row of a view to out."""
+    height, width, count = images.height, images.width, right - left
+    if source.curve == 0:
+        for j in range(count):
+            out[j] = _ONE
+    else:
         shape = Shape(images.views, images.channels, height, width)
-        low, span = source.ranges[piece.view_index, 0], source.ranges[piece.view_index, 1]
-        weighting = Weighting(source.curve, source.beta, low, span)
         operator = Operator(source.stencil, source.side, source.middle, source.norm)
-        weight_row(images.y, shape, piece, operator, weighting, out, at)
+        response_row(images.y, shape, operator, view, row, left, right, out)
+        _weigh(out, count, source.curve, source.beta, source.ranges[view, 0], source.ranges[view, 1])
+    for factor in (source.map, source.mask):
+        if factor.size > 0:
+            at = (row if factor.size == height * width else view * height + row) * width + left
+            _multiply(out, factor[at:], count)
+
+
+@compiled(fastmath=False)
+def _weigh(out, count, curve, beta, low, scale):  # type: ignore[no-untyped-def]
+    for j in range(count):
+        x = (out[j] - low) * scale
+        if curve == 2:
+            x = x * x
+        elif curve == 3:
+            x = np.sqrt(x)
+        elif curve == 4:
+            x = x * x * (_THREE - _TWO * x)
+        out[j] = _ONE + beta * x
+
+
+@compiled(fastmath=False)
+def _multiply(out, factor, count):  # type: ignore[no-untyped-def]
+    for j in range(count):
+        out[j] *= factor[j]
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

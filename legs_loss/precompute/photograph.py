@@ -39,8 +39,7 @@ def normalised_map_and_levels(image: np.ndarray, spec: WeightSpec) -> Tuple[np.n
 def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
     if compiles(image.size):
-        from legs_loss.kernels.numba_passes import photograph_response
-        from legs_loss.kernels.numba_response import supports_response
+        from legs_loss.kernels.numba_response import photograph_response, supports_response
 
         if supports_response(spec):
             return torch.from_numpy(photograph_response(image, spec))
@@ -75,8 +74,7 @@ def compiled_anew(spec: WeightSpec) -> bool:
     """Load the compiled code by a small picture, and say whether any of it was not on disk yet."""
     from numba.core import event
 
-    from legs_loss.kernels.numba_passes import photograph_response
-    from legs_loss.kernels.numba_response import supports_response
+    from legs_loss.kernels.numba_response import photograph_response, supports_response
 
     with event.install_recorder("numba:compile") as compiled:
         if supports_response(spec):

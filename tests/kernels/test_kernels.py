@@ -26,9 +26,9 @@ from tests.support import legs_environment
 
 pytest.importorskip("numba")
 
+from legs_loss.kernels import numba_loss
 from legs_loss.kernels.numba_loss import fused_loss
-from legs_loss.kernels.numba_passes import extremes, map_of_responses, photograph_response
-from legs_loss.kernels.numba_response import supports_response
+from legs_loss.kernels.numba_response import extremes, photograph_response, supports_response
 
 COMPILED = [name for name in OPERATORS if supports_response(WeightSpec(operator=name))]
 
@@ -133,25 +133,35 @@ class TestFusedLoss:
 class TestResponse:
     @pytest.mark.parametrize("operator", COMPILED)
     @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
-    def test_it_is_torchs_but_for_the_last_bit(self, operator, p):
+    def test_its_extremes_are_torchs_but_for_the_last_bit(self, operator, p):
         spec = WeightSpec(operator=operator, p=p)
         for shape in ((1, 3, 1, 1), (1, 3, 1, 40), (2, 1, 5, 2), (1, 4, 33, 9), (1, 3, 40, 10), (2, 3, 70, 67)):
             image = torch.rand(shape)
-            strength, found = map_of_responses(image.numpy(), spec)
-            expected = response(image, operator, p)[:, 0]
-            torch.testing.assert_close(torch.from_numpy(strength), expected, rtol=3e-7, atol=0.0)
-            assert found[:, 0].tolist() == strength.min((1, 2)).tolist()
-            assert found[:, 1].tolist() == strength.max((1, 2)).tolist()
-            assert found[:, 2].tolist() == image.abs().amax((1, 2, 3)).tolist()
-            assert (extremes(image.numpy(), spec) == found).all()
+            found = torch.from_numpy(extremes(image.numpy(), spec))
+            expected = response(image, operator, p)[:, 0].flatten(1)
+            torch.testing.assert_close(found[:, 0], expected.amin(1), rtol=3e-7, atol=0.0)
+            torch.testing.assert_close(found[:, 1], expected.amax(1), rtol=3e-7, atol=0.0)
+            assert not found[:, 2].any()
+
+    @pytest.mark.parametrize(("value", "excess"), [(1.5, 0.5), (-3.0, 2.0), (float("inf"), float("inf"))])
+    def test_values_beyond_one_are_noticed(self, value, excess):
+        image = torch.rand(2, 3, 40, 50)
+        image[1, 2, 39, 49] = value
+        assert extremes(image.numpy(), WeightSpec())[:, 2].tolist() == [0.0, excess]
+
+    def test_a_nan_is_noticed(self):
+        image = torch.rand(2, 3, 40, 50)
+        image[1, 0, 0, 0] = float("nan")
+        assert np.isnan(extremes(image.numpy(), WeightSpec())[:, 2]).tolist() == [False, True]
 
     @pytest.mark.parametrize(("dtype", "channels"), [(np.uint8, 3), (np.uint16, 1)])
     @pytest.mark.parametrize("size", [(1, 1), (2, 900), (700, 523)])
     def test_a_photograph_is_done_in_strips(self, size, dtype, channels):
         photograph = np.random.RandomState(0).randint(0, np.iinfo(dtype).max, (*size, channels)).astype(dtype)
-        strength = photograph_response(photograph, PRESETS["legs"])
-        expected = response(image_tensor(photograph))[0]
-        torch.testing.assert_close(torch.from_numpy(strength), expected, rtol=3e-7, atol=0.0)
+        for operator, p in itertools.product(COMPILED, (1.0, 2.0, float("inf"))):
+            strength = photograph_response(photograph, WeightSpec(operator=operator, p=p))
+            expected = response(image_tensor(photograph), operator, p)[0]
+            torch.testing.assert_close(torch.from_numpy(strength), expected, rtol=3e-7, atol=0.0)
 
     def test_precompute_uses_it_for_photographs_that_are_large(self, monkeypatch):
         photograph = np.random.RandomState(0).randint(0, 255, (600, 700, 3)).astype(np.uint8)
@@ -166,7 +176,7 @@ class TestResponse:
     @pytest.mark.parametrize("operator", COMPILED)
     def test_a_constant_image_has_exactly_none(self, operator, value):
         image = torch.full((1, 3, 19, 31), value)
-        assert not map_of_responses(image.numpy(), WeightSpec(operator=operator))[0].any()
+        assert extremes(image.numpy(), WeightSpec(operator=operator)).tolist() == [[0.0, 0.0, 0.0]]
 
 
 @pytest.fixture
@@ -286,19 +296,21 @@ class TestSelection:
         def broken(*_):
             raise RuntimeError("no such instruction\nsecond line")
 
-        monkeypatch.setattr("legs_loss.kernels.numba_loss.fused_loss", broken)
+        monkeypatch.setattr("legs_loss.kernels.numba_loss._differentiable", broken)
         for _ in range(3):
             assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         said = capfd.readouterr().err
         assert said == "legs-loss: numba is not used, torch is: RuntimeError: no such instruction\n"
 
     def test_a_backend_that_fails_after_its_trial_is_left(self, chosen, monkeypatch, capfd):
+        own = numba_loss._differentiable
+
         def breaks_at_four_channels(prediction, *rest):
             if prediction.shape[0] == 4:
                 raise RuntimeError("out of resource: shared memory")
-            return fused_loss(prediction, *rest)
+            return own(prediction, *rest)
 
-        monkeypatch.setattr("legs_loss.kernels.numba_loss.fused_loss", breaks_at_four_channels)
+        monkeypatch.setattr(numba_loss, "_differentiable", breaks_at_four_channels)
         assert used(legs_loss(*images((3, 20, 30)))) == "fused"
         for channels in (4, 4, 3):
             assert used(legs_loss(*images((channels, 20, 30)))) == "torch"
@@ -306,9 +318,8 @@ class TestSelection:
         assert said == "legs-loss: numba is not used, torch is: RuntimeError: out of resource: shared memory\n"
 
     def test_a_backend_that_computes_something_else_is_found_out(self, chosen, monkeypatch, capfd):
-        monkeypatch.setattr(
-            "legs_loss.kernels.numba_loss.fused_loss", lambda *args: 1.01 * fused_loss(*args[:2], *args[2:])
-        )
+        own = numba_loss._differentiable
+        monkeypatch.setattr(numba_loss, "_differentiable", lambda *args: 1.01 * own(*args))
         assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         assert "its trial of the loss gave" in capfd.readouterr().err
 

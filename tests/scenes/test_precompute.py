@@ -335,10 +335,10 @@ class TestInterrupted:
 class TestCompiling:
     def test_what_is_compiled_anew_is_noticed(self, monkeypatch):
         numba = pytest.importorskip("numba")
-        from legs_loss.kernels import numba_passes
+        from legs_loss.kernels import numba_response
 
         never_compiled = numba.njit(lambda image: image)
-        monkeypatch.setattr(numba_passes, "photograph_response", lambda image, spec: never_compiled(image))
+        monkeypatch.setattr(numba_response, "photograph_response", lambda image, spec: never_compiled(image))
         assert compiled_anew(PRESETS["legs"])
         assert not compiled_anew(PRESETS["legs"])
 

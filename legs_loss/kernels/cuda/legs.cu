@@ -208,9 +208,8 @@ DEVICE float weight_at(const Task& k, const Weights& w, int row, int column) {
     float x = (response(k, w.target, row, column) - w.low) * w.scale;
     x = x < 0.f ? 0.f : (x > 1.f ? 1.f : x);  // rounding; a NaN stays
     weight = fmaf(k.beta, curve(k.curve, x), 1.f);
-#else
-    if (w.map) weight = w.map[row * k.width + column];
 #endif
+    if (w.map) weight *= w.map[row * k.width + column];
     return w.mask ? weight * w.mask[row * k.width + column] : weight;
 }
 

@@ -1,4 +1,4 @@
-"""Eight float32 or int32 at once, as types that compiled functions compute with.
+"""Eight float32 or int32 at once, as types that compiled functions compute with: for the CPU rasterizers and Adam.
 
 LLVM's own vectoriser gives up on loops that read more than a few rows: it cannot show in time that they do not overlap.
 Here the vectors are written down, and LLVM maps them to what the processor has (AVX, two halves of SSE or NEON).

@@ -9,7 +9,7 @@ import re
 import secrets
 import stat
 import time
-from typing import BinaryIO, Callable, Union
+from typing import BinaryIO, Callable, Optional, Union
 
 from legs_loss.errors import LegsError
 
@@ -19,15 +19,19 @@ PathLike = Union[str, "os.PathLike[str]"]
 _ABANDONED = 3600.0  # seconds since the last byte
 
 
-def open_regular(path: PathLike) -> BinaryIO:
+def open_regular(path: PathLike, folder: Optional[int] = None) -> BinaryIO:
     """Open a regular file for reading; never wait for a pipe's other end.
+
+    Args:
+        path: the file; with ``folder``, the descriptor of an open folder, its name in there, and no link.
 
     Raises:
         OSError: it cannot be opened, or is a folder, a pipe, a socket or a device; ``strerror`` says which.
     """
     name = os.fspath(path)
     try:
-        descriptor = os.open(name, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        descriptor = os.open(name, flags if folder is None else flags | os.O_NOFOLLOW, dir_fd=folder)
     except ValueError:  # a NUL in the name
         raise OSError(errno.EINVAL, "no file can have this name", name) from None
     try:
@@ -42,17 +46,17 @@ def open_regular(path: PathLike) -> BinaryIO:
         raise
 
 
-def read_regular(path: PathLike, limit: int) -> bytes:
+def read_regular(path: PathLike, limit: int, folder: Optional[int] = None) -> bytes:
     """Read a regular file whole.
 
     Args:
-        path: the file.
+        path, folder: as for :func:`open_regular`.
         limit: in bytes; a file of this kind is never larger.
 
     Raises:
         OSError: as :func:`open_regular`, or the file is larger; ``strerror`` says which.
     """
-    with open_regular(path) as file:
+    with open_regular(path, folder) as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
             raise OSError(errno.EFBIG, f"{size} bytes, and no file of its kind has more than {limit}", os.fspath(path))

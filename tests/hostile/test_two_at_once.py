@@ -148,7 +148,16 @@ def test_who_holds_the_lock_is_said(tmp_path, monkeypatch, capsys):
     assert not list(root.glob(".legs-patch*"))
 
 
-OURS = ("legs_adapters/cli.py", "plan.py", "undo.py", "journal.py", "replace.py", "locks.py", "interrupts.py")
+OURS = (
+    "legs_adapters/cli.py",
+    "plan.py",
+    "undo.py",
+    "journal.py",
+    "replace.py",
+    "inside.py",
+    "locks.py",
+    "interrupts.py",
+)
 
 
 def at_line(number, action):
@@ -243,6 +252,40 @@ class TestAtAnyLine:
                 undo(root)
             assert snapshot(root) == PLAIN
             assert sorted(path.name for path in root.iterdir()) == sorted(PLAIN)
+
+
+@pytest.mark.parametrize("what", ["patch", "undo"])
+def test_a_folder_that_becomes_a_link_at_any_line(what, tmp_path):
+    """Whoever may write in the checkout swaps a folder for a link meanwhile: what it leads to stays as it was."""
+    sources = {"one.py": TRAIN, "inner/two.py": TRAIN, "inner/utils.py": UTILS, "utils.py": UTILS}
+
+    def fresh(name):
+        root = checkout(tmp_path / name, sources)
+        if what == "undo":
+            write(plan(root))
+        precious = {"two.py": b"mine", "utils.py": b"mine"}
+        outside = tmp_path / f"{name}-outside"
+        if what == "undo":  # what the undo would take for its own
+            precious["two.py"] = (root / "inner" / "two.py").read_bytes()
+        outside.mkdir()
+        for file, data in precious.items():
+            (outside / file).write_bytes(data)
+        return root, outside, precious
+
+    def swap(root, outside):
+        (root / "inner").rename(root / "moved")
+        (root / "inner").symlink_to(outside)
+
+    arguments = ["--undo"] if what == "undo" else ["--force"]
+    count = lines_of([*arguments, fresh("count")[0]])
+    said_all = set()
+    for number in range(3, count + 1, max(1, count // 40)):
+        root, outside, precious = fresh(str(number))
+        _, said = traced([*arguments, root], number, lambda root=root, outside=outside: swap(root, outside))
+        assert "Traceback" not in said, (number, said)
+        assert snapshot(outside) == precious, number
+        said_all.add(said.partition(": ")[2][:20])
+    assert len(said_all) >= 2, "no swap came in time"
 
 
 def test_the_owner_stays(tmp_path):

@@ -47,11 +47,11 @@ class TestWriting:
         before = snapshot(root)
         replace, calls = os.replace, []
 
-        def fail_at_the_third(source, target):
+        def fail_at_the_third(source, target, **folders):
             calls.append(target)
             if len(calls) == 3:
                 raise OSError(28, "No space left on device", target)
-            replace(source, target)
+            replace(source, target, **folders)
 
         monkeypatch.setattr(replace_module.os, "replace", fail_at_the_third)
         with pytest.raises(LegsError, match="No space left on device; nothing was changed"):
@@ -72,11 +72,11 @@ class TestWriting:
         before = snapshot(root)
         replace, calls = os.replace, []
 
-        def killed_at_the_third(source, target):
+        def killed_at_the_third(source, target, **folders):
             calls.append(target)
             if len(calls) == 3:
                 os._exit(9)
-            replace(source, target)
+            replace(source, target, **folders)
 
         child = os.fork()
         if child == 0:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import shutil
 import stat
-import tempfile
 from pathlib import Path
 from typing import Dict, Iterator, List, Mapping, Optional, Tuple
 
+from legs_adapters.checkout.inside import BY_DESCRIPTOR, folder_of
 from legs_adapters.code.folders import check_name
 from legs_loss import LegsError
 from legs_loss.system import FileLock, HeldError, held_back, read_regular
@@ -57,22 +58,18 @@ def replace_files(root: Path, changes: Changes) -> None:
     for path, (expected, _) in changes.items():
         if read_file(root, path) != expected:
             raise LegsError(f"{path} changed while legs-patch was running: nothing was written; run it again")
-    staging = root / _STAGING
     staged: Dict[str, str] = {}
     done: List[str] = []
     try:
-        staging.mkdir(mode=0o700)
+        (root / _STAGING).mkdir(mode=0o700)
         for path, (_, data) in changes.items():
             if data is not None:
-                staged[path] = _stage(staging, root / path, data)
+                staged[path] = _stage(root, path, data)
         with held_back():
             try:
-                for path, (_, data) in changes.items():
+                for path in changes:
+                    _put(root, path, staged.get(path))
                     done.append(path)
-                    if data is None:
-                        (root / path).unlink()
-                    else:
-                        os.replace(staged[path], str(root / path))
             except BaseException:
                 for path in reversed(done):
                     _restore(root, path, changes[path][0])
@@ -94,40 +91,45 @@ def read_file(root: Path, path: str) -> Optional[bytes]:
     if os.path.normcase(os.path.realpath(full)) != os.path.normcase(full):
         raise LegsError(f"{path} is a link or below one: legs-patch does not follow links")
     try:
-        return read_regular(full, LARGEST)
+        with folder_of(root, path) as (folder, name):
+            return read_regular(name, LARGEST, folder)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise LegsError(f"{full} cannot be read: {error.strerror}; nothing was changed") from None
 
 
-def _stage(staging: Path, target: Path, data: bytes) -> str:
-    handle, name = tempfile.mkstemp(dir=str(staging))
-    with os.fdopen(handle, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    try:
-        before = os.stat(str(target))
-    except FileNotFoundError:
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)
-        return name
-    if hasattr(os, "chown"):
-        with contextlib.suppress(PermissionError):  # only root can give a file away
-            os.chown(name, before.st_uid, before.st_gid)
-    os.chmod(name, stat.S_IMODE(before.st_mode))  # last: giving a file away takes bits of its mode
-    return name
+def _stage(root: Path, path: str, data: bytes) -> str:
+    """Write what a file is to become to the staging folder, with the owner and the mode that the file has."""
+    staged = f"{_STAGING}/{secrets.token_hex(8)}"
+    with folder_of(root, staged) as (folder, name):
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+        with os.fdopen(os.open(name, flags, 0o666, dir_fd=folder), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+            with contextlib.suppress(FileNotFoundError), folder_of(root, path) as (target, old):
+                before = os.stat(old, dir_fd=target, follow_symlinks=False)
+                if hasattr(os, "fchown"):
+                    with contextlib.suppress(PermissionError):  # only root can give a file away
+                        os.fchown(file.fileno(), before.st_uid, before.st_gid)
+                # Last: giving a file away takes bits of its mode.
+                os.chmod(file.fileno() if BY_DESCRIPTOR else name, stat.S_IMODE(before.st_mode))
+    return staged
+
+
+def _put(root: Path, path: str, staged: Optional[str]) -> None:
+    """Put a staged file in its place; None removes the file that is there."""
+    with folder_of(root, path) as (folder, name):
+        if staged is None:
+            os.unlink(name, dir_fd=folder)
+            return
+        with folder_of(root, staged) as (source, new):
+            os.replace(new, name, src_dir_fd=source, dst_dir_fd=folder)
 
 
 def _restore(root: Path, path: str, data: Optional[bytes]) -> None:
-    if read_file(root, path) == data:
-        return
-    if data is None:
-        (root / path).unlink()
-    else:
-        os.replace(_stage(root / _STAGING, root / path, data), str(root / path))
+    _put(root, path, None if data is None else _stage(root, path, data))
 
 
 def _sweep(root: Path) -> None:

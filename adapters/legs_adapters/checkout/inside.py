@@ -1,0 +1,40 @@
+"""Reach a file of a checkout through its own folders, even while somebody swaps one of them for a link."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import Iterator, Optional, Tuple
+
+__all__ = ["BY_DESCRIPTOR", "folder_of"]
+
+# Windows has no descriptors of folders: there paths are checked, then used.
+BY_DESCRIPTOR = {os.open, os.rename, os.unlink, os.stat} <= os.supports_dir_fd
+
+
+@contextlib.contextmanager
+def folder_of(root: Path, path: str) -> Iterator[Tuple[Optional[int], str]]:
+    """Open the folder of a file, part by part, none of them a link; yield its descriptor, and the file's name in it.
+
+    Where the system has no such descriptors, yield None and the whole path: functions of ``os`` take both as they take
+    the first two. An OSError meanwhile names the whole path.
+    """
+    if not BY_DESCRIPTOR:
+        yield None, str(root / path)
+        return
+    *folders, name = path.split("/")
+    options = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+    try:
+        folder = os.open(str(root), options)
+        try:
+            for part in folders:
+                inner = os.open(part, options | os.O_NOFOLLOW, dir_fd=folder)
+                os.close(folder)
+                folder = inner
+            yield folder, name
+        finally:
+            os.close(folder)
+    except OSError as error:
+        error.filename = str(root / path)
+        raise

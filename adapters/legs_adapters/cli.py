@@ -38,6 +38,9 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
         args = _arguments(argv)
         folder, undoing, before = args.folder, args.undo, _journal(args.folder)
         if args.verify:
+            from legs_adapters.verify import check_verifiable
+
+            check_verifiable(folder, args.script, args.arguments)
             return _patch(args) or _verify(args)
         return _undo(args) if args.undo else _patch(args)
     except LegsError as error:

@@ -23,10 +23,11 @@ from legs_adapters.checkout.replace import locked
 from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL
 from legs_adapters.plan import plan
+from legs_adapters.shims.packages import check_imports
 from legs_adapters.undo import undo
 from legs_loss import LegsError
 
-__all__ = ["ITERATIONS", "Run", "Verdict", "verify"]
+__all__ = ["ITERATIONS", "Run", "Verdict", "check_verifiable", "verify"]
 
 ITERATIONS = 40
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 96, 64, 800  # of the embedded scene
@@ -87,7 +88,17 @@ class Verdict(NamedTuple):
             step = f"{1000 * statistics.median(run.seconds):.0f} ms a step" if run.seconds else "no step"
             ended = "" if run.code == 0 else f", exit code {run.code}"
             lines.append(f"{name:<10} {len(run.losses)} steps, {step}{ended}")
+        if "patched" in self.runs:
+            lines += self._patched_lines()
+        lines += [f"{'holds' if held else 'FAILS':<10} {claim}" for claim, held in self.claims.items()]
+        for name, run in self.runs.items():
+            if run.code != 0 and run.error:
+                lines += [f"{name} ended with:", *(f"    {line}" for line in run.error.splitlines())]
+        return "\n".join(lines) + "\n"
+
+    def _patched_lines(self) -> List[str]:
         patched, unpatched = self.runs["patched"], self.runs["unpatched"]
+        lines = []
         if patched.seconds and unpatched.seconds:
             ratio = statistics.median(patched.seconds) / statistics.median(unpatched.seconds)
             lines.append(f"{'step':<10} patched takes {ratio:.2f} times the unpatched one's time (medians)")
@@ -100,11 +111,19 @@ class Verdict(NamedTuple):
         lines.append(
             f"{'maps':<10} {patched.stored} from the store, {patched.computed} computed; {patched.remembered} reused"
         )
-        lines += [f"{'holds' if held else 'FAILS':<10} {claim}" for claim, held in self.claims.items()]
-        for name, run in self.runs.items():
-            if run.code != 0 and run.error:
-                lines += [f"{name} ended with:", *(f"    {line}" for line in run.error.splitlines())]
-        return "\n".join(lines) + "\n"
+        return lines
+
+
+def check_verifiable(folder: str | os.PathLike[str], script: Optional[str], arguments: Optional[str]) -> None:
+    """Check before anything is patched that the training script can be run; arguments as for :func:`verify`.
+
+    Raises:
+        LegsError: it is ambiguous or not there, imports what is not installed, or its arguments name what is unknown.
+    """
+    root = check_root(folder)
+    script = _script(root, script)
+    check_imports(root, script)
+    _arguments(root / script, arguments, 1, scene=root, output=root)
 
 
 def verify(
@@ -132,9 +151,7 @@ def verify(
     root = check_root(folder)
     if not (root / JOURNAL).is_file():
         raise LegsError(f"{root} is not patched: nothing to verify")
-    script = script or _script(root)
-    if not (root / script).is_file():
-        raise LegsError(f"there is no {script} in {root}")
+    script = _script(root, script)
     with tempfile.TemporaryDirectory(prefix="legs-verify-") as work:
         scene = write_embedded_scene(
             Path(work) / "scene", views=VIEWS, width=WIDTH, height=HEIGHT, points=POINTS, samples=1
@@ -159,6 +176,8 @@ def verify(
             output = Path(work) / f"output-{name}"
             given = _arguments(copy / script, arguments, iterations, scene=scene, output=output)
             runs[name] = _run(copy, script, given, iterations, Path(work) / f"{name}.json", settings)
+            if not runs["unpatched"].losses:
+                return Verdict(runs, {"the unpatched script trained": False})
     return Verdict(runs, _claims(runs))
 
 
@@ -191,7 +210,11 @@ def _are_close(losses: Sequence[str], others: Sequence[str]) -> bool:
     )
 
 
-def _script(root: Path) -> str:
+def _script(root: Path, given: Optional[str]) -> str:
+    if given is not None and not (root / given).is_file():
+        raise LegsError(f"there is no {given} in {root}")
+    if given is not None:
+        return given
     found = plan(root).findings
     files = sorted({site.path for site in found.sites} | {site.path for site in found.patched})
     trains = [name for name in files if "__main__" in (root / name).read_text(encoding="utf-8", errors="replace")]

@@ -11,7 +11,7 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Optional, Sequence, Tuple
+from typing import TYPE_CHECKING, Callable, Optional, Sequence, Tuple
 
 from legs_loss import OPERATORS, LegsError, __version__
 from legs_loss.cli import Parser
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from legs_adapters.terms.findings import Problem
 
 __all__ = ["main"]
+
+HELP = "add the LEGS loss to a codebase, or remove it; the same as legs-patch"
 
 EXIT_CODES = (
     "exit codes: 0 done, or nothing to do; 1 --check: something would change, or --partial: a term needs a manual "
@@ -32,30 +34,50 @@ EXIT_CODES = (
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
-    folder, undoing, before = "", False, b""
-    try:
-        never_fail_to_print()
-        args = _arguments(argv)
-        folder, undoing, before = args.folder, args.undo, _journal(args.folder)
-        if args.verify:
-            from legs_adapters.verify import check_verifiable
+    never_fail_to_print()
+    parser = Parser(prog="legs-patch", description=__doc__)
+    add_arguments(parser)
+    parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
+    parser.offer_completion()
+    args = argparse.Namespace(folder="", undo=False)
+    return _reporting_errors(args, lambda: _run(parser.parse_args(argv, args)))
 
-            check_verifiable(folder, args.script, args.arguments)
-            return _patch(args) or _verify(args)
-        return _undo(args) if args.undo else _patch(args)
+
+def run(args: argparse.Namespace) -> int:
+    """Patch, undo or verify, as the arguments say, and return the exit code."""
+    return _reporting_errors(args, lambda: _run(args))
+
+
+def _run(args: argparse.Namespace) -> int:
+    if args.undo and (args.check or args.verify):
+        raise LegsError("--undo can be combined with --diff, --force and --trust only")
+    if args.trust is not None and not args.undo:
+        raise LegsError("--trust requires --undo")
+    args.before = _journal(args.folder)
+    if args.verify:
+        from legs_adapters.verify import check_verifiable
+
+        check_verifiable(args.folder, args.script, args.arguments)
+        return _patch(args) or _verify(args)
+    return _undo(args) if args.undo else _patch(args)
+
+
+def _reporting_errors(args: argparse.Namespace, work: Callable[[], int]) -> int:
+    """Return the exit code of ``work``, which runs with these arguments; an error is a line on stderr."""
+    try:
+        return work()
     except LegsError as error:
         say_error("legs-patch", error)
         return 2
     except KeyboardInterrupt:
-        say(f"legs-patch: interrupted; {_so_far(folder, undoing, before)}", sys.stderr)
+        say(f"legs-patch: interrupted; {_so_far(args)}", sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 0
     except OSError as error:  # a full disk under --verify, a folder that went away
         where = f"{error.filename}: " if error.filename is not None else ""
-        what = _so_far(folder, undoing, before)
-        say(f"legs-patch: error: {where}{error.strerror or str(error)[:500]}; {what}", sys.stderr)
+        say(f"legs-patch: error: {where}{error.strerror or str(error)[:500]}; {_so_far(args)}", sys.stderr)
         return 2
     except ModuleNotFoundError as error:
         if error.name != "libcst":
@@ -64,23 +86,13 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
         return 2
 
 
-def _so_far(folder: str, undoing: bool, before: bytes) -> str:
+def _so_far(args: argparse.Namespace) -> str:
     """Return what was done so far, from the journal: a command writes all files and the journal, or nothing."""
-    if _journal(folder) == before:
+    if _journal(args.folder) == getattr(args, "before", _journal(args.folder)):
         return "nothing was changed"
-    if undoing:
+    if args.undo:
         return "the patch was already undone"
-    return f"the patch was already written; undo it with: legs-patch --undo {folder}"
-
-
-def _arguments(argv: Optional[Sequence[str]]) -> argparse.Namespace:
-    parser = _parser()
-    args = parser.parse_args(argv)
-    if args.undo and (args.check or args.verify):
-        parser.error("--undo can be combined with --diff, --force and --trust only")
-    if args.trust is not None and not args.undo:
-        parser.error("--trust requires --undo")
-    return args
+    return f"the patch was already written; undo it with: legs-patch --undo {args.folder}"
 
 
 class _Explain(argparse.Action):
@@ -94,11 +106,10 @@ class _Explain(argparse.Action):
         parser.exit()
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="legs-patch", description=__doc__, epilog=EXIT_CODES)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``legs-patch`` and ``legs patch``: what most use first, the advanced ones last."""
+    parser.epilog = EXIT_CODES
     parser.add_argument("folder", metavar="FOLDER", help="the checkout")
-    parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
-    parser.offer_completion()
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--diff", action="store_true", help="show what would change as a unified diff; write nothing")
     what.add_argument("--check", action="store_true", help="exit with 1 if something would change; write nothing")
@@ -111,35 +122,43 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--undo", action="store_true", help="undo the patch, byte for byte; with --diff: show what would change"
     )
-    parser.add_argument(
-        "--trust",
-        metavar="NAME",
-        help="with --undo: accept a journal that you did not write on this machine; the error message gives its NAME",
+    settings = parser.add_argument_group("the loss, written to legs.toml")
+    settings.add_argument("--preset", metavar="NAME", help="3dgs, eggs, legs-l, legs or legs-robust; default: legs")
+    settings.add_argument("--beta", type=float, metavar="X", help="weight of the strongest response, minus 1")
+    settings.add_argument("--curve", metavar="NAME", help="C1 to C5")
+    settings.add_argument("--operator", metavar="NAME", help=f"one of {', '.join(OPERATORS)}")
+    settings.add_argument("--store", metavar="DIR", help="weight maps that legs precompute wrote")
+    terms = parser.add_argument_group("advanced: which terms")
+    terms.add_argument("--partial", action="store_true", help="patch the terms that can be decided, and no others")
+    terms.add_argument(
+        "--site", action="append", default=[], metavar="FILE:LINE", help="patch this term, and no other; repeatable"
     )
-    parser.add_argument(
-        "--force",
-        action="store_true",
-        help="patch despite uncommitted changes in git; with --undo: restore the patched lines of files that were "
-        "edited since, and keep the edits",
+    terms.add_argument(
+        "--exclude", action="append", default=[], metavar="GLOB", help="files or folders to ignore; repeatable"
     )
-    parser.add_argument(
+    terms.add_argument(
         "--ssim",
         action="store_true",
         help="also rewrite the training step's SSIM to legs_loss.ssim, which is faster, where the checkout's own is "
         "provably the SSIM of 3DGS",
     )
-    parser.add_argument("--partial", action="store_true", help="patch the terms that can be decided, and no others")
-    parser.add_argument(
-        "--site", action="append", default=[], metavar="FILE:LINE", help="patch this term, and no other; repeatable"
-    )
-    parser.add_argument(
-        "--exclude", action="append", default=[], metavar="GLOB", help="files or folders to ignore; repeatable"
-    )
-    parser.add_argument("--json", action="store_true", help="report as JSON")
-    parser.add_argument(
+    terms.add_argument(
         "--explain", action=_Explain, nargs="?", metavar="RULE", help="explain a rule, or list the rules, and exit"
     )
-    proof = parser.add_argument_group("with --verify")
+    safety = parser.add_argument_group("advanced: safety and scripts")
+    safety.add_argument(
+        "--force",
+        action="store_true",
+        help="patch despite uncommitted changes in git; with --undo: restore the patched lines of files that were "
+        "edited since, and keep the edits",
+    )
+    safety.add_argument(
+        "--trust",
+        metavar="NAME",
+        help="with --undo: accept a journal that you did not write on this machine; the error message gives its NAME",
+    )
+    safety.add_argument("--json", action="store_true", help="report as JSON")
+    proof = parser.add_argument_group("advanced: with --verify")
     proof.add_argument("--script", metavar="FILE", help="the training script; default: the file of the term")
     proof.add_argument("--iterations", type=int, default=40, metavar="N", help="steps to compare; default: 40")
     proof.add_argument(
@@ -148,13 +167,6 @@ def _parser() -> argparse.ArgumentParser:
         help="the script's arguments, with {scene}, {output}, {iterations}, {port} filled in; default: those of "
         "Inria's train.py that the script declares",
     )
-    settings = parser.add_argument_group("settings, written to legs.toml")
-    settings.add_argument("--preset", metavar="NAME", help="3dgs, eggs, legs-l, legs or legs-robust; default: legs")
-    settings.add_argument("--beta", type=float, metavar="X", help="weight of the strongest response, minus 1")
-    settings.add_argument("--curve", metavar="NAME", help="C1 to C5")
-    settings.add_argument("--operator", metavar="NAME", help=f"one of {', '.join(OPERATORS)}")
-    settings.add_argument("--store", metavar="DIR", help="weight maps that legs precompute wrote")
-    return parser
 
 
 def _patch(args: argparse.Namespace) -> int:

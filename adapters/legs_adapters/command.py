@@ -8,6 +8,8 @@ run on the CPU and a shim replaces the rasterizer: slow, but it trains.
 from __future__ import annotations
 
 import argparse
+import os
+from typing import Sequence
 
 from legs_loss import LegsError
 
@@ -23,7 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the script and return its exit code."""
+    """Run the script and return its exit code.
+
+    Raises:
+        LegsError: an option of ours stands behind the script, which does not know it.
+    """
+    _refuse_ours(args.script, args.arguments)
     try:
         from legs_adapters.runner import run_script
     except ModuleNotFoundError as error:
@@ -31,3 +38,16 @@ def run(args: argparse.Namespace) -> int:
             raise
         raise LegsError("legs run needs LibCST: pip install 'legs-loss[patch]'") from None
     return run_script(args.script, args.arguments, args.cpu, args.ssim)
+
+
+def _refuse_ours(script: str, arguments: Sequence[str]) -> None:
+    """Raise for `legs run train.py --cpu`: what stands behind the script is the script's own."""
+    ours = [word for word in arguments if word in ("--cpu", "--ssim")]
+    if ours and os.path.isfile(script):
+        with open(script, encoding="utf-8", errors="replace") as file:
+            text = file.read()
+        for option in ours:
+            if option[2:] not in text:
+                raise LegsError(
+                    f"{option} stands behind {script}, which does not know it: legs run {option} {script} ..."
+                )

@@ -26,8 +26,12 @@ EXIT_CODES = "exit codes: 0 done; 1 done, but some items failed; 2 bad input or 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs`` with these arguments (default: the process's own) and return its exit code."""
     never_fail_to_print()
-    args = _parser().parse_args(argv)
     try:
+        parser = _parser()
+        args = parser.parse_args(argv)
+        if args.command is None:  # not an error: a user asks what there is
+            say(parser.format_help(), lines=True)
+            return 0
         return args.run(args)
     except LegsError as error:
         say_error("legs", error)
@@ -52,7 +56,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
     parser.offer_completion()
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    commands.required = True
     modules: Dict[str, Callable[[], Any]] = {
         name: functools.partial(importlib.import_module, f"{__name__}.{name}") for name in COMMANDS
     }

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from contextlib import suppress
+from pathlib import Path
 from typing import Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes import Scene, View, image_size, training_size
 from legs_loss.system import say
 
-__all__ = ["check_resolution", "check_trainable"]
+__all__ = ["check_resolution", "check_trainable", "check_writable"]
 
 _TINY = 64  # pixels: a smaller width was probably meant as a divisor
 
@@ -48,6 +50,20 @@ def check_trainable(scene: Scene, resolution: int) -> None:
             "sparse/0/points3D.bin"
         )
     check_resolution(resolution, scene.views)
+
+
+def check_writable(folder: Path) -> None:
+    """Check that a folder can be made and written to; it is not made yet.
+
+    Raises:
+        LegsError: it cannot; the message says why.
+    """
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    try:
+        with tempfile.TemporaryFile(dir=str(there)):
+            pass
+    except OSError as error:
+        raise LegsError(f"cannot write to {folder}: {there}: {error.strerror or error}") from None
 
 
 def _first_size(views: Sequence[View]) -> Optional[Tuple[int, int]]:

@@ -53,25 +53,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="of each arm; default: 3")
     parser.add_argument(
-        "--first_seed", type=int, default=0, metavar="N", help="default: 0; with --seeds 1 a single row is trained"
-    )
-    parser.add_argument(
-        "-m", "--out", type=Path, default=Path("legs_compare"), metavar="DIR", help="default: legs_compare"
-    )
-    parser.add_argument(
         "--iterations",
         type=int,
         metavar="N",
         help="of each training; default: 2000, with --upstream the codebase's own",
     )
     parser.add_argument(
+        "-m", "--out", type=Path, default=Path("legs_compare"), metavar="DIR", help="default: legs_compare"
+    )
+    advanced = parser.add_argument_group("advanced")
+    advanced.add_argument(
+        "--first_seed", type=int, default=0, metavar="N", help="default: 0; with --seeds 1 a single row is trained"
+    )
+    advanced.add_argument(
         "--densify_grad_threshold", type=float, metavar="X", help="of all arms; default: as for legs train"
     )
-    parser.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
-    parser.add_argument(
+    advanced.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
+    advanced.add_argument(
         "--scheduler", metavar="ADDRESS", help="of a dask cluster that shares the file system; a training is a task"
     )
-    upstream = parser.add_argument_group("another codebase's trainings, one at a time")
+    upstream = parser.add_argument_group("advanced: another codebase's trainings, one at a time")
     upstream.add_argument("--upstream", type=Path, metavar="FOLDER", help="a checkout, which is copied to OUT/upstream")
     upstream.add_argument(
         "--profile", metavar="NAME|FILE", help="how it is trained: built in, or a TOML file; default: the one that fits"
@@ -87,7 +88,8 @@ def run(args: argparse.Namespace) -> int:
     """Train what is missing and print the tables."""
     from tqdm import tqdm
 
-    from legs_loss.cli.train import set_threads
+    from legs_loss.cli.checks import check_writable
+    from legs_loss.cli.train import COMPILING, set_threads
     from legs_loss.errors import LegsError
     from legs_loss.experiments.arms import needed, parse_arms
     from legs_loss.experiments.running import BASELINE, Comparison
@@ -103,6 +105,7 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, name) < least:
             raise LegsError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     study = STUDIES[args.study] if args.arms is None else these_arms(args.arms)
+    check_writable(args.out)
     if args.upstream is not None and study.degraded:
         raise LegsError(f"--study {args.study} is for the package's own trainer, which degrades the views itself")
     if args.upstream is not None:
@@ -130,6 +133,7 @@ def run(args: argparse.Namespace) -> int:
     say(f"{len(arms)} arms, {len(seeds)} seed(s); {missing} of {len(arms) * len(seeds)} trainings to do")
     reached: Dict[str, int] = {}
     bar = tqdm(total=missing * base.iterations, desc="iterations", mininterval=0.5, disable=not missing, delay=0.001)
+    bar.set_postfix_str(COMPILING)
     with bar, tensorboard_log(args.tensorboard) as log:
 
         def show(name: str, progress: Progress) -> None:
@@ -164,6 +168,8 @@ def _upstream(args: argparse.Namespace, study: Study) -> int:
 
     if args.scene is None:
         raise LegsError("--upstream needs a SCENE")
+    if not args.upstream.is_dir():
+        raise LegsError(f"there is no folder {args.upstream}: --upstream takes a checkout of the codebase")
     if args.scheduler is not None:
         raise LegsError("--upstream trains here, one run at a time: do not give --scheduler")
     if args.tensorboard is not None:

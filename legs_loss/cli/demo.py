@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -34,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make or read the scene, precompute, train, print the table and save the pictures."""
+    from legs_loss.cli.checks import check_writable
     from legs_loss.cli.train import progress_bar, set_threads
     from legs_loss.errors import LegsError
     from legs_loss.precompute import precompute
@@ -51,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
     if args.processes < 1:
         raise LegsError(f"--processes must be at least 1, got {args.processes}")
     out: Path = args.out
+    check_writable(out)
     if args.scene is None:
         root = out / "scene"
         say(f"making the embedded scene in {root}")
@@ -97,6 +100,8 @@ def run(args: argparse.Namespace) -> int:
         f"on one sheet: {sheet}"
     )
     say(f"Scenes: {out}{os.sep}METHOD{os.sep}point_cloud{os.sep}...{os.sep}point_cloud.ply")
+    moved = "" if args.scene is None else f" -s {shlex.quote(args.scene)}"
+    say(f"Look at them in the browser: legs view {shlex.quote(str(out))}{moved} (pip install 'legs-loss[view]')")
     say(f"{time.perf_counter() - started:.0f} s in all")
     return 0
 

@@ -63,7 +63,7 @@ class _PrintCompletion(argparse.Action):
             words = set(re.findall(r"[A-Z]+", action.metavar)) if isinstance(action.metavar, str) else set()
             if words & (_FILES | _FOLDERS):
                 action.complete = shtab.FILE if words & _FILES else shtab.DIRECTORY  # type: ignore[attr-defined]
-        print(shtab.complete(parser, given[1]))
+        print(shtab.complete(parser, given[1]), flush=True)  # flushed here, where a closed pipe is still caught
         parser.exit()
 
 

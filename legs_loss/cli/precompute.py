@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     """Check the arguments before anything is computed; return the tasks, and their stores as they were named."""
-    from legs_loss.cli.checks import check_resolution
+    from legs_loss.cli.checks import check_resolution, check_writable
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import SceneTask, find_scenes, stores_of
     from legs_loss.scenes import read_scene
@@ -97,6 +97,8 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
         raise LegsError(f"--workers must be at least 1, got {workers}")
     scenes = find_scenes(args.scene)
     stores = stores_of(scenes, args.out)
+    for scene in scenes if args.out is None else ():
+        _refuse_photographs_of_a_scene(scene)
     try:
         views = read_scene(scenes[0], args.images).views
     except LegsError:
@@ -106,6 +108,9 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     check_resolution(args.resolution, views)
     if args.out is not None:
         _make(stores[0].parent)
+    if args.scheduler is None:
+        for store in stores:
+            check_writable(store)
     images = None if args.images is None or not os.path.isdir(args.images) else os.path.abspath(args.images)
     return {
         SceneTask(
@@ -119,6 +124,23 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
         ): store
         for scene, store in zip(scenes, stores)
     }
+
+
+def _refuse_photographs_of_a_scene(folder: Path) -> None:
+    """Raise a LegsError for SCENE/images: no training that is given SCENE would find the maps in there."""
+    from legs_loss.errors import LegsError
+    from legs_loss.scenes.transforms import find_transforms
+
+    def is_scene(path: Path) -> bool:
+        return (path / "sparse").is_dir() or bool(find_transforms(path))
+
+    scene = folder.absolute().parent
+    if folder.is_dir() and is_scene(scene) and not is_scene(folder):
+        other = "" if folder.name == "images" else f" --images {shlex.quote(folder.name)}"
+        raise LegsError(
+            f"{folder} has the photographs of the scene {scene}: no training of it looks for maps in there; give "
+            f"the scene: legs precompute {shlex.quote(str(scene))}{other}"
+        )
 
 
 def _make(folder: Path) -> None:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 HELP = "train 3D Gaussians on a scene, on the CPU"
 
+COMPILING = "starts; the first time on a machine it compiles for 10 to 40 s"
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
@@ -37,42 +39,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the run's folder; default: output/SCENE-PRESET",
     )
     parser.add_argument("--resume", action="store_true", help="resume the run in the output folder")
-    parser.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")
-    parser.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
-    parser.add_argument("--threads", type=int, metavar="N", help="default: one a core")
-    parser.add_argument(
-        "--checkpoint_every", type=int, default=500, metavar="N", help="iterations between checkpoints; default: 500"
-    )
     # Settings of the run. One that is not given is absent, so that --resume can tell.
-    settings = parser.add_argument_group("settings", argument_default=argparse.SUPPRESS)
+    settings = parser.add_argument_group("the loss and the run", argument_default=argparse.SUPPRESS)
     settings.add_argument("--preset", dest="spec", choices=PRESETS, help="the loss; default: legs")
     settings.add_argument("--iterations", type=int, metavar="N", help="default: 2000")
     settings.add_argument(
         "-r", "--resolution", type=int, metavar="1|2|4|8|WIDTH", help="as in 3DGS; default: at most 1600 wide"
     )
     settings.add_argument("-w", "--white_background", action="store_true", help="white in place of black")
-    settings.add_argument("--sh_degree", type=int, choices=range(4), help="of the colours; default: 1")
-    settings.add_argument("--lambda_dssim", type=float, metavar="X", help="share of D-SSIM in the loss; default: 0.2")
-    settings.add_argument("--l1_scale", type=float, metavar="X", help="multiplies the L1 term; default: 1")
-    settings.add_argument(
+    settings.add_argument("--max_gaussians", type=int, metavar="N", help="a cap on their number; default: none")
+    settings.add_argument("--seed", type=int, metavar="N", help="default: 0")
+    advanced = parser.add_argument_group("advanced: the training", argument_default=argparse.SUPPRESS)
+    advanced.add_argument("--sh_degree", type=int, choices=range(4), help="of the colours; default: 1")
+    advanced.add_argument("--lambda_dssim", type=float, metavar="X", help="share of D-SSIM in the loss; default: 0.2")
+    advanced.add_argument("--l1_scale", type=float, metavar="X", help="multiplies the L1 term; default: 1")
+    advanced.add_argument(
         "--position_lr_max_steps",
         type=int,
         metavar="N",
         help="iterations over which the rate of positions falls; default: all; 3DGS: 30000",
     )
-    settings.add_argument(
+    advanced.add_argument(
         "--densify_grad_threshold",
         type=float,
         metavar="X",
         help="default: 0.12 / sqrt(width * height), at least 3DGS's 2e-4, which is too low for small images",
     )
-    settings.add_argument("--max_gaussians", type=int, metavar="N", help="a cap on their number; default: none")
-    settings.add_argument("--seed", type=int, metavar="N", help="default: 0")
+    places = parser.add_argument_group("advanced: files and threads")
+    places.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")
+    places.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
+    places.add_argument("--threads", type=int, metavar="N", help="default: one a core")
+    places.add_argument(
+        "--checkpoint_every", type=int, default=500, metavar="N", help="iterations between checkpoints; default: 500"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, or resume a training, and print the scores."""
-    from legs_loss.cli.checks import check_trainable
+    from legs_loss.cli.checks import check_trainable, check_writable
     from legs_loss.errors import LegsError
     from legs_loss.reference.training.checkpoint import CHECKPOINT, check_new
     from legs_loss.reference.training.trainer import TrainConfig, point_cloud, train
@@ -86,13 +90,12 @@ def run(args: argparse.Namespace) -> int:
     checkpoint = out / CHECKPOINT
     if args.checkpoint_every < 1:
         raise LegsError(f"--checkpoint_every must be at least 1, got {args.checkpoint_every}")
-    if args.resume:
-        config = _resumed(checkpoint, given)
-    else:
-        check_new(out)  # and again when it begins: another may have begun meanwhile
-        config = TrainConfig(**given)
+    config = _resumed(checkpoint, given) if args.resume else TrainConfig(**given)
     scene = read_scene(args.scene, args.images)
     check_trainable(scene, config.resolution)
+    if not args.resume:
+        check_new(out)  # and again when it begins: another may have begun meanwhile
+    check_writable(out)
     with progress_bar(config.iterations, out.name) as show, tensorboard_log(args.tensorboard) as log:
 
         def on_progress(progress: Progress) -> None:
@@ -124,7 +127,7 @@ def set_threads(count: Optional[int]) -> None:
     try:
         import numba
     except ImportError:
-        raise LegsError("training needs numba: pip install 'legs-loss[cpu]'") from None
+        raise LegsError("this command needs numba: pip install 'legs-loss[cpu]'") from None
     import torch
 
     if count is None:
@@ -142,6 +145,7 @@ def progress_bar(iterations: int, name: str, position: int = 0) -> Iterator[Call
     from tqdm import tqdm
 
     with tqdm(total=iterations, desc=printable(name), position=position, leave=position == 0, mininterval=0.5) as bar:
+        bar.set_postfix_str(COMPILING)
 
         def show(progress: Progress) -> None:
             if bar.n == 0 and progress.iteration > 10:  # resumed: this run did not compute these iterations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import shlex
 import shutil
@@ -18,7 +19,7 @@ from legs_loss.cli import main
 from legs_loss.errors import did_you_mean
 from legs_loss.precompute import precompute
 from legs_loss.scenes import read_scene
-from tests.support import colmap_scene, photograph, save
+from tests.support import ROOT, colmap_scene, legs_environment, photograph, save
 
 
 @pytest.fixture
@@ -165,6 +166,83 @@ class TestWhatIsNotThere:
         assert "a.png is a file: a scene is a folder" in says(capsys, "precompute", tmp_path / "a.png")[1]
 
 
+class TestFirstQuarterOfAnHour:
+    def test_legs_alone_gives_help(self, capsys):
+        assert main([]) == 0
+        text = capsys.readouterr().out
+        assert text.startswith("usage: legs ") and "\n    precompute " in text
+
+    def test_legs_patch_and_the_sub_command_are_one(self, capsys, tmp_path):
+        pytest.importorskip("libcst")
+        import legs_adapters.cli as command
+
+        parser = argparse.ArgumentParser()
+        command.add_arguments(parser)
+        outputs = []
+        for call in (patch, lambda given: command.run(parser.parse_args(given))):
+            assert call([str(tmp_path), "--diff"]) == 2
+            outputs.append(capsys.readouterr())
+        assert outputs[0] == outputs[1]
+        assert "no photometric L1 term was found" in outputs[0].err
+
+    def test_photographs_of_a_scene_are_no_scene(self, capsys, scene, tmp_path):
+        code, text = says(capsys, "precompute", scene / "images", "--workers", 1)
+        assert code == 2
+        assert text.endswith(f"give the scene: legs precompute '{scene}'\n")
+        assert not (scene / "images" / "legs_weights").exists()
+        (scene / "images").rename(scene / "images_2")
+        assert text.count("\n") == 1
+        assert says(capsys, "precompute", scene / "images_2", "--workers", 1)[1].endswith(" --images images_2\n")
+        assert says(capsys, "precompute", scene / "images_2", "--out", tmp_path / "maps", "--workers", 1)[0] == 0
+
+    @pytest.mark.parametrize("command", ["precompute", "train", "compare", "demo"])
+    def test_a_folder_that_cannot_be_written_is_met_before_anything_is_computed(self, capsys, scene, tmp_path, command):
+        pytest.importorskip("numba")
+        pytest.importorskip("matplotlib")
+        (tmp_path / "file").write_text("")
+        code, text = says(capsys, command, scene, "--out", tmp_path / "file" / "run")
+        assert code == 2
+        assert re.fullmatch(r"legs: error: cannot write to .*: (Not a directory|File exists)\n", text)
+
+    def test_a_bad_value_comes_before_the_run_that_is_there(self, capsys, scene, tmp_path):
+        pytest.importorskip("numba")
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run" / "checkpoint.npz").write_bytes(b"")
+        for arguments, message in ((["--iterations", "-1"], "iterations must"), ([], "already holds a run")):
+            code, text = says(capsys, "train", scene, "--out", tmp_path / "run", *arguments)
+            assert (code, text.count("\n")) == (2, 1)
+            assert message in text
+
+    def test_an_upstream_that_is_not_there(self, capsys, scene, tmp_path):
+        pytest.importorskip("numba")
+        code, text = says(capsys, "compare", scene, "--upstream", tmp_path / "nothere", "--out", tmp_path / "out")
+        assert code == 2
+        assert f"there is no folder {tmp_path / 'nothere'}: --upstream takes a checkout" in text
+
+    def test_cpu_behind_the_script(self, tmp_path):
+        pytest.importorskip("libcst")
+        script = tmp_path / "train.py"
+        script.write_text("print('ran')\n")
+        command = [sys.executable, "-m", "legs_loss", "run", str(script), "--cpu"]
+        done = subprocess.run(command, capture_output=True, text=True, env=legs_environment())
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.endswith(f"which does not know it: legs run --cpu {script} ...\n")
+
+    @pytest.mark.parametrize("module", ["legs_loss", "legs_adapters.cli"])
+    def test_completion_into_a_pipe_that_closes(self, module):
+        pytest.importorskip("shtab")
+        command = f"{shlex.quote(sys.executable)} -m {module} --print-completion bash | head -n 1"
+        done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=legs_environment())
+        assert done.stdout.startswith("# AUTOMATICALLY GENERATED")
+        assert done.stderr == ""
+
+    def test_the_extra_of_the_report_has_what_the_report_needs(self):
+        tomllib = pytest.importorskip("tomllib")
+        extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+        assert {"legs-loss[cpu]", "matplotlib>=3.5", "jinja2>=3"} <= set(extras["report"])
+        assert any(one.startswith("numba") for one in extras["cpu"])
+
+
 class TestCommandsToCopy:
     def test_undo_with_a_space_in_the_path(self, tmp_path):
         pytest.importorskip("libcst")
@@ -187,8 +265,6 @@ class TestCommandsToCopy:
         assert (checkout / "train.py").read_text() == before
 
     def test_extras_are_quoted_wherever_they_are_printed(self):
-        from tests.support import ROOT
-
         texts = [path for folder in ("legs_loss", "adapters", "docs") for path in (ROOT / folder).rglob("*.py")]
         for path in [*texts, *(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]:
             for line in path.read_text(encoding="utf-8").splitlines():

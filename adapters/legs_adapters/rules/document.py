@@ -33,13 +33,13 @@ def explain(name: str) -> str:
     """Return what ``--explain`` prints of a rule, or of each rule with a reason.
 
     Raises:
-        LegsError: there is no such rule; the message lists the rules and proposes a similar name.
+        LegsError: there is no such rule; the message proposes a similar name.
     """
     rules = [rule for rule in RULES.values() if name == rule.id] or [r for r in RULES.values() if name == r.reason]
     if not rules:
         near = difflib.get_close_matches(name.lower(), [*RULES, *(rule.reason for rule in RULES.values())], 1)
         guess = f"; did you mean {near[0]}?" if near else ""
-        raise LegsError(f"there is no rule {name!r}{guess}", listed().rstrip())
+        raise LegsError(f"there is no rule {name!r}{guess or '; legs-patch --explain lists them'}")
     return "\n".join(_explained(rule) for rule in rules)
 
 

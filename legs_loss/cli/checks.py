@@ -63,7 +63,8 @@ def check_writable(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=str(there)):
             pass
     except OSError as error:
-        raise LegsError(f"cannot write to {folder}: {there}: {error.strerror or error}") from None
+        where = "" if there == folder else f": {there}"
+        raise LegsError(f"cannot write to {folder}{where}: {error.strerror or error}") from None
 
 
 def _first_size(views: Sequence[View]) -> Optional[Tuple[int, int]]:

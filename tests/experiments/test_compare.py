@@ -136,7 +136,7 @@ def test_where_nothing_can_be_written(tiny_scene: Path, tmp_path: Path, capsys: 
     settings = ["--iterations", "4", "-r", "2", "--seeds", "1", "--processes", "1"]
     for scene in ([str(tiny_scene)], []):  # its own scene is written there first
         assert main(["compare", *scene, *settings, "--out", str(tmp_path / "file")]) == 2
-        assert capsys.readouterr().err.startswith(f"legs: error: cannot write {tmp_path / 'file'}")
+        assert capsys.readouterr().err.startswith(f"legs: error: cannot write to {tmp_path / 'file'}")
     out = tmp_path / "out"
     out.mkdir()
     (out / "3dgs").write_text("")

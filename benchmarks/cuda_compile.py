@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Any, Dict, List, Tuple
 
-from legs_loss.kernels.cuda.launch import NORMS, STENCILS, VALUES
+from legs_loss.kernels.cuda.backend import NORMS, STENCILS, VALUES
 from legs_loss.kernels.cuda.modules import Variant, options, source
 from legs_loss.kernels.cuda.nvrtc import Compiler, NotFound, find_compiler, resources
 

@@ -7,7 +7,7 @@ import subprocess
 from benchmarks.gpu.options import Options, Record
 from benchmarks.losses import machine as machines
 from benchmarks.losses.timing import copy_bandwidth
-from legs_loss.kernels import backends
+from legs_loss.kernels.available import BACKENDS
 
 __all__ = ["machine"]
 
@@ -21,8 +21,8 @@ def machine(options: Options, record: Record) -> None:
         ("nvcc", ["nvcc", "--version"]),
     ):
         record(**{name: _said_by(command)})
-    backend = backends.backend_for(device)
-    reason = backends.finding("cuda", device).reason
+    backend = BACKENDS.chosen(device)
+    reason = BACKENDS.availability("cuda", device).reason
     record(**{"backend": f"{backend}: {reason}", "GB/s of a copy": copy_bandwidth(device) / 1e9})
     if backend != "cuda":
         raise RuntimeError(f"the kernels are not used: {reason}")

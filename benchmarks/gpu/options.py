@@ -58,13 +58,13 @@ class Options:
 
 def emulate() -> None:
     """Put the CUDA kernels, compiled with g++, in the place of the CPU's backend in this process."""
-    from legs_loss.kernels import backends
+    from legs_loss.kernels.available import BACKENDS, Availability, Known
 
     sys.path.insert(0, str(ROOT))
     from tests.cuda_emulation import emulated
 
-    backends._KNOWN = {"cuda": ("tests.cuda_emulation", "cpu")}
-    backends._findings["cuda cpu"] = backends.Finding(emulated(), True, "emulated on the CPU")
+    BACKENDS._known = {"cuda": Known("tests.cuda_emulation", "cpu")}
+    BACKENDS._found = {("cuda", torch.device("cpu")): Availability(emulated(), True, "emulated on the CPU")}
 
 
 def first_line(error: Any) -> str:

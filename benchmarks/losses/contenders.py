@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legs_loss import legs_loss, weight_map
-from legs_loss.kernels.backends import backend_for, finding
+from legs_loss.kernels.available import BACKENDS
 from legs_loss.kernels.contract import Weights
 from legs_loss.spec import PRESETS
 from legs_loss.ssim import ssim_map
@@ -38,8 +38,7 @@ def losses(pairs: Pairs) -> Contenders:
         return lambda image, target: similarity(image.unsqueeze(0), target.unsqueeze(0), *rest, **settings)
 
     contenders: Dict[str, Loss] = {}
-    backend = backend_for(device)
-    kernel = finding(backend, device).backend if backend != "torch" else None
+    kernel = BACKENDS.ready(device)
     if kernel is not None:
         contenders["LEGS, weights in the kernel"] = lambda image, target, _: legs_loss(image, target, LEGS)
         contenders["LEGS, stored map"] = lambda image, target, stored: legs_loss(image, target, weight=stored)
@@ -100,7 +99,7 @@ def reference_ssim(image: Tensor, target: Tensor) -> Tensor:
 def weightings(target: Tensor) -> Contenders:
     """Return each way to the weights of a photograph as a function."""
     found: Contenders = {"weight_map": lambda: weight_map(target, LEGS)}
-    if not target.is_cuda and finding("numba", target.device).backend is not None:
+    if not target.is_cuda and BACKENDS.availability("numba", target.device).backend is not None:
         from legs_loss.kernels.numba_response import extremes
 
         batch = target.unsqueeze(0).numpy()

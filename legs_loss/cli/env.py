@@ -65,9 +65,7 @@ def _version(package: str) -> str:
 
 
 def _backend(device: torch.device) -> str:
-    from legs_loss.kernels.backends import BACKENDS, backend_for, finding, runs_on
+    from legs_loss.kernels.available import BACKENDS
 
-    chosen = backend_for(device)
-    tried = [name for name in BACKENDS if name != "torch" and runs_on(name, device)]
-    reasons = [f"{name}: {finding(name, device).reason}" for name in tried]
-    return "; ".join([chosen, *reasons])
+    reasons = [f"{name}: {BACKENDS.availability(name, device).reason}" for name in BACKENDS.names(device)]
+    return "; ".join([BACKENDS.chosen(device), *reasons])

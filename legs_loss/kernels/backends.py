@@ -1,95 +1,20 @@
-"""Choose the code that computes the loss: torch, or a backend that is installed and works.
-
-A backend is tested once before its first use, on a small image against torch. One that is not installed is skipped
-silently; one that fails, then or later, is reported once on stderr, and torch is used instead.
-``LEGS_BACKEND=torch|numba|cuda`` forces one; images that it does not support are computed by torch.
-"""
+"""The loss by the backend that is available for its images; each function returns None where torch has to do it."""
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import os
-import sys
-import threading
-from typing import Callable, Dict, NamedTuple, Optional
+from typing import Callable, Optional
 
 import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.images import as_map, channels_first, is_compiling
-from legs_loss.kernels.contract import Backend, NotNow, Weights
+from legs_loss.kernels.available import BACKENDS, OUT_OF_MEMORY, forced_backend
+from legs_loss.kernels.contract import Backend, DeviceFault, NotNow, Weights
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
 
-__all__ = [
-    "BACKENDS",
-    "Finding",
-    "backend_for",
-    "finding",
-    "fused_l1",
-    "fused_loss",
-    "fused_range",
-    "fused_ssim",
-    "is_capturing",
-    "runs_on",
-]
-
-# A backend: the module whose BACKEND it is, and the type of the devices it is for.
-_KNOWN = {
-    "numba": ("legs_loss.kernels.numba_loss", "cpu"),
-    "cuda": ("legs_loss.kernels.cuda.backend", "cuda"),
-}
-BACKENDS = ("torch", *_KNOWN)
-_OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
-
-
-class Finding(NamedTuple):
-    """The result of trying a backend on a device: the backend, or why it is not used.
-
-    Attributes:
-        backend: None where it is not used.
-        installed: whether its package is installed.
-        reason: why it is, or is not, used.
-    """
-
-    backend: Optional[Backend]
-    installed: bool
-    reason: str
-
-
-_findings: Dict[str, Finding] = {}
-_lock = threading.RLock()
-_forked = False
-
-
-def backend_for(device: torch.device) -> str:
-    """Return which backend the loss uses for images on a device: "torch" or the name of another.
-
-    Raises:
-        LegsError: LEGS_BACKEND is none of these.
-    """
-    forced = _forced()
-    name = forced or next((name for name in _KNOWN if runs_on(name, device)), "torch")
-    if name == "torch" or not runs_on(name, device):
-        return "torch"
-    return name if finding(name, device).backend is not None else "torch"
-
-
-def finding(name: str, device: torch.device) -> Finding:
-    """Return the result of a backend's trial on a device, which runs once per process."""
-    key = f"{name} {device.type}"
-    if key not in _findings:
-        with _lock:
-            if key not in _findings:
-                _record(name, device, _try(name, device))
-    return _findings[key]
-
-
-def runs_on(name: str, device: torch.device) -> bool:
-    """Return whether a backend is for a device."""
-    return device.type == _KNOWN[name][1] and not _forked
+__all__ = ["fused_l1", "fused_loss", "fused_range", "fused_ssim"]
 
 
 def fused_loss(
@@ -105,7 +30,7 @@ def fused_loss(
     The arguments are checked as a pair already; maps and masks are in any shape that ``legs_loss`` takes.
     """
     unweighted = weights.map is weights.mask is None and (weights.spec is None or weights.spec.unweighted)
-    if padding != "zeros" or lambda_dssim == 0.0 or (unweighted and not _forced()):
+    if padding != "zeros" or lambda_dssim == 0.0 or (unweighted and not forced_backend()):
         return None  # unweighted it is 3DGS's own loss, to the last bit
     return _fused(
         "loss",
@@ -177,7 +102,7 @@ def _fused(
 ) -> Optional[Tensor]:
     if is_compiling() or not _plain_tensors(prediction, target, weights.map, weights.mask, weights.range):
         return None
-    backend = _ready_backend(prediction.device)
+    backend = BACKENDS.ready(prediction.device)
     if backend is None or operation not in backend.offers:
         return None
     first, second = channels_first(prediction, channels_last), channels_first(target, channels_last)
@@ -191,28 +116,11 @@ def _fused(
         return run(backend, first, second, resolved)
     except NotNow:
         return None
-    except (LegsError, MemoryError, _OUT_OF_MEMORY):
+    except (LegsError, MemoryError, OUT_OF_MEMORY, DeviceFault):
         raise
     except Exception as error:  # a size or type that its trial did not cover
-        _record(backend.name, prediction.device, Finding(None, True, _in_words(error)))
+        BACKENDS.give_up(backend.name, prediction.device, error)
         return None
-
-
-def _ready_backend(device: torch.device) -> Optional[Backend]:
-    if is_capturing(device) and not _tried(device):
-        return None  # a trial waits for the device, which would break a capture
-    name = backend_for(device)
-    return None if name == "torch" else finding(name, device).backend
-
-
-def is_capturing(device: torch.device) -> bool:
-    """Return whether launches on a device are being recorded into a CUDA graph."""
-    probe = getattr(torch.cuda, "is_current_stream_capturing", None)
-    return device.type == "cuda" and probe is not None and bool(probe())
-
-
-def _tried(device: torch.device) -> bool:
-    return all(f"{name} {device.type}" in _findings for name in _KNOWN if runs_on(name, device))
 
 
 def _resolved(backend: Backend, weights: Weights, target: Tensor, channels_last: bool, with_maps: bool) -> Weights:
@@ -251,57 +159,3 @@ def _is_special(tensor: Tensor) -> bool:
     functorch = getattr(torch._C, "_functorch", None)
     wrapped = getattr(functorch, "is_functorch_wrapped_tensor", None)
     return wrapped is not None and wrapped(tensor)
-
-
-def _forced() -> Optional[str]:
-    name = os.environ.get("LEGS_BACKEND", "")
-    if name and name not in BACKENDS:
-        raise LegsError(f"LEGS_BACKEND must be one of {', '.join(BACKENDS)}, got {name!r}")
-    return name or None
-
-
-def _try(name: str, device: torch.device) -> Finding:
-    try:
-        missing = _missing(name)
-        if missing:
-            return Finding(None, False, missing)
-        from legs_loss.kernels.trial import difference_from_torch
-
-        backend = importlib.import_module(_KNOWN[name][0]).BACKEND
-        threads = torch.get_num_threads()
-        with torch.inference_mode(False):  # the first call may be in an evaluation; the trial needs gradients
-            problem = difference_from_torch(backend, device)
-        torch.set_num_threads(threads)  # numba's first parallel loop sets OpenMP's number, which is torch's too
-    except Exception as error:  # anything that a broken install, compiler or driver raises
-        return Finding(None, True, _in_words(error))
-    return Finding(None if problem else backend, True, problem or "its trial agreed with torch")
-
-
-def _missing(name: str) -> Optional[str]:
-    """Return why a backend cannot be used in this installation."""
-    if name == "cuda":
-        return None if torch.version.cuda else "this torch is built without CUDA"
-    if importlib.util.find_spec(name) is None:
-        return "it is not installed"
-    if sys.version_info < (3, 8):
-        return "the last numba for Python 3.7 takes minutes to compile the weights"
-    return None
-
-
-def _record(name: str, device: torch.device, found: Finding) -> None:
-    _findings[f"{name} {device.type}"] = found
-    if found.backend is None and (found.installed or _forced() == name):
-        print(f"legs-loss: {name} is not used, torch is: {found.reason}", file=sys.stderr, flush=True)
-
-
-def _in_words(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error).strip() or 'no message'}".splitlines()[0]
-
-
-def _after_fork() -> None:
-    global _forked
-    _forked = True  # numba's threads do not exist in a forked process; using them would crash it
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)

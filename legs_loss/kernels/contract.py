@@ -13,11 +13,15 @@ from torch import Tensor
 
 from legs_loss.spec import WeightSpec
 
-__all__ = ["Backend", "NotNow", "Weights"]
+__all__ = ["Backend", "DeviceFault", "NotNow", "Weights"]
 
 
 class NotNow(Exception):
-    """An operation cannot be launched now, since loading its kernel would break a capture: torch computes it once."""
+    """An operation cannot be done now, for want of memory or since a capture is under way: torch computes it once."""
+
+
+class DeviceFault(RuntimeError):
+    """A kernel of somebody else's has failed, and the device computes nothing any more: no backend's failure."""
 
 
 class Weights(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any, Dict, Tuple
 import numpy as np
 import torch
 
-from legs_loss.kernels.backends import backend_for
+from legs_loss.kernels.available import BACKENDS
 from legs_loss.levels import response_levels
 from legs_loss.operators import OPERATORS
 from legs_loss.response import response
@@ -67,7 +67,7 @@ def _normalised(strength: torch.Tensor, spec: WeightSpec) -> Tuple[np.ndarray, f
 
 def compiles(values: int) -> bool:
     """Return whether numba is there, and worth loading for so many values of a photograph."""
-    return values >= _WORTH_COMPILING and backend_for(torch.device("cpu")) == "numba"
+    return values >= _WORTH_COMPILING and BACKENDS.chosen(torch.device("cpu")) == "numba"
 
 
 def compiled_anew(spec: WeightSpec) -> bool:

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from legs_loss.config import Config
 from legs_loss.images import check_values
-from legs_loss.kernels.backends import fused_range, is_capturing
+from legs_loss.kernels.available import is_capturing
+from legs_loss.kernels.backends import fused_range
 from legs_loss.kernels.contract import Weights
 from legs_loss.levels import RunningLevels, response_levels
 from legs_loss.response import normalise_response, response

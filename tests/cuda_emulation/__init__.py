@@ -1,26 +1,28 @@
-"""The CUDA backend on a CPU: its Python layer as it is, its kernels' source compiled with g++.
+"""The CUDA backend on a CPU: all of its Python as it is, behind a libcuda and a libnvrtc that are compiled by g++.
 
-:class:`Gpp` stands in for NVRTC and :class:`EmulatedDriver` for the CUDA driver; what is between them and the loss is
-the product's own: variants, cache, packing of arguments, grids, strides, scaling in backward.
+The two libraries stand in for NVIDIA's: the driver class packs arguments, chooses contexts and meets errors as on a
+GPU, and the kernels that it launches are legs.cu, compiled for the CPU.
 """
 
 from __future__ import annotations
 
 import ctypes
-import os
 import shutil
 import subprocess
 import tempfile
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, List, Optional, Sequence, Tuple
+from types import SimpleNamespace
+from typing import Any, List, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 
 from legs_loss.kernels.cuda.backend import CudaBackend
-from legs_loss.kernels.cuda.cache import BinaryCache
-from legs_loss.kernels.cuda.launch import THREADS, Task
-from legs_loss.kernels.cuda.modules import Modules
-from legs_loss.kernels.cuda.nvrtc import Compiled
+from legs_loss.kernels.cuda.driver import CudaDriver
+from legs_loss.kernels.cuda.modules import BinaryCache, Modules
+from legs_loss.kernels.cuda.nvrtc import Compiler
+
+__all__ = ["COMPILER", "EmulatedDriver", "Libraries", "RecordingDriver", "Runtime", "emulated", "libraries"]
 
 COMPILER = shutil.which("g++")
 # Locals start as a large negative number, so that what is read before it is written shows.
@@ -36,80 +38,99 @@ FLAGS = [
 HERE = Path(__file__).parent
 
 
-class Gpp:
-    """g++ in place of NVRTC."""
+class Libraries(NamedTuple):
+    """libcuda and libnvrtc, as ctypes loads them, and a folder for compiled kernels."""
 
-    version = "emulated"
-
-    def __init__(self, flags: Sequence[str] = ()) -> None:
-        self.flags = [*FLAGS, *flags]
-        self.compiled = 0
-
-    def target(self, architecture: int) -> str:
-        return f"sm_{architecture}"
-
-    def compile(self, source: bytes, options: Sequence[str], target: str) -> Compiled:
-        self.compiled += 1
-        with tempfile.TemporaryDirectory() as folder:
-            text, binary = Path(folder) / "legs.cu", Path(folder) / "legs.so"
-            text.write_bytes(source)
-            macros = [f'-DSOURCE="{text}"', *(option for option in options if option.startswith("-D"))]
-            command = [str(COMPILER), *self.flags, *macros, "-o", str(binary), str(HERE / "emulate.cpp")]
-            subprocess.run(command, check=True)
-            return Compiled(binary.read_bytes(), "")
+    cuda: Any
+    nvrtc: Any
+    cache: Path
 
 
-class EmulatedDriver:
-    """The CPU in place of a GPU.
+@lru_cache(maxsize=None)
+def libraries(flags: Sequence[str] = ()) -> Libraries:
+    """Compile the two libraries, once in a process; ``flags`` are for g++ when it compiles kernels."""
+    folder = Path(tempfile.mkdtemp(prefix="legs-emulated-"))
+    found = []
+    for name in ("libcuda", "libnvrtc"):
+        path = folder / f"{name}.so"
+        command = [str(COMPILER), "-O1", "-std=c++17", "-shared", "-fPIC", "-o", str(path), str(HERE / f"{name}.cpp")]
+        subprocess.run([*command, "-ldl", "-pthread"], check=True)
+        found.append(ctypes.CDLL(str(path)))
+    command_of_kernels = " ".join([str(COMPILER), *FLAGS, *flags, str(HERE / "emulate.cpp")])
+    # Python's os.environ is not seen by a library that is loaded already where it copies; setenv is.
+    ctypes.CDLL(None).setenv(b"LEGS_EMULATION_COMMAND", command_of_kernels.encode(), 1)
+    found[0].test_calls.restype = ctypes.c_longlong
+    return Libraries(found[0], found[1], folder / "kernels")
+
+
+class Runtime:
+    """What the driver asks torch.cuda.
 
     Attributes:
-        launches: what was launched: name and number of blocks.
-        backwards: run the threads of a phase from the last to the first.
-        captures: what ``capturing`` says.
+        captures: whether the current stream is being captured.
+        emptied: how often torch's cache was emptied.
     """
 
-    architecture = 86
+    def __init__(self, multiprocessors: int = 4, architecture: Tuple[int, int] = (8, 6)) -> None:
+        major, minor = architecture
+        self._properties = SimpleNamespace(major=major, minor=minor, multi_processor_count=multiprocessors)
+        self.captures, self.emptied, self.stream = False, 0, 0
 
-    def __init__(self, multiprocessors: int = 4) -> None:
-        self.multiprocessors = multiprocessors
-        self.launches: List[Tuple[str, int]] = []
-        self.backwards = False
-        self.captures = False
-        self.loaded = 0
+    def current_device(self) -> int:
+        return 0
 
-    def load(self, binary: bytes) -> Any:
-        self.loaded += 1
-        handle, name = tempfile.mkstemp(suffix=".so")
-        with os.fdopen(handle, "wb") as file:
-            file.write(binary)
-        library = ctypes.CDLL(name)
-        os.unlink(name)
-        library.size_of_task.restype = ctypes.c_ulonglong
-        assert library.size_of_task() == ctypes.sizeof(Task)
-        return library
+    def get_device_properties(self, index: int) -> Any:
+        return self._properties
 
-    def function(self, module: Any, name: str) -> Any:
-        return name, getattr(module, name)
+    def current_stream(self, index: int) -> Any:
+        return SimpleNamespace(cuda_stream=self.stream)
 
-    def launch(self, function: Any, blocks: int, threads: int, task: Task) -> None:
-        assert threads == THREADS and 0 < blocks < 2**31
-        name, run = function
-        self.launches.append((name, blocks))
-        run(ctypes.c_longlong(blocks), ctypes.byref(task), int(self.backwards))
-
-    def capturing(self) -> bool:
+    def is_current_stream_capturing(self) -> bool:
         return self.captures
 
+    def empty_cache(self) -> None:
+        self.emptied += 1
 
-_CACHE: Optional[Path] = None
+
+class RecordingDriver(CudaDriver):
+    """A driver that keeps a list of its launches.
+
+    Attributes:
+        launches: name and number of blocks.
+        backwards: run the threads of a phase from the last to the first; a GPU's run in its own order.
+    """
+
+    backwards = False
+
+    def __init__(self, device: torch.device, *arguments: Any) -> None:
+        super().__init__(device, *arguments)
+        self.launches: List[Tuple[str, int]] = []
+
+    def function(self, module: int, name: str) -> Any:
+        return name, super().function(module, name)
+
+    def launch(self, function: Any, blocks: int, threads: int, task: Any) -> None:
+        name, own = function
+        self.launches.append((name, blocks))
+        super().launch(own, blocks, threads, task)
 
 
-def emulated(driver: Optional[EmulatedDriver] = None) -> CudaBackend:
+class EmulatedDriver(RecordingDriver):
+    """The CPU in place of a GPU."""
+
+    def __init__(self, multiprocessors: int = 4) -> None:
+        self.cuda = libraries().cuda
+        super().__init__(torch.device("cpu"), self.cuda, Runtime(multiprocessors))
+
+    def launch(self, function: Any, blocks: int, threads: int, task: Any) -> None:
+        self.cuda.test_reverse(int(self.backwards))
+        super().launch(function, blocks, threads, task)
+
+
+def emulated(driver: Optional[CudaDriver] = None, flags: Sequence[str] = ()) -> CudaBackend:
     """Return the CUDA backend for tensors on the CPU; this process's tests share its compiled kernels."""
-    global _CACHE
-    if _CACHE is None:
-        _CACHE = Path(tempfile.mkdtemp(prefix="legs-emulated-"))
-    modules = Modules(driver or EmulatedDriver(), Gpp(), BinaryCache(_CACHE))
+    found = libraries(tuple(flags))
+    modules = Modules(driver or EmulatedDriver(), Compiler(found.nvrtc), BinaryCache(found.cache))
 
     def opened(device: torch.device) -> Modules:
         assert device.type == "cpu"

@@ -13,7 +13,7 @@ import torch
 
 from legs_loss.cli import main
 from legs_loss.errors import LegsError
-from legs_loss.kernels.cuda.cache import BinaryCache
+from legs_loss.kernels.cuda.modules import BinaryCache
 from legs_loss.reference.embedded import write_embedded_scene
 from legs_loss.reference.gaussians import Gaussians
 from legs_loss.reference.ply import read_ply, write_ply

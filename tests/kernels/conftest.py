@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from legs_loss.kernels.cuda.cache import BinaryCache
-from legs_loss.kernels.cuda.modules import Modules
+from legs_loss.kernels.cuda.modules import BinaryCache, Modules
 from tests.kernels.parts import FakeCompiler, FakeDriver
 
 

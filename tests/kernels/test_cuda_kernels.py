@@ -28,8 +28,9 @@ from legs_loss import (
     weighted_l1,
 )
 from legs_loss.kernels import backends
+from legs_loss.kernels.available import BACKENDS, Availability, Known
 from legs_loss.kernels.contract import Weights
-from legs_loss.kernels.cuda.launch import STENCILS
+from legs_loss.kernels.cuda.backend import STENCILS
 from legs_loss.kernels.trial import difference_from_torch
 from legs_loss.response import response
 from legs_loss.runtime import state
@@ -54,9 +55,10 @@ def backend():
 def chosen(monkeypatch):
     """Make the backend under test the one for images on the device, and return it and its driver."""
     driver = new_driver()
-    found = backends.Finding(new_backend(driver), True, "")
-    monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("no module", DEVICE.type)})
-    monkeypatch.setattr(backends, "_findings", {f"cuda {DEVICE.type}": found})
+    found = Availability(new_backend(driver), True, "")
+    device = torch.empty(0, device=DEVICE).device
+    monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", DEVICE.type)})
+    monkeypatch.setattr(BACKENDS, "_found", {("cuda", device): found})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return found.backend, driver
 
@@ -356,7 +358,7 @@ class TestSelection:
 
 @pytest.mark.slow
 @pytest.mark.skipif(DEVICE.type != "cpu", reason="the sanitizers are g++'s")
-def test_no_access_is_out_of_bounds(tmp_path):
+def test_no_access_is_out_of_bounds():
     """Run every kernel with the address and undefined behaviour sanitizers, which end the process at a fault."""
     found = subprocess.run([str(COMPILER), "-print-file-name=libasan.so"], capture_output=True, text=True)
     library = found.stdout.strip()
@@ -366,14 +368,8 @@ def test_no_access_is_out_of_bounds(tmp_path):
         "import torch\n"
         "from legs_loss import WeightSpec\n"
         "from legs_loss.kernels.contract import Weights\n"
-        "from legs_loss.kernels.cuda.cache import BinaryCache\n"
-        "from legs_loss.kernels.cuda.modules import Modules\n"
-        "from legs_loss.kernels.cuda.backend import CudaBackend\n"
-        "from tests.cuda_emulation import EmulatedDriver, Gpp\n"
-        "from pathlib import Path\n"
-        "flags = ['-fsanitize=address,undefined', '-fno-sanitize-recover=all', '-O1']\n"
-        f"modules = Modules(EmulatedDriver(), Gpp(flags), BinaryCache(Path({str(tmp_path)!r})))\n"
-        "backend = CudaBackend(lambda device: modules)\n"
+        "from tests.cuda_emulation import emulated\n"
+        "backend = emulated(flags=['-fsanitize=address,undefined', '-fno-sanitize-recover=all', '-O1'])\n"
         "for shape in ((3, 1, 1), (1, 2, 7), (2, 3, 37, 113), (3, 130, 5)):\n"
         "    for dtype in (torch.float32, torch.float16):\n"
         "        x, y = torch.rand(shape).to(dtype).requires_grad_(), torch.rand(shape).to(dtype)\n"

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import tempfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-import torch
 
 from legs_loss.kernels.contract import NotNow
-from legs_loss.kernels.cuda import cache as cache_module
-from legs_loss.kernels.cuda import driver as driver_module
+from legs_loss.kernels.cuda import modules as modules_file
 from legs_loss.kernels.cuda import nvrtc
-from legs_loss.kernels.cuda.cache import BinaryCache, cache_folder
-from legs_loss.kernels.cuda.driver import CudaDriver, DriverError
-from legs_loss.kernels.cuda.launch import Task
-from legs_loss.kernels.cuda.modules import PLAIN, Modules, Variant
+from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules, Variant, cache_folder
 from legs_loss.kernels.cuda.nvrtc import Compiler, CompilerError, NotFound, candidates, find_compiler
 from tests.kernels.parts import FakeCompiler, FakeDriver
 
@@ -86,7 +79,7 @@ class TestCache:
             return first(**options)
 
         with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(cache_module.tempfile, "mkstemp", meanwhile)
+            patched.setattr(modules_file.tempfile, "mkstemp", meanwhile)
             writers[0].put(b"key", b"binary")
         assert writers[0].get(b"key") == b"binary" and len(list(tmp_path.iterdir())) == 1
 
@@ -244,70 +237,3 @@ class TestCompiler:
         with pytest.raises(CompilerError, match=r"legs.cu\(3\): error: bad"):
             Compiler(library).compile(b"bad", [], "sm_80")
         assert library.destroyed == 1
-
-
-class FakeCuda:
-    """The driver's library: notes calls, and fails where it is told to."""
-
-    def __init__(self, fails=None):
-        self.calls, self.fails, self.context = [], fails, None
-
-    def __getattr__(self, name):
-        def call(*arguments):
-            self.calls.append(name)
-            if name == self.fails:
-                return 209
-            if name == "cuDevicePrimaryCtxRetain":
-                arguments[0]._obj.value = 77
-            if name == "cuCtxGetCurrent":
-                arguments[0]._obj.value = self.context
-            if name == "cuCtxSetCurrent":
-                self.context = arguments[0].value
-            if name == "cuGetErrorString":
-                arguments[1]._obj.value = b"no kernel image is available"
-            if name == "cuLaunchKernel":
-                self.grid = [argument.value for argument in arguments[1:8]]
-                self.stream = arguments[8].value
-                self.task = ctypes.cast(arguments[9][0], ctypes.POINTER(Task)).contents.strip
-                self.launched_in = self.context
-            return 0
-
-        return call
-
-
-@pytest.fixture
-def cuda(monkeypatch):
-    """torch.cuda as it is with a GPU, as far as the driver asks."""
-    properties = SimpleNamespace(major=8, minor=6, multi_processor_count=84)
-    stand_in = SimpleNamespace(
-        current_device=lambda: 0,
-        get_device_properties=lambda index: properties,
-        current_stream=lambda device: SimpleNamespace(cuda_stream=0x1234),
-        is_current_stream_capturing=lambda: False,
-    )
-    monkeypatch.setattr(
-        driver_module, "torch", SimpleNamespace(cuda=stand_in, device=torch.device, empty=lambda *args, device: None)
-    )
-
-
-class TestDriver:
-    def test_a_launch_is_on_torchs_stream_and_in_torchs_context(self, cuda):
-        library = FakeCuda()
-        driver = CudaDriver(torch.device("cuda"), library)
-        assert (driver.architecture, driver.multiprocessors) == (86, 84)
-        driver.launch(ctypes.c_void_p(5), 1000, 128, Task(strip=48))
-        assert library.grid == [1000, 1, 1, 128, 1, 1, 0]
-        assert (library.stream, library.task, library.launched_in) == (0x1234, 48, 77)
-        assert library.context is None  # the thread has again what it had
-
-    def test_a_thread_that_has_the_context_keeps_it(self, cuda):
-        library = FakeCuda()
-        driver = CudaDriver(torch.device("cuda"), library)
-        library.context = 77
-        driver.load(b"binary")
-        assert "cuCtxSetCurrent" not in library.calls
-
-    def test_a_failure_is_named(self, cuda):
-        driver = CudaDriver(torch.device("cuda"), FakeCuda("cuModuleLoadData"))
-        with pytest.raises(DriverError, match=r"cuModuleLoadData failed: no kernel image is available \(209\)"):
-            driver.load(b"binary")

@@ -9,15 +9,13 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from legs_loss import LegsError, configure, l1_loss, legs_loss, ssim
-from legs_loss.kernels import backends
+from legs_loss.kernels import available, backends
+from legs_loss.kernels.available import BACKENDS, Availability, Known
 from legs_loss.kernels.contract import Weights
-from legs_loss.kernels.cuda.backend import CudaBackend
-from legs_loss.kernels.cuda.cache import BinaryCache
+from legs_loss.kernels.cuda.backend import CudaBackend, Layout, Task, chunks_of, strip_of
 from legs_loss.kernels.cuda.driver import DriverError
-from legs_loss.kernels.cuda.launch import Layout, Task, chunks_of, strip_of
-from legs_loss.kernels.cuda.modules import Modules
+from legs_loss.kernels.cuda.modules import BinaryCache, Modules
 from legs_loss.kernels.cuda.nvrtc import NotFound
-from legs_loss.kernels.cuda.operations import Shares, fused_loss
 from legs_loss.runtime import counts, sources, state
 from legs_loss.runtime.memo import _OVERHEAD
 from legs_loss.spec import PRESETS
@@ -51,9 +49,8 @@ class TestLaunch:
         tasks = []
         monkeypatch.setattr(parts[0], "launch", lambda function, blocks, threads, task: tasks.append((function, task)))
         windows = torch.empty(1 << 17, device="meta").as_strided((1, 65536, 256, 256), (0, 1, 2, 512))
-        fused_loss(
-            parts[2], windows.requires_grad_(), torch.empty(windows.shape, device="meta"), Weights(), Shares(0, 1)
-        )
+        backend = CudaBackend(lambda _: parts[2])
+        backend.ssim(windows.requires_grad_(), torch.empty(windows.shape, device="meta"))
         layout = dict(tasks)["legs_ssim_gradient"].of_gradient
         assert 255 * (layout.row + layout.column) < 2**31
 
@@ -78,10 +75,9 @@ class Watched(TorchDispatchMode):
 @pytest.fixture
 def on_meta(monkeypatch, parts):
     """The backend for tensors on torch's meta device, which have no values that could be read."""
-    monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("no module", "meta")})
-    monkeypatch.setattr(
-        backends, "_findings", {"cuda meta": backends.Finding(CudaBackend(lambda _: parts[2]), True, "")}
-    )
+    known = Availability(CudaBackend(lambda _: parts[2]), True, "")
+    monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "meta")})
+    monkeypatch.setattr(BACKENDS, "_found", {("cuda", torch.device("meta")): known})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return parts[0]
 
@@ -181,8 +177,8 @@ class TestCapture:
     def test_a_kernel_that_is_not_loaded_is_torchs_while_a_capture_lasts(self, monkeypatch, tmp_path):
         driver = FakeDriver()
         backend = CudaBackend(lambda _: Modules(driver, FakeCompiler(), BinaryCache(tmp_path)))
-        monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("no module", "cpu")})
-        monkeypatch.setattr(backends, "_findings", {"cuda cpu": backends.Finding(backend, True, "")})
+        monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "cpu")})
+        monkeypatch.setattr(BACKENDS, "_found", {("cuda", torch.device("cpu")): Availability(backend, True, "")})
         prediction, target = images((3, 20, 30))
         driver.captures = True
         assert used(legs_loss(prediction, target)) == "torch" and not driver.launches
@@ -194,11 +190,11 @@ class TestCapture:
         assert used(loss) == "fused" and driver.launches[-1] == "legs_scale"
 
     def test_the_trial_does_not_run_in_a_capture(self, monkeypatch):
-        monkeypatch.setattr(backends, "_findings", {})
-        monkeypatch.setattr(backends, "is_capturing", lambda device: True)
-        monkeypatch.setattr(backends, "_try", lambda *_: pytest.fail("a trial waits for the device"))
+        monkeypatch.setattr(BACKENDS, "_found", {})
+        monkeypatch.setattr(available, "is_capturing", lambda device: True)
+        monkeypatch.setattr(available, "difference_from_torch", lambda *_: pytest.fail("a trial waits for the device"))
         assert used(legs_loss(*images((3, 20, 30)))) == "torch"
-        assert not backends._findings
+        assert not BACKENDS._found
 
 
 class TestFailures:
@@ -215,19 +211,19 @@ class TestFailures:
             raise error
 
         module = SimpleNamespace(BACKEND=CudaBackend(broken))
-        monkeypatch.setattr(backends, "_KNOWN", {"cuda": ("broken", "cpu")})
-        monkeypatch.setattr(backends, "_findings", {})
-        monkeypatch.setattr(backends.importlib, "import_module", lambda name: module)
-        monkeypatch.setattr(backends, "_missing", lambda name: None)
+        monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("broken", "cpu")})
+        monkeypatch.setattr(BACKENDS, "_found", {})
+        monkeypatch.setattr(available.importlib, "import_module", lambda name: module)
+        monkeypatch.setattr(available, "_why_missing", lambda name: None)
         for _ in range(2):
             assert used(legs_loss(*images((3, 20, 30)))) == "torch"
-        assert capfd.readouterr().err == f"legs-loss: cuda is not used, torch is: {said}\n"
+        assert capfd.readouterr().err == f"legs-loss: cuda is unavailable, torch is used: {said}\n"
 
     def test_a_torch_without_cuda_is_no_failure(self, monkeypatch, capfd):
-        monkeypatch.setattr(backends, "_findings", {})
+        monkeypatch.setattr(BACKENDS, "_found", {})
         monkeypatch.setattr(torch.version, "cuda", None)
-        found = backends.finding("cuda", torch.device("cuda"))
-        assert found == backends.Finding(None, False, "this torch is built without CUDA")
+        found = BACKENDS.availability("cuda", torch.device("cuda", 0))
+        assert found == Availability(None, False, "this torch is built without CUDA")
         assert capfd.readouterr().err == ""
 
     def test_images_that_do_not_fit_their_map_are_still_an_error(self, on_meta):
@@ -235,5 +231,5 @@ class TestFailures:
             legs_loss(*(torch.empty(3, 8, 8, device="meta") for _ in range(2)), weight=torch.empty(4, 4, device="meta"))
 
     def test_shares(self, parts):
-        assert fused_loss(parts[2], *(torch.empty(3, 8, 8, device="meta"),) * 2, Weights(), Shares(0.0, 1.0)).dim() == 0
+        assert CudaBackend(lambda _: parts[2]).ssim(*(torch.empty(3, 8, 8, device="meta"),) * 2).dim() == 0
         assert parts[0].launches == ["legs_ssim_value", "legs_finish"]

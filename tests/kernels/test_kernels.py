@@ -15,7 +15,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from legs_loss import LegsError, LEGSLoss, WeightSpec, legs_loss, weight_map
-from legs_loss.kernels import backends
+from legs_loss.kernels.available import BACKENDS
 from legs_loss.operators import OPERATORS, Operator
 from legs_loss.precompute import normalised_map
 from legs_loss.response import response
@@ -182,7 +182,7 @@ class TestResponse:
 @pytest.fixture
 def chosen(monkeypatch):
     """Return a function that sets LEGS_BACKEND; clear the backends' findings before and after."""
-    monkeypatch.setattr(backends, "_findings", {})
+    monkeypatch.setattr(BACKENDS, "_found", {})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return lambda name: monkeypatch.setenv("LEGS_BACKEND", name)
 
@@ -300,7 +300,7 @@ class TestSelection:
         for _ in range(3):
             assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         said = capfd.readouterr().err
-        assert said == "legs-loss: numba is not used, torch is: RuntimeError: no such instruction\n"
+        assert said == "legs-loss: numba is unavailable, torch is used: RuntimeError: no such instruction\n"
 
     def test_a_backend_that_fails_after_its_trial_is_left(self, chosen, monkeypatch, capfd):
         own = numba_loss._differentiable
@@ -315,7 +315,7 @@ class TestSelection:
         for channels in (4, 4, 3):
             assert used(legs_loss(*images((channels, 20, 30)))) == "torch"
         said = capfd.readouterr().err
-        assert said == "legs-loss: numba is not used, torch is: RuntimeError: out of resource: shared memory\n"
+        assert said == "legs-loss: numba is unavailable, torch is used: RuntimeError: out of resource: shared memory\n"
 
     def test_a_backend_that_computes_something_else_is_found_out(self, chosen, monkeypatch, capfd):
         own = numba_loss._differentiable
@@ -343,7 +343,10 @@ class TestSelection:
         environment.pop("LEGS_BACKEND", None)
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
         assert done.returncode == 0, done.stderr
-        assert done.stderr.count("legs-loss: numba is not used, torch is: ImportError: needs NumPy 1.99 or less") == 1
+        assert (
+            done.stderr.count("legs-loss: numba is unavailable, torch is used: ImportError: needs NumPy 1.99 or less")
+            == 1
+        )
 
     @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
     def test_a_forked_process_uses_torch(self, chosen):

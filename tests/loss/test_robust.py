@@ -15,7 +15,7 @@ from torch.nn.functional import conv2d, pad
 
 from legs_loss import LegsError, LEGSLoss, WeightSpec, configure, l1_loss, legs_loss, weight_map
 from legs_loss.cli import main
-from legs_loss.kernels.backends import finding
+from legs_loss.kernels.available import BACKENDS
 from legs_loss.levels import levels_of, response_levels
 from legs_loss.precompute import precompute
 from legs_loss.response import gaussian_blur, response
@@ -301,7 +301,7 @@ class TestTraining:
     def test_no_backend_takes_it_for_another(self):
         for name, changes in (("over", {"over": "scene"}), ("smooth", {"smooth": 0.7})):
             spec = WeightSpec(**changes)
-            backend = finding("numba", torch.device("cpu")).backend
+            backend = BACKENDS.availability("numba", torch.device("cpu")).backend
             assert backend is None or not backend.makes_weights_of(spec), name
 
     def test_a_compiled_graph_declines(self, monkeypatch):

@@ -11,7 +11,7 @@ from PIL import Image
 
 from legs_loss import configure, l1_loss
 from legs_loss import store as store_module
-from legs_loss.kernels.backends import is_capturing
+from legs_loss.kernels.available import is_capturing
 from legs_loss.precompute import precompute
 from legs_loss.runtime import counts, sources, state
 from legs_loss.scenes import read_scene

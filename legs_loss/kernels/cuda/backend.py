@@ -1,23 +1,88 @@
-"""The CUDA kernels as a backend."""
+"""The backend for CUDA: what each kernel is given (``struct Task`` of legs.cu), and the operations that launch them.
+
+Nothing waits for the device. Backward multiplies by the incoming gradient, which the kernel reads on the device (and
+changes nothing where it is 1). What depends on shapes, strides, types and settings alone is worked out once, in a plan.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import threading
-from typing import Callable, Dict, FrozenSet
+from typing import Any, Callable, Dict, FrozenSet, List, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
 
 from legs_loss.kernels.contract import Backend, Weights
-from legs_loss.kernels.cuda.cache import BinaryCache, cache_folder
 from legs_loss.kernels.cuda.driver import CudaDriver
-from legs_loss.kernels.cuda.launch import CURVES, NORMS, STENCILS
-from legs_loss.kernels.cuda.modules import Modules
+from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules, Variant, cache_folder
 from legs_loss.kernels.cuda.nvrtc import find_compiler
-from legs_loss.kernels.cuda.operations import Shares, fused_loss, response_range
+from legs_loss.kernels.differentiable import differentiable
 from legs_loss.spec import WeightSpec
 
-__all__ = ["BACKEND", "CudaBackend"]
+__all__ = [
+    "BACKEND",
+    "NORMS",
+    "STENCILS",
+    "THREADS",
+    "VALUES",
+    "CudaBackend",
+    "Layout",
+    "Task",
+    "chunks_of",
+    "strip_of",
+]
+
+THREADS = 128
+VALUES = {torch.float32: 0, torch.float16: 1, torch.bfloat16: 2}
+# kind of stencil, the weights of a gradient's outer and middle rows
+STENCILS: Dict[str, Tuple[int, float, float]] = {
+    "laplacian": (1, 0.0, 0.0),
+    "laplacian8": (2, 0.0, 0.0),
+    "central": (3, 0.0, 0.5),
+    "sobel": (3, 1.0, 2.0),
+    "scharr": (3, 3.0, 10.0),
+}
+NORMS = {1.0: 1, 2.0: 2, float("inf"): 3}
+CURVES = {"C1": 1, "C2": 2, "C3": 3, "C4": 4, "C5": 5}
+
+_REACH = 5  # of SSIM's window
+_BLOCKS_AT_A_TIME = 4  # of a multiprocessor: 128 registers a thread
+_MOST = 2**31 - 1
+_PLANS = 256  # of a device; a codebase with more shapes of images begins again
+
+
+class Layout(ctypes.Structure):
+    """The strides of images [B, C, H, W], in values."""
+
+    _fields_ = [
+        ("view", ctypes.c_longlong),
+        ("channel", ctypes.c_longlong),
+        ("row", ctypes.c_int),
+        ("column", ctypes.c_int),
+    ]
+
+
+class Task(ctypes.Structure):
+    """``struct Task`` of legs.cu, where each field is described."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("prediction", "target", "gradient", "scaled", "step", "partial")),
+        *((name, ctypes.c_void_p) for name in ("result", "map", "mask", "covered", "range")),
+        *((name, Layout) for name in ("of_prediction", "of_target", "of_gradient")),
+        *((name, ctypes.c_longlong) for name in ("map_view", "mask_view", "count")),
+        *((name, ctypes.c_int) for name in ("views", "channels", "height", "width", "strip", "curve", "chunks")),
+        *((name, ctypes.c_float) for name in ("side", "middle", "beta", "eps")),
+        *((name, ctypes.c_float) for name in ("l1_share", "ssim_share", "constant")),
+    ]
+
+
+class Shares(NamedTuple):
+    """The loss is l1 * L1 + ssim * SSIM + constant; a term of share 0 is not computed."""
+
+    l1: float
+    ssim: float
+    constant: float = 0.0
 
 
 class CudaBackend(Backend):
@@ -36,32 +101,251 @@ class CudaBackend(Backend):
 
     def __init__(self, open_device: Callable[[torch.device], Modules]) -> None:
         self._open = open_device
-        self._modules: Dict[torch.device, Modules] = {}
+        self._devices: Dict[torch.device, _Device] = {}
         self._lock = threading.Lock()
 
     def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
         """Return each view's least response and the span."""
-        return response_range(self._of(target), target, spec)
+        return self._of(target).response_range(_batch(target.detach()), spec)
 
     def loss(self, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
         """Return the whole loss."""
         shares = Shares(1.0 - lambda_dssim, -lambda_dssim, lambda_dssim)
-        return fused_loss(self._of(target), prediction, target, weights, shares)
+        return self._of(target).fused_loss(prediction, target, weights, shares)
 
     def weighted_l1(self, prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
         """Return the weighted L1."""
-        return fused_loss(self._of(target), prediction, target, weights, Shares(1.0, 0.0))
+        return self._of(target).fused_loss(prediction, target, weights, Shares(1.0, 0.0))
 
     def ssim(self, prediction: Tensor, target: Tensor) -> Tensor:
         """Return the mean SSIM."""
-        return fused_loss(self._of(target), prediction, target, Weights(), Shares(0.0, 1.0))
+        return self._of(target).fused_loss(prediction, target, Weights(), Shares(0.0, 1.0))
 
-    def _of(self, images: Tensor) -> Modules:
-        if images.device not in self._modules:
+    def _of(self, images: Tensor) -> _Device:
+        device = self._devices.get(images.device)
+        if device is None:
             with self._lock:
-                if images.device not in self._modules:
-                    self._modules[images.device] = self._open(images.device)
-        return self._modules[images.device]
+                device = self._devices.get(images.device) or _Device(self._open(images.device))
+                self._devices[images.device] = device
+        return device
+
+
+class _Plan(NamedTuple):
+    """A launch that is prepared: all but the addresses.
+
+    Attributes:
+        own, finish: the kernels.
+        blocks: of the first of them.
+        task: its argument.
+        copies: whether prediction and target must be made contiguous first: strides that the kernels cannot address.
+        gradient: the gradient's strides, or None where none is wanted.
+    """
+
+    own: Any
+    finish: Any
+    blocks: int
+    task: Task
+    copies: Tuple[bool, bool]
+    gradient: Optional[Tuple[int, ...]]
+
+
+class _Device:
+    """The operations on one device."""
+
+    def __init__(self, modules: Modules) -> None:
+        self._modules = modules
+        self._launch = modules.driver.launch
+        self._plans: Dict[Any, _Plan] = {}
+
+    def fused_loss(self, prediction: Tensor, target: Tensor, weights: Weights, shares: Shares) -> Tensor:
+        """Return a loss of images [C, H, W] or [B, C, H, W], differentiable once in the prediction; float32.
+
+        Images of two different types are computed in float32.
+        """
+        if prediction.dtype != target.dtype:
+            prediction, target = prediction.float(), target.float()
+        prediction, target = _batch(prediction), _batch(target)
+        dtype = prediction.dtype
+
+        def compute(wanted: bool, x: Tensor, constants: Sequence[Optional[Tensor]]) -> Tuple[Tensor, Optional[Tensor]]:
+            y, map_, mask, found = constants
+            assert y is not None
+            given = Weights(weights.spec, found, map_, mask, weights.renormalise)
+            return self._loss_and_gradient(x, y.detach(), given, shares, wanted)
+
+        def scale(gradient: Tensor, step: Tensor) -> Tensor:
+            return self._scaled(gradient, step, dtype)
+
+        return differentiable(prediction, (target, weights.map, weights.mask, weights.range), compute, scale)
+
+    def response_range(self, y: Tensor, spec: WeightSpec) -> Tensor:
+        """Return the least response of each view of [B, C, H, W], and the greatest less the least: float32 [B, 2]."""
+        key = (y.shape, y.stride(), y.dtype, spec)
+        plan = self._plans.get(key)
+        if plan is None:
+            plan = self._keep(key, self._plan_of_range(y, spec))
+        y = y.contiguous() if plan.copies[1] else y
+        task = Task.from_buffer_copy(plan.task)
+        partial = torch.empty(3 * task.count, dtype=torch.float32, device=y.device)
+        result = torch.empty((y.shape[0], 2), dtype=torch.float32, device=y.device)
+        task.target, task.partial, task.result = y.data_ptr(), partial.data_ptr(), result.data_ptr()
+        self._launch(plan.own, plan.blocks, THREADS, task)
+        self._launch(plan.finish, y.shape[0], THREADS, task)
+        return result
+
+    def _loss_and_gradient(
+        self, x: Tensor, y: Tensor, weights: Weights, shares: Shares, wanted: bool
+    ) -> Tuple[Tensor, Optional[Tensor]]:
+        spec = weights.spec if shares.l1 else None
+        key = (x.shape, x.stride(), y.stride(), x.dtype, wanted, shares, spec)
+        plan = self._plans.get(key)
+        if plan is None:
+            plan = self._keep(key, self._plan_of_loss(x, y, spec, shares, wanted))
+        x, y = (images.contiguous() if copied else images for images, copied in zip((x, y), plan.copies))
+        task = Task.from_buffer_copy(plan.task)
+        # These must live until the launch; the allocator keeps the order of one stream.
+        held = self._add_weights(task, y, weights, spec) if shares.l1 else []
+        gradient = None
+        if plan.gradient is not None:
+            gradient = torch.empty_strided(x.shape, plan.gradient, dtype=torch.float32, device=x.device)
+            task.gradient = gradient.data_ptr()
+        partial = torch.empty(2 * plan.blocks, dtype=torch.float32, device=x.device)
+        loss = torch.empty((), dtype=torch.float32, device=x.device)
+        task.prediction, task.target = x.data_ptr(), y.data_ptr()
+        task.partial, task.result = partial.data_ptr(), loss.data_ptr()
+        self._launch(plan.own, plan.blocks, THREADS, task)
+        self._launch(plan.finish, 1, THREADS, task)
+        del held
+        return loss, gradient
+
+    def _add_weights(self, task: Task, y: Tensor, weights: Weights, spec: Optional[WeightSpec]) -> List[Tensor]:
+        held = []
+        if spec is not None:
+            found = weights.range if weights.range is not None else self.response_range(y, spec)
+            found = found.to(device=y.device, dtype=torch.float32).contiguous()
+            if found.shape != (y.shape[0], 2):
+                raise ValueError(f"a range {list(found.shape)} does not fit images {list(y.shape)}")
+            task.range = found.data_ptr()
+            held.append(found)
+        pixels = y.shape[2] * y.shape[3]
+        for name, values in (("map", weights.map), ("mask", weights.mask)):
+            if values is None:
+                continue
+            values = values.detach().to(torch.float32).contiguous()
+            if values.numel() not in (pixels, pixels * y.shape[0]):
+                raise ValueError(f"a {name} {list(values.shape)} does not fit images {list(y.shape)}")
+            setattr(task, name, values.data_ptr())
+            setattr(task, f"{name}_view", pixels if values.numel() > pixels else 0)
+            held.append(values)
+            if name == "mask" and weights.renormalise:
+                covered = values.mean()
+                task.covered = covered.data_ptr()
+                held.append(covered)
+        return held
+
+    def _scaled(self, gradient: Tensor, step: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return the gradient times the incoming gradient of backward, rounded once, in the prediction's type."""
+        step = step.to(torch.float32).contiguous()
+        scaled = gradient if dtype == torch.float32 else torch.empty_like(gradient, dtype=dtype)
+        count = gradient.numel()
+        task = Task(gradient=gradient.data_ptr(), scaled=scaled.data_ptr(), step=step.data_ptr(), count=count)
+        blocks = max(1, min(-(-count // (4 * THREADS)), 16 * self._modules.driver.multiprocessors))
+        self._launch(self._modules.function("legs_scale", variant_of(dtype, None)), blocks, THREADS, task)
+        return scaled
+
+    def _keep(self, key: Any, plan: _Plan) -> _Plan:
+        if len(self._plans) >= _PLANS:
+            self._plans.clear()
+        self._plans[key] = plan
+        return plan
+
+    def _plan_of_loss(self, x: Tensor, y: Tensor, spec: Optional[WeightSpec], shares: Shares, wanted: bool) -> _Plan:
+        modules, plain = self._modules, variant_of(x.dtype, None)
+        variant = variant_of(x.dtype, spec)
+        modules.load(variant, plain, PLAIN)  # backward's too, which a capture may contain alone
+        copies = (not _is_addressable(x), not _is_addressable(y))
+        task = _task_of(x, spec)
+        task.of_prediction = _layout_of(x.contiguous() if copies[0] else x)
+        task.of_target = _layout_of(y.contiguous() if copies[1] else y)
+        task.l1_share, task.ssim_share, task.constant = shares
+        term = "l1" if shares.ssim == 0.0 else ("loss" if shares.l1 else "ssim")
+        task.strip, blocks = strip_of(x, modules.driver.multiprocessors, wanted)
+        if term == "l1":
+            task.chunks = chunks_of(x, modules.driver.multiprocessors)
+            blocks = task.chunks * task.views
+        task.count = blocks
+        strides = None
+        if wanted:  # dense, where x may be windows that overlap
+            dense = torch.empty_like(x, dtype=torch.float32)
+            dense = dense if _is_addressable(dense) else dense.contiguous()
+            task.of_gradient, strides = _layout_of(dense), dense.stride()
+        own = modules.function(f"legs_{term}_{'gradient' if wanted else 'value'}", variant)
+        return _Plan(own, modules.function("legs_finish", PLAIN), blocks, task, copies, strides)
+
+    def _plan_of_range(self, y: Tensor, spec: WeightSpec) -> _Plan:
+        modules, variant = self._modules, variant_of(y.dtype, spec)
+        copied = not _is_addressable(y)
+        task = _task_of(y, spec)
+        task.of_target = _layout_of(y.contiguous() if copied else y)
+        task.chunks = chunks_of(y, modules.driver.multiprocessors)
+        task.count = y.shape[0] * task.chunks
+        own, finish = (modules.function(name, variant) for name in ("legs_range", "legs_range_finish"))
+        return _Plan(own, finish, task.count, task, (False, copied), None)
+
+
+def variant_of(dtype: torch.dtype, spec: Optional[WeightSpec]) -> Variant:
+    """Return which variant of the kernels computes images of a type with the weights of a spec, or of a map or none."""
+    if spec is None:
+        return Variant(VALUES[dtype])
+    return Variant(VALUES[dtype], STENCILS[spec.operator][0], NORMS[spec.p])
+
+
+def strip_of(images: Tensor, multiprocessors: int, wanted: bool) -> Tuple[int, int]:
+    """Return how many rows a block of the streaming pass does, and how many blocks there are.
+
+    Every strip repeats the rows above and below it, so strips are long; but all multiprocessors should have work.
+    """
+    views, channels, height, width = images.shape
+    halo = 2 * _REACH if wanted else _REACH
+    tiles = -(-width // (THREADS - 2 * halo)) * views * channels
+    at_a_time = _BLOCKS_AT_A_TIME * multiprocessors
+
+    def cost(strip: int) -> int:
+        return -(-tiles * -(-height // strip) // at_a_time) * (min(strip, height) + 2 * halo)
+
+    strip = min(range(16, 513, 16), key=cost)
+    return strip, tiles * -(-height // strip)
+
+
+def chunks_of(images: Tensor, multiprocessors: int) -> int:
+    """Return how many blocks a view gets in a pass that goes pixel by pixel."""
+    views, _, height, width = images.shape
+    return max(1, min(-(-height * width // (4 * THREADS)), -(-16 * multiprocessors // views)))
+
+
+def _batch(images: Tensor) -> Tensor:
+    return images.unsqueeze(0) if images.dim() == 3 else images
+
+
+def _task_of(images: Tensor, spec: Optional[WeightSpec]) -> Task:
+    """Return a task with the size of images [B, C, H, W] and the settings of a spec's weights."""
+    views, channels, height, width = images.shape
+    task = Task(views=views, channels=channels, height=height, width=width)
+    if spec is not None:
+        _, task.side, task.middle = STENCILS[spec.operator]
+        task.curve, task.beta, task.eps = CURVES.get(spec.curve, 0), spec.beta, spec.eps
+    return task
+
+
+def _layout_of(images: Tensor) -> Layout:
+    return Layout(*images.stride())
+
+
+def _is_addressable(images: Tensor) -> bool:
+    """Return whether the kernels can address the planes of images [B, C, H, W]: all strides but huge ones."""
+    _, _, row, column = images.stride()
+    reach = (images.shape[2] - 1) * row + (images.shape[3] - 1) * column
+    return max(row, column, reach) <= _MOST
 
 
 def _open(device: torch.device) -> Modules:

@@ -5,15 +5,48 @@ from __future__ import annotations
 import ctypes
 import sys
 from contextlib import contextmanager
-from typing import Any, Iterator, Optional
+from typing import Any, Dict, Iterator, List, Optional
 
 import torch
 
-__all__ = ["CudaDriver", "DriverError", "load_library"]
+from legs_loss.kernels.contract import DeviceFault, NotNow
+
+__all__ = ["CudaDriver", "DriverError", "OutOfMemory", "load_library"]
+
+UNSUPPORTED_PTX = 222
+_OUT_OF_MEMORY = 2
+# What a kernel did that ran before: from then on every call returns it, until the process ends.
+_STICKY = frozenset({700, 702, 710, 714, 715, 716, 717, 718, 719})
+_RELAXED = 2  # a mode of stream capture
+
+_POINTER, _INT, _UNSIGNED = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint
+_OUT = ctypes.POINTER(ctypes.c_void_p)
+_ARGUMENTS: Dict[str, List[Any]] = {
+    "cuDevicePrimaryCtxRetain": [_OUT, _INT],
+    "cuCtxGetCurrent": [_OUT],
+    "cuCtxSetCurrent": [_POINTER],
+    "cuThreadExchangeStreamCaptureMode": [ctypes.POINTER(_INT)],
+    "cuModuleLoadData": [_OUT, ctypes.c_char_p],
+    "cuModuleGetFunction": [_OUT, _POINTER, ctypes.c_char_p],
+    "cuLaunchKernel": [_POINTER, *[_UNSIGNED] * 7, _POINTER, ctypes.POINTER(_POINTER), _POINTER],
+    "cuGetErrorString": [_INT, ctypes.POINTER(ctypes.c_char_p)],
+}
 
 
 class DriverError(Exception):
-    """The CUDA driver returned an error; the message names the function and the reason."""
+    """The CUDA driver returned an error; the message names the function and the reason.
+
+    Attributes:
+        code: the driver's.
+    """
+
+    def __init__(self, message: str, code: int = 0) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class OutOfMemory(NotNow):
+    """The card is full: torch computes this call, and the next one tries again."""
 
 
 def load_library(platform: str = sys.platform) -> Any:
@@ -32,56 +65,74 @@ class CudaDriver:
     Args:
         device: torch's.
         library: for tests; the driver's own without it.
+        runtime: for tests; torch.cuda without it.
 
     Attributes:
         architecture: of the GPU, as 86.
         multiprocessors: how many it has.
     """
 
-    def __init__(self, device: torch.device, library: Optional[Any] = None) -> None:
-        self._library = load_library() if library is None else library
+    def __init__(self, device: torch.device, library: Optional[Any] = None, runtime: Any = torch.cuda) -> None:
+        library = load_library() if library is None else library
+        for name, arguments in _ARGUMENTS.items():
+            getattr(library, name).argtypes = arguments
+        self._library, self._runtime = library, runtime
         torch.empty(1, device=device)  # torch makes the context before it is asked for
-        index = torch.cuda.current_device() if device.index is None else device.index
-        self._device = torch.device("cuda", index)
-        properties = torch.cuda.get_device_properties(index)
+        index = runtime.current_device() if device.index is None else device.index
+        self._index = index
+        properties = runtime.get_device_properties(index)
         self.architecture: int = 10 * properties.major + properties.minor
         self.multiprocessors: int = properties.multi_processor_count
-        self._context = ctypes.c_void_p()
+        context = ctypes.c_void_p()
         # torch numbers the devices that CUDA_VISIBLE_DEVICES leaves, and so does the driver.
-        self._call("cuDevicePrimaryCtxRetain", ctypes.byref(self._context), ctypes.c_int(index))
+        self._call("cuDevicePrimaryCtxRetain", ctypes.byref(context), index)
+        self._context = context.value
+        raw = getattr(torch._C, "_cuda_getCurrentRawStream", None)  # some microseconds faster
+        usual = runtime is not torch.cuda or raw is None
+        self._stream: Any = (lambda index: runtime.current_stream(index).cuda_stream) if usual else raw
 
-    def load(self, binary: bytes) -> ctypes.c_void_p:
-        """Return a module of machine code or PTX."""
+    def load(self, binary: bytes) -> int:
+        """Return a module of machine code or PTX. Where the card is full, torch's cache is emptied first.
+
+        Raises:
+            OutOfMemory: there is no room for it.
+            DriverError: it cannot be loaded.
+        """
         module = ctypes.c_void_p()
-        with self._current():
-            self._call("cuModuleLoadData", ctypes.byref(module), binary)
-        return module
+        with self._current(), self._relaxed():
+            try:
+                self._call("cuModuleLoadData", ctypes.byref(module), binary)
+            except OutOfMemory:
+                self._runtime.empty_cache()
+                self._call("cuModuleLoadData", ctypes.byref(module), binary)
+        assert module.value is not None
+        return module.value
 
-    def function(self, module: ctypes.c_void_p, name: str) -> ctypes.c_void_p:
+    def function(self, module: int, name: str) -> int:
         """Return a kernel of a module."""
         function = ctypes.c_void_p()
-        with self._current():
+        with self._current(), self._relaxed():
             self._call("cuModuleGetFunction", ctypes.byref(function), module, name.encode())
-        return function
+        assert function.value is not None
+        return function.value
 
-    def launch(self, function: ctypes.c_void_p, blocks: int, threads: int, task: ctypes.Structure) -> None:
+    def launch(self, function: int, blocks: int, threads: int, task: ctypes.Structure) -> None:
         """Launch a kernel on torch's current stream; its one argument is copied at once."""
-        stream = ctypes.c_void_p(torch.cuda.current_stream(self._device).cuda_stream)
         arguments = (ctypes.c_void_p * 1)(ctypes.addressof(task))
-        sizes = [ctypes.c_uint(size) for size in (blocks, 1, 1, threads, 1, 1, 0)]
+        stream = self._stream(self._index)
         with self._current():
-            self._call("cuLaunchKernel", function, *sizes, stream, arguments, None)
+            self._call("cuLaunchKernel", function, blocks, 1, 1, threads, 1, 1, 0, stream, arguments, None)
 
     def capturing(self) -> bool:
-        """Return whether the current stream is being captured: nothing may be loaded then."""
-        return bool(torch.cuda.is_current_stream_capturing())
+        """Return whether the current stream is being captured: nothing is loaded then."""
+        return bool(self._runtime.is_current_stream_capturing())
 
     @contextmanager
     def _current(self) -> Iterator[None]:
         # A thread of autograd's, or another device's, may have no context or another one.
         before = ctypes.c_void_p()
         self._call("cuCtxGetCurrent", ctypes.byref(before))
-        if before.value == self._context.value:
+        if before.value == self._context:
             yield
             return
         self._call("cuCtxSetCurrent", self._context)
@@ -90,9 +141,27 @@ class CudaDriver:
         finally:
             self._call("cuCtxSetCurrent", before)
 
+    @contextmanager
+    def _relaxed(self) -> Iterator[None]:
+        """Let what is loaded here not end the capture of another thread's stream."""
+        mode = ctypes.c_int(_RELAXED)
+        self._call("cuThreadExchangeStreamCaptureMode", ctypes.byref(mode))
+        try:
+            yield
+        finally:
+            self._call("cuThreadExchangeStreamCaptureMode", ctypes.byref(mode))
+
     def _call(self, name: str, *arguments: Any) -> None:
         code = getattr(self._library, name)(*arguments)
-        if code != 0:
-            text = ctypes.c_char_p()
-            self._library.cuGetErrorString(code, ctypes.byref(text))
-            raise DriverError(f"{name} failed: {(text.value or b'unknown error').decode()} ({code})")
+        if code == 0:
+            return
+        text = ctypes.c_char_p()
+        self._library.cuGetErrorString(code, ctypes.byref(text))
+        reason = f"{(text.value or b'unknown error').decode()} ({code})"
+        if code == _OUT_OF_MEMORY:
+            raise OutOfMemory(f"{name} failed: {reason}")
+        if code in _STICKY:
+            raise DeviceFault(
+                f"CUDA error: {reason}, of a kernel that was launched before; CUDA_LAUNCH_BLOCKING=1 shows which"
+            )
+        raise DriverError(f"{name} failed: {reason}", code)

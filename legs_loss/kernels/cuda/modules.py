@@ -1,16 +1,23 @@
-"""Get a kernel by its name and variant: from memory, from the disk cache, or compiled."""
+"""Get a kernel by its name and variant: from memory, from the disk, or compiled."""
 
 from __future__ import annotations
 
 import hashlib
+import os
+import sys
+import tempfile
 import threading
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple, Tuple
+from typing import Any, Dict, List, Mapping, NamedTuple, Optional
 
 from legs_loss.kernels.contract import NotNow
-from legs_loss.kernels.cuda.cache import BinaryCache
+from legs_loss.kernels.cuda.driver import UNSUPPORTED_PTX, DriverError
 
-__all__ = ["PLAIN", "Modules", "Variant", "options", "source"]
+__all__ = ["PLAIN", "BinaryCache", "Modules", "Variant", "cache_folder", "options", "source"]
+
+_DIGEST = hashlib.sha256().digest_size
+_OF_OTHERS = 0o022  # may be written by the group, or by all
 
 
 class Variant(NamedTuple):
@@ -25,6 +32,14 @@ class Variant(NamedTuple):
     value: int
     stencil: int = 0
     norm: int = 0
+
+    @property
+    def kernels(self) -> List[str]:
+        """The names of the kernels in its module."""
+        terms = ["l1", "loss"] if self.stencil else ["l1", "loss", "ssim"]
+        others = ["range", "range_finish"] if self.stencil else ["finish", "scale"]
+        losses = [f"{term}_{kind}" for term in terms for kind in ("value", "gradient")]
+        return [f"legs_{name}" for name in (*others, *losses)]
 
 
 PLAIN = Variant(0)
@@ -45,8 +60,8 @@ class Modules:
     """The kernels of one GPU.
 
     Args:
-        driver: loads and launches; :class:`~legs_loss.kernels.cuda.driver.CudaDriver` says how it looks.
-        compiler: as :class:`~legs_loss.kernels.cuda.nvrtc.Compiler`.
+        driver: a :class:`~legs_loss.kernels.cuda.driver.CudaDriver`.
+        compiler: a :class:`~legs_loss.kernels.cuda.nvrtc.Compiler`.
         cache: of compiled modules.
     """
 
@@ -54,33 +69,124 @@ class Modules:
         self.driver = driver
         self._compiler = compiler
         self._cache = cache
-        self._modules: Dict[Variant, Any] = {}
-        self._functions: Dict[Tuple[str, Variant], Any] = {}
+        self._functions: Dict[Variant, Dict[str, Any]] = {}
         self._lock = threading.Lock()
 
-    def function(self, name: str, variant: Variant) -> Any:
-        """Return a kernel for ``driver.launch``.
+    def load(self, *variants: Variant) -> None:
+        """Load all kernels of variants that are not loaded yet, so that no later call has to.
 
         Raises:
-            NotNow: it is not loaded, and a capture, which loading would break, is under way.
-            CompilerError, DriverError: it cannot be compiled or loaded.
+            NotNow: a capture, which loading would break, is under way; or the card is full.
+            CompilerError, DriverError: one cannot be compiled or loaded.
         """
-        key = (name, variant)
-        if key not in self._functions:
+        for variant in variants:
+            if variant in self._functions:
+                continue
             if self.driver.capturing():
                 raise NotNow
             with self._lock:
-                if variant not in self._modules:
-                    self._modules[variant] = self.driver.load(self._binary(variant))
-                self._functions[key] = self.driver.function(self._modules[variant], name)
-        return self._functions[key]
+                if variant not in self._functions:
+                    module = self._loaded(variant)
+                    self._functions[variant] = {name: self.driver.function(module, name) for name in variant.kernels}
 
-    def _binary(self, variant: Variant) -> bytes:
+    def function(self, name: str, variant: Variant) -> Any:
+        """Return a kernel for ``driver.launch``; raises as :meth:`load`."""
+        self.load(variant)
+        return self._functions[variant][name]
+
+    def _loaded(self, variant: Variant) -> Any:
         text, given = source(), options(variant)
         target = self._compiler.target(self.driver.architecture)
         key = "\n".join([self._compiler.version, target, *given, hashlib.sha256(text).hexdigest()]).encode()
         binary = self._cache.get(key)
-        if binary is None:
-            binary = self._compiler.compile(text, given, target).binary
-            self._cache.put(key, binary)
-        return binary
+        if binary is not None:
+            try:
+                return self.driver.load(binary)
+            except DriverError:  # whatever it was compiled for
+                self._cache.discard(key)
+        binary = self._compiler.compile(text, given, target).binary
+        try:
+            module = self.driver.load(binary)
+        except DriverError as error:
+            if error.code != UNSUPPORTED_PTX:
+                raise
+            raise DriverError(
+                f"the GPU (sm_{self.driver.architecture}) is newer than torch's NVRTC {self._compiler.version}, "
+                "and the driver too old for its PTX: update the driver, or install a torch for a newer CUDA",
+                error.code,
+            ) from None
+        self._cache.put(key, binary)
+        return module
+
+
+def cache_folder(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> Optional[Path]:
+    """Return the folder of compiled kernels: in XDG_CACHE_HOME, LOCALAPPDATA (Windows) or ~/.cache; None if none is."""
+    if platform == "win32" and environment.get("LOCALAPPDATA"):
+        return Path(environment["LOCALAPPDATA"]) / "legs-loss" / "kernels"
+    base = environment.get("XDG_CACHE_HOME", "")
+    try:
+        return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "legs-loss" / "kernels"
+    except RuntimeError:  # a container's user may have no home
+        return None
+
+
+class BinaryCache:
+    """A folder of compiled kernels, each file with a checksum. Files that cannot be read or written are ignored.
+
+    What lies in it runs on the card, so folder and files must be the user's own, and nobody else's to write.
+
+    Args:
+        folder: is made when something is kept; None keeps nothing.
+    """
+
+    def __init__(self, folder: Optional[Path]) -> None:
+        self.folder = folder
+
+    def get(self, key: bytes) -> Optional[bytes]:
+        """Return what is kept under a key; None where there is nothing, or it is not what this user wrote."""
+        if self.folder is None:
+            return None
+        try:
+            with open(str(_path(self.folder, key)), "rb") as file:
+                if not (_is_private(os.fstat(file.fileno())) and _is_private(os.stat(str(self.folder)))):
+                    return None
+                content = file.read()
+        except OSError:
+            return None
+        digest, binary = content[:_DIGEST], content[_DIGEST:]
+        return binary if binary and hashlib.sha256(key + binary).digest() == digest else None
+
+    def put(self, key: bytes, binary: bytes) -> None:
+        """Keep a binary: the file appears whole or not at all, whoever else writes it meanwhile."""
+        if self.folder is None:
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if not _is_private(os.stat(str(self.folder))):
+                return
+            handle, name = tempfile.mkstemp(dir=str(self.folder))
+        except OSError:
+            return
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(key + binary).digest() + binary)
+            os.replace(name, str(_path(self.folder, key)))
+        except OSError:
+            with suppress(OSError):
+                os.unlink(name)
+
+    def discard(self, key: bytes) -> None:
+        """Remove what is kept under a key."""
+        if self.folder is not None:
+            with suppress(OSError):
+                _path(self.folder, key).unlink()
+
+
+def _is_private(found: os.stat_result) -> bool:
+    if not hasattr(os, "getuid"):  # Windows: LOCALAPPDATA is the user's own
+        return True
+    return found.st_uid == os.getuid() and not found.st_mode & _OF_OTHERS
+
+
+def _path(folder: Path, key: bytes) -> Path:
+    return folder / f"{hashlib.sha256(key).hexdigest()}.bin"

@@ -1,0 +1,193 @@
+"""Which backend is available on which device: one that is installed, and gave torch's own results in a trial.
+
+The trial runs once before a device's first use, on a small image. A backend that is not installed is skipped silently;
+one that fails, then or later, is reported once on stderr, and torch is used instead. ``LEGS_BACKEND=torch|numba|cuda``
+forces one; images that it does not support are computed by torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+import threading
+from typing import Dict, List, NamedTuple, Optional, Tuple
+
+import torch
+
+from legs_loss.errors import LegsError
+from legs_loss.kernels.contract import Backend, DeviceFault, NotNow
+from legs_loss.kernels.trial import difference_from_torch
+
+__all__ = ["BACKENDS", "OUT_OF_MEMORY", "Availability", "Backends", "Known", "forced_backend", "is_capturing"]
+
+OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
+_NAMES = ("torch", "numba", "cuda")
+
+
+class Known(NamedTuple):
+    """A backend: the module whose BACKEND it is, the type of its devices, and whether a forked process may use it."""
+
+    module: str
+    device: str
+    survives_fork: bool = True
+
+
+class Availability(NamedTuple):
+    """Whether a backend is available on a device.
+
+    Attributes:
+        backend: None where it is not.
+        installed: whether its package is installed.
+        reason: why it is, or is not, available.
+    """
+
+    backend: Optional[Backend]
+    installed: bool
+    reason: str
+
+
+class Backends:
+    """The backends of this process, and which of them are available on each device.
+
+    Args:
+        known: by name, the first for a device first.
+    """
+
+    def __init__(self, known: Dict[str, Known]) -> None:
+        self._known = known
+        self._found: Dict[Tuple[str, torch.device], Availability] = {}
+        self._lock = threading.RLock()
+        self._forked = False
+
+    def names(self, device: torch.device) -> List[str]:
+        """Return the names of the backends for a device."""
+        return [name for name, known in self._known.items() if known.device == device.type]
+
+    def chosen(self, device: torch.device) -> str:
+        """Return which backend the loss uses for images on a device: "torch" or the name of another.
+
+        Raises:
+            LegsError: LEGS_BACKEND is none of these.
+        """
+        forced, names = forced_backend(), self.names(device)
+        name = forced or (names[0] if names else "torch")
+        return name if name in names and self.availability(name, device).backend is not None else "torch"
+
+    def ready(self, device: torch.device) -> Optional[Backend]:
+        """Return the backend for images on a device, None where that is torch: also where its trial may not run now."""
+        if is_capturing(device) and not all((name, _indexed(device)) in self._found for name in self.names(device)):
+            return None  # a trial waits for the device, which would break a capture
+        name = self.chosen(device)
+        return None if name == "torch" else self.availability(name, device).backend
+
+    def availability(self, name: str, device: torch.device) -> Availability:
+        """Return whether a backend is available on a device, by a trial that runs once for each device.
+
+        On a card that is full it is not available now, and the next call tries it again.
+
+        Raises:
+            DeviceFault: the device computes nothing any more, since a kernel has failed before.
+        """
+        key = name, _indexed(device)
+        if key not in self._found:
+            with self._lock:
+                if key not in self._found:
+                    try:
+                        self._record(key, self._tried(name, device))
+                    except (NotNow, MemoryError, OUT_OF_MEMORY) as error:
+                        return Availability(None, True, _in_words(error))
+        return self._found[key]
+
+    def give_up(self, name: str, device: torch.device, error: Exception) -> None:
+        """Leave a backend that failed after its trial."""
+        self._record((name, _indexed(device)), Availability(None, True, _in_words(error)))
+
+    def after_fork(self) -> None:
+        """Forget, in a forked process, the backends that it may not use."""
+        self._lock, self._forked = threading.RLock(), True
+        self._found = {key: found for key, found in self._found.items() if self._known[key[0]].survives_fork}
+
+    def _tried(self, name: str, device: torch.device) -> Availability:
+        if self._forked and not self._known[name].survives_fork:
+            return Availability(None, True, "its threads do not exist in a forked process")
+        missing = _why_missing(name)
+        if missing:
+            return Availability(None, False, missing)
+        try:
+            return self._trial(name, device)
+        except (NotNow, OUT_OF_MEMORY):  # torch's allocator holds what is free
+            if device.type == "cuda":
+                torch.cuda.empty_cache()
+            return self._trial(name, device)
+
+    def _trial(self, name: str, device: torch.device) -> Availability:
+        try:
+            backend = importlib.import_module(self._known[name].module).BACKEND
+            threads = torch.get_num_threads()
+            with torch.inference_mode(False):  # the first call may be in an evaluation; the trial needs gradients
+                problem = difference_from_torch(backend, device)
+            torch.set_num_threads(threads)  # numba's first parallel loop sets OpenMP's number, which is torch's too
+        except (NotNow, MemoryError, OUT_OF_MEMORY, DeviceFault):
+            raise
+        except Exception as error:  # anything that a broken install, compiler or driver raises
+            if "CUDA error" in str(error):
+                raise DeviceFault(str(error)) from error  # torch's own: it computes nothing on this device either
+            return Availability(None, True, _in_words(error))
+        return Availability(None if problem else backend, True, problem or "its trial agreed with torch")
+
+    def _record(self, key: Tuple[str, torch.device], found: Availability) -> None:
+        self._found[key] = found
+        if found.backend is None and (found.installed or forced_backend() == key[0]):
+            print(f"legs-loss: {key[0]} is unavailable, torch is used: {found.reason}", file=sys.stderr, flush=True)
+
+
+BACKENDS = Backends(
+    {
+        "numba": Known("legs_loss.kernels.numba_loss", "cpu", survives_fork=False),
+        "cuda": Known("legs_loss.kernels.cuda.backend", "cuda"),
+    }
+)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=BACKENDS.after_fork)
+
+
+def forced_backend() -> Optional[str]:
+    """Return the backend that LEGS_BACKEND names, or None.
+
+    Raises:
+        LegsError: there is none of this name.
+    """
+    name = os.environ.get("LEGS_BACKEND", "")
+    if name and name not in _NAMES:
+        raise LegsError(f"LEGS_BACKEND must be one of {', '.join(_NAMES)}, got {name!r}")
+    return name or None
+
+
+def is_capturing(device: torch.device) -> bool:
+    """Return whether launches on a device are being recorded into a CUDA graph."""
+    probe = getattr(torch.cuda, "is_current_stream_capturing", None)
+    return device.type == "cuda" and probe is not None and bool(probe())
+
+
+def _indexed(device: torch.device) -> torch.device:
+    """Return a device with its number, which "cuda" alone does not say."""
+    if device.type == "cuda" and device.index is None and torch.cuda.is_available():
+        return torch.device("cuda", torch.cuda.current_device())
+    return device
+
+
+def _why_missing(name: str) -> Optional[str]:
+    """Return why a backend cannot be used in this installation."""
+    if name == "cuda":
+        return None if torch.version.cuda else "this torch is built without CUDA"
+    if importlib.util.find_spec(name) is None:
+        return "it is not installed"
+    if sys.version_info < (3, 8):
+        return "the last numba for Python 3.7 takes minutes to compile the weights"
+    return None
+
+
+def _in_words(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).strip() or 'no message'}".splitlines()[0]

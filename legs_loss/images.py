@@ -1,16 +1,19 @@
-"""Check images and their layouts, as every public function does."""
+"""Read the layout of images from their shapes, as every public function does, and check their values."""
 
 from __future__ import annotations
+
+from typing import NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
 
-__all__ = ["as_map", "channels_first", "check_image", "check_pair", "check_values", "is_compiling", "shape_of"]
+__all__ = ["Layout", "check_values", "is_compiling", "read_layout", "read_pair", "shape_of"]
 
 # A rendering may overshoot 1 and an HDR photograph may exceed it; 8-bit values are far larger.
 _SURELY_NOT_UNIT_RANGE = 16.0
+_CHANNELS = (1, 3, 4)  # of a photograph: gray, colour, colour and alpha; a rendering may have any number
 
 
 def is_compiling() -> bool:
@@ -25,35 +28,135 @@ def shape_of(tensor: Tensor) -> str:
     return str(list(tensor.shape))
 
 
-def check_image(image: Tensor, name: str = "image") -> None:
-    """Check that this is a float tensor of three or four dimensions, none of them empty.
+class Layout(NamedTuple):
+    """Meaning of an image's axes: all of this package computes on [C, H, W] or [B, C, H, W].
+
+    Attributes:
+        shape: of the image as it was given.
+        channels_last: whether its last axis is the channel.
+    """
+
+    shape: Sequence[int]
+    channels_last: bool
+
+    def channels_first(self, image: Tensor) -> Tensor:
+        """Return an image of this layout as [C, H, W], or [B, C, H, W]: all axes in front of an image are one batch."""
+        if len(self.shape) == 2:
+            return image.unsqueeze(0)
+        image = image.movedim(-1, -3) if self.channels_last else image
+        return image.flatten(0, -4) if image.dim() > 4 else image
+
+    def restored(self, image: Tensor) -> Tensor:
+        """Return an image [..., C, H, W], of any number of channels, with its axes as they were given."""
+        if len(self.shape) == 2:
+            return image.squeeze(-3)
+        if len(self.shape) > 4:
+            image = image.reshape(*self.shape[:-3], *image.shape[-3:])
+        return image.movedim(-3, -1) if self.channels_last else image
+
+    def map_first(self, values: Optional[Tensor], image: Tensor, name: str) -> Optional[Tensor]:
+        """Return a weight map or a mask as [1, H, W] or [B, 1, H, W]; None stays None.
+
+        Args:
+            values: one value a pixel: the given image's shape with one channel, or without the channel, and for a batch
+                either one a view or one for all.
+            image: an image of this layout, as it was given.
+            name: "weight" or "mask", for the message.
+
+        Raises:
+            LegsError: the shapes do not fit (the message names both), or the devices differ.
+        """
+        if values is None:
+            return None
+        if not isinstance(values, Tensor):
+            raise LegsError(f"{name} must be a torch.Tensor, got {type(values).__name__}")
+        if values.device != image.device:
+            raise LegsError(f"{name} is on {values.device} and the images on {image.device}")
+        batch = list(self.shape[:-3])
+        height, width = self.shape[-3:-1] if self.channels_last else self.shape[-2:]
+        one, none = ([height, width, 1] if self.channels_last else [1, height, width]), [height, width]
+        shape = list(values.shape)
+        if batch and shape in (batch + one, batch + none):
+            return values.reshape(-1, 1, height, width)
+        if shape in (one, none):
+            return values.reshape(1, height, width)
+        raise LegsError(
+            f"{name} {shape} does not fit images {shape_of(image)}: expected {batch + one} or {batch + none}"
+        )
+
+
+def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str = "image") -> Layout:
+    """Return the layout of an image, as its shape shows it.
+
+    Args:
+        image: floats, [H, W], [C, H, W] or [B, C, H, W], with more axes in front, or with the channel last. It is taken
+            for the last axis where that is 1, 3 or 4 and the third from last is none of these.
+        channels_last: the caller's word, where both read well, as in [3, 100, 4].
+        name: of the image, for messages.
 
     Raises:
-        LegsError: it is not; the message names the type or the shape.
+        LegsError: it is no float tensor, has too few axes or an empty one; its channel may be either axis and
+            ``channels_last`` is None; its shape contradicts ``channels_last``; or it may be a list of pixels, [N, 3].
+
+    Example:
+        >>> read_layout(torch.zeros(1, 6, 8, 3)).channels_last
+        True
     """
     if not isinstance(image, Tensor):
         raise LegsError(f"{name} must be a torch.Tensor, got {type(image).__name__}")
     if not image.is_floating_point():
         raise LegsError(f"{name} is of type {image.dtype}: give floats in [0, 1] (8-bit images: image / 255.0)")
-    if image.dim() not in (3, 4) or image.numel() == 0:
+    if image.dim() < 2 or image.numel() == 0:
         raise LegsError(
-            f"{name} must be an image [C, H, W] or a batch [B, C, H, W] (channels_last=True: "
-            f"[H, W, C] or [B, H, W, C]), got {shape_of(image)}"
+            f"{name} must be an image [H, W], [C, H, W] or [H, W, C], or a batch [B, C, H, W] or [B, H, W, C], "
+            f"got {shape_of(image)}"
         )
+    if image.dim() == 2:
+        if image.shape[0] in _CHANNELS or image.shape[1] in _CHANNELS:
+            raise LegsError(
+                f"{name} {shape_of(image)} may be a list of pixels, not an image: give the whole image [C, H, W], "
+                "a gray one as [1, H, W]"
+            )
+        return Layout(image.shape, False)
+    first, last = image.shape[-3], image.shape[-1]
+    if channels_last is None:
+        if first in _CHANNELS and last in _CHANNELS:
+            raise LegsError(
+                f"{name} {shape_of(image)} may have its channels first or last: say channels_last=False ({first} "
+                f"channels) or channels_last=True ({last} channels)"
+            )
+        return Layout(image.shape, last in _CHANNELS)
+    channel, other = (last, first) if channels_last else (first, last)
+    if channel > max(_CHANNELS) and other in _CHANNELS:
+        raise LegsError(
+            f"{name} {shape_of(image)} has its channels {'first' if channels_last else 'last'}: leave "
+            f"channels_last={bool(channels_last)} out of the call"
+        )
+    return Layout(image.shape, bool(channels_last))
 
 
-def check_pair(prediction: Tensor, target: Tensor) -> None:
-    """Check that prediction and target are images of one shape on one device.
+def read_pair(
+    prediction: Tensor, target: Tensor, channels_last: Optional[bool] = None
+) -> Tuple[Layout, Tensor, Tensor]:
+    """Return the layout of a prediction and its target, and both of one shape, as they were given.
+
+    An image beside a batch of one image becomes a batch of one.
 
     Raises:
-        LegsError: they are not; the message names both shapes or both devices.
+        LegsError: as :func:`read_layout`; their shapes or devices differ (the message names both).
     """
-    check_image(prediction, "prediction")
-    check_image(target, "target")
-    if prediction.shape != target.shape:
-        raise LegsError(f"prediction {shape_of(prediction)} and target {shape_of(target)} differ in shape")
+    if isinstance(prediction, Tensor) and isinstance(target, Tensor):
+        if target.shape == (1, *prediction.shape):
+            prediction = prediction.unsqueeze(0)
+        elif prediction.shape == (1, *target.shape):
+            target = target.unsqueeze(0)
+        if prediction.shape != target.shape:
+            raise LegsError(f"prediction {shape_of(prediction)} and target {shape_of(target)} differ in shape")
+    read_layout(prediction, channels_last, "prediction")
+    layout = read_layout(target, channels_last, "target")
     if prediction.device != target.device:
         raise LegsError(f"prediction is on {prediction.device} and target on {target.device}: move one of them first")
+    return layout, prediction, target
 
 
 def check_values(image: Tensor, name: str = "target") -> None:
@@ -74,39 +177,3 @@ def check_values(image: Tensor, name: str = "target") -> None:
             f"{name} {shape_of(image)} has values up to {largest:g}: images are in [0, 1] here "
             "(8-bit images: image / 255.0)"
         )
-
-
-def channels_first(image: Tensor, channels_last: bool) -> Tensor:
-    """Return the image as [..., C, H, W], a view of the same memory."""
-    return image.movedim(-1, -3) if channels_last else image
-
-
-def as_map(values: Tensor, image: Tensor, channels_last: bool, name: str) -> Tensor:
-    """Return a weight map or a mask in a shape that broadcasts over the image's channels.
-
-    Args:
-        values: one value a pixel: the image's shape with one channel, or without the channel, and for a batch
-            either one a view or one for all.
-        image: the image [C, H, W] or [B, C, H, W] that it belongs to (or channels-last).
-        channels_last: where the image's channel stands.
-        name: "weight" or "mask", for the message.
-
-    Raises:
-        LegsError: the shapes do not fit (the message names both), or the devices differ.
-    """
-    if not isinstance(values, Tensor):
-        raise LegsError(f"{name} must be a torch.Tensor, got {type(values).__name__}")
-    if values.device != image.device:
-        raise LegsError(f"{name} is on {values.device} and the images on {image.device}")
-    channel = image.dim() - (1 if channels_last else 3)
-    one_channel = list(image.shape)
-    one_channel[channel] = 1
-    no_channel = one_channel[:channel] + one_channel[channel + 1 :]
-    shape = list(values.shape)
-    if shape == one_channel:
-        return values
-    if shape == no_channel:
-        return values.unsqueeze(channel)
-    if image.dim() == 4 and shape in (one_channel[1:], no_channel[1:]):
-        return as_map(values, image[0], channels_last, name)
-    raise LegsError(f"{name} {shape} does not fit images {shape_of(image)}: expected {one_channel} or {no_channel}")

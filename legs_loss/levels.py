@@ -58,7 +58,7 @@ def levels_of(images: Iterable[Tensor], spec: WeightSpec) -> Optional[Tensor]:
     if spec.over != "scene":
         return None
     return scene_levels(
-        response_levels(response(image, spec.operator, spec.p, smooth=spec.smooth), spec) for image in images
+        response_levels(response(image, spec.operator, spec.p, False, spec.smooth), spec) for image in images
     )
 
 

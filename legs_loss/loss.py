@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from legs_loss.errors import LegsError
-from legs_loss.images import as_map, check_pair
+from legs_loss.images import read_pair
 from legs_loss.kernels.backends import fused_loss
 from legs_loss.kernels.contract import Weights
 from legs_loss.levels import RunningLevels, response_levels
@@ -26,25 +26,26 @@ def weighted_l1(
     weight: Optional[Tensor] = None,
     mask: Optional[Tensor] = None,
     renormalise: bool = False,
-    channels_last: bool = False,
+    channels_last: Optional[bool] = None,
 ) -> Tensor:
     """Return the mean over pixels of W times the mean over channels of |prediction - target|.
 
     Args:
-        prediction: floats, [C, H, W] or [B, C, H, W]; channels-last on request.
-        target: the same shape.
-        weight: one value a pixel, [1, H, W], [H, W], [B, 1, H, W] or [B, H, W]; None is 1 everywhere, and then
-            the result is ``torch.abs(prediction - target).mean()`` to the last bit. It is not divided by its
-            mean, as in the paper.
+        prediction: floats, [H, W], [C, H, W], [H, W, C], or batches of these, as of the views of several scenes
+            [B, V, C, H, W]. The channel stands last where that axis is 1, 3 or 4 and the one for [C, H, W] is not.
+        target: the same shape; an image beside a batch of one image is a batch of one.
+        weight: one value a pixel, in the images' shape with one channel or without the channel, and for a batch one a
+            view or one for all; None is 1 everywhere, and then the result is
+            ``torch.abs(prediction - target).mean()`` to the last bit. It is not divided by its mean, as in the paper.
         mask: bool, or floats in [0, 1], in the weight's shapes: zeroes the weight where it is 0.
         renormalise: divide by the mask's mean, so that masked pixels do not count as pixels without error.
-        channels_last: where the channel stands.
+        channels_last: where the channel stands, for a shape that does not show it, as [3, 100, 4].
 
     Returns:
         A scalar, differentiable in prediction and target.
 
     Raises:
-        LegsError: shapes or devices that do not fit; the message names both.
+        LegsError: shapes or devices that do not fit; the message names both. A shape that may be read either way.
 
     Source: the LEGS paper, its weighted L1; the mean over channels (the paper writes a sum) is 3DGS's.
 
@@ -53,16 +54,18 @@ def weighted_l1(
         >>> weighted_l1(prediction, target, weight=torch.tensor([[1.0, 3.0]]))
         tensor(2.)
     """
-    check_pair(prediction, target)
-    error = torch.abs(prediction - target)
+    layout, prediction, target = read_pair(prediction, target, channels_last)
+    weight, mask = layout.map_first(weight, target, "weight"), layout.map_first(mask, target, "mask")
+    if weight is None and mask is None:
+        return torch.abs(prediction - target).mean()
+    error = torch.abs(layout.channels_first(prediction) - layout.channels_first(target))
     if weight is not None:
-        weight = as_map(weight, prediction, channels_last, "weight")
         # A float64 map must not turn a float32 loss into a float64 one.
         weight = weight.to(torch.promote_types(error.dtype, torch.float32))
         error = weight * error
     if mask is None:
         return error.mean()
-    mask = as_map(mask, prediction, channels_last, "mask").to(torch.promote_types(error.dtype, torch.float32))
+    mask = mask.to(torch.promote_types(error.dtype, torch.float32))
     loss = (mask * error).mean()
     if not renormalise:
         return loss
@@ -79,12 +82,12 @@ def legs_loss(
     lambda_dssim: float = 0.2,
     padding: str = "zeros",
     renormalise: bool = False,
-    channels_last: bool = False,
+    channels_last: Optional[bool] = None,
 ) -> Tensor:
     """Return (1 - lambda) * L_w + lambda * (1 - SSIM), the loss of a training step.
 
     Args:
-        prediction: the rendering, floats in [0, 1], [C, H, W] or [B, C, H, W]; channels-last on request.
+        prediction: the rendering, floats in [0, 1], in a shape that :func:`weighted_l1` takes.
         target: the photograph of the same view, the same shape.
         spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own to the last bit. A spec that is normalised
             over the scene uses the images of this call as the scene; :class:`LEGSLoss` and ``l1_loss`` use all so far.
@@ -93,7 +96,7 @@ def legs_loss(
         lambda_dssim: in [0, 1], the share of D-SSIM; 3DGS's name and value.
         padding: of SSIM, see :func:`~legs_loss.ssim`.
         renormalise: divide the masked L1 term by the mask's mean.
-        channels_last: where the channel stands.
+        channels_last: where the channel stands, for a shape that does not show it.
 
     Returns:
         A scalar, differentiable in the prediction. With a weight it is computed by a backend where one is
@@ -114,19 +117,21 @@ def legs_loss(
     spec = as_spec(spec)
     if not 0.0 <= lambda_dssim <= 1.0:
         raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
-    check_pair(prediction, target)
+    layout, prediction, target = read_pair(prediction, target, channels_last)
+    weight, mask = layout.map_first(weight, target, "weight"), layout.map_first(mask, target, "mask")
+    prediction, target = layout.channels_first(prediction), layout.channels_first(target)
     if weight is None and spec.error > 0.0:
-        weight = error_weight_map(prediction, target, spec, channels_last)
+        weight = error_weight_map(prediction, target, spec)
     weights = Weights(spec if weight is None else None, None, weight, mask, renormalise)
-    fused = fused_loss(prediction, target, weights, lambda_dssim, padding, channels_last)
+    fused = fused_loss(prediction, target, weights, lambda_dssim, padding)
     if fused is not None:
         return fused
     if weight is None and not spec.unweighted:
-        weight = weight_map(target, spec, channels_last)
-    photometric = weighted_l1(prediction, target, weight, mask, renormalise, channels_last)
+        weight = weight_map(target, spec, False)
+    photometric = weighted_l1(prediction, target, weight, mask, renormalise, False)
     if lambda_dssim == 0.0:
         return photometric
-    return (1.0 - lambda_dssim) * photometric + lambda_dssim * d_ssim(prediction, target, padding, channels_last)
+    return (1.0 - lambda_dssim) * photometric + lambda_dssim * d_ssim(prediction, target, padding, False)
 
 
 class LEGSLoss(nn.Module):
@@ -140,10 +145,10 @@ class LEGSLoss(nn.Module):
         lambda_dssim: the share of D-SSIM.
         padding: of SSIM.
         renormalise: divide the masked L1 term by the mask's mean.
-        channels_last: where the channel stands.
+        channels_last: where the channel stands, for shapes that do not show it.
 
     Shape:
-        prediction, target: [C, H, W] or [B, C, H, W]; weight, mask: one value a pixel; output: a scalar.
+        prediction, target: [H, W], [C, H, W], [H, W, C] or batches; weight, mask: one value a pixel; output: a scalar.
 
     Example:
         >>> criterion = LEGSLoss("legs-l")
@@ -158,7 +163,7 @@ class LEGSLoss(nn.Module):
         lambda_dssim: float = 0.2,
         padding: str = "zeros",
         renormalise: bool = False,
-        channels_last: bool = False,
+        channels_last: Optional[bool] = None,
     ) -> None:
         super().__init__()
         self.spec: WeightSpec = as_spec(spec)

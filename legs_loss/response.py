@@ -9,29 +9,33 @@ from __future__ import annotations
 
 import math
 from functools import reduce
-from typing import Dict, List, Mapping, Sequence, Tuple
+from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from legs_loss.images import channels_first, check_image
+from legs_loss.images import read_layout
 from legs_loss.operators import OPERATORS, Operator, Stencil, check_operator
 
 __all__ = ["gaussian_blur", "normalise_response", "response"]
 
 
 def response(
-    image: Tensor, operator: str = "laplacian", p: float = 2.0, channels_last: bool = False, smooth: float = 0.0
+    image: Tensor,
+    operator: str = "laplacian",
+    p: float = 2.0,
+    channels_last: Optional[bool] = None,
+    smooth: float = 0.0,
 ) -> Tensor:
     """Return the response E = || op F ||_p of an image, one value a pixel.
 
     Args:
-        image: floats, [C, H, W] or [B, C, H, W] with any number of channels; [H, W, C] or [B, H, W, C] with
-            ``channels_last``. Half precision is computed in float32.
+        image: floats, [H, W], [C, H, W] with any number of channels, [H, W, C], or batches of these; half precision is
+            computed in float32.
         operator: a name of :data:`legs_loss.OPERATORS`, which has its stencils: a Laplacian or a gradient.
         p: 1, 2 or inf: the norm over channels, and for a gradient over its two directions too.
-        channels_last: where the channel stands.
+        channels_last: where the channel stands, for a shape that does not show it.
         smooth: the standard deviation in pixels of a Gaussian that the image is averaged with first.
 
     Returns:
@@ -39,19 +43,18 @@ def response(
         (the edge pixel is not repeated), so the border of the image is not an edge. No gradient flows to the image.
 
     Raises:
-        LegsError: not an image, or an unknown operator or norm.
+        LegsError: not an image, one whose channel may be first or last, or an unknown operator or norm.
 
     Example:
-        >>> dot = torch.zeros(1, 3, 3)
-        >>> dot[0, 1, 1] = 1.0
+        >>> dot = torch.zeros(2, 5)
+        >>> dot[0, 2] = 1.0
         >>> response(dot)
-        tensor([[[0., 2., 0.],
-                 [2., 4., 2.],
-                 [0., 2., 0.]]])
+        tensor([[0., 1., 4., 1., 0.],
+                [0., 0., 2., 0., 0.]])
     """
-    check_image(image)
+    layout = read_layout(image, channels_last)
     check_operator(operator, p)
-    flat = channels_first(image.detach(), channels_last)
+    flat = layout.channels_first(image.detach())
     flat = flat.to(torch.promote_types(flat.dtype, torch.float32))
     if smooth > 0.0:
         # Operators do not respond to a constant: without it, the response of a flat image is exactly 0.
@@ -59,14 +62,14 @@ def response(
     single = flat.dim() == 3
     strength = _norm(_components(flat.unsqueeze(0) if single else flat, OPERATORS[operator]), p)
     strength = strength[0] if single else strength
-    return strength.movedim(-3, -1) if channels_last else strength
+    return layout.restored(strength)
 
 
 def normalise_response(response: Tensor, eps: float = 1e-8) -> Tensor:
     """Return E^ = (E - min E) / (max E - min E + eps), each image of a batch by itself.
 
     Args:
-        response: [1, H, W] or [B, 1, H, W], or channels-last, as :func:`response` returns it.
+        response: [H, W], [1, H, W] or [B, 1, H, W], or channels-last, as :func:`response` returns it.
         eps: keeps a constant response at 0.
 
     Returns:
@@ -76,7 +79,7 @@ def normalise_response(response: Tensor, eps: float = 1e-8) -> Tensor:
         >>> normalise_response(torch.tensor([[[1.0, 2.0, 5.0]]]))
         tensor([[[0.0000, 0.2500, 1.0000]]])
     """
-    over = tuple(range(response.dim() - 3, response.dim()))
+    over = tuple(range(max(0, response.dim() - 3), response.dim()))
     low = response.amin(over, keepdim=True)
     high = response.amax(over, keepdim=True)
     return (response - low) / (high - low + eps)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from legs_loss.config import is_off
 from legs_loss.errors import LegsError
-from legs_loss.images import channels_first, check_pair, is_compiling, shape_of
+from legs_loss.images import is_compiling, read_pair, shape_of
 from legs_loss.kernels.backends import fused_ssim
 
 __all__ = ["d_ssim", "ssim"]
@@ -39,12 +39,11 @@ def ssim(
     (docs/performance.md): equal up to rounding, differentiable once; with LEGS_OFF=1 they are 3DGS's own there, too.
 
     Args:
-        img1, img2: the two images, in either order, by 3DGS's names: floats in [0, 1], [C, H, W] or [B, C, H, W],
-            channels-last on request, of one shape; or one image of a batch of one and the other without its axis, as
-            3DGS's takes them.
+        img1, img2: the two images, in either order, by 3DGS's names: floats in [0, 1], of one shape, [H, W],
+            [C, H, W], [H, W, C] or batches of these; or an image beside a batch of one image, as 3DGS's takes them.
         padding: "zeros" as in 3DGS's code, "reflect", "replicate", or "valid" (only windows inside the image). A
             number is interpreted as 3DGS's third argument, ``window_size``, and the next one as ``size_average``.
-        channels_last: where the channel stands.
+        channels_last: where the channel stands, for a shape that does not show it.
         window_size: the window's side in pixels, odd.
         size_average: the mean over all images; False is one value an image, [B].
 
@@ -53,7 +52,8 @@ def ssim(
         variances are differences of near-equal numbers.
 
     Raises:
-        LegsError: the shapes differ, the padding is unknown, the window is even, or the image is too small for it.
+        LegsError: the shapes differ or may be read either way, the padding is unknown, the window is even, or the image
+            is too small for it.
 
     Example:
         >>> image = torch.rand(3, 16, 16)
@@ -64,49 +64,36 @@ def ssim(
         if channels_last is not None:
             size_average = bool(channels_last)
         window_size, padding, channels_last = padding, "zeros", None
-    last = bool(channels_last)
-    img1, img2 = _of_one_rank(img1, img2)
     if window_size == WINDOW_SIZE and size_average and torch.is_grad_enabled() and not is_off():
-        check_pair(img1, img2)
-        trained, constant = (img1, img2) if img1.requires_grad else (img2, img1)
+        layout, first, second = read_pair(img1, img2, channels_last)
+        trained, constant = (first, second) if first.requires_grad else (second, first)
         if trained.requires_grad:
-            fused = fused_ssim(trained, constant, padding, last)
+            fused = fused_ssim(layout.channels_first(trained), layout.channels_first(constant), padding)
             if fused is not None:
                 return fused
-    similarity = ssim_map(img1, img2, padding, last, window_size)
+    similarity = ssim_map(img1, img2, padding, channels_last, window_size)
     return similarity.mean() if size_average else similarity.mean(-3).mean(-2).mean(-1)
-
-
-def _of_one_rank(prediction: Tensor, target: Tensor) -> Tuple[Tensor, Tensor]:
-    """Return [C, H, W] beside [1, C, H, W] as two batches of one; others as they are."""
-    if isinstance(prediction, Tensor) and isinstance(target, Tensor):
-        if target.shape == (1, *prediction.shape):
-            return prediction.unsqueeze(0), target
-        if prediction.shape == (1, *target.shape):
-            return prediction, target.unsqueeze(0)
-    return prediction, target
 
 
 def ssim_map(
     prediction: Tensor,
     target: Tensor,
     padding: str = "zeros",
-    channels_last: bool = False,
+    channels_last: Optional[bool] = None,
     window_size: int = WINDOW_SIZE,
 ) -> Tensor:
     """Return the SSIM of every pixel and channel, channels first, whose mean :func:`ssim` is; arguments as there.
 
     Padding "valid" leaves out the pixels whose window is not inside the image.
     """
-    check_pair(prediction, target)
-    first = channels_first(prediction, channels_last)
-    second = channels_first(target, channels_last)
+    layout, prediction, target = read_pair(prediction, target, channels_last)
+    first, second = layout.channels_first(prediction), layout.channels_first(target)
     dtype = torch.promote_types(torch.promote_types(first.dtype, second.dtype), torch.float32)
     with _no_autocast(first):
         return _ssim_map(first.to(dtype), second.to(dtype), padding, window_size)
 
 
-def d_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: bool = False) -> Tensor:
+def d_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: Optional[bool] = None) -> Tensor:
     """Return 1 - SSIM, the structural term of 3DGS's loss, always to the last bit; arguments as for :func:`ssim`."""
     return 1.0 - ssim_map(prediction, target, padding, channels_last).mean()
 

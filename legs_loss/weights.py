@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legs_loss.curves import curve
 from legs_loss.errors import LegsError
-from legs_loss.images import channels_first, check_image, check_values, is_compiling
+from legs_loss.images import check_values, is_compiling, read_layout
 from legs_loss.levels import levels_of, over_scene, percentile
 from legs_loss.response import gaussian_blur, normalise_response, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
@@ -18,15 +18,14 @@ __all__ = ["curved", "error_weight_map", "weight_from_response", "weight_map", "
 
 
 def weight_map(
-    image: Tensor, spec: Spec = "legs", channels_last: bool = False, scene: Optional[Tensor] = None
+    image: Tensor, spec: Spec = "legs", channels_last: Optional[bool] = None, scene: Optional[Tensor] = None
 ) -> Tensor:
     """Return the weight map of a training image.
 
     Args:
-        image: the photograph as the training uses it, floats in [0, 1], [C, H, W] or [B, C, H, W]; [H, W, C] or
-            [B, H, W, C] with ``channels_last``.
+        image: the photograph as the training uses it, floats in [0, 1], [H, W], [C, H, W], [H, W, C], or a batch.
         spec: a preset's name or a :class:`~legs_loss.WeightSpec`.
-        channels_last: where the channel stands.
+        channels_last: where the channel stands, for a shape that does not show it.
         scene: for a spec that is normalised over the scene its levels, [2], as :func:`legs_loss.levels.scene_levels`
             returns them; without them the images of this call are the scene.
 
@@ -35,30 +34,29 @@ def weight_map(
         (float64 for float64). It carries no gradient. A constant image gets 1 everywhere.
 
     Raises:
-        LegsError: not an image, or (on the CPU) values that are NaN, infinite or plainly of 0..255. On other
-            devices the values are not checked, since that would wait for the device: a NaN in the image
-            makes the whole map NaN instead.
+        LegsError: not an image, one whose channel may be first or last, or (on the CPU) values that are NaN, infinite
+            or plainly of 0..255. On other devices the values are not checked, since that would wait for the device: a
+            NaN in the image makes the whole map NaN instead.
 
     Source: the LEGS paper, its weighted loss; the reflected border and the constant image are this project's choice.
 
     Example:
-        >>> dot = torch.zeros(1, 3, 3)
-        >>> dot[0, 1, 1] = 1.0
+        >>> dot = torch.zeros(2, 5)
+        >>> dot[0, 2] = 1.0
         >>> weight_map(dot, "legs-l")
-        tensor([[[ 1.,  6.,  1.],
-                 [ 6., 11.,  6.],
-                 [ 1.,  6.,  1.]]])
+        tensor([[ 1.0000,  3.5000, 11.0000,  3.5000,  1.0000],
+                [ 1.0000,  1.0000,  6.0000,  1.0000,  1.0000]])
     """
     spec = as_spec(spec)
     if spec.error > 0.0:
         raise LegsError("weights that follow the error (error > 0) need the rendering too: see error_weight_map")
-    check_image(image)
+    layout = read_layout(image, channels_last)
     if image.device.type == "cpu" and not is_compiling():
         check_values(image, "image")
-    strength = response(image, spec.operator, spec.p, channels_last, spec.smooth)
+    strength = response(layout.channels_first(image), spec.operator, spec.p, False, spec.smooth)
     if spec.over == "scene":
-        return weight_over_scene(strength, spec, scene)
-    return weight_from_response(normalise_response(strength, spec.eps), spec)
+        return layout.restored(weight_over_scene(strength, spec, scene))
+    return layout.restored(weight_from_response(normalise_response(strength, spec.eps), spec))
 
 
 def weight_maps(images: Iterable[Tensor], spec: Spec = "legs") -> List[Tensor]:
@@ -75,7 +73,7 @@ def weight_maps(images: Iterable[Tensor], spec: Spec = "legs") -> List[Tensor]:
     """
     spec, images = as_spec(spec), list(images)
     scene = levels_of(images, spec)
-    return [weight_map(image, spec, scene=scene) for image in images]
+    return [weight_map(image, spec, False, scene) for image in images]
 
 
 def weight_over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor] = None) -> Tensor:
@@ -124,7 +122,6 @@ def error_weight_map(
     prediction: Tensor,
     target: Tensor,
     spec: WeightSpec,
-    channels_last: bool = False,
     normalised: Optional[Tensor] = None,
 ) -> Tensor:
     """Return the weight map of this step for a spec whose weights follow the rendering's error (``spec.error``).
@@ -133,10 +130,8 @@ def error_weight_map(
     and e the mean over channels of the absolute error, averaged with a Gaussian of ``spec.error_blur`` pixels.
 
     Args:
-        prediction, target: the rendering and the photograph, [C, H, W] or [B, C, H, W]; [H, W, C] or [B, H, W, C] with
-            ``channels_last``.
+        prediction, target: the rendering and the photograph, [C, H, W] or [B, C, H, W].
         spec: the settings.
-        channels_last: where the channel stands.
         normalised: E^ of the target if it is known, in the shape of the map.
 
     Returns:
@@ -150,12 +145,11 @@ def error_weight_map(
         tensor([[[ 1.0000,  3.5000,  6.0000, 11.0000]]])
     """
     if normalised is None:
-        normalised = normalise_response(response(target, spec.operator, spec.p, channels_last, spec.smooth), spec.eps)
-    wrong = (channels_first(prediction, channels_last) - channels_first(target, channels_last)).detach().abs()
+        normalised = normalise_response(response(target, spec.operator, spec.p, False, spec.smooth), spec.eps)
+    wrong = (prediction - target).detach().abs()
     wrong = gaussian_blur(wrong.mean(-3, keepdim=True).to(normalised.dtype), spec.error_blur)
-    mixed = channels_first(normalised, channels_last) ** (1.0 - spec.error) * wrong**spec.error
-    weight = weight_from_response(normalise_response(mixed, spec.eps), spec)
-    return weight.movedim(-3, -1) if channels_last else weight
+    mixed = normalised ** (1.0 - spec.error) * wrong**spec.error
+    return weight_from_response(normalise_response(mixed, spec.eps), spec)
 
 
 def curved(normalised: Tensor, spec: WeightSpec) -> Tensor:

@@ -65,7 +65,7 @@ def fused_loss(
         LegsError: a spec, and a target with NaN, infinity or plainly of 0..255.
     """
     if isinstance(weight, WeightSpec) and not BACKEND.makes_weights_of(weight):
-        weight = weight_map(target, weight)
+        weight = weight_map(target, weight, False)
     weights = Weights(spec=weight) if isinstance(weight, WeightSpec) else Weights(map=weight)
     return BACKEND.loss(prediction, target, weights, lambda_dssim)
 

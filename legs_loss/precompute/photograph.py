@@ -49,7 +49,7 @@ def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     for rows in row_strips(height, width):
         # Rows that the operator reaches; at the photograph's own border it reflects.
         above, below = max(rows.start - reach, 0), min(rows.stop + reach, height)
-        strip = response(image_tensor(image[above:below]), spec.operator, spec.p, smooth=spec.smooth)
+        strip = response(image_tensor(image[above:below]), spec.operator, spec.p, False, spec.smooth)
         strength[rows] = strip[0, rows.start - above : rows.stop - above]
     return strength
 

@@ -30,23 +30,24 @@ def l1_loss(
     target: Tensor,
     view: View = None,
     mask: Optional[Tensor] = None,
-    channels_last: bool = False,
+    channels_last: Optional[bool] = None,
     reduction: str = "mean",
     own: Optional[Own] = None,
 ) -> Tensor:
     """Return the LEGS-weighted L1 loss; a drop-in for the ``l1_loss`` of a 3DGS codebase.
 
     Args:
-        prediction: the rendering, [C, H, W], [B, C, H, W], or with more axes in front, as the views of several
-            scenes [B, V, C, H, W]; channels-last on request. Where it requires no gradient (evaluation,
-            ``no_grad``) the result is ``torch.abs(prediction - target).mean()``, unweighted.
+        prediction: the rendering, [H, W], [C, H, W], [H, W, C], or batches of these, as of the views of several scenes
+            [B, V, C, H, W]. The channel stands last where that axis is 1, 3 or 4 and the one for [C, H, W] is not.
+            Where it requires no gradient (evaluation, ``no_grad``) the result is
+            ``torch.abs(prediction - target).mean()``, unweighted.
         target: the photograph of this step, the same shape; [C, H, W] beside [1, C, H, W] are both a batch of one,
             as in ``torch.abs(prediction - target)``.
         view: the name of the view, or its number (for a batch: one a view), if the target is that view's own stored
             image. It enables maps from ``legs precompute``, which are used only where the target's fingerprint
             shows that they were made from it. On the CPU a stored map is found by the fingerprint alone.
         mask: one value a pixel, zeroes the weight where it is 0.
-        channels_last: where the channel stands.
+        channels_last: where the channel stands, for a shape that does not show it, as [3, 100, 4].
         reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.
         own: the codebase's own L1 of (prediction, target), where it is more than a mean: its mask or reduction is then
             applied to the weighted difference. It is called with the target and a prediction whose difference from it
@@ -57,9 +58,9 @@ def l1_loss(
         ``torch.abs(prediction - target).mean()``, or ``own(prediction, target)``, to the last bit.
 
     Raises:
-        LegsError: shapes that do not fit (both are named), images whose layout contradicts
-            ``channels_last``, on the CPU a target with NaN or infinity,
-            a setting in legs.toml or LEGS_* that is out of range.
+        LegsError: shapes that do not fit (both are named), that may be read either way, or that contradict
+            ``channels_last``; on the CPU a target with NaN or infinity; a setting in legs.toml or LEGS_* that is out of
+            range.
 
     Example:
         >>> target = torch.rand(3, 8, 8)
@@ -94,9 +95,9 @@ def _compiled(call: Call) -> Tensor:
         )
     call = call.aligned()
     if spec.error > 0.0:
-        weight = error_weight_map(call.prediction, call.target, spec, call.channels_last)
+        weight = error_weight_map(call.prediction, call.target, spec)
     else:
-        weight = weight_map(call.target, spec, call.channels_last)
+        weight = weight_map(call.target, spec, False)
     return call.weighted(Weights(map=weight))
 
 

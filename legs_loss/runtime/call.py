@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.images import as_map, check_pair
+from legs_loss.images import Layout, read_pair
 from legs_loss.kernels.backends import fused_l1
 from legs_loss.kernels.contract import Weights
 from legs_loss.loss import weighted_l1
@@ -24,17 +24,17 @@ class Call(NamedTuple):
     """The arguments of :func:`~legs_loss.l1_loss`.
 
     Attributes:
-        shape: of the images as they were given, where :meth:`aligned` has folded the axes before their last three.
+        layout: of the images as they were given; None until :meth:`aligned` has made them [C, H, W] or [B, C, H, W].
     """
 
     prediction: Tensor
     target: Tensor
     view: View
     mask: Optional[Tensor]
-    channels_last: bool
+    channels_last: Optional[bool]
     reduction: str
     own: Optional[Own]
-    shape: Optional[Sequence[int]] = None
+    layout: Optional[Layout] = None
 
     def check_options(self) -> None:
         """Check the options; the images are checked by :meth:`aligned`, when they need a weight.
@@ -52,25 +52,18 @@ class Call(NamedTuple):
         return self.prediction.requires_grad and torch.is_grad_enabled()
 
     def aligned(self) -> Call:
-        """Return the call with a pair of images or of batches, checked, as a weight needs them.
-
-        Axes in front of a batch's are folded into it; beside a batch of one image, an image is a batch of one.
+        """Return the call with images [C, H, W] or [B, C, H, W], checked, as a weight needs them.
 
         Raises:
             LegsError: shapes or devices that do not fit, or a layout that contradicts ``channels_last``.
         """
-        call = self
-        if isinstance(self.target, Tensor) and isinstance(self.prediction, Tensor):
-            prediction, target = self.prediction, self.target
-            if target.dim() > 4 and prediction.shape == target.shape:
-                call = self._folded()
-            elif target.shape == (1, *prediction.shape):
-                call = self._replace(prediction=prediction.unsqueeze(0))
-            elif prediction.shape == (1, *target.shape):
-                call = self._replace(target=target.unsqueeze(0))
-        check_pair(call.prediction, call.target)
-        _check_layout(call.target, call.channels_last)
-        return call
+        layout, prediction, target = read_pair(self.prediction, self.target, self.channels_last)
+        return self._replace(
+            prediction=layout.channels_first(prediction),
+            target=layout.channels_first(target),
+            mask=layout.map_first(self.mask, target, "mask"),
+            layout=layout,
+        )
 
     def view_names(self) -> List[Optional[str]]:
         """Return the name of each image's view, None for an image without one.
@@ -98,55 +91,32 @@ class Call(NamedTuple):
             return self.own(self.prediction, self.target)
         if self.is_mean() and self.mask is None:
             return torch.abs(self.prediction - self.target).mean()
-        return self._with_map(None)
+        return self.aligned()._with_map(None)
 
     def weighted(self, weights: Weights) -> Tensor:
         """Return the loss with these weights."""
         if self.is_mean():
-            loss = fused_l1(self.prediction, self.target, weights._replace(mask=self.mask), self.channels_last)
+            loss = fused_l1(self.prediction, self.target, weights._replace(mask=self.mask))
             if loss is not None:
                 return loss
         if weights.spec is None:
             return self._with_map(weights.map)
         with torch.no_grad():
-            weight = weight_map(self.target, weights.spec, self.channels_last)
+            weight = weight_map(self.target, weights.spec, False)
         return self._with_map(weight)
 
     def _with_map(self, weight: Optional[Tensor]) -> Tensor:
+        assert self.layout is not None
         if self.own is not None:
             assert weight is not None
             # |F + W * (U - F) - F| = W * |U - F|: any L1 of the difference becomes the weighted one, and masks that the
             # codebase makes from the target stay as they are.
-            weight = as_map(weight, self.prediction, self.channels_last, "weight").to(self.prediction.dtype)
-            moved = self.target + weight * (self.prediction - self.target)
-            return self.own(self._unfolded(moved), self._unfolded(self.target))
+            moved = self.target + weight.to(self.prediction.dtype) * (self.prediction - self.target)
+            return self.own(self.layout.restored(moved), self.layout.restored(self.target))
         if self.reduction == "mean":
-            return weighted_l1(self.prediction, self.target, weight, self.mask, channels_last=self.channels_last)
+            return weighted_l1(self.prediction, self.target, weight, self.mask, channels_last=False)
         error = torch.abs(self.prediction - self.target)
-        for factor, name in ((weight, "weight"), (self.mask, "mask")):
+        for factor in (weight, self.mask):
             if factor is not None:
-                error = as_map(factor, self.prediction, self.channels_last, name).to(error.dtype) * error
-        return self._unfolded(error)
-
-    def _folded(self) -> Call:
-        shape = self.target.shape
-
-        def folded(tensor: Tensor) -> Tensor:
-            return tensor.reshape(-1, *tensor.shape[len(shape) - 3 :])
-
-        mask = None if self.mask is None else folded(self.mask)
-        return self._replace(prediction=folded(self.prediction), target=folded(self.target), mask=mask, shape=shape)
-
-    def _unfolded(self, images: Tensor) -> Tensor:
-        return images if self.shape is None else images.reshape(self.shape)
-
-
-def _check_layout(target: Tensor, channels_last: bool) -> None:
-    first, last = (target.shape[-3], target.shape[-1])
-    if channels_last:
-        first, last = last, first
-    if first > 4 and last in (1, 3, 4):
-        raise LegsError(
-            f"target {list(target.shape)} has its channels {'first' if channels_last else 'last'}: "
-            f"call l1_loss with channels_last={not channels_last}"
-        )
+                error = factor.to(error.dtype) * error
+        return self.layout.restored(error)

@@ -73,20 +73,17 @@ class WeightSource:
         spec = self.config.spec
         if spec.error > 0.0:
             normalised = found[0] if call.target.dim() == 3 else torch.stack(found)
-            return Weights(map=error_weight_map(call.prediction, call.target, spec, call.channels_last, normalised))
+            return Weights(map=error_weight_map(call.prediction, call.target, spec, normalised))
         if spec.over == "scene":
             strength = found[0] if call.target.dim() == 3 else torch.stack(found)
             return Weights(map=weight_over_scene(strength, spec, self._scene_levels(found[0].numel())))
         if all(map(_is_range, found)):
             return Weights(spec=spec, range=torch.cat(found))
-        maps = [
-            weight_map(image, spec, call.channels_last) if _is_range(weight) else weight
-            for image, weight in zip(images, found)
-        ]
+        maps = [weight_map(image, spec, False) if _is_range(weight) else weight for image, weight in zip(images, found)]
         return Weights(map=maps[0] if call.target.dim() == 3 else torch.stack(maps))
 
     def _weight(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
-        """Return an image's weight map [1, H, W] (channels-last [H, W, 1]), or the range that makes it, [1, 2].
+        """Return an image's weight map [1, H, W], or the range that makes it, [1, 2].
 
         For weights that follow the rendering's error it is E^, their constant part; for weights normalised over the
         scene it is E, since the scene's levels change with each new view.
@@ -98,7 +95,7 @@ class WeightSource:
             return self._computed(image, call, again=True)
         if call.is_mean() and image.device.type == "cpu" and self.config.store is None:
             # Here a SHA-256 of an image's bytes takes longer than its range.
-            found = fused_range(image, self.config.spec, call.channels_last)
+            found = fused_range(image, self.config.spec)
             if found is not None:
                 counts.computed += 1
                 return found
@@ -108,7 +105,7 @@ class WeightSource:
         return weight
 
     def _made(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
-        weight = self._stored.weight(image, view, call.channels_last)
+        weight = self._stored.weight(image, view)
         if weight is not None:
             self._counts.stored += 1
             return weight
@@ -121,14 +118,14 @@ class WeightSource:
         if spec.error > 0.0 or spec.over == "scene":
             if image.device.type == "cpu":
                 check_values(image, "target")
-            strength = response(image, spec.operator, spec.p, call.channels_last, spec.smooth)
+            strength = response(image, spec.operator, spec.p, False, spec.smooth)
             if spec.error > 0.0:
                 return normalise_response(strength, spec.eps)
             if not again:
                 self._seen.add(response_levels(strength, spec))
             return strength
-        found = fused_range(image, spec, call.channels_last) if call.is_mean() else None
-        return weight_map(image, spec, call.channels_last) if found is None else found
+        found = fused_range(image, spec) if call.is_mean() else None
+        return weight_map(image, spec, False) if found is None else found
 
     def _scene_levels(self, pixels: int) -> Optional[Tensor]:
         """Return the levels of the scene: of all the store's views of this size, else of those seen so far."""

@@ -43,21 +43,20 @@ class StoredWeights:
         self._store: Optional[WeightStore] = None
         self._opened = False
 
-    def weight(self, image: Tensor, view: Optional[str], channels_last: bool) -> Optional[Tensor]:
-        """Return an image's weight map [1, H, W] (channels-last [H, W, 1]), None if no map was made from this image.
+    def weight(self, image: Tensor, view: Optional[str]) -> Optional[Tensor]:
+        """Return an image's weight map [1, H, W], None if no map was made from this image.
 
         Where weights follow the rendering's error it is E^; where they are normalised over the scene, E.
 
         Args:
-            image: [C, H, W] or [H, W, C].
+            image: [C, H, W].
             view: its name, if the call gave one.
-            channels_last: where the channel stands.
         """
         store = self._open()
         if store is None:
             return None
         try:
-            entry = self._entry(store, image.movedim(-1, 0) if channels_last else image, view)
+            entry = self._entry(store, image, view)
             if entry is None:
                 return None
             over_scene = self._config.spec.over == "scene"
@@ -69,7 +68,7 @@ class StoredWeights:
         weight = known.float()
         if self._config.spec.error == 0.0 and not over_scene:
             weight = weight_from_response(known, self._config.spec)
-        return weight.movedim(0, -1) if channels_last else weight
+        return weight
 
     def scene_levels(self, pixels: int) -> Optional[Tensor]:
         """Return the levels of all the store's views of this size, None where it lacks them."""

@@ -20,7 +20,7 @@ def compare(fused, prediction, target, weight, lambda_dssim=0.2):
     exact = prediction.detach().double().requires_grad_()
     spec = weight if isinstance(weight, WeightSpec) else "3dgs"
     stored = weight.double() if isinstance(weight, torch.Tensor) else None
-    expected = legs_loss(exact, target.double(), spec, stored, lambda_dssim=lambda_dssim)
+    expected = legs_loss(exact, target.double(), spec, stored, lambda_dssim=lambda_dssim, channels_last=False)
     expected.backward()
     assert loss.dtype == torch.float32 and loss.shape == ()
     # float32 keeps 7 digits; SSIM's variances, differences of near-equal numbers, keep about 5.

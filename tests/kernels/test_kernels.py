@@ -41,7 +41,10 @@ class TestFusedLoss:
     def test_value_and_gradient_equal_the_reference(self, shape, weight):
         prediction, target = images(shape)
         compare(
-            fused_loss, prediction, target, {"none": None, "map": weight_map(target), "spec": PRESETS["legs"]}[weight]
+            fused_loss,
+            prediction,
+            target,
+            {"none": None, "map": weight_map(target, channels_last=False), "spec": PRESETS["legs"]}[weight],
         )
 
     @pytest.mark.parametrize("operator", COMPILED)
@@ -63,7 +66,13 @@ class TestFusedLoss:
         prediction, target = images((channels, height, width))
         spread = response(target).max() - response(target).min()
         assume(kind != 2 or spread > 1e-3)  # two pixels respond alike but for rounding, which the weights then magnify
-        compare(fused_loss, prediction, target, [None, weight_map(target), PRESETS["legs-l"]][kind], lambda_dssim)
+        compare(
+            fused_loss,
+            prediction,
+            target,
+            [None, weight_map(target, channels_last=False), PRESETS["legs-l"]][kind],
+            lambda_dssim,
+        )
 
     def test_one_map_for_a_batch(self):
         prediction, target = images((2, 3, 20, 30))

@@ -107,7 +107,7 @@ class TestValues:
         torch.testing.assert_close(weight_map(views[0], ROBUST), weight_maps(views[:1], ROBUST)[0])
         batch = weight_map(torch.stack(views), ROBUST)
         torch.testing.assert_close(batch, torch.stack(weight_maps(views, ROBUST)))
-        last = weight_map(torch.stack(views).movedim(1, -1), ROBUST, channels_last=True)
+        last = weight_map(torch.stack(views).movedim(1, -1), ROBUST)
         torch.testing.assert_close(last.movedim(-1, 1), batch)
 
     def test_a_constant_image_has_no_weight(self):

@@ -16,7 +16,7 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE, read_rows, scene_of
-from legs_loss.experiments.statistics import COLUMNS, difference, summarise_all, times_gaussians
+from legs_loss.experiments.statistics import COLUMNS, Difference, difference, summarise_all, times_gaussians
 from legs_loss.experiments.tables import LABELS, MISSING, difference_cell, score_cells, times_cell, with_values
 from legs_loss.levels import levels_of
 from legs_loss.reference.training.dataset import load_dataset, load_view, split_views
@@ -124,10 +124,11 @@ def _page(
             f"{len(arms)} arms, {len(seeds)} seed(s), {base['iterations']:,} iterations of 3D Gaussian Splatting each, "
             f"on {views[0].width}x{views[0].height} photographs."
         ),
+        verdict=_verdict(rows, arms, preferred),
         scores=_scores(rows, arms),
         differences=_differences(rows, others) if BASELINE in arms and others else "There is no second arm.",
         by_iterations=Markup(by_iterations(rows, arms)),
-        by_gaussians=Markup(by_gaussians(rows, arms)),
+        by_gaussians=[Markup(plot) for plot in by_gaussians(rows, arms)],
         seed=first[arms[0]]["seed"],
         settings=_settings(settings, rows),
         arms=_own_settings(arms, first),
@@ -135,6 +136,27 @@ def _page(
         data=data,  # as JSON in which no "</script>" ends the element
         script=base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii"),
     )
+
+
+def _verdict(rows: Sequence[Row], arms: Sequence[str], arm: str) -> str:
+    """Return the comparison in one sentence: what an arm gains over the baseline, for how many more Gaussians."""
+    split = "train" if any(row["metrics"]["test"] is None for row in rows) else "test"
+    found = difference(rows, arm, BASELINE, split) if BASELINE in arms and arm != BASELINE else None
+    if found is None:
+        return "There is nothing to compare yet: a second arm with the seeds of 3dgs makes it a comparison."
+    times = times_gaussians(rows, arm, BASELINE)
+    cost = "" if times is None else f", with {times:.1f} times the Gaussians"
+    where = "on held-out views" if split == "test" else "on training views"
+    sentence = f"{arm} has {_in_words(found)} {BASELINE} {where}{cost}"
+    equal = difference(rows, f"{arm}@{BASELINE}", BASELINE, split) if f"{arm}@{BASELINE}" in arms else None
+    if equal is None:
+        return f"{sentence}; at the same number of Gaussians it was not compared (the arm {arm}@{BASELINE})."
+    return f"{sentence}; at the same number of Gaussians it has {_in_words(equal)} it."
+
+
+def _in_words(found: Difference) -> str:
+    amount = f"{abs(found.mean):.2f} dB {'more' if found.mean > 0 else 'less'} PSNR than"
+    return amount if found.clear else f"no clear difference in PSNR ({found.mean:+.2f} dB, may be chance) to"
 
 
 def _scores(rows: Sequence[Row], arms: Sequence[str]) -> str:

@@ -48,25 +48,26 @@ def by_iterations(rows: Rows, arms: Sequence[str]) -> str:
     """
     if not any(row["metrics"]["history"] for row in rows):
         return ""
-    figure, axes = _figure(1)
+    figure, panel = _figure(len(arms))
     style = colours(arms)
     for arm in arms:
         histories = [row["metrics"]["history"] for row in rows if row["arm"] == arm]
         length = min(len(history) for history in histories)
         x = [point["iteration"] for point in histories[0][:length]]
         y = np.array([[point.get("test_psnr", np.nan) for point in history[:length]] for history in histories])
-        axes[0].plot(x, y.mean(0), color=style[arm][0], marker=style[arm][1], markersize=4, linewidth=1.6, label=arm)
-        axes[0].fill_between(x, y.min(0), y.max(0), color=style[arm][0], alpha=0.12, linewidth=0)
-    axes[0].set(xlabel="iterations", ylabel="held-out PSNR, dB")
-    _legend(axes[0], len(arms))
+        panel.plot(x, y.mean(0), color=style[arm][0], marker=style[arm][1], markersize=4, linewidth=1.6, label=arm)
+        panel.fill_between(x, y.min(0), y.max(0), color=style[arm][0], alpha=0.12, linewidth=0)
+    panel.set(xlabel="iterations", ylabel="held-out PSNR, dB")
+    _legend(panel)
     return _svg(figure, "iterations", "Held-out PSNR by iterations, a line an arm; the last values are in the table")
 
 
-def by_gaussians(rows: Rows, arms: Sequence[str]) -> str:
+def by_gaussians(rows: Rows, arms: Sequence[str]) -> List[str]:
     """Plot training and held-out PSNR by the number of Gaussians at the end: each seed, their mean larger."""
-    figure, axes = _figure(2)
     style = colours(arms)
-    for panel, split, title in ((axes[0], "train", "training views"), (axes[1], "test", "held-out views")):
+    plots = []
+    for split, title in (("train", "training views"), ("test", "held-out views")):
+        figure, panel = _figure(len(arms))
         for arm in arms:
             points = [
                 (row["metrics"]["gaussians"], row["metrics"][split]["psnr"])
@@ -83,37 +84,36 @@ def by_gaussians(rows: Rows, arms: Sequence[str]) -> str:
         panel.set_title(title, fontsize=11, color=_INK)
         panel.locator_params(axis="x", nbins=5)
         panel.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
-    _legend(axes[1], len(arms))
-    return _svg(figure, "gaussians", "PSNR by number of Gaussians, a point an arm; the values are in the table")
+        _legend(panel)
+        says = f"PSNR of {title} by number of Gaussians, a point an arm; the values are in the table"
+        plots.append(_svg(figure, f"gaussians-{split}", says))
+    return plots
 
 
-def _figure(panels: int) -> Tuple[Any, List[Any]]:
+def _figure(arms: int) -> Tuple[Any, Any]:
+    """Return a figure that a telephone shows whole, with room below for the names of the arms."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
         raise LegsError("plots need matplotlib: pip install 'legs-loss[report]'") from None
-    figure: Any = Figure(figsize=(9.5, 4.2), constrained_layout=True)
-    axes = list(np.atleast_1d(figure.subplots(1, panels)))
-    for panel in axes:
-        panel.set_facecolor("none")
-        panel.grid(alpha=0.25, linewidth=0.6, color=_INK)
-        panel.tick_params(colors=_INK, labelsize=9)
-        panel.xaxis.label.set_color(_INK)
-        panel.yaxis.label.set_color(_INK)
-        for name, spine in panel.spines.items():
-            spine.set_visible(name in ("left", "bottom"))
-            spine.set_color(_INK)
-    return figure, axes
+    figure: Any = Figure(figsize=(4.6, 3.4 + 0.2 * -(-arms // 3)), constrained_layout=True)
+    panel = figure.subplots()
+    panel.set_facecolor("none")
+    panel.grid(alpha=0.25, linewidth=0.6, color=_INK)
+    panel.tick_params(colors=_INK, labelsize=9)
+    panel.xaxis.label.set_color(_INK)
+    panel.yaxis.label.set_color(_INK)
+    for name, spine in panel.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_color(_INK)
+    return figure, panel
 
 
-def _legend(axes: Any, count: int) -> None:
-    axes.legend(
-        loc="center left",
-        bbox_to_anchor=(1.02, 0.5),
-        frameon=False,
-        labelcolor=_INK,
-        fontsize=9 if count < 12 else 7,
-    )
+def _legend(panel: Any) -> None:
+    if panel.get_legend_handles_labels()[1]:
+        panel.legend(
+            loc="upper center", bbox_to_anchor=(0.5, -0.17), ncol=3, frameon=False, labelcolor=_INK, fontsize=9
+        )
 
 
 def _svg(figure: Any, salt: str, says: str) -> str:

@@ -28,14 +28,13 @@ def find_content(path: Path, scene: Optional[Path] = None) -> Content:
     Args:
         path: a .ply of 3DGS; the output folder of a training (``legs train``, 3DGS and its forks); a folder of several
             such, as ``legs demo`` writes; or a comparison.
-        scene: where the photographs lie; a comparison knows it.
+        scene: where the photographs lie; a comparison knows it, and ``legs demo`` leaves its own beside the runs.
 
     Raises:
         LegsError: there are no Gaussians in it.
     """
     if not path.exists():
         raise LegsError(f"there is no file or folder {path}: give a .ply, a run's folder or a comparison")
-    read = None if scene is None else read_scene(scene)
     if (path / "comparison.json").is_file():
         return _comparison(path, scene)
     if path.is_file():
@@ -44,7 +43,9 @@ def find_content(path: Path, scene: Optional[Path] = None) -> Content:
         methods = dict(_runs(path))
     if not methods:
         raise LegsError(f"{path} holds no Gaussians: a run has point_cloud/iteration_N/point_cloud.ply")
-    return Content(path.resolve().name, methods, read, -1)
+    if scene is None and (path / "scene" / "sparse").is_dir():
+        scene = path / "scene"
+    return Content(path.resolve().name, methods, None if scene is None else read_scene(scene), -1)
 
 
 def _runs(path: Path) -> Iterator[Tuple[str, Path]]:

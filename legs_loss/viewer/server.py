@@ -36,9 +36,9 @@ def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port:
     check_address(host, port)
     loaded = {name: splats(read_ply(path)) for name, path in content.methods.items()}
     server, address = _start(host, port)
-    server.gui.configure_theme(control_layout="collapsible", dark_mode=False, show_share_button=False)
     server.gui.add_markdown(f"### {content.title}")
     _Methods(server, loaded)
+    _add_dark_mode(server)
     if content.scene is not None:
         _Cameras(server, content, preset)
     else:
@@ -68,6 +68,16 @@ def _start(host: str, port: int) -> Tuple[Any, str]:
     return server, guard.address(server.get_port())
 
 
+def _add_dark_mode(server: Any) -> None:
+    dark = server.gui.add_checkbox("dark", initial_value=False)
+
+    def apply() -> None:
+        server.gui.configure_theme(control_layout="collapsible", dark_mode=dark.value, show_share_button=False)
+
+    dark.on_update(lambda _: apply())
+    apply()
+
+
 class _Methods:
     """The splats of each method: shown or not, or two of them on either side of a line."""
 
@@ -89,8 +99,9 @@ class _Methods:
         if len(names) > 1:
             with server.gui.add_folder("Wipe"):
                 self.wiping = server.gui.add_checkbox("wipe between two", initial_value=False)
-                self.left = server.gui.add_dropdown("left", names, initial_value=names[0])
-                self.right = server.gui.add_dropdown("right", names, initial_value=names[-1])
+                left, right = ("3dgs", "legs") if {"3dgs", "legs"} <= set(names) else (names[0], names[-1])
+                self.left = server.gui.add_dropdown("left", names, initial_value=left)
+                self.right = server.gui.add_dropdown("right", names, initial_value=right)
                 self.share = server.gui.add_slider("line", min=0.0, max=1.0, step=0.01, initial_value=0.5)
             for control in (self.wiping, self.left, self.right, self.share):
                 control.on_update(lambda event: self.draw(event.client))

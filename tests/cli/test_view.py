@@ -61,6 +61,12 @@ class TestContent:
         assert find_content(runs).scene is None
         assert len(find_content(runs, tiny_scene).scene.views) == len(read_scene(tiny_scene).views)
 
+    def test_a_demo_has_its_scene_beside_the_runs(self, runs, tiny_scene):
+        shutil.copytree(str(tiny_scene), str(runs / "scene"))
+        found = find_content(runs)
+        assert list(found.methods) == ["green", "red"]
+        assert len(found.scene.views) == len(read_scene(tiny_scene).views)
+
     def test_what_holds_none(self, tmp_path):
         with pytest.raises(LegsError, match="holds no Gaussians"):
             find_content(tmp_path)

@@ -8,7 +8,7 @@ import io
 import re
 import shutil
 from pathlib import Path
-from typing import Any, Iterator, List
+from typing import Any, Dict, Iterator, List
 
 import numpy as np
 import pytest
@@ -252,7 +252,7 @@ def test_everything_has_a_name_and_is_seen(page: Any) -> None:
     )
     assert unnamed == []
     assert page.evaluate("[...document.images].every((one) => one.alt)")
-    assert page.get_by_role("img", name="PSNR by number of Gaussians").count() == 1
+    assert page.get_by_role("img", name="by number of Gaussians").count() == 2
     ground, ink = page.evaluate(
         "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
     )
@@ -295,3 +295,36 @@ def test_what_a_stranger_named_is_shown_and_not_run(page_path: Path, comparison:
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in page
     assert "default-src 'none'" in page_path.read_text(encoding="utf-8")
+
+
+def test_plots_fit_a_telephone(browser: Any, page_path: Path) -> None:
+    page = browser.new_page(viewport={"width": 400, "height": 800}, offline=True)
+    page.goto(page_path.as_uri())
+    right = page.evaluate(
+        "[...document.querySelectorAll('figure svg')].map((one) => one.getBoundingClientRect().right)"
+    )
+    assert len(right) == 3
+    assert max(right) <= 400
+    size = page.evaluate("document.querySelector('figure svg text').getBoundingClientRect().height")
+    assert size >= 8  # pixels: read without a magnifying glass
+    page.close()
+
+
+def _row(arm: str, seed: int, psnr: float, gaussians: int) -> Dict[str, Any]:
+    views = {"test": {"a.png": {"psnr": psnr}, "b.png": {"psnr": psnr + 1}}}
+    return {
+        "arm": arm,
+        "seed": seed,
+        "metrics": {"test": {"psnr": psnr + 0.5}, "views": views, "gaussians": gaussians},
+    }
+
+
+def test_the_verdict_is_one_sentence() -> None:
+    rows = [_row(arm, seed, 20.0 + seed + gain, count) for seed in range(3) for arm, gain, count in (
+        ("3dgs", 0.0, 1000), ("legs", 0.25, 2300), ("legs@3dgs", (-0.5, 0.5, 0.3)[seed], 1000))]  # fmt: skip
+    assert report._verdict(rows, ["3dgs", "legs", "legs@3dgs"], "legs") == (
+        "legs has 0.25 dB more PSNR than 3dgs on held-out views, with 2.3 times the Gaussians; at the same number of "
+        "Gaussians it has no clear difference in PSNR (+0.10 dB, may be chance) to it."
+    )
+    assert "it was not compared" in report._verdict(rows, ["3dgs", "legs"], "legs")
+    assert report._verdict(rows, ["3dgs"], "3dgs").startswith("There is nothing to compare yet")

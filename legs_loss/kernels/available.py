@@ -1,4 +1,4 @@
-"""Which backend is available on which device: one that is installed, and gave torch's own results in a trial.
+"""Choose backends: one is available on a device where it is installed and gave torch's own results in a trial.
 
 The trial runs once before a device's first use, on a small image. A backend that is not installed is skipped silently;
 one that fails, then or later, is reported once on stderr, and torch is used instead. ``LEGS_BACKEND=torch|numba|cuda``
@@ -35,7 +35,7 @@ class Known(NamedTuple):
 
 
 class Availability(NamedTuple):
-    """Whether a backend is available on a device.
+    """An answer: whether a backend is available on a device.
 
     Attributes:
         backend: None where it is not.

@@ -64,7 +64,7 @@ def libraries(flags: Sequence[str] = ()) -> Libraries:
 
 
 class Runtime:
-    """What the driver asks torch.cuda.
+    """The part of torch.cuda that the driver asks.
 
     Attributes:
         captures: whether the current stream is being captured.

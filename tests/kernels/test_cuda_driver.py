@@ -174,7 +174,7 @@ class TestLoading:
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners and modes are POSIX's")
 class TestWhoseFiles:
-    """What lies in the cache runs on the card: as ssh, it takes nothing that somebody else may have written."""
+    """A binary of the cache runs on the card: as ssh, it takes nothing that somebody else may have written."""
 
     @pytest.mark.parametrize("mode", [0o777, 0o770, 0o722])
     @pytest.mark.parametrize("what", ["folder", "file"])

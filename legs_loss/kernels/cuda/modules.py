@@ -35,7 +35,7 @@ class Variant(NamedTuple):
 
     @property
     def kernels(self) -> List[str]:
-        """The names of the kernels in its module."""
+        """Return the names of the kernels in its module."""
         terms = ["l1", "loss"] if self.stencil else ["l1", "loss", "ssim"]
         others = ["range", "range_finish"] if self.stencil else ["finish", "scale"]
         losses = [f"{term}_{kind}" for term in terms for kind in ("value", "gradient")]

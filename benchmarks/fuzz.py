@@ -156,7 +156,7 @@ def make_comparison(folder: Path) -> None:
     metrics = {"train": scores, "test": scores, "gaussians": 9, "mean_weight": 2.5, "seconds": 1.5, "iterations": 30}
     metrics.update(growth=[[45, 18]], history=[{"iteration": 30, "train_psnr": 15.5}])
     metrics.update(views={"train": {"images/a.png": scores}, "test": {"images/b.png": scores}})
-    row = {"arm": "legs", "seed": 0, "config": base, "weighting": None, "loss": None, "caps": [[45, 18]]}
+    row = {"arm": "legs", "seed": 0, "config": base, "caps": [[45, 18]]}
     row.update(versions={"legs_loss": "0.1.0"}, metrics=metrics)
     write_json(folder / "legs" / "seed-0" / "row.json", row)
     read_rows(folder)

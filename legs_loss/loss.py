@@ -15,7 +15,7 @@ from legs_loss.levels import RunningLevels, response_levels
 from legs_loss.response import response
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.ssim import d_ssim
-from legs_loss.weights import error_weight_map, weight_map
+from legs_loss.weights import weight_map
 
 __all__ = ["LEGSLoss", "legs_loss", "weighted_l1"]
 
@@ -120,8 +120,6 @@ def legs_loss(
     layout, prediction, target = read_pair(prediction, target, channels_last)
     weight, mask = layout.map_first(weight, target, "weight"), layout.map_first(mask, target, "mask")
     prediction, target = layout.channels_first(prediction), layout.channels_first(target)
-    if weight is None and spec.error > 0.0:
-        weight = error_weight_map(prediction, target, spec)
     weights = Weights(spec if weight is None else None, None, weight, mask, renormalise)
     fused = fused_loss(prediction, target, weights, lambda_dssim, padding)
     if fused is not None:

@@ -35,14 +35,7 @@ class WeightSpec:
             responses are clamped to 1.
         normalise: "none", as in the paper, or "mean": each map is divided by its mean, so that it changes the
             distribution of weight, but not the scale of the L1 term.
-        scale: in (0, 1e6], multiplies the map. In a loss with lambda 0.2 a map of mean 1 times 0.6 has the balance of
-            L1 and SSIM of lambda 0.3; gradients, which many codebases compare with a threshold to densify, shrink
-            with it.
         eps: >= 1e-30, in the normalisation's denominator.
-        error: in [0, 1], the share of the rendering's error in the weight: the curve is applied to
-            E^ ** (1 - error) * e ** error, normalised to [0, 1], where e is the mean absolute error around a pixel. 0
-            is the paper's weight, 1 uses the error only. Such weights change at every step; none are stored.
-        error_blur: >= 0, the standard deviation in pixels of the Gaussian that the error is averaged with.
         over: what the response is normalised over: "image", as in the paper, or "scene": the response that counts as 1
             is the median over views of each one's percentile, so that a photograph out of focus gets small weights
             beside sharp ones. ``legs precompute`` uses all views; without its maps the views seen so far are used as
@@ -66,10 +59,7 @@ class WeightSpec:
     beta: float = 10.0
     percentile: float = 100.0
     normalise: str = "none"
-    scale: float = 1.0
     eps: float = 1e-8
-    error: float = 0.0
-    error_blur: float = 1.5
     over: str = "image"
     noise_floor: float = 0.0
     smooth: float = 0.0
@@ -79,10 +69,7 @@ class WeightSpec:
         curve(self.curve)
         _check_number("beta", self.beta, 0.0 <= self.beta <= _LARGEST_FACTOR, "at least 0 and at most 1e6")
         _check_number("percentile", self.percentile, 0.0 < self.percentile <= 100.0, "above 0 and at most 100")
-        _check_number("scale", self.scale, 0.0 < self.scale <= _LARGEST_FACTOR, "above 0 and at most 1e6")
         _check_number("eps", self.eps, _LEAST_EPS <= self.eps < float("inf"), f"at least {_LEAST_EPS:g}")
-        _check_number("error", self.error, 0.0 <= self.error <= 1.0, "in [0, 1]")
-        _check_number("error_blur", self.error_blur, 0.0 <= self.error_blur < float("inf"), "at least 0")
         _check_number(
             "noise_floor", self.noise_floor, 0.0 <= self.noise_floor <= _LARGEST_FACTOR, "at least 0 and at most 1e6"
         )
@@ -93,13 +80,11 @@ class WeightSpec:
             raise LegsError(f'over must be "image" or "scene", got {self.over!r}')
         if self.over == "image" and self.noise_floor > 0.0:
             raise LegsError('noise_floor goes with over="scene": a single image cannot separate noise from texture')
-        if self.over == "scene" and self.error > 0.0:
-            raise LegsError('weights that follow the error (error > 0) are normalised over="image" only')
 
     @property
     def unweighted(self) -> bool:
         """Return whether the weight is 1 everywhere: 3DGS's own loss."""
-        return self.beta == 0.0 and self.scale == 1.0
+        return self.beta == 0.0
 
 
 Spec = Union[str, WeightSpec]

@@ -11,10 +11,10 @@ from legs_loss.curves import curve
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, is_compiling, read_layout
 from legs_loss.levels import levels_of, over_scene, percentile
-from legs_loss.response import gaussian_blur, normalise_response, response
+from legs_loss.response import normalise_response, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
-__all__ = ["curved", "error_weight_map", "weight_from_response", "weight_map", "weight_maps", "weight_over_scene"]
+__all__ = ["curved", "weight_from_response", "weight_map", "weight_maps", "weight_over_scene"]
 
 
 def weight_map(
@@ -48,8 +48,6 @@ def weight_map(
                 [ 1.0000,  1.0000,  6.0000,  1.0000,  1.0000]])
     """
     spec = as_spec(spec)
-    if spec.error > 0.0:
-        raise LegsError("weights that follow the error (error > 0) need the rendering too: see error_weight_map")
     layout = read_layout(image, channels_last)
     if image.device.type == "cpu" and not is_compiling():
         check_values(image, "image")
@@ -67,6 +65,7 @@ def weight_maps(images: Iterable[Tensor], spec: Spec = "legs") -> List[Tensor]:
 
     Example:
         >>> sharp = (torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) > 0.9).float()
+        >>> from legs_loss.response import gaussian_blur
         >>> blurred = gaussian_blur(sharp, 2.0)
         >>> [round(float(weight.mean()), 1) for weight in weight_maps([sharp, sharp, blurred], "legs-robust")]
         [1.3, 1.3, 1.0]
@@ -118,46 +117,12 @@ def weight_from_response(normalised: Tensor, spec: Spec = "legs") -> Tensor:
     return curved(normalised, spec)
 
 
-def error_weight_map(
-    prediction: Tensor,
-    target: Tensor,
-    spec: WeightSpec,
-    normalised: Optional[Tensor] = None,
-) -> Tensor:
-    """Return the weight map of this step for a spec whose weights follow the rendering's error (``spec.error``).
-
-    The curve is applied to E^ ** (1 - s) * e ** s, normalised to [0, 1] an image at a time, where s is ``spec.error``
-    and e the mean over channels of the absolute error, averaged with a Gaussian of ``spec.error_blur`` pixels.
-
-    Args:
-        prediction, target: the rendering and the photograph, [C, H, W] or [B, C, H, W].
-        spec: the settings.
-        normalised: E^ of the target if it is known, in the shape of the map.
-
-    Returns:
-        One value a pixel, as :func:`weight_map` returns it. It carries no gradient. A rendering without any error gets
-        the weight of a constant image.
-
-    Example:
-        >>> target = torch.zeros(1, 1, 4)
-        >>> prediction = torch.tensor([[[0.0, 0.1, 0.2, 0.4]]])
-        >>> error_weight_map(prediction, target, WeightSpec(curve="C1", error=1.0, error_blur=0.0))
-        tensor([[[ 1.0000,  3.5000,  6.0000, 11.0000]]])
-    """
-    if normalised is None:
-        normalised = normalise_response(response(target, spec.operator, spec.p, False, spec.smooth), spec.eps)
-    wrong = (prediction - target).detach().abs()
-    wrong = gaussian_blur(wrong.mean(-3, keepdim=True).to(normalised.dtype), spec.error_blur)
-    mixed = normalised ** (1.0 - spec.error) * wrong**spec.error
-    return weight_from_response(normalise_response(mixed, spec.eps), spec)
-
-
 def curved(normalised: Tensor, spec: WeightSpec) -> Tensor:
     """Return the weight map of a response that is normalised and clamped already, by the spec."""
     weight = 1.0 + spec.beta * curve(spec.curve)(normalised)
     if spec.normalise == "mean":
         weight = weight / weight.mean(_pixels(weight), keepdim=True)
-    return weight if spec.scale == 1.0 else spec.scale * weight
+    return weight
 
 
 def _pixels(maps: Tensor) -> Tuple[int, ...]:

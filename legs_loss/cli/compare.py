@@ -38,13 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--arms", nargs="+", metavar="ARM", help="default: those of --study")
     what.add_argument(
-        "--again",
-        type=Path,
-        metavar="ROW",
-        help="train one row again from its OUT/ARM/seed-N/row.json, and compare the scores; the other settings are the "
-        "row's",
-    )
-    what.add_argument(
         "--study",
         choices=STUDIES,
         default="main",
@@ -62,9 +55,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-m", "--out", type=Path, default=Path("legs_compare"), metavar="DIR", help="default: legs_compare"
     )
     advanced = parser.add_argument_group("advanced")
-    advanced.add_argument(
-        "--first_seed", type=int, default=0, metavar="N", help="default: 0; with --seeds 1 a single row is trained"
-    )
     advanced.add_argument(
         "--densify_grad_threshold", type=float, metavar="X", help="of all arms; default: as for legs train"
     )
@@ -99,26 +89,20 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.scenes import read_scene
 
     set_threads(None)  # fail now if numba is missing
-    if args.again is not None:
-        return _again(args)
-    for name, least in (("seeds", 1), ("first_seed", 0), ("processes", 1)):
-        if getattr(args, name) < least:
-            raise LegsError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    for name in ("seeds", "processes"):
+        if getattr(args, name) < 1:
+            raise LegsError(f"--{name} must be at least 1, got {getattr(args, name)}")
     study = STUDIES[args.study] if args.arms is None else these_arms(args.arms)
     check_writable(args.out)
-    if args.upstream is not None and study.degraded:
-        raise LegsError(f"--study {args.study} is for the package's own trainer, which degrades the views itself")
     if args.upstream is not None:
         return _upstream(args, study)
     for name in ("profile", "cpu", "gaussians", "extra"):
         if getattr(args, name):
             raise LegsError(f"--{name} is for --upstream")
     arms = needed(parse_arms([BASELINE, *study.arms]))
-    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    seeds = range(args.seeds)
     iterations = 2000 if args.iterations is None else args.iterations
-    base = TrainConfig(
-        iterations=iterations, densify_grad_threshold=args.densify_grad_threshold, degraded=study.degraded
-    )
+    base = TrainConfig(iterations=iterations, densify_grad_threshold=args.densify_grad_threshold)
     root = _embedded(args.out / "scene") if args.scene is None else Path(args.scene)
     resolution = args.resolution
     if resolution is None:
@@ -190,7 +174,7 @@ def _upstream(args: argparse.Namespace, study: Study) -> int:
         cpu=args.cpu,
     )
     arms = needed(parse_arms([BASELINE, *study.arms]))
-    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    seeds = range(args.seeds)
     say(f"{profile.name}: {len(arms)} arms, {len(seeds)} seed(s), one training at a time")
     comparison.train(arms, seeds, say)
     _say_scores(args.out, study, seeds)
@@ -208,18 +192,6 @@ def _embedded(root: Path) -> Path:
         except OSError as error:
             raise LegsError(f"cannot write {root}: {error.strerror or error}") from None
     return root
-
-
-def _again(args: argparse.Namespace) -> int:
-    from legs_loss.cli.train import progress_bar
-    from legs_loss.experiments.running import read_row, train_again
-    from legs_loss.experiments.tables import again_text
-
-    row = read_row(args.again)
-    with progress_bar(row["config"]["iterations"], row["arm"]) as show:
-        now = train_again(args.again, None if args.scene is None else Path(args.scene), show)
-    say(again_text(row, now), lines=True)
-    return 0
 
 
 READING = """\

@@ -27,17 +27,9 @@ CHANGES: Mapping[str, str] = {
     "scale": "no map: the L1 term times the loss's mean weight",
     "shuffled": "each map's pixels in random order",
     "mean1": "each map divided by its mean",
-    "half": "half the L1 term, weighted or not, so that SSIM counts for more",
     "lambda=X": "the share X of D-SSIM in the loss",
     "threshold": "the densification threshold times the loss's mean weight",
-    "growing": "beta grows from 0 over the run",
-    "fading": "beta falls to 0 over the run",
-    "multiscale": "the mean of the responses at three sizes",
-    "late": "the weights set in after a third of the run",
-    "latest": "the weights set in after two thirds of the run",
-    "ssim": "the weights also inside the mean of SSIM's map",
 }
-_WEIGHTINGS = ("shuffled", "growing", "fading", "multiscale", "late", "latest")  # one of them at most
 
 LOOSE = 0.25  # of the threshold: low enough that another arm's numbers are reached
 
@@ -56,16 +48,6 @@ class ArmSpec:
     def folder(self) -> str:
         """Return the name as a folder's, on any system."""
         return self.name.replace(":", "-").replace("@", "-at-").replace("=", "-").replace(",", "-")
-
-    @property
-    def weighting(self) -> Optional[str]:
-        """Return the name of the function that makes its weights during the run, None for its spec's maps."""
-        return next((change for change in self.changes if change in _WEIGHTINGS), None)
-
-    @property
-    def loss(self) -> Optional[str]:
-        """Return the name of its iterations' loss, None for 3DGS's with weights."""
-        return "ssim" if "ssim" in self.changes else None
 
     @property
     def needs_mean_weight(self) -> bool:
@@ -88,8 +70,8 @@ class ArmSpec:
             return replace(base, spec="3dgs", l1_scale=base.l1_scale * mean_weight, densify_grad_threshold=threshold)
         if self.lambda_dssim is not None:
             base = replace(base, lambda_dssim=self.lambda_dssim)
-        scale = base.l1_scale * (0.5 if "half" in self.changes else 1.0)
-        return replace(base, spec=self.spec, l1_scale=scale, densify_grad_threshold=threshold)
+        shuffled = "shuffled" in self.changes
+        return replace(base, spec=self.spec, shuffled=shuffled, densify_grad_threshold=threshold)
 
 
 def parse_arm(name: str) -> ArmSpec:
@@ -110,17 +92,15 @@ def parse_arm(name: str) -> ArmSpec:
     for change in changes:
         if change not in CHANGES and not change.startswith("lambda="):
             raise LegsError(f"{name}: no change is named {change!r}: choose one of {', '.join(CHANGES)}")
-    if len(set(changes)) < len(changes) or sum(change in _WEIGHTINGS for change in changes) > 1:
-        raise LegsError(f"{name}: give each change once, and one of {', '.join(_WEIGHTINGS)} at most")
+    if len(set(changes)) < len(changes):
+        raise LegsError(f"{name}: give each change once")
     if "scale" in changes and len(changes) > 1:
         raise LegsError(f"{name}: scale uses no map, so no other change applies")
     if at_sign and "@" in at:
         raise LegsError(f"{name}: the arm after @ must not contain an @")
     spec = _loss(name, loss)
-    if spec.unweighted and any(change != "half" and not change.startswith("lambda=") for change in changes):
+    if spec.unweighted and any(not change.startswith("lambda=") for change in changes):
         raise LegsError(f"{name}: {loss} has no weights to change")
-    if spec.over == "scene" and "multiscale" in changes:
-        raise LegsError(f"{name}: multiscale normalises image by image, this loss over the scene")
     leader = parse_arm(at).name if at_sign else None
     preset = next((preset for preset, known in PRESETS.items() if known == spec), loss)
     own_name = ":".join([preset, *changes])

@@ -1,7 +1,7 @@
-"""A comparison in a folder: its settings, and one row for each arm and seed, which can be trained again separately.
+"""A comparison in a folder: its settings, and one row for each arm and seed.
 
 OUT/comparison.json              the scene and the settings that all arms share, the proof of the baseline
-OUT/ARM/seed-N/plan.json         the row's complete settings, from which it can be trained again
+OUT/ARM/seed-N/plan.json         the row's complete settings
 OUT/ARM/seed-N/row.json          the same with the scores, once it is trained
 OUT/ARM/seed-N/point_cloud/...   its Gaussians
 """
@@ -23,14 +23,12 @@ from legs_loss._version import __version__
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import ArmSpec, needed, parse_arm
 from legs_loss.experiments.baseline import prove_unweighted
-from legs_loss.experiments.losses import LOSSES
 from legs_loss.experiments.on_cluster import train_on_cluster
 from legs_loss.experiments.schema import PLAN, ROW, SETTINGS, what_is_wrong
-from legs_loss.experiments.weighting import WEIGHTINGS
 from legs_loss.reference.training.checkpoint import CHECKPOINT, alone_in
 from legs_loss.reference.training.dataset import Dataset, load_dataset
 from legs_loss.reference.training.side_by_side import Arm, train_arm, train_side_by_side
-from legs_loss.reference.training.trainer import Progress, TrainConfig, default_threshold, step_loss
+from legs_loss.reference.training.trainer import Progress, TrainConfig, default_threshold
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
 from legs_loss.system import read_regular, write_whole
@@ -43,10 +41,8 @@ __all__ = [
     "identity",
     "keep",
     "read_json",
-    "read_row",
     "read_rows",
     "scene_of",
-    "train_again",
     "versions",
     "write_json",
 ]
@@ -87,9 +83,7 @@ class Comparison:
         """Return the baseline's views."""
         if self._data is None:
             base = self.base
-            self._data = load_dataset(
-                self.scene, base.weights, base.resolution, base.white_background, worse=base.degraded
-            )
+            self._data = load_dataset(self.scene, base.weights, base.resolution, base.white_background)
         return self._data
 
     def mean_weight(self, spec: WeightSpec) -> float:
@@ -163,8 +157,6 @@ class Comparison:
             "arm": arm.name,
             "seed": seed,
             "config": config.as_dict(),
-            "weighting": arm.weighting,
-            "loss": arm.loss,
             "caps": None if caps is None else sorted(caps.items()),
         }
         keep(folder / "plan.json", json.loads(json.dumps(plan)), "row", PLAN)
@@ -234,36 +226,6 @@ def scene_of(settings: Mapping[str, Any], moved: Optional[Path] = None) -> Scene
     return scene
 
 
-def read_row(path: Path) -> Row:
-    """Return the row of a ``row.json`` that can be trained again.
-
-    Raises:
-        LegsError: it is no row, or a codebase's own script trained it.
-    """
-    if path.name != "row.json" or not path.is_file():
-        raise LegsError(f"{path}: there is no row here: a row is COMPARISON/ARM/seed-N/row.json")
-    row = read_json(path, ROW)
-    if "upstream" in row:
-        raise LegsError(
-            f"{path}: a codebase's own script trained this row, and only rows of the package's own trainer are trained "
-            "again from their file: give the comparison's command with another folder (--out), --first_seed "
-            f"{row['seed']} --seeds 1"
-        )
-    return row
-
-
-def train_again(path: Path, moved: Optional[Path], on_progress: Callable[[Progress], None]) -> Row:
-    """Train the row of a ``row.json`` again, from that file only, without saving; return the new row.
-
-    Raises:
-        LegsError: as for :func:`read_row`, or its scene is not there.
-    """
-    row = read_row(path)
-    settings = read_json(path.resolve().parents[2] / "comparison.json", SETTINGS)
-    training = _planned(row["arm"], row, scene_of(settings, moved).root, settings["images"], None)
-    return dict(row, versions=versions(), metrics=train_arm(training, on_progress))
-
-
 def versions() -> Dict[str, str]:
     """Return the versions of all software that a result may depend on."""
     import numba
@@ -298,8 +260,6 @@ def _planned(name: str, plan: Mapping[str, Any], root: Path, images: Optional[st
         config,
         folder,
         images,
-        weighting=None if plan["weighting"] is None else WEIGHTINGS[plan["weighting"]],
-        loss=step_loss if plan["loss"] is None else LOSSES[plan["loss"]],
         caps=None if plan["caps"] is None else {int(iteration): int(count) for iteration, count in plan["caps"]},
         evaluate_every=max(1, config.iterations // EVALUATIONS),
         resume=None,

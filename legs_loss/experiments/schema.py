@@ -9,15 +9,13 @@ from typing import Any, Callable, Dict, Iterable, Mapping, Optional
 
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import parse_arm
-from legs_loss.experiments.losses import LOSSES
-from legs_loss.experiments.weighting import WEIGHTINGS
 from legs_loss.reference.training.config import TrainConfig
 
 __all__ = ["PLAN", "ROW", "SETTINGS", "what_is_wrong"]
 
 # The required contents of the files.
 SETTINGS = ("scene", "path", "images", "base", "baseline")
-PLAN = ("arm", "seed", "config", "weighting", "loss", "caps")
+PLAN = ("arm", "seed", "config", "caps")
 ROW = (*PLAN, "versions", "metrics")
 _LARGEST = 1 << 63
 
@@ -136,8 +134,6 @@ _FIELDS: Dict[str, Callable[[Any], bool]] = {
     "arm": lambda value: parse_arm(value).name == value,
     "seed": _count,
     "config": _config,
-    "weighting": _optional(lambda value: value in WEIGHTINGS),
-    "loss": _optional(lambda value: value in LOSSES),
     "caps": _optional(_each(_pair)),
     "versions": _of_names(_text),
     "metrics": _metrics,

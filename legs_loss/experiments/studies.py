@@ -20,8 +20,6 @@ class Study(NamedTuple):
     against: which arm each arm is measured against, where that is not the baseline.
     paper: the paper's training PSNR of an arm, where it gives one.
     paper_says: in words, with its source.
-    degraded: whether a third of the training views is out of focus, moved or noisy.
-    alike: whether its arms should not differ: each is then compared with each, to see how far they do all the same.
     """
 
     title: str
@@ -29,8 +27,6 @@ class Study(NamedTuple):
     paper_says: str
     against: Mapping[str, str] = MappingProxyType({})
     paper: Mapping[str, float] = MappingProxyType({})
-    alike: bool = False
-    degraded: bool = False
 
     def reference(self, arm: str) -> Optional[str]:
         """Return the arm that this one is measured against, None for the baseline itself."""
@@ -72,59 +68,11 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
             ("beta=0", "beta=1", "beta=2", "beta=5", "beta=10", "beta=15", "beta=20"),
             "The paper's beta is 10; the numbers of its own sweep are not known here.",
         ),
-        "fixed-budget": Study(
-            "Better at the same number of Gaussians?",
-            (
-                "3dgs",
-                "legs:mean1@3dgs",
-                "legs-l:mean1@3dgs",
-                "beta=3:mean1@3dgs",
-                "percentile=99:mean1@3dgs",
-                "legs:mean1:fading@3dgs",
-                "legs:mean1:growing@3dgs",
-                "legs:mean1:multiscale@3dgs",
-                "percentile=99,error=0.5,curve=C1:mean1@3dgs",
-                "percentile=99,error=1,curve=C1:mean1@3dgs",
-                "legs-l:mean1:ssim@3dgs",
-                "legs:mean1:ssim@3dgs",
-                "3dgs:half@3dgs",
-                "legs:mean1:half@3dgs",
-                "percentile=99,error=1,curve=C1:mean1:lambda=0.3@3dgs",
-                "3dgs:lambda=0.3@3dgs",
-            ),
-            "The paper does not compare at equal numbers of Gaussians.",
-        ),
-        "preregistered": Study(
-            "The candidate for a fixed number of Gaussians",
-            ("3dgs", "percentile=99,normalise=mean,scale=0.6,error=1,curve=C1@3dgs"),
-            "The paper does not compare at equal numbers of Gaussians.",
-        ),
         "codebase": Study(
             "By a codebase's own script (--upstream)",
-            (
-                "3dgs",
-                "eggs",
-                "legs-l",
-                "legs",
-                "legs:scale",
-                "3dgs@legs",
-                "percentile=99,normalise=mean,scale=0.6,error=1,curve=C1",
-            ),
+            ("3dgs", "eggs", "legs-l", "legs", "legs:mean1", "3dgs@legs"),
             "The paper reports LEGS 1.2 to 1.7 dB above the codebase it is added to, on training views.",
             {"3dgs@legs": "legs"},
-        ),
-        "degraded": Study(
-            "A third of the training views out of focus, moved or noisy",
-            ("3dgs", "legs", "legs-robust", "legs@3dgs", "legs-robust@3dgs"),
-            "The paper trains on photographs as they are.",
-            degraded=True,
-        ),
-        # Weights of at most 1.00001: what differs is rounding, and what it grows to.
-        "noise": Study(
-            "What differs where nothing should",
-            ("3dgs", "beta=1e-6", "beta=2e-6", "beta=3e-6", "beta=4e-6", "beta=5e-6", "beta=6e-6"),
-            "The paper does not say how far its runs scatter.",
-            alike=True,
         ),
     }
 )

@@ -8,14 +8,13 @@ from typing import Any, List, Mapping, Optional, Sequence, Tuple, TypeVar
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import BASELINE
-from legs_loss.experiments.statistics import COLUMNS, Difference, difference, summarise, summarise_all, times_gaussians
+from legs_loss.experiments.statistics import COLUMNS, Difference, difference, summarise_all, times_gaussians
 from legs_loss.experiments.studies import Study
 from legs_loss.reference.training.metrics import METRICS
 
 __all__ = [
     "LABELS",
     "MISSING",
-    "again_text",
     "difference_cell",
     "differences_table",
     "markdown",
@@ -102,8 +101,6 @@ DIFFERENCES: Mapping[str, Tuple[str, str]] = {
 
 def differences_table(rows: Rows, study: Study) -> str:
     """Return each arm's differences from its reference arm, with their intervals."""
-    if study.alike:
-        return _pairs_table(rows, study)
     lines = []
     for arm in study.arms:
         name, reference = parse_arm(arm).name, study.reference(parse_arm(arm).name)
@@ -117,20 +114,6 @@ def differences_table(rows: Rows, study: Study) -> str:
         if ratio is not None:
             lines.append([f"{label(arm)} − {reference}", *cells, times_cell(ratio)])
     return markdown(*with_values(["difference", *DIFFERENCES, "Gaussians"], lines))
-
-
-def _pairs_table(rows: Rows, study: Study) -> str:
-    """Return for each score the largest difference of two arms, and the number of clear differences."""
-    lines = []
-    for column, (split, score) in DIFFERENCES.items():
-        pairs = combinations([parse_arm(arm).name for arm in study.arms], 2)
-        gaps = [difference(rows, first, second, split, score) for first, second in pairs]
-        found = [gap for gap in gaps if gap is not None]
-        if found:
-            sizes = sorted(abs(gap.mean) for gap in found)
-            shown = [format(size, METRICS[score].format) for size in (sizes[len(sizes) // 2], sizes[-1])]
-            lines.append([column, *shown, f"{sum(gap.clear for gap in found)} of {len(found)}"])
-    return markdown(["between any two", "median difference", "largest", "not marked ?"], lines)
 
 
 def paper_text(rows: Rows, study: Study) -> str:
@@ -149,34 +132,6 @@ def study_text(rows: Rows, study: Study) -> str:
     """Return a study's tables and the paper's statements."""
     parts = [f"## {study.title}", scores_table(rows, study.arms), differences_table(rows, study)]
     return "\n\n".join([*parts, paper_text(rows, study)])
-
-
-def again_text(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return a row's scores before and after it was trained again, and whether they are equal."""
-    lines = [[when, *score_cells(*summarise([row])[2:])] for when, row in (("then", then), ("now", now))]
-    same = _scores_agree(then, now) and all(
-        then["metrics"][name] == now["metrics"][name] for name in ("gaussians", "growth")
-    )
-    text = f"{then['arm']}, seed {then['seed']}\n\n{markdown(*with_values(['', *LABELS], lines))}\n\n"
-    if same:
-        return text + "The same to the last digit."
-    changed = [name for name, value in now["versions"].items() if then["versions"].get(name) != value]
-    told = ", ".join(f"{name} ({then['versions'].get(name)}, now {now['versions'][name]})" for name in changed)
-    return text + (
-        f"Not the same. Different: {told or 'probably the processor'}. A rounding difference grows in a training "
-        "until it changes the scores; --study noise shows how far."
-    )
-
-
-def _scores_agree(then: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Return whether every view has the same scores, of the metrics that both rows have."""
-    for split, views in then["metrics"]["views"].items():
-        for view, scores in views.items():
-            again = now["metrics"]["views"][split].get(view, {})
-            shared = set(scores) & set(again)
-            if not shared or any(scores[key] != again[key] for key in shared):
-                return False
-    return True
 
 
 def _orders(rows: Rows, study: Study, gains: Mapping[str, Difference]) -> List[str]:

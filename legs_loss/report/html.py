@@ -205,7 +205,6 @@ def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> str:
         "L1 scale",
         "threshold",
         "weights",
-        "loss",
         "numbers of",
     ]
     body = []
@@ -214,11 +213,8 @@ def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> str:
         config, spec = row["config"], row["config"]["spec"]
         values = [spec[name] for name in ("operator", "p", "curve", "beta", "percentile", "normalise")]
         threshold = config["densify_grad_threshold"]
-        values += [
-            f"{config['l1_scale'] * spec.get('scale', 1.0):.4g}",
-            "–" if threshold is None else f"{threshold:.4g}",
-        ]
-        values += [row["weighting"] or "the spec's", parse_arm(arm).loss or "3DGS's", parse_arm(arm).at or "its own"]
+        values += [f"{config['l1_scale']:.4g}", "–" if threshold is None else f"{threshold:.4g}"]
+        values += ["shuffled" if config.get("shuffled") else "the spec's", parse_arm(arm).at or "its own"]
         body.append([(arm, arm)] + [(str(value), "") for value in values])
     return _table("", heads, body, sortable=False)
 
@@ -310,7 +306,7 @@ def _scene_levels(scene: Scene, base: TrainConfig, rows: Mapping[str, Row]) -> D
     if all(spec.over != "scene" for spec in specs.values()):
         return {}
     unweighted = replace(base, spec="3dgs").weights
-    views = load_dataset(scene, unweighted, base.resolution, base.white_background, worse=base.degraded).train
+    views = load_dataset(scene, unweighted, base.resolution, base.white_background).train
     return {arm: levels_of((view.image for view in views), spec) for arm, spec in specs.items()}
 
 

@@ -15,12 +15,10 @@ from torch.nn.functional import avg_pool2d
 
 from legs_loss.errors import LegsError
 from legs_loss.experiments.upstream.training import read_picture
-from legs_loss.experiments.weighting import WEIGHTINGS
 from legs_loss.reference.ply import read_ply
-from legs_loss.reference.training.dataset import TrainingView
+from legs_loss.reference.training.dataset import TrainingView, shuffled
 from legs_loss.reference.training.trainer import TrainConfig, draw, point_cloud, step_weight
-from legs_loss.spec import WeightSpec
-from legs_loss.weights import error_weight_map, weight_map
+from legs_loss.weights import weight_map
 
 __all__ = ["KINDS", "Drawn", "Pictures", "differing", "draw_row", "encode"]
 
@@ -59,7 +57,7 @@ class Pictures(NamedTuple):
 
 
 def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView, scene: Optional[Tensor] = None) -> Drawn:
-    """Draw a view with a row's Gaussians, and make the weight map that its run would have ended with there.
+    """Draw a view with a row's Gaussians, and make the weight map of its run there.
 
     ``scene`` are the levels of the training views, for weights that are normalised over the scene.
     """
@@ -68,10 +66,11 @@ def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView, scene: Op
         rendering = _upstreams_own(row, folder, view)
     else:
         rendering = draw(read_ply(point_cloud(folder, config)), view, config)
-    weight = _weight(config.weights, view.image, rendering, scene)
-    if row["weighting"] is not None:
-        weight = WEIGHTINGS[row["weighting"]]([replace(view, weight=weight)], config)(0, 1.0, rendering)
-    weight = step_weight(weight, view, config)
+    if not config.weights.unweighted:
+        view = replace(view, weight=weight_map(view.image, config.weights, scene=scene))
+    if config.shuffled:
+        view = shuffled([view], config.seed)[0]
+    weight = step_weight(view.weight, view, config)
     return Drawn(rendering.clamp(0, 1), torch.ones_like(view.image[:1]) if weight is None else weight)
 
 
@@ -82,15 +81,6 @@ def _upstreams_own(row: Mapping[str, Any], folder: Path, view: TrainingView) -> 
     if full is None or folder.resolve().parents[1] not in full.parents or not full.is_file():
         raise LegsError(f"{row['arm']} left no rendering of {view.name}: choose held-out views (--views)")
     return read_picture(full)
-
-
-def _weight(spec: WeightSpec, photograph: Tensor, rendering: Tensor, scene: Optional[Tensor]) -> Optional[Tensor]:
-    """Return the weight map at the end of the run; None where nothing is weighted."""
-    if spec.unweighted:
-        return None
-    if spec.error > 0.0:
-        return error_weight_map(rendering, photograph, spec)
-    return weight_map(photograph, spec, scene=scene)
 
 
 def encode(view: TrainingView, drawn: Mapping[str, Drawn], form: Mapping[str, Any]) -> Pictures:

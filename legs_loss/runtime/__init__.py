@@ -18,7 +18,7 @@ from legs_loss.kernels.contract import Weights
 from legs_loss.runtime.call import Call, Own, View
 from legs_loss.runtime.sources import Counts
 from legs_loss.runtime.state import active, configure, counted, counts, current_run, spec_to_compile, thread, version
-from legs_loss.weights import error_weight_map, weight_map
+from legs_loss.weights import weight_map
 
 __all__ = ["Counts", "active", "configure", "counts", "l1_loss", "unweighted"]
 
@@ -94,11 +94,7 @@ def _compiled(call: Call) -> Tensor:
             "leave the loss out of torch.compile, or set LEGS_PRESET=legs"
         )
     call = call.aligned()
-    if spec.error > 0.0:
-        weight = error_weight_map(call.prediction, call.target, spec)
-    else:
-        weight = weight_map(call.target, spec, False)
-    return call.weighted(Weights(map=weight))
+    return call.weighted(Weights(map=weight_map(call.target, spec, False)))
 
 
 def unweighted(function: Callable[..., Result]) -> Callable[..., Result]:

@@ -19,11 +19,11 @@ from legs_loss.kernels.available import is_capturing
 from legs_loss.kernels.backends import fused_range
 from legs_loss.kernels.contract import Weights
 from legs_loss.levels import RunningLevels, response_levels
-from legs_loss.response import normalise_response, response
+from legs_loss.response import response
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.memo import WeightMemo
 from legs_loss.runtime.stored import StoredWeights
-from legs_loss.weights import error_weight_map, weight_map, weight_over_scene
+from legs_loss.weights import weight_map, weight_over_scene
 
 __all__ = ["Counts", "WeightSource"]
 
@@ -71,9 +71,6 @@ class WeightSource:
         images = [call.target] if call.target.dim() == 3 else [call.target[i] for i in range(len(names))]
         found = [self._weight(image, name, call) for image, name in zip(images, names)]
         spec = self.config.spec
-        if spec.error > 0.0:
-            normalised = found[0] if call.target.dim() == 3 else torch.stack(found)
-            return Weights(map=error_weight_map(call.prediction, call.target, spec, normalised))
         if spec.over == "scene":
             strength = found[0] if call.target.dim() == 3 else torch.stack(found)
             return Weights(map=weight_over_scene(strength, spec, self._scene_levels(found[0].numel())))
@@ -85,8 +82,7 @@ class WeightSource:
     def _weight(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
         """Return an image's weight map [1, H, W], or the range that makes it, [1, 2].
 
-        For weights that follow the rendering's error it is E^, their constant part; for weights normalised over the
-        scene it is E, since the scene's levels change with each new view.
+        For weights normalised over the scene it is E, since the scene's levels change with each new view.
         """
         counts = self._counts
         if is_capturing(image.device):
@@ -115,12 +111,10 @@ class WeightSource:
     def _computed(self, image: Tensor, call: Call, again: bool = False) -> Tensor:
         """Return what :meth:`_weight` returns of an image; ``again`` where it will be computed at each step."""
         spec = self.config.spec
-        if spec.error > 0.0 or spec.over == "scene":
+        if spec.over == "scene":
             if image.device.type == "cpu":
                 check_values(image, "target")
             strength = response(image, spec.operator, spec.p, False, spec.smooth)
-            if spec.error > 0.0:
-                return normalise_response(strength, spec.eps)
             if not again:
                 self._seen.add(response_levels(strength, spec))
             return strength

@@ -66,7 +66,7 @@ class StoredWeights:
             return None
         known = torch.from_numpy(values).to(image.device).unsqueeze(0)
         weight = known.float()
-        if self._config.spec.error == 0.0 and not over_scene:
+        if not over_scene:
             weight = weight_from_response(known, self._config.spec)
         return weight
 

@@ -111,7 +111,7 @@ def state(**changes):
         "loss": None,
         "psnr": None,
     }
-    facts.update(weight_sum=0.0, growth=[], history=[])
+    facts.update(growth=[], history=[])
     for name, value in changes.items():
         place = facts if name in facts else arrays
         place.pop(name) if value is None else place.update({name: value})

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from legs_loss import LegsError, WeightSpec, configure, d_ssim, l1_loss, legs_loss, weight_map
+from legs_loss import LegsError, WeightSpec, weight_map
 from legs_loss.response import gaussian_blur
-from legs_loss.weights import error_weight_map, weight_from_response
+from legs_loss.weights import weight_from_response
 from tests.strategies import images
 
 CURVES = ("C1", "C2", "C3", "C4", "C5")
@@ -148,63 +148,8 @@ def test_the_paper_prototypes_mean_weights_on_the_real_capture(fox):
         assert means[curve] == pytest.approx(expected, rel=0.05)
 
 
-# Weights that follow the rendering's error
-
-
-def test_error_weights_by_hand() -> None:
-    target = torch.zeros(2, 1, 3)
-    prediction = torch.tensor([[[0.0, 0.3, 0.6]], [[0.0, 0.1, 0.2]]])  # mean errors 0, 0.2, 0.4
-    normalised = torch.tensor([[[1.0, 1.0, 0.25]]])
-    spec = WeightSpec(curve="C1", beta=10.0, error=0.5, error_blur=0.0)
-    mixed = [0.0, 0.2**0.5, (0.25 * 0.4) ** 0.5]
-    expected = torch.tensor([[[1.0 + 10.0 * value / max(mixed) for value in mixed]]])
-    assert torch.allclose(error_weight_map(prediction, target, spec, normalised=normalised), expected, atol=1e-5)
-    pair = [torch.stack([x, x]) for x in (prediction, target, normalised)]
-    batch = error_weight_map(pair[0], pair[1], spec, normalised=pair[2])
-    assert torch.equal(batch[0], batch[1]) and torch.allclose(batch[0], expected, atol=1e-5)
-
-
 @pytest.mark.skipif(sys.version_info < (3, 8), reason="this scipy has no axes=")
-def test_the_error_is_averaged_as_scipy_does() -> None:
+def test_an_image_is_blurred_as_scipy_does() -> None:
     image = torch.rand(1, 17, 23, dtype=torch.float64)
     expected = gaussian_filter(image[0].numpy(), 1.5, mode="mirror", radius=5)
     assert torch.allclose(gaussian_blur(image, 1.5)[0], torch.from_numpy(expected), atol=1e-12)
-
-
-def test_a_map_that_needs_the_rendering_is_refused_without_it() -> None:
-    with pytest.raises(LegsError, match="need the rendering too"):
-        weight_map(torch.rand(3, 8, 8), WeightSpec(error=1.0))
-
-
-@pytest.mark.parametrize("setting", [{"error": 1.5}, {"error": -0.1}, {"error_blur": -1.0}])
-def test_error_settings_out_of_range(setting) -> None:
-    with pytest.raises(LegsError, match=next(iter(setting))):
-        WeightSpec(**setting)
-
-
-def test_error_weights_in_the_loss_and_in_the_drop_in() -> None:
-    spec = WeightSpec(curve="C1", percentile=99.0, normalise="mean", error=0.5)
-    target, prediction = torch.rand(3, 20, 24), torch.rand(3, 20, 24, requires_grad=True)
-    weight = error_weight_map(prediction, target, spec)
-    expected = (weight * (prediction - target).abs()).mean()
-    torch.testing.assert_close(legs_loss(prediction, target, spec, lambda_dssim=0.0), expected)
-    torch.testing.assert_close(
-        legs_loss(prediction, target, spec), 0.8 * expected + 0.2 * d_ssim(prediction, target), rtol=1e-4, atol=1e-6
-    )
-    configure(spec)
-    try:
-        for _ in range(2):  # the second time the response is remembered, the error is not
-            torch.testing.assert_close(l1_loss(prediction, target), expected)
-        flipped = l1_loss(prediction.movedim(0, -1), target.movedim(0, -1))
-        torch.testing.assert_close(flipped, expected)
-        other = (prediction.detach() * 0.5).requires_grad_()
-        weight = error_weight_map(other, target, spec)
-        torch.testing.assert_close(l1_loss(other, target), (weight * (other - target).abs()).mean())
-    finally:
-        configure("legs")
-
-
-def test_scale_multiplies_the_map() -> None:
-    image = torch.rand(3, 9, 9)
-    torch.testing.assert_close(weight_map(image, WeightSpec(scale=0.6)), 0.6 * weight_map(image, "legs"))
-    assert torch.equal(weight_map(image, WeightSpec(beta=0.0, scale=3.0)), torch.full((1, 9, 9), 3.0))

@@ -20,10 +20,9 @@ from legs_loss.reference.training.adam import Adam
 from legs_loss.reference.training.dataset import extent, load_dataset, load_view, split_views
 from legs_loss.reference.training.densify import Schedule
 from legs_loss.reference.training.metrics import psnr, score, strongest
-from legs_loss.reference.training.trainer import TrainConfig, Weigh, default_threshold, train
+from legs_loss.reference.training.trainer import TrainConfig, default_threshold, train
 from legs_loss.scenes import Scene, read_scene
-from tests.reference.training import SHORT, assert_equal, run_until_killed
-from tests.support import without_times
+from tests.reference.training import SHORT, assert_equal
 
 pytest.importorskip("numba")
 
@@ -231,37 +230,6 @@ def test_the_numbers_of_another_run_can_be_taken(scene: Scene) -> None:
     assert free > 1.2 * led.metrics["gaussians"]
     assert followed["gaussians"] == pytest.approx(led.metrics["gaussians"], rel=0.01)
     assert followed["growth"] == led.metrics["growth"]
-
-
-def rising(views: List[Any], config: TrainConfig) -> Weigh:
-    """A weight that depends on all that it may depend on."""
-    return lambda index, done, rendering: 1 + done * (views[index].weight - 1) * rendering.mean()
-
-
-def test_weights_may_change_during_a_run(scene: Scene, tmp_path: Path) -> None:
-    told: List[Any] = []
-
-    def constant(views: List[Any], config: TrainConfig) -> Weigh:
-        def weigh(index: int, done: float, rendering: torch.Tensor) -> torch.Tensor:
-            told.append((index, done, rendering.requires_grad))
-            return views[index].weight
-
-        return weigh
-
-    maps = train(scene, SHORT)
-    same = train(scene, SHORT, weighting=constant)
-    assert_equal(same.gaussians, maps.gaussians)
-    assert [done for _, done, _ in told] == [(i + 1) / 60 for i in range(60)]
-    assert {index for index, _, _ in told} == set(range(10))
-    assert not any(gradient for _, _, gradient in told)
-    assert same.metrics["mean_weight"] == pytest.approx(maps.metrics["mean_weight"], rel=1e-6)
-    whole = train(scene, SHORT, weighting=rising, evaluate_every=20)
-    assert not torch.equal(whole.gaussians.means, maps.gaussians.means)
-    assert 1.0 < whole.metrics["mean_weight"] < maps.metrics["mean_weight"]
-    run_until_killed(scene, tmp_path, SHORT, 30, weighting=rising, evaluate_every=20)
-    resumed = train(scene, SHORT, out=tmp_path, resume=True, weighting=rising, evaluate_every=20)
-    assert_equal(resumed.gaussians, whole.gaussians)
-    assert without_times(resumed.metrics) == without_times(whole.metrics)
 
 
 def test_a_run_keeps_its_history_and_each_views_scores(scene: Scene) -> None:

@@ -9,7 +9,6 @@ import torch
 
 from legs_loss import LegsError, WeightSpec, configure, l1_loss, weight_map
 from legs_loss.runtime import counts, state
-from legs_loss.weights import error_weight_map
 from tests.runtime.support import pair, plain, weighted
 
 
@@ -41,11 +40,11 @@ class TestBackends:
         l1_loss(prediction, target)
         assert (counts().computed, counts().remembered) == (2, 0)
 
-    @pytest.mark.parametrize("spec", [WeightSpec(curve="C5"), WeightSpec(percentile=90.0), WeightSpec(error=0.5)])
+    @pytest.mark.parametrize("spec", [WeightSpec(curve="C5"), WeightSpec(percentile=90.0)])
     def test_specs_that_need_a_map(self, spec):
         configure(spec)
         prediction, target = pair(3, 30, 40)
-        expected = error_weight_map(prediction, target, spec) if spec.error else weight_map(target, spec)
+        expected = weight_map(target, spec)
         for _ in range(2):
             loss = l1_loss(prediction, target)
             torch.testing.assert_close(loss, (expected * torch.abs(prediction - target)).mean())

@@ -32,7 +32,7 @@ __all__ = ["UpstreamComparison", "next_factor"]
 
 CLOSE = 0.01  # of the number of Gaussians: what the count control is to meet
 TRIALS = 6
-CHANGES = ("scale", "mean1")  # of arms: what a codebase can be told by the settings of its loss
+CHANGES = ("mean1",)  # of arms: what a codebase can be told by the settings of its loss
 
 
 class UpstreamComparison:
@@ -150,16 +150,8 @@ class UpstreamComparison:
                 rows.append(row)
         return rows
 
-    def spec_of(self, arm: ArmSpec) -> WeightSpec:
-        """Return the settings of the drop-in for an arm."""
-        if "scale" not in arm.changes:
-            return arm.spec
-        return WeightSpec(beta=0.0, scale=self.mean_weight(arm.spec))
-
     def mean_weight(self, spec: WeightSpec) -> float:
-        """Return the mean weight of a spec's maps over the training views; NaN where they follow the error."""
-        if spec.error > 0.0:
-            return spec.scale if spec.normalise == "mean" else math.nan
+        """Return the mean weight of a spec's maps over the training views."""
         if spec not in self._mean_weights:
             images = (load_view(self.scene, view, self.base.resolution).image for view in split_views(self.scene)[0])
             means = [float(weight.double().mean()) for weight in weight_maps(images, spec)]
@@ -178,7 +170,7 @@ class UpstreamComparison:
         return self.out / arm.folder / f"seed-{seed}"
 
     def _train(self, arm: ArmSpec, seed: int, tell: Callable[[str], None]) -> Row:
-        spec, folder = self.spec_of(arm), self._folder(arm, seed)
+        spec, folder = arm.spec, self._folder(arm, seed)
         if arm.at is None:
             tell(f"{arm.name}, seed {seed}")
             return self._row(arm, seed, spec, 1.0, train_and_score(self.checkout, spec, seed, folder, 1.0))
@@ -219,8 +211,6 @@ class UpstreamComparison:
             "arm": arm.name,
             "seed": seed,
             "config": config.as_dict(),
-            "weighting": None,
-            "loss": None,
             "caps": None,
             "upstream": {
                 "profile": self.profile.name,

@@ -72,7 +72,6 @@ FACTS: Dict[str, Tuple[type, ...]] = {
     "order": (list,),
     "loss": (float, int, type(None)),
     "psnr": (float, int, type(None)),
-    "weight_sum": (float, int),
     "growth": (list,),
     "history": (list,),
 }

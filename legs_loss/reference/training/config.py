@@ -1,10 +1,10 @@
-"""The settings of a training run, and the functions that an experiment may replace."""
+"""The settings of a training run."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, Callable, Dict, List, Mapping, Optional
+from typing import Any, Dict, List, Mapping, Optional
 
 import torch
 from torch import Tensor
@@ -13,14 +13,10 @@ from legs_loss.errors import LegsError
 from legs_loss.reference.training.dataset import TrainingView
 from legs_loss.spec import PRESETS, Spec, WeightSpec, as_spec
 
-__all__ = ["Loss", "TrainConfig", "Weigh", "Weighting", "default_threshold"]
+__all__ = ["TrainConfig", "default_threshold"]
 
 # What a spec had not when the first comparisons were written: absent where it is the default, so that they go on.
 ADDED_SETTINGS = ("over", "noise_floor", "smooth")
-
-# Weights that change during a run: of a training view's index, the share of the run that is done, and the view's
-# rendering [3, H, W], detached, the weight map [1, H, W] of this one iteration. It must depend on nothing else.
-Weigh = Callable[[int, float, Tensor], Optional[Tensor]]
 
 
 @dataclass(frozen=True)
@@ -40,7 +36,7 @@ class TrainConfig:
             it by the size of the photographs, see :func:`default_threshold`.
         max_gaussians: a cap on their number, None for none.
         white_background: white in place of black.
-        degraded: a third of the training views are out of focus, moved or noisy (:mod:`.degrade`): for experiments.
+        shuffled: each weight map's pixels in random order, the same weights displaced: for experiments.
         seed: of the order of the views and of the places of split Gaussians.
     """
 
@@ -54,7 +50,7 @@ class TrainConfig:
     densify_grad_threshold: Optional[float] = None
     max_gaussians: Optional[int] = None
     white_background: bool = False
-    degraded: bool = False
+    shuffled: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -74,6 +70,7 @@ class TrainConfig:
                 self.densify_grad_threshold is None or self.densify_grad_threshold > 0.0,
                 "above 0",
             ),
+            ("shuffled", type(self.shuffled) is bool, "True or False"),
             ("max_gaussians", self.max_gaussians is None or self.max_gaussians >= 1, "at least 1"),
         ):
             if not fits:
@@ -86,8 +83,8 @@ class TrainConfig:
         for name in ADDED_SETTINGS:
             if values["spec"][name] == getattr(PRESETS["legs"], name):
                 del values["spec"][name]
-        if not self.degraded:
-            del values["degraded"]
+        if not self.shuffled:
+            del values["shuffled"]
         return values
 
     @classmethod
@@ -116,13 +113,6 @@ class TrainConfig:
     def background(self) -> Tensor:
         """Return the colour behind all Gaussians, [3]."""
         return torch.full((3,), 1.0 if self.white_background else 0.0)
-
-
-# Makes a run's Weigh from its training views, each with its spec's weight map.
-Weighting = Callable[[List[TrainingView], TrainConfig], Weigh]
-
-# An iteration's loss, as `step_loss`: of rendering, photograph, weight map (None: 1 everywhere) and lambda.
-Loss = Callable[[Tensor, Tensor, Optional[Tensor], float], Tensor]
 
 
 def default_threshold(views: List[TrainingView]) -> float:

@@ -12,13 +12,21 @@ from torch import Tensor
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
-from legs_loss.reference.training.degrade import degraded
 from legs_loss.scenes import Camera, Scene, View, image_tensor, load_training_image
 from legs_loss.spec import WeightSpec
 from legs_loss.store import Entry, WeightStore, fingerprint
 from legs_loss.weights import weight_from_response, weight_map, weight_maps, weight_over_scene
 
-__all__ = ["Dataset", "TrainingView", "extent", "load_dataset", "load_view", "pinhole_camera", "split_views"]
+__all__ = [
+    "Dataset",
+    "TrainingView",
+    "extent",
+    "load_dataset",
+    "load_view",
+    "pinhole_camera",
+    "shuffled",
+    "split_views",
+]
 
 HOLD_OUT = 8  # every 8th view, sorted by name, as usual for 3DGS
 
@@ -67,7 +75,6 @@ def load_dataset(
     white_background: bool = False,
     store: Optional[Path] = None,
     weights: Optional[Mapping[str, Tensor]] = None,
-    worse: bool = False,
 ) -> Dataset:
     """Load every view of a scene.
 
@@ -79,7 +86,6 @@ def load_dataset(
         store: a store of weight maps; default: ``legs_weights`` in the scene folder, if it is there. A map is used
             only for exactly the image that it was made from, else it is computed.
         weights: explicit maps [1, H, W] by view name, in place of the spec's: for experiments.
-        worse: a third of the training views is degraded (:mod:`.degrade`): for experiments.
 
     Raises:
         LegsError: a view has no pinhole camera, a photograph cannot be read, or an explicit map is missing or does
@@ -88,8 +94,6 @@ def load_dataset(
     train, test = (
         [load_view(scene, view, resolution, white_background) for view in views] for views in split_views(scene)
     )
-    if worse:
-        train = [replace(view, image=image) for view, image in zip(train, degraded([view.image for view in train]))]
     if weights is not None:
         train = [replace(view, weight=_explicit(weights, view)) for view in train]
     elif not spec.unweighted:
@@ -108,6 +112,18 @@ def load_view(scene: Scene, view: View, resolution: int = -1, white_background: 
     image = image_tensor(load_training_image(view, resolution, white_background))
     height, width = image.shape[1:]
     return TrainingView(view.name, camera.resized(width, height), image.expand(3, height, width).contiguous())
+
+
+def shuffled(views: List[TrainingView], seed: int) -> List[TrainingView]:
+    """Return views with each weight map's pixels in random order, another one for each view and seed."""
+    generator = torch.Generator().manual_seed(1_000_003 + seed)
+
+    def shuffle(weight: Optional[Tensor]) -> Optional[Tensor]:
+        if weight is None:
+            return None
+        return weight.flatten()[torch.randperm(weight.numel(), generator=generator)].reshape(weight.shape)
+
+    return [replace(view, weight=shuffle(view.weight)) for view in views]
 
 
 def extent(views: List[TrainingView]) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence
 
 from legs_loss.errors import LegsError
-from legs_loss.reference.training.trainer import Loss, Progress, TrainConfig, Weighting, step_loss, train
+from legs_loss.reference.training.trainer import Progress, TrainConfig, train
 from legs_loss.scenes import read_scene
 from legs_loss.system import kept_from_children
 
@@ -16,10 +16,7 @@ __all__ = ["Arm", "train_arm", "train_side_by_side"]
 
 
 class Arm(NamedTuple):
-    """One training: its name, and what `train` needs. ``images`` is the folder that ``read_scene`` takes.
-
-    ``weighting`` and ``loss`` are functions of a module, since they are sent to another process by their names.
-    """
+    """One training: its name, and what `train` needs. ``images`` is the folder that ``read_scene`` takes."""
 
     name: str
     scene: Path
@@ -27,8 +24,6 @@ class Arm(NamedTuple):
     out: Optional[Path]
     images: Optional[str] = None
     store: Optional[Path] = None
-    weighting: Optional[Weighting] = None
-    loss: Loss = step_loss
     caps: Optional[Mapping[int, int]] = None
     evaluate_every: Optional[int] = None
     resume: Optional[bool] = False
@@ -109,8 +104,6 @@ def train_arm(arm: Arm, on_progress: Callable[[Progress], None]) -> Dict[str, An
         resume=arm.resume,
         store=arm.store,
         on_progress=on_progress,
-        weighting=arm.weighting,
-        loss=arm.loss,
         caps=arm.caps,
         evaluate_every=arm.evaluate_every,
     ).metrics

@@ -24,24 +24,17 @@ from legs_loss.reference.ply import write_ply
 from legs_loss.reference.rasterizer import Rendering, rasterize
 from legs_loss.reference.training.adam import Adam, position_rate
 from legs_loss.reference.training.checkpoint import CHECKPOINT, alone_in, check_new, read_state, write_checkpoint
-from legs_loss.reference.training.config import Loss, TrainConfig, Weigh, Weighting, default_threshold
-from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, load_dataset
+from legs_loss.reference.training.config import TrainConfig, default_threshold
+from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, load_dataset, shuffled
 from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.reference.training.metrics import mean_scores, psnr, score
-from legs_loss.response import normalise_response, response
 from legs_loss.scenes import Scene
-from legs_loss.spec import WeightSpec
 from legs_loss.system import noted, write_whole
-from legs_loss.weights import error_weight_map
 
 __all__ = [
-    "Loss",
     "Progress",
     "Result",
     "TrainConfig",
-    "Weigh",
-    "Weighting",
-    "by_error",
     "default_threshold",
     "draw",
     "point_cloud",
@@ -75,18 +68,6 @@ def step_loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lamb
     return fused_loss(prediction, target, weight, lambda_dssim)
 
 
-def by_error(views: List[TrainingView], config: TrainConfig) -> Weigh:
-    """Make the weights of a spec that follows the rendering's error (``spec.error``)."""
-    spec = config.weights
-    strengths = [response(view.image, spec.operator, spec.p, smooth=spec.smooth) for view in views]
-    responses = [normalise_response(strength, spec.eps) for strength in strengths]
-
-    def weigh(index: int, done: float, rendering: Tensor) -> Tensor:
-        return error_weight_map(rendering, views[index].image, spec, normalised=responses[index])
-
-    return weigh
-
-
 def draw(gaussians: Gaussians, view: TrainingView, config: TrainConfig) -> Tensor:
     """Return a finished scene's rendering of a view, [3, H, W], not clipped."""
     with torch.no_grad():
@@ -107,8 +88,6 @@ def train(
     weights: Optional[Mapping[str, Tensor]] = None,
     checkpoint_every: int = 500,
     on_progress: Optional[Callable[[Progress], None]] = None,
-    weighting: Optional[Weighting] = None,
-    loss: Loss = step_loss,
     caps: Optional[Mapping[int, int]] = None,
     evaluate_every: Optional[int] = None,
 ) -> Result:
@@ -125,11 +104,9 @@ def train(
         weights: explicit maps instead, see there.
         checkpoint_every: iterations between checkpoints. Another one is written on Ctrl-C.
         on_progress: called every 10 iterations.
-        weighting: makes weights that change during the run, in place of the maps: for experiments.
-        loss: in place of 3DGS's with weights: for experiments.
         caps: the most Gaussians that a densification may lead to, before it prunes, by its iteration; in place of
             ``config.max_gaussians``. Another run's ``metrics["growth"]`` gives this one that run's numbers: for
-            experiments. A resumed run needs the same ``weighting``, ``loss`` and ``caps``.
+            experiments. A resumed run needs the same ``weights`` and ``caps``.
         evaluate_every: score the held-out views every so many iterations into ``metrics["history"]``, outside of the
             run's time; None: only at the end.
 
@@ -138,10 +115,9 @@ def train(
             writes to ``out``, or a run is there and ``resume`` is False.
         KeyboardInterrupt: Ctrl-C, after the checkpoint.
     """
-    maps = config.weights if config.weights.error == 0.0 else WeightSpec(beta=0.0)
-    data = load_dataset(scene, maps, config.resolution, config.white_background, store, weights, config.degraded)
-    if weighting is None and config.weights.error > 0.0:
-        weighting = by_error
+    data = load_dataset(scene, config.weights, config.resolution, config.white_background, store, weights)
+    if config.shuffled:
+        data = data._replace(train=shuffled(data.train, config.seed))
     folder = None if out is None else Path(out)
     if resume and folder is None:
         raise LegsError("there is nothing to resume from without an output folder")
@@ -152,8 +128,7 @@ def train(
         elif folder is not None and not resume:
             check_new(folder)
         run = begun if not resume and begun is not None else _Run.restore(data, config, Path(out or ".") / CHECKPOINT)
-        run.step_loss, run.caps, run.evaluate_every = loss, caps, evaluate_every
-        run.weigh = None if weighting is None else weighting(data.train, config)
+        run.caps, run.evaluate_every = caps, evaluate_every
         if folder is not None:
             _write_json(folder / "cfg.json", config.as_dict())
             if not resume:
@@ -182,9 +157,6 @@ class _Run:
         self.psnr: Optional[float] = None
         self._forget_gradients()
         self.weights = [step_weight(view.weight, view, config) for view in data.train]
-        self.weigh: Optional[Weigh] = None
-        self.step_loss: Loss = step_loss
-        self.weight_sum = 0.0  # of the mean weights of all iterations, where they change
         self.caps: Optional[Mapping[int, int]] = None
         self.growth: List[List[int]] = []  # [iteration of a densification, Gaussians before it pruned]
         self.evaluate_every: Optional[int] = None
@@ -209,7 +181,7 @@ class _Run:
         run = cls(data, config, Adam.restore(arrays))
         run.iteration, run.clocks, run.order = facts["iteration"], np.array(facts["clocks"]), facts["order"]
         run.loss, run.psnr = facts["loss"], facts["psnr"]
-        run.weight_sum, run.growth, run.history = facts["weight_sum"], facts["growth"], facts["history"]
+        run.growth, run.history = facts["growth"], facts["history"]
         run.gradient_sum = torch.from_numpy(arrays["gradient_sum"])
         run.times_seen = torch.from_numpy(arrays["times_seen"])
         run.generator.set_state(torch.from_numpy(arrays["generator"]))
@@ -230,7 +202,6 @@ class _Run:
             "order": self.order,
             "loss": self.loss,
             "psnr": self.psnr,
-            "weight_sum": self.weight_sum,
             "growth": self.growth,
             "history": self.history,
         }
@@ -266,8 +237,7 @@ class _Run:
         degree = min(self.config.sh_degree, self.iteration // self.schedule.sh_every)
         viewspace = torch.zeros(len(gaussians), 2, requires_grad=True)
         drawn = _rasterize(gaussians, view, self.config, degree, viewspace)
-        weight = self._weight(index, drawn.image.detach())
-        loss = self.step_loss(drawn.image, view.image, weight, self.config.lambda_dssim)
+        loss = step_loss(drawn.image, view.image, self.weights[index], self.config.lambda_dssim)
         loss.backward()
         if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
             self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image))
@@ -307,8 +277,6 @@ class _Run:
         return draw(self.adam.gaussians, view, self.config)
 
     def _mean_weight(self) -> float:
-        if self.weigh is not None:
-            return self.weight_sum / self.iteration
         maps = [1.0 if weight is None else float(weight.double().mean()) for weight in self.weights]
         return sum(maps) / len(maps)
 
@@ -320,14 +288,6 @@ class _Run:
             values = [psnr(self._drawn(view).clamp(0.0, 1.0), view.image) for view in self.data.test]
             point["test_psnr"] = sum(values) / len(values)
         self.history.append(point)
-
-    def _weight(self, index: int, rendering: Tensor) -> Optional[Tensor]:
-        if self.weigh is None:
-            return self.weights[index]
-        weight = self.weigh(index, self.iteration / self.config.iterations, rendering)
-        weight = step_weight(weight, self.data.train[index], self.config)
-        self.weight_sum += 1.0 if weight is None else float(weight.double().mean())
-        return weight
 
     def _next_view(self) -> int:
         if not self.order:

@@ -9,6 +9,7 @@ from legs_loss.system.ctrl_c import held_back, kept_from_children, noted
 from legs_loss.system.distributed import is_first_process
 from legs_loss.system.files import open_regular, read_regular, write_whole
 from legs_loss.system.locks import FileLock, HeldError, is_held
+from legs_loss.system.memory import keep_freed_memory
 from legs_loss.system.plugins import plugins
 from legs_loss.system.processors import cores
 from legs_loss.system.terminal import never_fail_to_print, printable, say, say_error
@@ -20,6 +21,7 @@ __all__ = [
     "held_back",
     "is_first_process",
     "is_held",
+    "keep_freed_memory",
     "kept_from_children",
     "never_fail_to_print",
     "noted",

@@ -29,7 +29,7 @@ from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, 
 from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.reference.training.metrics import mean_scores, psnr, score
 from legs_loss.scenes import Scene
-from legs_loss.system import noted, write_whole
+from legs_loss.system import keep_freed_memory, noted, write_whole
 
 __all__ = [
     "Progress",
@@ -122,6 +122,7 @@ def train(
     if resume and folder is None:
         raise LegsError("there is nothing to resume from without an output folder")
     begun = None if resume else _Run.begin(data, config, scene)
+    keep_freed_memory()  # the arrays of a step are as large as those of the step before
     with alone_in(folder, make=not resume):
         if folder is not None and resume is None:
             resume = (folder / CHECKPOINT).is_file()
@@ -151,6 +152,7 @@ class _Run:
         self.threshold = config.densify_grad_threshold or default_threshold(data.train)
         self.iteration = 0
         self.clocks = np.zeros(2)  # seconds: on the wall, and of the processor
+        self.scoring = np.zeros(2)  # the same for the history's scores, which do not count
         self.generator = torch.Generator().manual_seed(config.seed)
         self.order: List[int] = []  # the views that this round through all of them has still to show
         self.loss: Optional[float] = None
@@ -215,10 +217,7 @@ class _Run:
         with noted() as interrupted:  # not between two dependent updates
             while self.iteration < self.config.iterations:
                 self.step()
-                self.clocks = _clocks() - started
-                if self.evaluate_every is not None and self.iteration % self.evaluate_every == 0:
-                    self._evaluate()
-                    started = _clocks() - self.clocks
+                self.clocks = _clocks() - started - self.scoring
                 last = self.iteration == self.config.iterations
                 if on_progress is not None and (last or self.iteration % 10 == 0):
                     assert self.loss is not None and self.psnr is not None
@@ -243,6 +242,8 @@ class _Run:
             self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image))
         steps = self.config.position_lr_max_steps or self.config.iterations
         self.adam.step(position_rate(min(1.0, self.iteration / steps), self.extent))
+        if self.evaluate_every is not None and self.iteration % self.evaluate_every == 0:
+            self._evaluate()  # as in 3DGS before Gaussians are added, which blurs the picture for some iterations
         if self.iteration < self.schedule.densify_until:
             assert viewspace.grad is not None
             self.gradient_sum += viewspace.grad.norm(dim=1)  # 0 where it was not seen
@@ -281,6 +282,7 @@ class _Run:
         return sum(maps) / len(maps)
 
     def _evaluate(self) -> None:
+        begun = _clocks()
         point: Dict[str, float] = {"iteration": self.iteration, "gaussians": len(self.adam.gaussians)}
         if self.psnr is not None:
             point["train_psnr"] = self.psnr
@@ -288,6 +290,7 @@ class _Run:
             values = [psnr(self._drawn(view).clamp(0.0, 1.0), view.image) for view in self.data.test]
             point["test_psnr"] = sum(values) / len(values)
         self.history.append(point)
+        self.scoring += _clocks() - begun
 
     def _next_view(self) -> int:
         if not self.order:

@@ -29,7 +29,7 @@ def shape_of(tensor: Tensor) -> str:
 
 
 class Layout(NamedTuple):
-    """Meaning of an image's axes: all of this package computes on [C, H, W] or [B, C, H, W].
+    """What the axes of an image stand for: all of this package computes on [C, H, W] or [B, C, H, W].
 
     Attributes:
         shape: of the image as it was given.
@@ -96,7 +96,7 @@ def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str =
 
     Raises:
         LegsError: it is no float tensor, has too few axes or an empty one; its channel may be either axis and
-            ``channels_last`` is None; its shape contradicts ``channels_last``; or it may be a list of pixels, [N, 3].
+            ``channels_last`` is None; its shape contradicts ``channels_last``; it is a list of pixels, [N] or [N, 3].
 
     Example:
         >>> read_layout(torch.zeros(1, 6, 8, 3)).channels_last
@@ -106,17 +106,16 @@ def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str =
         raise LegsError(f"{name} must be a torch.Tensor, got {type(image).__name__}")
     if not image.is_floating_point():
         raise LegsError(f"{name} is of type {image.dtype}: give floats in [0, 1] (8-bit images: image / 255.0)")
-    if image.dim() < 2 or image.numel() == 0:
+    if image.dim() == 0 or image.numel() == 0:
         raise LegsError(
             f"{name} must be an image [H, W], [C, H, W] or [H, W, C], or a batch [B, C, H, W] or [B, H, W, C], "
             f"got {shape_of(image)}"
         )
+    if image.dim() == 1 or (image.dim() == 2 and not {*image.shape}.isdisjoint(_CHANNELS)):
+        raise LegsError(
+            f"{name} {shape_of(image)} is a list of pixels: a weight map needs the whole image, [C, H, W] or [H, W, C]"
+        )
     if image.dim() == 2:
-        if image.shape[0] in _CHANNELS or image.shape[1] in _CHANNELS:
-            raise LegsError(
-                f"{name} {shape_of(image)} may be a list of pixels, not an image: give the whole image [C, H, W], "
-                "a gray one as [1, H, W]"
-            )
         return Layout(image.shape, False)
     first, last = image.shape[-3], image.shape[-1]
     if channels_last is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -141,12 +143,17 @@ def test_a_shape_that_reads_either_way_is_refused_with_what_to_pass(shape, funct
     assert function(image, channels_last=True).shape == (*batch, first, middle, 1)
 
 
-@pytest.mark.parametrize("shape", [(500, 3), (3, 500), (1, 9), (500, 1)])
+@pytest.mark.parametrize("shape", [(500,), (500, 3), (3, 500), (500, 4), (1, 9), (500, 1)])
 def test_a_list_of_pixels_is_no_gray_image(shape):
-    pixels = torch.rand(shape, requires_grad=True)
-    for function in (legs_loss, weighted_l1, ssim, l1_loss):
-        with pytest.raises(LegsError, match="may be a list of pixels"):
+    pixels, message = torch.rand(shape, requires_grad=True), "is a list of pixels: a weight map needs the whole image"
+    for function in (legs_loss, weighted_l1, ssim, l1_loss, partial(l1_loss, own=torch.nn.functional.l1_loss)):
+        with pytest.raises(LegsError, match=message):
             function(pixels, torch.rand(shape))
+    for function in (weight_map, response):
+        with pytest.raises(LegsError, match=message):
+            function(pixels)
+    with torch.no_grad():
+        assert l1_loss(pixels, torch.zeros(shape)) == pixels.mean()
 
 
 def test_what_is_not_one_image_and_its_photograph_is_refused():
@@ -154,5 +161,5 @@ def test_what_is_not_one_image_and_its_photograph_is_refused():
     for function in (legs_loss, weighted_l1, ssim, l1_loss):
         with pytest.raises(LegsError, match=r"\[3, 20, 30\] and target \[20, 30, 3\] differ in shape"):
             function(image, torch.rand(20, 30, 3))
-        with pytest.raises(LegsError, match=r"got \[30\]"):
-            function(image[0, 0], torch.rand(30))
+        with pytest.raises(LegsError, match=r"got \[\]"):
+            function(image[0, 0, 0], torch.rand(()))

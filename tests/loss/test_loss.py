@@ -206,7 +206,7 @@ class TestBadInput:
             weighted_l1(torch.rand(3, 8, 8), torch.rand(3, 8, 8), mask=torch.ones(2, 8, 8))
 
     def test_what_is_no_image_is_named(self):
-        with pytest.raises(LegsError, match=r"\[5, 3\] may be a list of pixels"):
+        with pytest.raises(LegsError, match=r"\[5, 3\] is a list of pixels"):
             legs_loss(torch.rand(5, 3), torch.rand(5, 3))
         with pytest.raises(LegsError, match="ndarray"):
             legs_loss(torch.rand(3, 4, 5), torch.rand(3, 4, 5).numpy())

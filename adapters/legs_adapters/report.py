@@ -61,7 +61,6 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
                 "column": site.column,
                 "function": site.function,
                 "code": one_line(site.form.node),
-                "channels_last": site.channels_last,
                 **({} if site.form.weighs else {"term": "ssim"}),
             }
             for site in found.sites

@@ -116,8 +116,8 @@ class TestCommandLine:
         done = run("--json", "--check", root)
         content = json.loads(done.stdout)
         assert done.returncode == 1
-        found = [(s["line"], s["channels_last"]) for s in content["sites"] if s["file"] == "simple_trainer.py"]
-        assert found[:4] == [(16, True), (19, True), (25, True), (39, True)]
+        found = [s["line"] for s in content["sites"] if s["file"] == "simple_trainer.py"]
+        assert found[:4] == [16, 19, 25, 39]
         assert content["left"][0]["reason"] == "definition" or content["left"][0]["reason"] == "depth"
         assert "simple_trainer.py" in content["would_change"]
         assert content["wrote"] == []

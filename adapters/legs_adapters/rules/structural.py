@@ -80,7 +80,7 @@ class _Finder:
         elif self._is_free(function, place):
             why = self.analysis.ssims.proof(function, form).reason
             stands = (function.module.path, place.line, place.column, place.last_line)
-            self.sites.append(Site(*stands, form, False, "", False, why, function))
+            self.sites.append(Site(*stands, form, False, "", why, function))
         else:
             self.left.append((Left.at(function, place, "not chosen"), set()))
 

@@ -9,14 +9,13 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
-from legs_adapters.code.syntax import arguments, code, one_line, same, walk_expressions
+from legs_adapters.code.syntax import arguments, code, one_line
 from legs_adapters.lexicon.masks import is_rows, picked_from
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import AMBIGUOUS, DEFINITION, HUBER, ORDER, RULES, UNREAD, first, first_of_call
 from legs_adapters.rules.rule import CallOfTerm, Term
 from legs_adapters.rules.uses import Use, Uses
-from legs_adapters.tensors.layout import is_channels_last, lies_last
 from legs_adapters.terms.error_maps import shared_of
 from legs_adapters.terms.findings import Kept, Left, Problem, Site
 from legs_adapters.terms.form import Form
@@ -88,12 +87,10 @@ class Verdicts:
             aside = tuple(shared.aside)
         elif shared is not None:
             return self.problem(function, form, place, f"{one_line(form.node)} has other uses than the loss", flipped)
-        last = self._is_channels_last(function, prediction, target, form.node)
-        last = last or (picked is not None and lies_last(function, picked[0]))
         stands = (function.module.path, place.line, place.column, place.last_line)
         kept = tuple(self._kept(function, use, other.reason) for use, other in others)
         selection, why = pair.selection + form.selection, self._why(function, target)
-        return Site(*stands, form, flipped, selection, last, why, function, aside, kept)
+        return Site(*stands, form, flipped, selection, why, function, aside, kept)
 
     def of_any(self, function: Function, form: Form, place: Place) -> Left | Problem:
         """Return the verdict on a call whose function is chosen by settings: a problem, unless a rule applies."""
@@ -124,7 +121,7 @@ class Verdicts:
         """Return a callback as a site."""
         place = function.place(form.node)
         stands = (function.module.path, place.line, place.column, place.line)
-        return Site(*stands, form, False, "", False, "passed by name", function)
+        return Site(*stands, form, False, "", "passed by name", function)
 
     @staticmethod
     def _kept(function: Function, use: Use, purpose: str) -> Kept:
@@ -144,23 +141,6 @@ class Verdicts:
         alike = re.sub(r"\s+", "", _index(one)) == re.sub(r"\s+", "", _index(other))
         return (one, other) if alike else None
 
-    def _is_channels_last(
-        self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode, error: cst.CSTNode
-    ) -> bool:
-        """Return whether the two are [H, W, C], or another target that the same rendering is compared with."""
-        others = [
-            form.second
-            for form in self.analysis.forms.of(function)
-            if form.first is not prediction
-            and same(form.first, prediction)
-            and _is_same_place(function, form.first, prediction)
-        ]
-        lie = (
-            is_channels_last(self.analysis.training, function, prediction, other, error=error)
-            for other in (target, *others)
-        )
-        return any(lie)
-
     def _why(self, function: Function, target: cst.BaseExpression) -> str:
         """Return what shows that a side is the photograph."""
         name = one_line(target)
@@ -170,20 +150,13 @@ class Verdicts:
 
     def problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
         """Return a form as a problem, with the advice for the manual edit."""
-        last = is_channels_last(self.analysis.training, function, form.first, form.second)
         rows = any(is_rows(self.analysis.meanings, function, side) for side in (form.first, form.second))
-        text = form.advice(Writing(swapped=flipped, channels_last=last), rows)
+        text = form.advice(Writing(swapped=flipped), rows)
         return Problem.at(function, place, reason, text)
 
 
 def _index(node: cst.Subscript) -> str:
     return code(node)[len(code(node.value)) :].strip()
-
-
-def _is_same_place(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
-    """Return whether two expressions of the same text have the same values."""
-    names = [[part for part in walk_expressions(node) if isinstance(part, cst.Name)] for node in (first, second)]
-    return all(function.flow.reaching(one) == function.flow.reaching(other) for one, other in zip(*names))
 
 
 def _in_a_copy(function: Function, uses: Sequence[Use]) -> str:

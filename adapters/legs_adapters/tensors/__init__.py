@@ -1,1 +1,1 @@
-"""The meaning of torch's operations: gradients, backward passes, optimiser steps, axes. No splats."""
+"""The meaning of torch's operations: gradients, backward passes, optimiser steps. No splats."""

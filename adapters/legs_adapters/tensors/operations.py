@@ -39,7 +39,6 @@ no_grad       inference_mode no_grad set_grad_enabled
 backward      backward manual_backward
 transforms    exp log log10 log1p log2 pow sigmoid sqrt square tanh
 other_losses  huber_loss mse_loss norm smooth_l1_loss
-channels_last rasterization rasterization_2dgs rasterization_inria_wrapper rasterize_gaussians
 modules       F TF einops functional nn np numpy torch
 module_self   cpu cuda double eval float half requires_grad_ to train
 module_wraps  DDP DataParallel DistributedDataParallel compile convert_sync_batchnorm fabric.setup prepare
@@ -82,7 +81,6 @@ NO_GRAD = _ROWS["no_grad"]  # contexts and decorators under which no gradient is
 BACKWARD = _ROWS["backward"]  # manual_backward is Lightning's
 TRANSFORMS = _ROWS["transforms"]  # the result is no longer an absolute error
 OTHER_LOSSES = _ROWS["other_losses"]  # losses other than an L1
-CHANNELS_LAST = _ROWS["channels_last"]  # renderers that return [H, W, C]: gsplat's
 MODULES = _ROWS["modules"]  # the names under which torch and its neighbours are imported
 MODULE_SELF = _ROWS["module_self"]  # methods of an nn.Module that return it
 MODULE_WRAPS = _ROWS["module_wraps"]  # these return a module wrapped; Lightning's fabric.setup, accelerate's prepare

@@ -47,7 +47,6 @@ class Site(NamedTuple):
         swapped: the ground truth is the first of the two arguments.
         selection: the index by a mask that both arguments carry, as written with its brackets, and the one that a named
             difference of them is taken with; empty without.
-        channels_last: the images are [H, W, C].
         why: what is known of it, in words.
         scope: the function that it stands in.
         aside: other reads of the same error map, which keep the plain map.
@@ -61,7 +60,6 @@ class Site(NamedTuple):
     form: Form
     swapped: bool
     selection: str
-    channels_last: bool
     why: str
     scope: Function
     aside: Tuple[cst.Name, ...] = ()

@@ -92,7 +92,7 @@ class Form:
         whole, other = without_rows(prediction), without_rows(target)
         if whole is not prediction and other is not target:
             image, photo = one_line(whole), one_line(other)
-            return writing._replace(channels_last=True).call(image, f"{photo}.reshape({image}.shape)")
+            return writing.call(image, f"{photo}.reshape({image}.shape)")
         return self._advice(writing, one_line(prediction), one_line(target), rows)
 
     def _advice(self, writing: Writing, prediction: str, target: str, rows: bool) -> str:

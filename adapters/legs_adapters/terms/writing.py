@@ -23,14 +23,12 @@ class Writing(NamedTuple):
         package: the name that legs_loss has in the file.
         swapped: whether the target is the first of the two sides.
         selection: the index by a mask that both images carry, with its brackets; empty without.
-        channels_last: whether the images are [H, W, C].
         where: the file and line, for errors.
     """
 
     package: str = PACKAGE
     swapped: bool = False
     selection: str = ""
-    channels_last: bool = False
     where: str = ""
 
     def ordered(self, first: _Side, second: _Side) -> Tuple[_Side, _Side]:
@@ -48,14 +46,13 @@ class Writing(NamedTuple):
             as_map: whether the unreduced map is asked for.
             own: the codebase's own L1, where it is more than a mean.
         """
-        parts = ["channels_last=True"] if self.channels_last else []
-        parts += ['reduction="none"'] if as_map else []
+        parts = ['reduction="none"'] if as_map else []
         parts += [f"own={own}"] if own else []
         return "".join(f", {part}" for part in parts)
 
     def weight_map(self, target: str) -> str:
         """Return the call that makes the weight map of a target."""
-        return f"{self.package}.weight_map({target}{', channels_last=True' if self.channels_last else ''})"
+        return f"{self.package}.weight_map({target})"
 
     def own(self, callee: cst.BaseExpression, extras: Sequence[cst.Arg]) -> str:
         """Return the codebase's own function of (prediction, target), with its further arguments."""

@@ -1,4 +1,4 @@
-"""Write docs/compatibility.md from corpus.csv, rounds.csv and page.md; every figure on the page is counted here.
+"""Write docs/compatibility.md from corpus.csv, rounds.csv and page.txt; every figure on the page is counted here.
 
 python docs/compatibility/build.py            # write the page
 python docs/compatibility/build.py --check    # exit 1 if the page is not what the data says
@@ -133,7 +133,7 @@ def figures():
 
 def page():
     """Return the page that the data gives."""
-    return Template((HERE / "page.md").read_text(encoding="utf-8")).substitute(figures())
+    return Template((HERE / "page.txt").read_text(encoding="utf-8")).substitute(figures())
 
 
 def stale():

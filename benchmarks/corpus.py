@@ -3,17 +3,17 @@
     python -m benchmarks.corpus CHECKOUTS plans.json --save     # before a change: plan, and save
     python -m benchmarks.corpus CHECKOUTS plans.json            # after it: plan, and print what differs
     python -m benchmarks.corpus CHECKOUTS plans.json --sites    # only what is edited counts, no word of a report
+    python -m benchmarks.corpus CHECKOUTS plans.json --ablate   # each part switched off: what it decides, where
 
 A plan is the report of `legs-patch --check --json`: call sites, what was left and why, problems.
 Nothing is written to a checkout. Each is planned in a process of its own, which is killed at the limit.
-Exit codes: 0 nothing differs, or saved; 1 a plan differs; 2 bad usage.
+--ablate compares with plans.json, too, as the plans that were judged; it needs os.fork.
+Exit codes: 0 nothing differs, saved, or a table; 1 a plan differs; 2 bad usage.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 import json
 import multiprocessing
 import os
@@ -22,26 +22,31 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
 from tqdm import tqdm
 
+from benchmarks import ablation
+
 Plan = Dict[str, Any]
 CONTEXT = multiprocessing.get_context("forkserver" if hasattr(os, "fork") else "spawn")
-LOADED = ["libcst", "legs_adapters.cli"]  # once, in the process that the others are forked from
+LOADED = ["libcst", "legs_adapters.cli", "benchmarks.ablation"]  # once, in the process that the others are forked from
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     args = parse(argv)
     folders = sorted(path for path in args.checkouts.iterdir() if path.is_dir())
     started = time.perf_counter()
-    plans, seconds = plan_all(folders, args.jobs, args.limit)
+    plans, seconds = answers(_ablated if args.ablate else _planned, folders, args.jobs, args.limit)
     slowest = sorted(seconds, key=lambda name: -seconds[name])[:3]
     print(
         f"{len(plans)} plans in {time.perf_counter() - started:.0f} s; slowest: "
         + ", ".join(f"{name} {seconds[name]:.1f} s" for name in slowest),
         file=sys.stderr,
     )
+    if args.ablate:
+        print(ablation.table(args.before, plans))
+        return 0
     if args.save:
         args.plans.write_text(json.dumps(plans, indent=1, sort_keys=True) + "\n", encoding="utf-8")
         return 0
@@ -56,8 +61,10 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     )
     parser.add_argument("checkouts", type=Path, metavar="CHECKOUTS", help="a folder; every folder in it is a checkout")
     parser.add_argument("plans", type=Path, metavar="PLANS", help="the file of plans")
-    parser.add_argument("--save", action="store_true", help="write PLANS instead of comparing with it")
-    parser.add_argument("--sites", action="store_true", help="compare call sites and the lines of problems only")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--save", action="store_true", help="write PLANS instead of comparing with it")
+    what.add_argument("--sites", action="store_true", help="compare call sites and the lines of problems only")
+    what.add_argument("--ablate", action="store_true", help="print what each part of the patcher decides")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="default: %(default)s")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="a checkout; default: %(default)s")
     args = parser.parse_args(argv)
@@ -65,6 +72,8 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         parser.error(f"{args.checkouts}: no folder with checkouts in it")
     if args.jobs < 1 or not args.limit > 0:
         parser.error("--jobs and --limit must be greater than 0")
+    if args.ablate and not hasattr(os, "fork"):
+        parser.error("--ablate needs os.fork, which this system lacks")
     if not args.save:
         args.before = read_plans(parser, args.plans)
     return args
@@ -80,22 +89,29 @@ def read_plans(parser: argparse.ArgumentParser, path: Path) -> Dict[str, Plan]:
     return found
 
 
-def plan_all(folders: List[Path], jobs: int, limit: float) -> Tuple[Dict[str, Plan], Dict[str, float]]:
-    """Plan these checkouts, that many at a time; return plans and seconds by the folders' names."""
+def answers(
+    work: Callable[[str, float], Plan], folders: List[Path], jobs: int, limit: float
+) -> Tuple[Dict[str, Plan], Dict[str, float]]:
+    """Do this with each checkout, that many at a time; return answers and seconds by the folders' names."""
     if CONTEXT.get_start_method() == "forkserver":
         CONTEXT.set_forkserver_preload(LOADED)
     with ThreadPoolExecutor(jobs) as pool:  # a thread only waits for its process
-        planned = pool.map(lambda folder: plan(folder, limit), folders)
-        found = list(tqdm(planned, total=len(folders), unit="checkout", disable=None))  # no bar where nobody looks
+        done = pool.map(lambda folder: answer(work, folder, limit), folders)
+        found = list(tqdm(done, total=len(folders), unit="checkout", disable=None))  # no bar where nobody looks
     names = [folder.name for folder in folders]
     return dict(zip(names, (one for one, _ in found))), dict(zip(names, (taken for _, taken in found)))
 
 
 def plan(folder: Path, limit: float) -> Tuple[Plan, float]:
     """Plan a checkout in a process of its own; return the plan and the seconds it took."""
+    return answer(_planned, folder, limit)
+
+
+def answer(work: Callable[[str, float], Plan], folder: Path, limit: float) -> Tuple[Plan, float]:
+    """Do this with a checkout in a process of its own; return the answer and the seconds it took."""
     started = time.perf_counter()
     here, there = CONTEXT.Pipe(duplex=False)
-    child = CONTEXT.Process(target=_child, args=(str(folder), there), daemon=True)
+    child = CONTEXT.Process(target=_child, args=(work, str(folder), limit, there), daemon=True)
     child.start()
     there.close()
     found: Plan = {"error": f"no plan within {limit:g} s"}
@@ -110,18 +126,16 @@ def plan(folder: Path, limit: float) -> Tuple[Plan, float]:
     return found, time.perf_counter() - started
 
 
-def _child(folder: str, results: Connection) -> None:
-    from legs_adapters.cli import main as legs_patch
+def _child(work: Callable[[str, float], Plan], folder: str, limit: float, results: Connection) -> None:
+    results.send(work(folder, limit))
 
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = legs_patch(["--check", "--json", folder])
-    try:
-        found = json.loads(out.getvalue())
-        found.pop("root", None)
-    except ValueError:  # an error before there was a plan
-        found = {"error": err.getvalue().replace(folder, "CHECKOUT").strip()}
-    results.send({"exit": code, **found})
+
+def _planned(folder: str, _: float) -> Plan:
+    return ablation.plan_of(folder)
+
+
+def _ablated(folder: str, limit: float) -> Plan:
+    return ablation.Checkout(folder, 0.9 * limit).ablate()
 
 
 def compare(before: Dict[str, Plan], after: Dict[str, Plan], sites: bool = False) -> int:

@@ -10,7 +10,7 @@ from legs_loss.errors import LegsError
 from legs_loss.precompute.photograph import normalised_map_and_levels
 from legs_loss.scenes import View, image_size, load_training_image, training_size
 from legs_loss.spec import WeightSpec
-from legs_loss.store import Entry, fingerprint, is_intact, stage
+from legs_loss.store import Entry, fingerprint, is_intact, sampled_fingerprint, stage
 
 __all__ = ["Job", "Result", "Task", "make"]
 
@@ -63,11 +63,12 @@ def make(job: Job, task: Task) -> Result:
             "source_bytes": source.st_size,
             "source_mtime_ns": source.st_mtime_ns,
         }
-        if any(wanted.items() <= vars(entry).items() and is_intact(job.store, entry) for entry in task.known):
+        known = [entry for entry in task.known if entry.sample and wanted.items() <= vars(entry).items()]
+        if any(is_intact(job.store, entry) for entry in known):
             return Result(view.name)
         image = load_training_image(view, job.resolution, job.white_background)
         made, levels = normalised_map_and_levels(image, job.spec)
-        entry = Entry(fingerprint=fingerprint(image), **wanted, **levels)
+        entry = Entry(fingerprint=fingerprint(image), sample=sampled_fingerprint(image), **wanted, **levels)
         try:
             return Result(view.name, stage(job.staging, entry, made))
         except OSError as error:  # a full disk, a missing folder: all later views would fail too

@@ -43,9 +43,8 @@ def l1_loss(
             ``torch.abs(prediction - target).mean()``, unweighted.
         target: the photograph of this step, the same shape; [C, H, W] beside [1, C, H, W] are both a batch of one,
             as in ``torch.abs(prediction - target)``.
-        view: the name of the view, or its number (for a batch: one a view), if the target is that view's own stored
-            image. It enables maps from ``legs precompute``, which are used only where the target's fingerprint
-            shows that they were made from it. On the CPU a stored map is found by the fingerprint alone.
+        view: the name of the view, or its number (for a batch: one a view), for messages. Maps from ``legs precompute``
+            are found by the target's fingerprint, and used only for the very image that they were made from.
         mask: one value a pixel, zeroes the weight where it is 0.
         channels_last: where the channel stands, for a shape that does not show it, as [3, 100, 4].
         reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.

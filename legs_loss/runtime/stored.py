@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Callable, Dict, Optional, Set, Tuple
+from typing import TYPE_CHECKING, Callable, Dict, Optional
 
 import torch
 from torch import Tensor
@@ -16,14 +16,11 @@ if TYPE_CHECKING:
 
 __all__ = ["StoredWeights"]
 
-_CHANGED = (
-    "view {view!r}: the training image is not the one that the stored map was made from, so its weight is computed "
-    "(said once; see docs/precompute.md)"
-)
-_RENEWED = (
-    "view {view!r}: its training image is another tensor than before, or on another stream; on a GPU it cannot be "
-    "proven to be the stored map's without waiting for the device, so its weight is computed (said once; see "
-    "docs/precompute.md)"
+_MISSES = 2  # lookups for each view of the store
+
+_ABSENT = (
+    "{store} has no map of the training image{view} of {width}x{height}: another size or other pixels than legs "
+    "precompute read; the weight of such images is computed (said once; see docs/precompute.md)"
 )
 
 
@@ -38,7 +35,7 @@ class StoredWeights:
     def __init__(self, config: Config, say_once: Callable[[str, str], None]) -> None:
         self._config = config
         self._say_once = say_once
-        self._asked: Set[Tuple[str, int, int]] = set()
+        self._misses = 0  # since an image was found
         self._levels: Dict[int, Optional[Tensor]] = {}
         self._store: Optional[WeightStore] = None
         self._opened = False
@@ -50,7 +47,7 @@ class StoredWeights:
 
         Args:
             image: [C, H, W].
-            view: its name, if the call gave one.
+            view: its name, if the call gave one, for messages.
         """
         store = self._open()
         if store is None:
@@ -79,35 +76,15 @@ class StoredWeights:
 
     def _entry(self, store: WeightStore, image: Tensor, view: Optional[str]) -> Optional[Entry]:
         """Return the store's entry that was made from an image [C, H, W]."""
-        from legs_loss.store import fingerprint
-
-        height, width = image.shape[1:]
-        named = None if view is None else store.find(view, height, width, self._config.spec)
-        if image.device.type != "cpu":
-            # A fingerprint waits for the device, so it is computed once per view; new tensors are recomputed.
-            if named is None:
-                reason = "the call names no view (view=)" if view is None else f"it has no map of view {view!r}"
-                self._say_once(
-                    "absent", f"{store.path} is not used: {reason} at {width}x{height}; weights are computed"
-                )
-                return None
-            if (str(view), height, width) in self._asked:
-                self._say_once("renewed", _RENEWED.format(view=view))
-                return None
-            self._asked.add((str(view), height, width))
-            if named.fingerprint == fingerprint(image):
-                return named
-        else:
-            name = fingerprint(image)
-            entry = named if named is not None and named.fingerprint == name else None
-            entry = entry or store.find_image(name, height, width, self._config.spec)
-            if entry is not None:
-                return entry
-        if named is not None:
-            self._say_once("changed", _CHANGED.format(view=view))
-        elif view is not None:
-            self._say_once("absent", f"the store has no map of view {view!r} at {width}x{height}: computed instead")
-        return None
+        if self._misses >= _MISSES * len(store.entries):
+            return None  # targets that are new at each step, and a lookup waits for a device
+        entry = store.find_image(image, self._config.spec)
+        self._misses = 0 if entry is not None else self._misses + 1
+        if entry is None:
+            height, width = image.shape[1:]
+            named = "" if view is None else f" of view {view!r}"
+            self._say_once("absent", _ABSENT.format(store=store.path, view=named, width=width, height=height))
+        return entry
 
     def _open(self) -> Optional[WeightStore]:
         if not self._opened:

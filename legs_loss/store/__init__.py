@@ -10,7 +10,7 @@ leftover of a killed writer, and the next writer deletes it.
 
 from __future__ import annotations
 
-from legs_loss.store.fingerprints import fingerprint
+from legs_loss.store.fingerprints import fingerprint, sampled_fingerprint
 from legs_loss.store.manifest import MANIFEST, DamagedStoreError, Entry
 from legs_loss.store.maps import is_intact, read_map, stage
 from legs_loss.store.reading import Damage, WeightStore
@@ -26,5 +26,6 @@ __all__ = [
     "fingerprint",
     "is_intact",
     "read_map",
+    "sampled_fingerprint",
     "stage",
 ]

@@ -20,7 +20,7 @@ from legs_loss.system import read_regular
 __all__ = ["MANIFEST", "DamagedStoreError", "Entry", "is_map_name", "manifest_bytes", "read_manifest"]
 
 MANIFEST = "manifest.json"
-VERSION = 2  # 1 is written where no entry has what came with 2, so that older versions read it
+VERSION = 3  # 1 or 2 is written where no entry has what came later, so that older versions read it
 _LARGEST = 256 << 20  # bytes: some 500,000 entries
 _SIDE = 1 << 20  # pixels
 _FILE_NAME = re.compile(r"[0-9a-z_]+-[0-9a-f]{16}\.npy")
@@ -49,6 +49,7 @@ class Entry:
             made to be normalised over its scene.
         percentile: of the level ``strong``.
         median, strong: the view's levels (:mod:`legs_loss.levels`).
+        sample: of the training image (:func:`sampled_fingerprint`), "" from before version 3.
     """
 
     view: str
@@ -70,6 +71,7 @@ class Entry:
     percentile: Optional[float] = None
     median: Optional[float] = None
     strong: Optional[float] = None
+    sample: str = ""
 
     @property
     def key(self) -> Tuple[Any, ...]:
@@ -79,7 +81,8 @@ class Entry:
 
 _STRONGEST = 1e6  # response: images are in [0, 1]; weights of larger ones would overflow
 _LEVELS = ("low", "span", "percentile", "median", "strong")
-_ADDED = {"smooth": 0.0, **dict.fromkeys(_LEVELS)}  # by version 2, and what they are where they are not written
+# By which version, and what they are where they are not written.
+_ADDED = {"smooth": (2, 0.0), **dict.fromkeys(_LEVELS, (2, None)), "sample": (3, "")}
 
 
 def _is_level(value: Any) -> bool:
@@ -103,6 +106,7 @@ _FIELDS: Dict[str, Callable[[Any], bool]] = {
     "sha256": lambda value: type(value) is str and _CHECKSUM.fullmatch(value) is not None,
     "smooth": lambda value: type(value) is float and 0 <= value <= 100,
     **dict.fromkeys(_LEVELS, _is_level),
+    "sample": lambda value: type(value) is str,
 }
 
 
@@ -116,11 +120,11 @@ def manifest_bytes(entries: Iterable[Entry]) -> bytes:
     rows, version = [], 1
     for entry in sorted(entries, key=lambda entry: entry.key):
         values = dict(vars(entry), p=entry.p if math.isfinite(entry.p) else "inf")
-        for name, absent in _ADDED.items():
+        for name, (since, absent) in _ADDED.items():
             if values[name] == absent:
                 del values[name]
             else:
-                version = VERSION
+                version = max(version, since)
         rows.append(json.dumps(values, sort_keys=True, allow_nan=False))
     body = '"entries": [\n' + ",\n".join(rows) + f'\n],\n"version": {version}'
     return f'{{"checksum": "{hashlib.sha256(body.encode()).hexdigest()}",\n{body}}}\n'.encode()

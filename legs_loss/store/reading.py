@@ -14,6 +14,7 @@ from legs_loss.errors import LegsError
 from legs_loss.levels import scene_levels
 from legs_loss.scenes.model import view_names
 from legs_loss.spec import WeightSpec
+from legs_loss.store.fingerprints import fingerprint, sampled_fingerprint
 from legs_loss.store.leftovers import leftovers
 from legs_loss.store.manifest import MANIFEST, Entry, read_manifest
 from legs_loss.store.maps import is_intact, read_map
@@ -49,8 +50,9 @@ class WeightStore:
         self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
         self._by_image: Dict[Tuple[Any, ...], Entry] = {}
         for entry in self.entries.values():
-            image = (entry.fingerprint, *entry.key[1:])
-            self._by_image[image] = entry
+            for name in (entry.fingerprint, entry.sample):
+                image = (name, *entry.key[1:])
+                self._by_image[image] = entry
             for name in view_names(entry.view):
                 key = (name, *entry.key[1:])
                 self._by_name[key] = None if key in self._by_name else entry
@@ -69,9 +71,13 @@ class WeightStore:
         entry = self._by_name.get((view.replace("\\", "/"), height, width, *_made_with(spec)))
         return entry if entry is not None and self.fits(entry, spec) else None
 
-    def find_image(self, fingerprint: str, height: int, width: int, spec: WeightSpec) -> Optional[Entry]:
-        """Return the entry that was made from an image with a fingerprint, whatever its view is called, or None."""
-        entry = self._by_image.get((fingerprint, height, width, *_made_with(spec)))
+    def find_image(self, image: Tensor, spec: WeightSpec) -> Optional[Entry]:
+        """Return the entry that was made from an image [C, H, W], whatever its view is called, or None.
+
+        On the CPU every value of the image is compared; elsewhere a sample of them, which waits for the device.
+        """
+        name = fingerprint(image) if image.device.type == "cpu" else sampled_fingerprint(image)
+        entry = self._by_image.get((name, *image.shape[1:], *_made_with(spec)))
         return entry if entry is not None and self.fits(entry, spec) else None
 
     @staticmethod

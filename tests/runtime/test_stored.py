@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 
 from legs_loss import configure, l1_loss
-from legs_loss import store as store_module
 from legs_loss.kernels.available import is_capturing
 from legs_loss.precompute import precompute
 from legs_loss.runtime import counts, sources, state
 from legs_loss.scenes import read_scene
+from legs_loss.store import WeightStore, fingerprint, reading, sampled_fingerprint
 from tests.runtime.support import weighted
 
 
@@ -73,7 +73,7 @@ class TestStore:
             target = torch.roll(photograph(scene, "a.png"), shift, dims=2)
             torch.testing.assert_close(l1_loss(prediction, target, view="a"), weighted(prediction, target))
         assert (counts().stored, counts().computed) == (0, 2)
-        assert capsys.readouterr().err.count("is not the one that the stored map was made from") == 1
+        assert capsys.readouterr().err.count("has no map of the training image of view 'a' of 8x9") == 1
 
     def test_nor_for_another_size_or_finer_values_or_an_unknown_view(self, scene, capsys):
         configure("legs", store=scene / "legs_weights")
@@ -82,20 +82,33 @@ class TestStore:
         l1_loss(torch.rand(3, 8, 8, requires_grad=True), target[:, :8], view="a")
         l1_loss(torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8), view="z")
         assert (counts().stored, counts().computed) == (0, 3)
-        assert "no map of view 'a' at 8x8" in capsys.readouterr().err
+        assert capsys.readouterr().err.count("has no map of the training image of 8x9") == 1
 
-    def test_on_a_device_it_is_for_a_tensor_that_stays(self, scene, capsys, monkeypatch):
-        """To know a new one again would wait for the device at each step: it is said, and its weight is computed."""
+    def test_on_a_device_each_new_tensor_is_found_by_a_sample_of_its_values(self, scene, monkeypatch):
         configure("legs", store=scene / "legs_weights")
-        image, compared = photograph(scene, "a.png"), []
-        proven = store_module.fingerprint(image)
-        monkeypatch.setattr(store_module, "fingerprint", lambda target: compared.append(target) or proven)
+        image = photograph(scene, "a.png")
+        monkeypatch.setattr(reading, "sampled_fingerprint", lambda target: sampled_fingerprint(image))
         prediction, kept = torch.rand(3, 9, 8, device="meta", requires_grad=True), image.to("meta")
         for target in (kept, kept, image.to("meta"), image.to("meta")):
-            l1_loss(prediction, target, view="a")
-        assert (counts().stored, counts().remembered, counts().computed) == (1, 1, 2)
-        assert len(compared) == 1
-        assert capsys.readouterr().err.count("view 'a': its training image is another tensor than before") == 1
+            l1_loss(prediction, target)
+        assert (counts().stored, counts().remembered, counts().computed) == (3, 1, 0)
+
+    def test_a_store_without_the_targets_is_asked_twice_a_view(self, scene, monkeypatch):
+        configure("legs", store=scene / "legs_weights")
+        asked = []
+        monkeypatch.setattr(reading, "fingerprint", lambda target: asked.append(target) or fingerprint(target))
+
+        def step(target):
+            l1_loss(torch.rand(3, 9, 8, requires_grad=True), target)
+
+        for _ in range(5):
+            step(torch.rand(3, 9, 8))
+        step(photograph(scene, "a.png"))  # one is found, so the count begins anew
+        for _ in range(9):
+            step(torch.rand(3, 9, 8))
+        assert (len(asked), counts().stored, counts().computed) == (5 + 1 + 6, 1, 14)
+        step(photograph(scene, "b.png"))
+        assert len(asked) == 12 and counts().stored == 1
 
     def test_nor_for_another_operator(self, scene):
         configure("eggs", store=scene / "legs_weights")
@@ -118,6 +131,24 @@ class TestStore:
         l1_loss(torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8), view="a")
         assert counts().computed == 1
         assert "is not a store of weight maps" in capsys.readouterr().err
+
+
+class TestSampledFingerprint:
+    def test_it_is_stored_beside_the_whole_one(self, scene):
+        entries = WeightStore(scene / "legs_weights").entries.values()
+        for entry in entries:
+            image = photograph(scene, entry.view[len("images/") :])
+            assert (entry.fingerprint, entry.sample) == (fingerprint(image), sampled_fingerprint(image))
+        assert len({entry.sample for entry in entries}) == 3
+
+    def test_a_shift_another_size_or_a_changed_block_has_another(self):
+        image = torch.randint(0, 256, (3, 120, 160), generator=torch.Generator().manual_seed(0)).float() / 255
+        block = image.clone()
+        block[:, 40:52, 60:76] = 0.5  # a hundredth of the image
+        others = [image, image.roll(1, 2), image.roll(1, 1), block, image * 0.999, image[:, :119], image.flip(-1)]
+        assert len({sampled_fingerprint(other) for other in others}) == len(others)
+        eight_bit = (image * 255).round().byte().permute(1, 2, 0).numpy()
+        assert sampled_fingerprint(eight_bit) == sampled_fingerprint(image) == sampled_fingerprint(image.half())
 
 
 class TestCapture:

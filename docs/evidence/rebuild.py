@@ -1,10 +1,9 @@
-"""Rebuild the tables and plots of docs/evidence.md and of evidence/codebases.md from the rows beside this file.
+"""Rebuild the tables and plots of docs/evidence.md, and evidence/captures.md, from the rows beside this file.
 
-    python docs/evidence/rebuild.py                           # tables and plots, from the .json files beside it
+    python docs/evidence/rebuild.py                                       # from the .json files beside it
     python docs/evidence/rebuild.py --take OUT docs/evidence/NAME.json    # first: the rows of a `legs compare` folder
-    python docs/evidence/mean_weights.py SCENE docs/evidence/NAME_weights.json
 
-A table stands in the text between `<!-- NAME STUDY -->` and `<!-- end -->`.
+A table stands in the text between `<!-- NAMES -->` and `<!-- end -->`; TABLES says what it shows.
 """
 
 from __future__ import annotations
@@ -13,29 +12,60 @@ import json
 import re
 import sys
 from pathlib import Path
-from typing import Any, List, Tuple
+from typing import Any, List, Mapping, NamedTuple, Sequence, Tuple
 
-from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import read_rows
 from legs_loss.experiments.statistics import pooled_difference, summarise_all, times_gaussians
-from legs_loss.experiments.studies import STUDIES, Study
-from legs_loss.experiments.tables import (
-    DIFFERENCES,
-    difference_cell,
-    differences_table,
-    markdown,
-    paper_text,
-    scores_table,
-    times_cell,
-    with_values,
-)
-from legs_loss.reference.training.metrics import METRICS
+from legs_loss.experiments.tables import difference_cell, times_cell
 
 HERE = Path(__file__).resolve().parent
-TEXTS = (HERE.parent / "evidence.md", HERE / "codebases.md")
+TEXT = HERE.parent / "evidence.md"
 PICTURES = HERE.parent / "pictures"
-SCENES = ("fox", "embedded")
-DIGITS = 6
+FRESH = ("fresh_fern", "fresh_monstree", "fresh_kitchen")
+CANDIDATE = "percentile=99,normalise=mean,scale=0.6,error=1,curve=C1@3dgs"
+CODEBASES = {name: tuple(f"{scene}_{name}_200" for scene in ("fox", "fern", "kitchen")) for name in ("3dgs", "fastgs")}
+CODEBASES["mcmc"] = tuple(f"{scene}_mcmc_200" for scene in ("fox", "fern", "kitchen"))
+SCHEDULE = "fern_800_schedule"
+SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs@3dgs")
+COLOURS = ("#555555", "#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#ff7f0e")
+COLUMNS = {
+    "train PSNR": ("train", "psnr"),
+    "held-out PSNR": ("test", "psnr"),
+    "held-out SSIM": ("test", "ssim"),
+    "strongest 10%": ("test", "psnr_strong"),
+}
+
+
+class Table(NamedTuple):
+    """Differences of arms, each from another one, over captures with the same share each."""
+
+    captures: Tuple[str, ...]
+    pairs: Tuple[Tuple[str, str], ...]
+
+
+def _from_3dgs(*arms: str) -> Tuple[Tuple[str, str], ...]:
+    return tuple((arm, "3dgs") for arm in arms)
+
+
+_CONTROLS = (
+    *_from_3dgs("eggs", "legs-l", "legs", "legs:scale", "legs:shuffled", "legs:mean1"),
+    ("3dgs@legs", "legs"),
+    *_from_3dgs("legs@3dgs", "legs:mean1@3dgs"),
+)
+_CODEBASE = (*_from_3dgs("eggs", "legs-l", "legs", "legs:scale"), ("3dgs@legs", "legs"))
+_CURVES = _from_3dgs("legs", "C5", "legs-l", "C4", "C2")
+_ROBUST = (*_from_3dgs("legs", "legs-robust"), ("legs-robust", "legs"), *_from_3dgs("legs-robust@3dgs"))
+TABLES: Mapping[str, Table] = {
+    "fox": Table(("fox",), _CONTROLS),
+    "embedded": Table(("embedded",), _CONTROLS),
+    "codebase-3dgs": Table(CODEBASES["3dgs"], _CODEBASE),
+    "codebase-fastgs": Table(CODEBASES["fastgs"], _CODEBASE),
+    "codebase-mcmc": Table(CODEBASES["mcmc"], _CODEBASE[:-1]),
+    "curves": Table(("fox",), _CURVES),
+    "preregistered": Table(FRESH, ((CANDIDATE, "3dgs"),)),
+    "degraded-fox": Table(("degraded_fox",), _ROBUST),
+    "degraded-embedded": Table(("degraded_embedded",), _ROBUST),
+}
 
 
 def take(out: Path, path: Path) -> None:
@@ -44,107 +74,173 @@ def take(out: Path, path: Path) -> None:
     settings.pop("path")
     for row in rows:
         row.get("upstream", {}).pop("pictures", None)
-        for scores in row["metrics"]["views"]["train"].values():
-            for name in [key for key, metric in METRICS.items() if "train" not in metric.splits]:
-                scores.pop(name, None)  # of rows that scored training views with it too
     lines = ",\n".join(json.dumps(_rounded(row), separators=(",", ":")) for row in rows)
     path.write_text(f'{{"settings":{json.dumps(settings)},"rows":[\n{lines}\n]}}\n', encoding="utf-8")
 
 
-def tables(text: str) -> str:
-    """Return the text with every table made anew."""
+def differences(table: Table) -> str:
+    """Return a table of differences with their intervals; ? marks what is not clear."""
+    scenes = [rows_of(capture) for capture in table.captures]
+    lines = []
+    for arm, reference in table.pairs:
+        found = [pooled_difference(scenes, arm, reference, *metric) for metric in COLUMNS.values()]
+        cells = [difference_cell(one, metric[1]) for one, metric in zip(found, COLUMNS.values())]
+        times = [times_cell(times_gaussians(rows, arm, reference) or 1.0) for rows in scenes]
+        name = "the candidate@3dgs" if arm == CANDIDATE else arm
+        lines.append([f"{name} − {reference}", *cells, ", ".join(dict.fromkeys(times))])
+    return compact(["difference", *COLUMNS, "Gaussians"], lines)
 
-    def table(match: re.Match[str]) -> str:
-        if match.group(2) == "weights":
-            return f"<!-- {match.group(1)} weights -->\n\n{_weights(match.group(1))}\n\n<!-- end -->"
-        scene, study = match.group(1), STUDIES[match.group(2)]
-        if "+" in scene:
-            return f"<!-- {scene} {match.group(2)} -->\n\n{_pooled(scene.split('+'), study)}\n\n<!-- end -->"
-        rows = _rows(scene)
-        trained = {row["arm"] for row in rows}
-        study = study._replace(arms=tuple(arm for arm in study.arms if parse_arm(arm).name in trained))
-        parts = [scores_table(rows, study.arms), differences_table(rows, study)]
-        if study.paper:
-            parts.append(paper_text(rows, study).partition("\n\n")[2])
-        return f"<!-- {scene} {match.group(2)} -->\n\n" + "\n\n".join(parts) + "\n\n<!-- end -->"
 
-    return re.sub(r"<!-- ([\w+]+) ([\w-]+) -->.*?<!-- end -->", table, text, flags=re.DOTALL)
+def schedule() -> str:
+    """Return the scores by 3DGS's own schedule, at the iterations that every arm of the first three has reached."""
+    rows = {(row["arm"], row["iteration"]): row for row in rows_of(SCHEDULE)}
+    lines = []
+    for iteration in (1000, 2000, 3000, 4000, 5000, 6000, 7000):
+        for arm in SCHEDULE_ARMS:
+            if (arm, iteration) in rows:
+                row = rows[arm, iteration]["metrics"]
+                train, test = row["train"], row["test"]
+                scores = [f"{train['psnr']:.2f}", f"{train['ssim']:.3f}", f"{test['psnr']:.2f}", f"{test['ssim']:.3f}"]
+                count = f"{row['gaussians']:,}"
+                lines.append([f"{iteration:,}", arm, *scores, f"{test['psnr_strong']:.2f}", count])
+    heads = ["iteration", "arm", "train PSNR", "SSIM", "held-out PSNR", "SSIM", "strongest 10%", "Gaussians"]
+    return compact(heads, lines)
+
+
+def compact(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table without padding; numbers stand to the right."""
+    rule = ["---"] + ["---:"] * (len(heads) - 1)
+    return "\n".join(f"|{'|'.join(cells)}|" for cells in (heads, rule, *lines))
+
+
+def captures() -> str:
+    """Return the page of all captures: each arm's mean scores."""
+    parts = [
+        "# Every capture, every arm",
+        "Made from the rows beside this page by `python docs/evidence/rebuild.py`. Means over seeds; PSNR in dB; "
+        "*strong* is the PSNR of the strongest 10% of held-out pixels. What follows from them: "
+        "[evidence.md](../evidence.md). Arms that no longer exist (`fading`, `growing`, `multiscale`, `half`, `ssim`, "
+        "`error`, `scale=`) and the studies with degraded views are trained by commit b401bbf.",
+    ]
+    for path in sorted(HERE.glob("*.json")):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if "settings" not in found or path.stem == SCHEDULE:
+            continue
+        base, scene, by = found["settings"]["base"], found["settings"]["scene"], found["settings"].get("upstream")
+        trainer = f"by the script of {by['profile']}" if by else "by the package's trainer"
+        views = f"{scene['name']}, {scene['views']} photographs, `-r {base['resolution']}`"
+        parts.append(
+            f"## {path.stem}\n\n{views}, {base['iterations']:,} iterations, {trainer}.\n\n{_scores(found['rows'])}"
+        )
+    return "\n\n".join(parts) + "\n"
+
+
+def _scores(rows: List[Any]) -> str:
+    lines = []
+    for summary in summarise_all(rows, sorted({row["arm"] for row in rows}, key=_order)):
+        mean = summary.mean
+        psnr = [f"{mean['train PSNR']:.2f}", f"{mean['train SSIM']:.4f}", f"{mean['held-out PSNR']:.2f}"]
+        rest = [f"{mean['held-out SSIM']:.4f}", f"{mean['strongest 10%']:.2f}", f"{mean['Gaussians']:,.0f}"]
+        lines.append([f"`{summary.arm}`", *psnr, *rest, str(summary.seeds)])
+    return compact(["arm", "train", "SSIM", "held-out", "SSIM", "strong", "Gaussians", "seeds"], lines)
+
+
+def _order(arm: str) -> Tuple[int, str]:
+    first = ("3dgs", "eggs", "legs-l", "legs")
+    return (first.index(arm) if arm in first else len(first), arm)
 
 
 def plots() -> None:
-    """Draw PSNR by Gaussians of each scene, with the arms' names at their points."""
+    """Draw PSNR by Gaussians, the codebases' differences, the curves, and the scores over 3DGS's schedule."""
     from matplotlib.figure import Figure
 
     figure: Any = Figure(figsize=(11, 8.4), constrained_layout=True)
-    grid = figure.subplots(len(SCENES), 2)
-    arms = list(dict.fromkeys(parse_arm(arm).name for name in ("main", "controls") for arm in STUDIES[name].arms))
-    for panels, scene in zip(grid, SCENES):
-        found = summarise_all(_rows(scene), arms)
+    grid = figure.subplots(2, 2)
+    arms = ("3dgs", *dict.fromkeys(arm for arm, _ in _CONTROLS))
+    for panels, scene in zip(grid, ("fox", "embedded")):
+        found = summarise_all(rows_of(scene), arms)
         for panel, score in zip(panels, ("train PSNR", "held-out PSNR")):
             values = [summary.mean[score] for summary in found]
-            line = 0.045 * (max(values) - min(values))  # a label's height, in dB
+            line = 0.05 * (max(values) - min(values))  # a label's height, in dB
             labels: List[Tuple[float, float]] = []  # places of those that are written
             for summary in sorted(found, key=lambda one: one.mean[score]):
                 x, y = summary.mean["Gaussians"] / 1000, summary.mean[score]
-                plain = parse_arm(summary.arm).spec.beta == 0
-                colour = "#555555" if plain else "#d62728" if summary.arm == "legs" else "#1f77b4"
-                panel.errorbar(x, y, summary.spread[score], fmt="s" if plain else "o", color=colour, markersize=6)
                 at = max([y] + [below + line for beside, below in labels if abs(beside - x) < 10])
                 labels.append((x, at))
+                plain = summary.arm.startswith("3dgs")
+                colour = "#555555" if plain else "#d62728" if summary.arm == "legs" else "#1f77b4"
+                panel.errorbar(x, y, summary.spread[score], fmt="s" if plain else "o", color=colour, markersize=6)
                 panel.annotate(f"  {summary.arm}", (x, at), fontsize=9, color=colour, va="center")
             panel.set(xlabel="thousand Gaussians", ylabel=f"{score}, dB", title=scene)
             panel.margins(x=0.25, y=0.12)
             panel.grid(alpha=0.3)
-    figure.savefig(str(PICTURES / "evidence_gaussians.png"), dpi=110, facecolor="white")
+    _save(figure, "evidence_gaussians.png")
+
+    figure = Figure(figsize=(11, 3.4), constrained_layout=True)
+    for panel, (name, label) in zip(
+        figure.subplots(1, 3, sharex=True), (("3dgs", "3DGS"), ("fastgs", "FastGS"), ("mcmc", "3DGS-MCMC"))
+    ):
+        table = TABLES[f"codebase-{name}"]
+        scenes = [rows_of(capture) for capture in table.captures]
+        for place, (arm, reference) in enumerate(reversed(table.pairs)):
+            for offset, colour, metric in ((0.15, "#1f77b4", "train PSNR"), (-0.15, "#d62728", "held-out PSNR")):
+                one = pooled_difference(scenes, arm, reference, *COLUMNS[metric])
+                assert one is not None
+                panel.plot([one.low, one.high], [place + offset] * 2, color=colour, linewidth=2)
+                panel.plot(one.mean, place + offset, "o", color=colour, label=metric if place == 0 else None)
+        panel.set_yticks(range(len(table.pairs)), [f"{arm} − {to}" for arm, to in reversed(table.pairs)], fontsize=9)
+        panel.axvline(0, color="#999999", linewidth=1)
+        panel.set(title=label, xlabel="dB")
+        panel.grid(alpha=0.3)
+    figure.axes[-1].legend(fontsize=8, loc="center right")
+    _save(figure, "evidence_codebases.png")
+
+    rows = rows_of(SCHEDULE)
+    figure = Figure(figsize=(11, 3.4), constrained_layout=True)
+    scores = {"train PSNR": ("train", "psnr"), "held-out PSNR": ("test", "psnr"), "held-out SSIM": ("test", "ssim")}
+    for panel, (label, (split, key)) in zip(figure.subplots(1, 3), scores.items()):
+        for arm, colour in zip(SCHEDULE_ARMS, COLOURS):
+            points = [(row["iteration"], row["metrics"][split][key]) for row in rows if row["arm"] == arm]
+            if points:
+                panel.plot(*zip(*sorted(points)), marker="o", markersize=4, color=colour, label=arm)
+        panel.set(xlabel="iteration of 30,000", title=label)
+        panel.grid(alpha=0.3)
+    figure.axes[0].legend(fontsize=8)
+    _save(figure, "evidence_schedule.png")
 
 
-def _pooled(scenes: List[str], study: Study) -> str:
-    """Each arm's differences over several scenes, each with the same share."""
-    rows = [_rows(scene) for scene in scenes]
-    lines = []
-    for arm in study.arms:
-        name, reference = parse_arm(arm).name, study.reference(parse_arm(arm).name)
-        found = [pooled_difference(rows, name, reference or name, *place) for place in DIFFERENCES.values()]
-        if reference is not None and found[0] is not None:
-            cells = [difference_cell(each, key) for each, (_, key) in zip(found, DIFFERENCES.values())]
-            times = [times_cell(times_gaussians(one, name, reference) or 1.0) for one in rows]
-            lines.append([f"{name} − {reference}", *cells, ", ".join(times) if len(set(times)) > 1 else times[0]])
-    return markdown(*with_values([f"over {len(scenes)} captures", *DIFFERENCES, "Gaussians"], lines))
+def _save(figure: Any, name: str) -> None:
+    # Without the version of matplotlib in it, so that drawing it again changes no byte.
+    figure.savefig(str(PICTURES / name), dpi=110, facecolor="white", metadata={"Software": None})
 
 
-def _weights(scene: str) -> str:
-    """Mean weights of degraded photographs, measured by mean_weights.py."""
-    measured = json.loads((HERE / f"{scene}_weights.json").read_text(encoding="utf-8"))
-    arms = list(measured["rows"][0]["mean"])
-    lines = [
-        [row["photograph"], *(f"{row['mean'][arm]:.2f} ({row['rises'][arm]} of {measured['views']})" for arm in arms)]
-        for row in measured["rows"]
-    ]
-    return markdown(["one photograph of the scene", *(f"{arm}: mean weight (of which it rose)" for arm in arms)], lines)
-
-
-def _rows(scene: str) -> List[Any]:
-    return json.loads((HERE / f"{scene}.json").read_text(encoding="utf-8"))["rows"]
+def rows_of(capture: str) -> List[Any]:
+    """Return a capture's rows."""
+    return json.loads((HERE / f"{capture}.json").read_text(encoding="utf-8"))["rows"]
 
 
 def _rounded(value: Any) -> Any:
     if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}")
+        return float(f"{value:.6g}")
     if isinstance(value, dict):
         return {name: _rounded(one) for name, one in value.items()}
-    if isinstance(value, list):
-        return [_rounded(one) for one in value]
-    return value
+    return [_rounded(one) for one in value] if isinstance(value, list) else value
 
 
 def main(words: List[str]) -> None:
     """Take the files that --take names, then rebuild."""
     while words[:1] == ["--take"]:
-        taken: Tuple[str, ...] = tuple(words[1:3])
-        take(Path(taken[0]), Path(taken[1]))
+        take(Path(words[1]), Path(words[2]))
         words = words[3:]
-    for text in TEXTS:
-        text.write_text(tables(text.read_text(encoding="utf-8")), encoding="utf-8")
+
+    def table(match: re.Match[str]) -> str:
+        name = match.group(1)
+        body = schedule() if name == "schedule" else differences(TABLES[name])
+        return f"<!-- {name} -->\n\n{body}\n\n<!-- end -->"
+
+    text = re.sub(r"<!-- ([\w-]+) -->.*?<!-- end -->", table, TEXT.read_text(encoding="utf-8"), flags=re.DOTALL)
+    TEXT.write_text(text, encoding="utf-8")
+    (HERE / "captures.md").write_text(captures(), encoding="utf-8")
     plots()
 
 

@@ -3,8 +3,9 @@
     python reproduce.py --inria gaussian-splatting --fastgs FastGS --nerficg nerficg --data datasets --dry-run
 
 DATA holds tanksandtemples/{truck,train} and mipnerf360/{bicycle,...}. Each codebase and scene is one `legs compare
---upstream`, with the codebase's own official settings: the four losses, the L1 scaled, and the unweighted codebase at
-LEGS's number of Gaussians, over several seeds. The paper scores training views: this scores them and those held out.
+--upstream`, with the codebase's own official settings: the four losses, LEGS's maps of mean 1, and the unweighted
+codebase at LEGS's number of Gaussians, over several seeds. The paper scores training views: this scores them and those
+held out.
 The same command goes on after an interruption. --dry-run prints every command and runs none.
 """
 

@@ -277,3 +277,12 @@ def test_a_real_capture(fox: Path) -> None:
     assert plain["test"]["psnr"] > 25
     assert legs["gaussians"] > 1.3 * plain["gaussians"]
     assert legs["test"]["psnr_strong"] > plain["test"]["psnr_strong"]
+
+
+def test_a_run_may_stop_at_a_milestone_and_go_on(scene: Scene, tmp_path: Path) -> None:
+    whole = train(scene, SHORT)
+    part = train(scene, SHORT, out=tmp_path, stop=29)
+    assert part.metrics["iterations"] == 29
+    assert not list(tmp_path.rglob("*.ply"))
+    rest = train(scene, SHORT, out=tmp_path, resume=True)
+    assert_equal(rest.gaussians, whole.gaussians)

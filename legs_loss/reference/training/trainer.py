@@ -90,6 +90,7 @@ def train(
     on_progress: Optional[Callable[[Progress], None]] = None,
     caps: Optional[Mapping[int, int]] = None,
     evaluate_every: Optional[int] = None,
+    stop: Optional[int] = None,
 ) -> Result:
     """Train 3D Gaussians on a scene.
 
@@ -109,6 +110,7 @@ def train(
             experiments. A resumed run needs the same ``weights`` and ``caps``.
         evaluate_every: score the held-out views every so many iterations into ``metrics["history"]``, outside of the
             run's time; None: only at the end.
+        stop: end after this iteration of the schedule; the run goes on from its checkpoint when it is resumed.
 
     Raises:
         LegsError: the scene cannot be trained on, numba is missing, the checkpoint does not fit, another training
@@ -134,10 +136,11 @@ def train(
             _write_json(folder / "cfg.json", config.as_dict())
             if not resume:
                 run.save(folder / CHECKPOINT)
-        run.go(folder, checkpoint_every, on_progress)
+        run.go(folder, checkpoint_every, on_progress, min(stop or config.iterations, config.iterations))
         metrics = run.metrics()
         if folder is not None:
-            write_ply(point_cloud(folder, config), run.adam.gaussians)
+            if run.iteration == config.iterations:
+                write_ply(point_cloud(folder, config), run.adam.gaussians)
             _write_json(folder / "metrics.json", metrics)
         return Result(run.adam.gaussians, metrics)
 
@@ -210,17 +213,21 @@ class _Run:
         write_checkpoint(path, arrays, facts)
 
     def go(
-        self, folder: Optional[Path], checkpoint_every: int, on_progress: Optional[Callable[[Progress], None]]
+        self,
+        folder: Optional[Path],
+        checkpoint_every: int,
+        on_progress: Optional[Callable[[Progress], None]],
+        stop: int,
     ) -> None:
-        """Run to the last iteration."""
+        """Run to the last iteration, or to ``stop``."""
         started = _clocks() - self.clocks
         with noted() as interrupted:  # not between two dependent updates
-            while self.iteration < self.config.iterations:
+            while self.iteration < stop:
                 self.step()
                 self.clocks = _clocks() - started - self.scoring
-                last = self.iteration == self.config.iterations
-                if on_progress is not None and (last or self.iteration % 10 == 0):
-                    assert self.loss is not None and self.psnr is not None
+                last = self.iteration == stop
+                due = last or self.iteration % 10 == 0
+                if on_progress is not None and due and self.loss is not None and self.psnr is not None:
                     on_progress(Progress(self.iteration, self.loss, self.psnr, len(self.adam.gaussians)))
                 if folder is not None and (last or interrupted() or self.iteration % checkpoint_every == 0):
                     self.save(folder / CHECKPOINT)

@@ -22,7 +22,7 @@ def load(folder):
 
 build = load(DATA)
 ROWS = build.corpus()
-COLUMNS = ["codebase", "commit", "kind", "round", "known", "first", "now", "sites", "view", "note"]
+COLUMNS = ["codebase", "commit", "kind", "round", "known", "first", "now", "sites", "view", "rules", "note"]
 
 
 @pytest.fixture
@@ -85,6 +85,7 @@ class TestRows:
             assert row["known"] in ("", "yes"), row
             assert bool(row["first"]) == (row["round"] != "0"), row
             assert row["sites"], row
+            assert re.fullmatch(r"(([a-z-]+)( [a-z-]+)*)?", row["rules"]), row
         assert len({row["codebase"].lower() for row in ROWS}) == len(ROWS)
 
     def test_what_was_not_right_has_a_note(self):

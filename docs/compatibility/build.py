@@ -1,4 +1,4 @@
-"""Write docs/compatibility.md from corpus.csv, rounds.csv and page.txt; every figure on the page is counted here.
+"""Write docs/compatibility.md from the csv files beside this script and page.txt; every figure on it is counted here.
 
 python docs/compatibility/build.py            # write the page
 python docs/compatibility/build.py --check    # exit 1 if the page is not what the data says
@@ -89,6 +89,18 @@ def round_table(blind):
     return "\n".join(lines)
 
 
+def parts_that_decide(kind):
+    """Return the parts of a kind without which some site differs, each with the number of codebases where."""
+    rows = [row for row in read("parts.csv") if row["kind"] == kind and row["decides"] != "0"]
+    return ", ".join(f"`{row['name']}` {row['decides']}" for row in rows)
+
+
+def parts_that_do_not(*kinds):
+    """Return the parts of these kinds without which no site differs."""
+    rows = [row for row in read("parts.csv") if row["kind"] in kinds and row["decides"] == "0"]
+    return ", ".join(f"`{row['name']}`" for row in rows)
+
+
 def figures():
     """Return every figure and list of the page, counted from the rows."""
     rows = corpus()
@@ -127,6 +139,14 @@ def figures():
         "missed_now": failed["missed"],
         "error_count": now["error"],
         "error_now": failed["error"],
+        "planned": sum(row["rules"] != "" for row in rows),
+        "ablated": read("parts.csv")[0]["of"],
+        "deciding_rules": parts_that_decide("rule"),
+        "deciding_forms": parts_that_decide("form"),
+        "deciding_readers": parts_that_decide("reader"),
+        "deciding_words": parts_that_decide("words"),
+        "idle": parts_that_do_not("rule", "form", "reader"),
+        "idle_words": parts_that_do_not("words").count(",") + 1,
         "kinds": ", ".join(f"{kind} {count}" for kind, count in Counter(row["kind"] for row in rows).most_common()),
     }
 

@@ -3,9 +3,13 @@
     pip install nvidia-cuda-nvrtc-cu12 nvidia-cuda-nvrtc     # the compilers of CUDA 12 and 13
     python -m benchmarks --parts cuda-compile
 
+With nvdisasm beside it (`pip install nvidia-cuda-nvdisasm`) the instructions that a warp executes for 32 values are
+counted (cuda_instructions.py), for NVRTC 12 and sm_89 and sm_90, against the budget there.
+
 Each NVRTC that lies in a package named nvidia is used, for the GPUs that it knows. A stack is counted too: an array
 that is indexed at run time lies in memory though nothing is spilled. Exit status 1 where a kernel has a spill, a stack
-or more than 48 kB of shared memory, which not every GPU has; 2 where there is no compiler.
+or more than 48 kB of shared memory, which not every GPU has, or is above its budget of instructions; 2 where there is
+no compiler.
 """
 
 from __future__ import annotations
@@ -17,8 +21,9 @@ import statistics
 import sys
 import time
 from pathlib import Path
-from typing import Any, Dict, List, Tuple
+from typing import Any, Dict, List, Sequence, Tuple
 
+from benchmarks import cuda_instructions
 from legs_loss.kernels.cuda.backend import NORMS, STENCILS, VALUES
 from legs_loss.kernels.cuda.modules import Variant, options, source
 from legs_loss.kernels.cuda.nvrtc import Compiler, NotFound, find_compiler, resources
@@ -49,10 +54,27 @@ def main() -> int:
     bad = [row for row in rows if row["spills"] or row["stack"] or row["shared"] > MOST_SHARED]
     for row in bad:
         print(f"BAD {row}")
+    counts, above = instructions(compilers, args.architectures)
+    for name in above:
+        print(f"ABOVE ITS BUDGET {name}")
     print(f"{len(rows)} kernels of {len(chosen)} variants, {len(bad)} with a spill, a stack or over 48 kB")
     if args.json:
-        Path(args.json).write_text(json.dumps({"kernels": rows}) + "\n", encoding="utf-8")
-    return 1 if bad else 0
+        Path(args.json).write_text(json.dumps({"kernels": rows, "instructions": counts}) + "\n", encoding="utf-8")
+    return 1 if bad or above else 0
+
+
+def instructions(compilers: List[Compiler], architectures: Sequence[int]) -> Tuple[Dict[str, Any], List[str]]:
+    """Count the instructions of the GPUs that :mod:`cuda_instructions` knows; return the counts, and what is above."""
+    nvdisasm = cuda_instructions.disassembler()
+    if nvdisasm is None:
+        print("there is no nvdisasm here: pip install nvidia-cuda-nvdisasm")
+        return {}, []
+    counts, above = {}, []
+    for compiler in (each for each in compilers if each.version.startswith("12.")):
+        for architecture in sorted({89, 90} & set(architectures)):
+            counts[f"sm_{architecture}"], over = cuda_instructions.report(compiler, architecture, nvdisasm)
+            above += over
+    return counts, above
 
 
 def found_compilers() -> List[Compiler]:

@@ -39,6 +39,7 @@ static inline To same_bits(From from) {
 }
 static inline float as_float(unsigned bits) { return same_bits<float>(bits); }
 static inline unsigned as_bits(float value) { return same_bits<unsigned>(value); }
+static inline float reciprocal(float x) { return 1.f / x; }
 static inline float half_to_float(unsigned short bits) { return (float)same_bits<_Float16>(bits); }
 static inline unsigned short float_to_half(float value) { return same_bits<unsigned short>((_Float16)value); }
 

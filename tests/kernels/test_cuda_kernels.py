@@ -335,9 +335,7 @@ class TestSelection:
         assert used(ssim(prediction, target, channels_last=channels_last)) == "fused"
         state.reset()
 
-    @pytest.mark.parametrize(
-        "changes", [{"percentile": 90.0}, {"normalise": "mean"}, {"scale": 0.6}, {"curve": "test-cube"}]
-    )
+    @pytest.mark.parametrize("changes", [{"percentile": 90.0}, {"normalise": "mean"}, {"curve": "test-cube"}])
     def test_specs_that_it_does_not_know_get_torchs_map(self, chosen, changes):
         if "curve" in changes:
             with contextlib.suppress(LegsError):  # registered by an earlier run of this test

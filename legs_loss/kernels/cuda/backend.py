@@ -68,7 +68,7 @@ class Task(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("prediction", "target", "gradient", "scaled", "step", "partial")),
-        *((name, ctypes.c_void_p) for name in ("result", "map", "mask", "covered", "range")),
+        *((name, ctypes.c_void_p) for name in ("result", "map", "mask", "covered", "range", "response")),
         *((name, Layout) for name in ("of_prediction", "of_target", "of_gradient")),
         *((name, ctypes.c_longlong) for name in ("map_view", "mask_view", "count")),
         *((name, ctypes.c_int) for name in ("views", "channels", "height", "width", "strip", "curve", "chunks")),
@@ -106,7 +106,7 @@ class CudaBackend(Backend):
 
     def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
         """Return each view's least response and the span."""
-        return self._of(target).response_range(_batch(target.detach()), spec)
+        return self._of(target).response_range(_batch(target.detach()), spec)[0]
 
     def loss(self, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
         """Return the whole loss."""
@@ -178,8 +178,11 @@ class _Device:
 
         return differentiable(prediction, (target, weights.map, weights.mask, weights.range), compute, scale)
 
-    def response_range(self, y: Tensor, spec: WeightSpec) -> Tensor:
-        """Return the least response of each view of [B, C, H, W], and the greatest less the least: float32 [B, 2]."""
+    def response_range(self, y: Tensor, spec: WeightSpec, kept: bool = False) -> Tuple[Tensor, Optional[Tensor]]:
+        """Return the least response of each view of [B, C, H, W], and the greatest less the least: float32 [B, 2].
+
+        With ``kept`` the response of every pixel, too: float32 [B, H, W].
+        """
         key = (y.shape, y.stride(), y.dtype, spec)
         plan = self._plans.get(key)
         if plan is None:
@@ -189,9 +192,14 @@ class _Device:
         partial = torch.empty(3 * task.count, dtype=torch.float32, device=y.device)
         result = torch.empty((y.shape[0], 2), dtype=torch.float32, device=y.device)
         task.target, task.partial, task.result = y.data_ptr(), partial.data_ptr(), result.data_ptr()
+        response = None
+        if kept:
+            views, _, height, width = y.shape
+            response = torch.empty((views, height, width), dtype=torch.float32, device=y.device)
+            task.response = response.data_ptr()
         self._launch(plan.own, plan.blocks, THREADS, task)
         self._launch(plan.finish, y.shape[0], THREADS, task)
-        return result
+        return result, response
 
     def _loss_and_gradient(
         self, x: Tensor, y: Tensor, weights: Weights, shares: Shares, wanted: bool
@@ -204,7 +212,7 @@ class _Device:
         x, y = (images.contiguous() if copied else images for images, copied in zip((x, y), plan.copies))
         task = Task.from_buffer_copy(plan.task)
         # These must live until the launch; the allocator keeps the order of one stream.
-        held = self._add_weights(task, y, weights, spec) if shares.l1 else []
+        held = self._add_weights(task, y, weights, spec, streams=shares.ssim != 0.0) if shares.l1 else []
         gradient = None
         if plan.gradient is not None:
             gradient = torch.empty_strided(x.shape, plan.gradient, dtype=torch.float32, device=x.device)
@@ -218,29 +226,46 @@ class _Device:
         del held
         return loss, gradient
 
-    def _add_weights(self, task: Task, y: Tensor, weights: Weights, spec: Optional[WeightSpec]) -> List[Tensor]:
-        held = []
+    def _add_weights(
+        self, task: Task, y: Tensor, weights: Weights, spec: Optional[WeightSpec], streams: bool
+    ) -> List[Tensor]:
+        """Set a task's weights, for the streaming pass as one map that is made here; return the memory they are in."""
+        held, response = [], None
+        views, _, height, width = y.shape
         if spec is not None:
-            found = weights.range if weights.range is not None else self.response_range(y, spec)
+            found = weights.range
+            if found is None or streams:
+                made, response = self.response_range(y, spec, streams)
+                found = made if found is None else found
             found = found.to(device=y.device, dtype=torch.float32).contiguous()
-            if found.shape != (y.shape[0], 2):
+            if found.shape != (views, 2):
                 raise ValueError(f"a range {list(found.shape)} does not fit images {list(y.shape)}")
             task.range = found.data_ptr()
             held.append(found)
-        pixels = y.shape[2] * y.shape[3]
+            if response is not None:
+                task.response = response.data_ptr()
+                held.append(response)
         for name, values in (("map", weights.map), ("mask", weights.mask)):
             if values is None:
                 continue
             values = values.detach().to(torch.float32).contiguous()
-            if values.numel() not in (pixels, pixels * y.shape[0]):
+            if values.numel() not in (height * width, views * height * width):
                 raise ValueError(f"a {name} {list(values.shape)} does not fit images {list(y.shape)}")
             setattr(task, name, values.data_ptr())
-            setattr(task, f"{name}_view", pixels if values.numel() > pixels else 0)
+            setattr(task, f"{name}_view", height * width if values.numel() > height * width else 0)
             held.append(values)
             if name == "mask" and weights.renormalise:
                 covered = values.mean()
                 task.covered = covered.data_ptr()
                 held.append(covered)
+        if streams and (response is not None or (task.map and task.mask)):
+            made = torch.empty((views, height, width), device=y.device) if response is None else response
+            task.result, task.chunks = made.data_ptr(), chunks_of(y, self._modules.driver.multiprocessors)
+            self._launch(self._modules.function("legs_weights", PLAIN), task.chunks * views, THREADS, task)
+            task.map, task.map_view = made.data_ptr(), height * width
+            held.append(made)
+        elif streams and task.mask:
+            task.map, task.map_view = task.mask, task.mask_view
         return held
 
     def _scaled(self, gradient: Tensor, step: Tensor, dtype: torch.dtype) -> Tensor:
@@ -260,9 +285,8 @@ class _Device:
         return plan
 
     def _plan_of_loss(self, x: Tensor, y: Tensor, spec: Optional[WeightSpec], shares: Shares, wanted: bool) -> _Plan:
-        modules, plain = self._modules, variant_of(x.dtype, None)
-        variant = variant_of(x.dtype, spec)
-        modules.load(variant, plain, PLAIN)  # backward's too, which a capture may contain alone
+        modules, plain, weighted = self._modules, variant_of(x.dtype, None), variant_of(x.dtype, spec)
+        modules.load(weighted, plain, PLAIN)  # backward's too, which a capture may contain alone
         copies = (not _is_addressable(x), not _is_addressable(y))
         task = _task_of(x, spec)
         task.of_prediction = _layout_of(x.contiguous() if copies[0] else x)
@@ -279,6 +303,7 @@ class _Device:
             dense = torch.empty_like(x, dtype=torch.float32)
             dense = dense if _is_addressable(dense) else dense.contiguous()
             task.of_gradient, strides = _layout_of(dense), dense.stride()
+        variant = weighted if term == "l1" else plain
         own = modules.function(f"legs_{term}_{'gradient' if wanted else 'value'}", variant)
         return _Plan(own, modules.function("legs_finish", PLAIN), blocks, task, copies, strides)
 

@@ -31,6 +31,11 @@ DEVICE unsigned short float_to_half(float value) {
     asm("cvt.rn.f16.f32 %0, %1;" : "=h"(bits) : "f"(value));
     return bits;
 }
+DEVICE float reciprocal(float x) {  // to the last bit or its neighbour; no path for subnormal numbers
+    float y;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return fmaf(y, fmaf(-x, y, 1.f), y);
+}
 DEVICE float as_float(unsigned bits) { return __uint_as_float(bits); }
 DEVICE unsigned as_bits(float value) { return __float_as_uint(value); }
 #endif
@@ -74,6 +79,7 @@ struct Task {
     const float* mask;     // the same
     const float* covered;  // the mask's mean, where the L1 is divided by it
     const float* range;    // [views, 2]: the least response, the greatest less the least
+    float* response;       // [views, height, width], of the range pass; in its place the weights of the streaming pass
     Layout of_prediction, of_target, of_gradient;
     long long map_view, mask_view;  // strides between views, 0 for one map for all
     long long count;                // values (scale); blocks whose sums are to be added (finish)
@@ -164,6 +170,7 @@ DEVICE float response(const Task& k, const Value* view, int row, int column) {
 #endif
     return strength + poison;
 }
+#endif
 
 DEVICE float curve(int which, float x) {
     if (which == 1) return x;
@@ -177,40 +184,46 @@ DEVICE float curve(int which, float x) {
     const float y = 0.5f - sine;
     return y < 0.f ? 0.f : (y > 1.f ? 1.f : y);
 }
-#endif
 
 // What the weights of one view share.
 struct Weights {
     const float* map;
     const float* mask;
-#if STENCIL
     const Value* target;
+    const float* response;
     float low, scale;
-#endif
 };
 
 DEVICE Weights weights_of(const Task& k, long long view) {
     Weights w;
     w.map = k.map ? k.map + view * k.map_view : 0;
     w.mask = k.mask ? k.mask + view * k.mask_view : 0;
-#if STENCIL
     w.target = plane_of(k.target, k.of_target, view, 0);
-    const float span = k.range[2 * view + 1];
-    w.low = k.range[2 * view];
-    w.scale = span == 0.f ? 0.f : 1.f / (span + k.eps);  // a NaN is not equal to 0
-#endif
+    w.response = k.response ? k.response + view * k.height * k.width : 0;
+    w.low = w.scale = 0.f;
+    if (k.range) {
+        const float span = k.range[2 * view + 1];
+        w.low = k.range[2 * view];
+        w.scale = span == 0.f ? 0.f : 1.f / (span + k.eps);  // a NaN is not equal to 0
+    }
     return w;
 }
 
-DEVICE float weight_at(const Task& k, const Weights& w, int row, int column) {
-    float weight = 1.f;
-#if STENCIL
-    float x = (response(k, w.target, row, column) - w.low) * w.scale;
+DEVICE float weight_of(const Task& k, const Weights& w, float response) {
+    float x = (response - w.low) * w.scale;
     x = x < 0.f ? 0.f : (x > 1.f ? 1.f : x);  // rounding; a NaN stays
-    weight = fmaf(k.beta, curve(k.curve, x), 1.f);
+    return fmaf(k.beta, curve(k.curve, x), 1.f);
+}
+
+// The weight of a pixel of the pixelwise passes; `at` is row * width + column.
+DEVICE float weight_at(const Task& k, const Weights& w, int row, int column, int at) {
+#if STENCIL
+    float weight = weight_of(k, w, response(k, w.target, row, column));
+#else
+    float weight = w.response ? weight_of(k, w, w.response[at]) : 1.f;
 #endif
-    if (w.map) weight *= w.map[row * k.width + column];
-    return w.mask ? weight * w.mask[row * k.width + column] : weight;
+    if (w.map) weight *= w.map[at];
+    return w.mask ? weight * w.mask[at] : weight;
 }
 
 DEVICE float l1_step(const Task& k, float values) {
@@ -260,6 +273,18 @@ KERNEL(legs_finish, 1) {
 
 struct Nothing {};
 
+// The weight of each pixel, once for all channels, for the streaming pass: there each channel has a block of its own. The
+// response is overwritten, where there is one.
+KERNEL(legs_weights, 1) {
+    LANES(Nothing, lanes);
+    const int view = (int)(BLOCK / k.chunks), chunk = (int)(BLOCK % k.chunks), pixels = k.height * k.width;
+    phase(lanes, [&](Nothing&, int t) {
+        const Weights weights = weights_of(k, view);
+        for (long long p = (long long)chunk * THREADS + t; p < pixels; p += (long long)k.chunks * THREADS)
+            k.result[(long long)view * pixels + p] = weight_at(k, weights, 0, 0, (int)p);
+    });
+}
+
 // The gradient times the step that arrives in backward, read here, rounded once to the images' type.
 KERNEL(legs_scale, 1) {
     LANES(Nothing, lanes);
@@ -308,6 +333,7 @@ KERNEL(legs_range, 1) {
         for (long long p = (long long)chunk * THREADS + t; p < pixels; p += (long long)k.chunks * THREADS) {
             const int row = (int)p / k.width;
             const float e = response(k, target, row, (int)p - row * k.width);
+            if (k.response) k.response[(long long)view * pixels + p] = e;
             join(lane, e, e, 0.f * e);
         }
     });
@@ -347,7 +373,7 @@ DEVICE void l1(const Task& k) {
         const float step = l1_step(k, (float)k.views * k.channels * k.height * k.width);
         for (long long p = (long long)chunk * THREADS + t; p < pixels; p += (long long)k.chunks * THREADS) {
             const int row = (int)p / k.width, column = (int)p - row * k.width;
-            const float w = weight_at(k, weights, row, column);
+            const float w = weight_at(k, weights, row, column, (int)p);
             for (int channel = 0; channel < k.channels; ++channel) {
                 const float u = read(plane_of(k.prediction, k.of_prediction, view, channel)
                                      + row * k.of_prediction.row + column * k.of_prediction.column);
@@ -421,7 +447,8 @@ DEVICE void stream(const Task& k) {
     const int last = first + k.strip < k.height ? first + k.strip : k.height;
     const Value* xs = plane_of(k.prediction, k.of_prediction, view, channel);
     const Value* ys = plane_of(k.target, k.of_target, view, channel);
-    const Weights weights = weights_of(k, view);
+    const float* map = L1 && k.map ? k.map + view * k.map_view : 0;
+    float* slopes = k.gradient + (WANTED ? view * k.of_gradient.view + channel * k.of_gradient.channel : 0);
     const float values = (float)k.views * k.channels * k.height * k.width;
     const float l1_scale = L1 ? l1_step(k, values) : 0.f, ssim_scale = k.ssim_share / values;
 
@@ -483,7 +510,7 @@ DEVICE void stream(const Task& k) {
                 const float m12 = m1 * m2, mm = fmaf(m1, m1, m2 * m2);
                 const float a1 = fmaf(2.f, m12, 0.0001f), a2 = fmaf(2.f, product - m12, 0.0009f);
                 const float d1 = mm + 0.0001f, d2 = (squares - mm) + 0.0009f;
-                const float inverse = 1.f / (d1 * d2), a1_inverse = a1 * inverse, similarity = a2 * a1_inverse;
+                const float inverse = reciprocal(d1 * d2), a1_inverse = a1 * inverse, similarity = a2 * a1_inverse;
                 if (mine && row >= first && row < last) lane.similar += similarity;
                 if (WANTED) {
                     const bool ok = inside && row >= 0 && row < k.height;
@@ -500,7 +527,7 @@ DEVICE void stream(const Task& k) {
                     if (!(mine && row >= first && row < last)) continue;
                     const float d = read(xs + row * k.of_prediction.row + column * k.of_prediction.column)
                                     - read(ys + row * k.of_target.row + column * k.of_target.column);
-                    lane.absolute = fmaf(weight_at(k, weights, row, column), fabsf(d), lane.absolute);
+                    lane.absolute = fmaf(map ? map[row * k.width + column] : 1.f, fabsf(d), lane.absolute);
                 }
             }
         });
@@ -517,32 +544,30 @@ DEVICE void stream(const Task& k) {
         phase(lanes, [&](Stream& lane, int t) {  // the vertical blur of the slopes, and the gradient of row base + r - 10
             const int column = left + t;
             const bool mine = t >= halo && t < halo + core && column < k.width;
-            if (L1) {  // again a loop of its own; raw is free until the next step
-#pragma unroll 1
-                for (int r = 0; r < ROWS; ++r) {
-                    const int row = base + r - halo;
-                    if (mine && row >= first && row < last)
-                        raw[r * PITCH + REACH + t] = weight_at(k, weights, row, column);
-                }
-            }
+            int row = base - halo, at = row * k.width + column;
+            int x_at = row * k.of_prediction.row + column * k.of_prediction.column;
+            int y_at = row * k.of_target.row + column * k.of_target.column;
+            int slope_at = row * k.of_gradient.row + column * k.of_gradient.column;
 #pragma unroll SLOPE_ROWS
             for (int r = 0; r < ROWS; ++r) {
                 const float* from = blurred + r * THREADS + t;
                 const float s1 = push(lane.slopes[0], from[0]), s2 = push(lane.slopes[1], from[ROWS * THREADS]);
                 const float s3 = push(lane.slopes[2], from[2 * ROWS * THREADS]);
-                const int row = base + r - halo;
                 if (mine && row >= first && row < last) {
-                    const float u = read(xs + row * k.of_prediction.row + column * k.of_prediction.column);
-                    const float v = read(ys + row * k.of_target.row + column * k.of_target.column);
+                    const float u = read(xs + x_at), v = read(ys + y_at);
                     float slope = ssim_scale * fmaf(v, s3, fmaf(u, s2, s1));
                     if (L1) {
-                        const float w = raw[r * PITCH + REACH + t], d = u - v;
+                        const float w = map ? map[at] : 1.f, d = u - v;
                         lane.absolute = fmaf(w, fabsf(d), lane.absolute);
                         slope = fmaf(l1_scale * w, sign(d), slope);
                     }
-                    k.gradient[view * k.of_gradient.view + channel * k.of_gradient.channel
-                               + row * k.of_gradient.row + column * k.of_gradient.column] = slope;
+                    slopes[slope_at] = slope;
                 }
+                ++row;
+                at += k.width;
+                x_at += k.of_prediction.row;
+                y_at += k.of_target.row;
+                slope_at += k.of_gradient.row;
             }
         });
     }
@@ -550,9 +575,9 @@ DEVICE void stream(const Task& k) {
                        [](const Stream& lane) { return lane.similar; });
 }
 
+#if STENCIL == 0
 KERNEL(legs_loss_gradient, 4) { stream<true, true>(k); }
 KERNEL(legs_loss_value, 4) { stream<true, false>(k); }
-#if STENCIL == 0
 KERNEL(legs_ssim_gradient, 4) { stream<false, true>(k); }
 KERNEL(legs_ssim_value, 4) { stream<false, false>(k); }
 #endif

@@ -36,8 +36,8 @@ class Variant(NamedTuple):
     @property
     def kernels(self) -> List[str]:
         """Return the names of the kernels in its module."""
-        terms = ["l1", "loss"] if self.stencil else ["l1", "loss", "ssim"]
-        others = ["range", "range_finish"] if self.stencil else ["finish", "scale"]
+        terms = ["l1"] if self.stencil else ["l1", "loss", "ssim"]
+        others = ["range", "range_finish"] if self.stencil else ["finish", "scale", "weights"]
         losses = [f"{term}_{kind}" for term in terms for kind in ("value", "gradient")]
         return [f"legs_{name}" for name in (*others, *losses)]
 

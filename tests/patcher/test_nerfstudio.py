@@ -11,7 +11,7 @@ import textwrap
 import pytest
 import torch
 
-from legs_loss import weight_map
+from legs_loss import LegsError, weight_map
 from legs_loss.runtime import state
 from tests.support import ROOT, legs_environment
 
@@ -165,6 +165,32 @@ def test_off_and_evaluation_are_splatfacto_s_own_to_the_last_bit(nerfstudio, mon
     losses = [model.get_loss_dict(outputs, batch)["main_loss"] for model in (own, legs)]
     assert torch.equal(*losses)
     assert torch.equal(*(torch.autograd.grad(loss, outputs["rgb"])[0] for loss in losses))
+
+
+def test_settings_are_flags_of_ns_train(nerfstudio):
+    import dataclasses
+
+    from legs_adapters.upstreams import nerfstudio as plugin
+    from nerfstudio.configs.method_configs import all_methods
+
+    config = all_methods["splatfacto-legs"].pipeline.model
+    assert type(config) is plugin.SplatfactoLegsModelConfig
+    assert (config.legs_preset, config.legs_beta, config.legs_curve) == (None, None, None)
+    assert dataclasses.asdict(config)["background_color"] == "random"
+    outputs, batch = step()
+    losses = {}
+    for flags in ({}, {"legs_beta": 0.0}, {"legs_preset": "legs-l"}, {"legs_curve": "C1", "legs_beta": 10.0}):
+        state.reset()
+        given = dataclasses.replace(config, **flags)
+        losses[str(flags)] = float(given._target(given).get_loss_dict(outputs, batch)["main_loss"].detach())
+    legs, off, linear, same = losses.values()
+    own = float(models()[0].get_loss_dict(outputs, batch)["main_loss"].detach())
+    assert off == pytest.approx(own, rel=1e-6)
+    assert linear == pytest.approx(same, rel=1e-6)
+    assert legs > linear > off
+    given = dataclasses.replace(config, legs_curve="C77")
+    with pytest.raises(LegsError, match="C77"):
+        given._target(given)
 
 
 def test_the_method_is_splatfacto_s_but_for_its_name_and_model(nerfstudio):

@@ -2,7 +2,7 @@
 
 That function takes tensors of any shape and returns unreduced errors. It is weighted for trained images of three
 channels in either layout; depths, intensities and everything without a gradient are unchanged. A target that requires a
-gradient is not a photograph. Source: gsplat/losses.py, which gsplat has since its version 1.5.3.
+gradient is not a photograph. Source: gsplat/losses.py, which gsplat has after its release 1.5.3.
 """
 
 from __future__ import annotations

@@ -12,25 +12,36 @@ import copy
 import dataclasses
 import functools
 import importlib
-from typing import Any, Dict
+import sys
+from typing import Any, Dict, Optional
 
 import legs_loss
+from legs_loss.config import find_config
 from legs_loss.runtime import active
+from legs_loss.spec import as_spec
 from legs_loss.upstreams import Applied
 
 METHOD = "splatfacto-legs"
 DESCRIPTION = "Gaussian Splatting with the LEGS loss: splatfacto, its L1 weighted towards contours and thin structures."
 
 
+# Settings as flags of ns-train, --pipeline.model.legs-beta 5; None leaves them to legs.toml and LEGS_*.
+FLAGS = {"legs_preset": str, "legs_beta": float, "legs_curve": str}
+
+
 def __getattr__(name: str) -> Any:
     if name == "splatfacto_legs":
         return _specification()
-    if name == "SplatfactoLegsModel" and name in globals():
-        return globals()[name]
-    if name == "SplatfactoLegsModel":  # the config.yml of a run has this name
-        base = importlib.import_module("nerfstudio.models.splatfacto").SplatfactoModel
-        globals()[name] = model = legs_model(base)
-        return model
+    if name in ("SplatfactoLegsModel", "SplatfactoLegsModelConfig"):  # the config.yml of a run has these names
+        splatfacto = importlib.import_module("nerfstudio.models.splatfacto")
+        if name == "SplatfactoLegsModel":
+            made = legs_model(splatfacto.SplatfactoModel)
+        else:
+            flags = [(flag, Optional[kind], dataclasses.field(default=None)) for flag, kind in FLAGS.items()]
+            made = dataclasses.make_dataclass(name, flags, bases=(splatfacto.SplatfactoModelConfig,))
+            made.__module__ = __name__
+        globals()[name] = made
+        return made
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
@@ -41,7 +52,9 @@ def _specification() -> Any:
 
     trainer = copy.deepcopy(method_configs["splatfacto"])
     trainer.method_name = METHOD
-    trainer.pipeline.model = dataclasses.replace(trainer.pipeline.model, _target=__getattr__("SplatfactoLegsModel"))
+    this, own = sys.modules[__name__], trainer.pipeline.model
+    values = {field.name: getattr(own, field.name) for field in dataclasses.fields(own) if field.init}
+    trainer.pipeline.model = this.SplatfactoLegsModelConfig(**{**values, "_target": this.SplatfactoLegsModel})
     return MethodSpecification(config=trainer, description=DESCRIPTION)
 
 
@@ -68,12 +81,30 @@ def legs_model(base: Any) -> Any:
     class SplatfactoLegsModel(_Weighted, base):
         """Splatfacto with the LEGS loss."""
 
+        def __init__(self, config: Any, *arguments: Any, **named: Any) -> None:
+            _configure(config)
+            super().__init__(config, *arguments, **named)
+
         def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> Dict[str, Any]:
             """Return splatfacto's losses, the L1 share of ``main_loss`` weighted."""
             return weighted(self, super().get_loss_dict(outputs, batch, metrics_dict), outputs, batch)
 
     SplatfactoLegsModel.__module__, SplatfactoLegsModel.__qualname__ = __name__, "SplatfactoLegsModel"
     return SplatfactoLegsModel
+
+
+def _configure(config: Any) -> None:
+    """Apply the flags that ns-train was given.
+
+    Raises:
+        LegsError: a value is unknown or out of range.
+    """
+    given = {flag[len("legs_") :]: getattr(config, flag, None) for flag in FLAGS}
+    given = {name: value for name, value in given.items() if value is not None}
+    if given:
+        preset = given.pop("preset", None)
+        base = find_config().spec if preset is None else as_spec(preset)
+        legs_loss.configure(dataclasses.replace(base, **given) if given else preset)
 
 
 def weighted(model: Any, losses: Dict[str, Any], outputs: Any, batch: Any) -> Dict[str, Any]:

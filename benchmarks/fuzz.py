@@ -13,10 +13,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import os
 import random
+import re
 import shutil
 import signal
+import struct
 import sys
 import tempfile
 import time
@@ -42,10 +45,18 @@ from legs_loss.reference.training.checkpoint import read_state, write_checkpoint
 from legs_loss.scenes import View, load_training_image, read_scene
 from legs_loss.store import Entry, WeightStore
 from legs_loss.store.manifest import MANIFEST, manifest_bytes, read_manifest
+from legs_loss.viewer.splats import splats
 
 SECONDS = 30  # that a case may take
 PIECES = [b"\0", b"\xff" * 8, b"-1", b"1e999", b"NaN", b'"', b"[" * 50, b"{", b"(" * 50, b"\n", b"\r", b"#", b"    "]
 PIECES += [b"\xef\xbb\xbf", b"../", b".git", b"lambda: ", (1 << 60).to_bytes(8, "little"), b"\0\0\0\x80"]
+PIECES += [struct.pack(kind, value) for kind in ("<f", "<d") for value in (math.nan, math.inf, -math.inf, 3e38)]
+# What stands in place of a number in a text, and of an array in a checkpoint.
+VALUES = [b"9" * 400, b"-" + b"9" * 400, b"1" + b"0" * 30, b"9" * 5000, b"%d" % (1 << 63), b"-1", b"0", b"0.5"]
+VALUES += [b"1e308", b"1e999", b"-1e999", b"NaN", b"Infinity", b"nan", b"inf", b"true", b"null", b'""', b'"1"']
+VALUES += [b"[]", b"{}", b"[[1]]"]
+KINDS = ["int64", "uint8", "bool", "float16", "float64", "complex64", "U4", "S3", "M8[s]", ">f4"]
+NUMBER = re.compile(rb"-?\d+(\.\d+)?([eE][-+]?\d+)?")
 TRAIN = b"""import torch
 from utils import l1_loss, ssim
 from gaussian_renderer import render
@@ -67,7 +78,11 @@ Reader = Tuple[Callable[[Path], None], List[str], Callable[[Path], Any]]
 
 
 def damage(data: bytes, at: random.Random) -> bytes:
-    """Return bytes with one to four accidents."""
+    """Return bytes with one number replaced, or with one to four accidents."""
+    numbers = list(NUMBER.finditer(data))
+    if numbers and at.random() < 0.4:
+        found = at.choice(numbers)
+        return data[: found.start()] + at.choice(VALUES) + data[found.end() :]
     changed = bytearray(data)
     for _ in range(at.randint(1, 4)):
         place, what = at.randrange(len(changed) + 1), at.randrange(6)
@@ -138,9 +153,57 @@ def make_checkpoint(folder: Path) -> None:
         Adam(some_gaussians()).state(), gradient_sum=np.zeros(9, np.float32), times_seen=np.zeros(9, np.float32)
     )
     facts = {"config": {}, "views": ["a"], "iteration": 3, "clocks": [0.0, 0.0], "order": [0], "loss": 0.5}
-    facts.update(psnr=9.0, weight_sum=0.0, growth=[], history=[])
+    facts.update(psnr=9.0, growth=[[45, 18]], history=[{"iteration": 3, "train_psnr": 9.5}])
     write_checkpoint(folder / "c.npz", dict(arrays, generator=torch.Generator().get_state().numpy()), facts)
-    read_state(folder / "c.npz")
+    resume(folder)  # which compiles what it needs, outside of a case's time
+
+
+def make_arrays(folder: Path) -> None:
+    make_checkpoint(folder)
+    (folder / "which").write_bytes(b"the bytes that choose what is changed")
+
+
+def read_arrays(folder: Path) -> None:
+    """Resume from a checkpoint in good form with an array of another kind or other values, or another fact."""
+    at = random.Random((folder / "which").read_bytes())
+    with np.load(str(folder / "c.npz")) as file:
+        arrays = {name: file[name] for name in file.files}
+    facts = arrays.pop("__facts__").tobytes()
+    name = at.choice(sorted(arrays))
+    if at.random() < 0.3:
+        found = at.choice(list(NUMBER.finditer(facts)))
+        facts = facts[: found.start()] + at.choice(VALUES) + facts[found.end() :]
+    elif at.random() < 0.5:
+        with contextlib.suppress(TypeError, ValueError, OverflowError):  # no such change
+            arrays[name] = arrays[name].astype(at.choice(KINDS))
+    else:
+        with contextlib.suppress(ValueError, OverflowError):
+            arrays[name] = np.array(arrays[name])
+            arrays[name].flat[at.randrange(arrays[name].size)] = at.choice([math.nan, math.inf, 3e38, -1, 1 << 62])
+    np.savez(str(folder / "c.npz"), __facts__=np.frombuffer(facts, np.uint8), **arrays)
+    resume(folder)
+
+
+def resume(folder: Path) -> None:
+    """Take a step from a checkpoint."""
+    import torch
+
+    from legs_loss.reference.training.adam import FIELDS, Adam
+
+    arrays, facts = read_state(folder / "c.npz")
+    adam = Adam.restore(arrays)
+    for name in FIELDS:
+        parameter = getattr(adam.gaussians, name)
+        parameter.grad = torch.zeros_like(parameter)
+    adam.step(1e-3)
+    assert all(torch.isfinite(getattr(adam.gaussians, name)).all() for name in FIELDS)
+    (torch.from_numpy(arrays["gradient_sum"]) + torch.zeros(9)).norm() / torch.from_numpy(arrays["times_seen"]).sum()
+    0.6 * float(facts["loss"] or 0) + 0.6 * float(facts["psnr"] or 0)
+    np.array(facts["clocks"], np.float64).reshape(2)
+    [(iteration + 1, count + 1) for iteration, count in facts["growth"]]
+
+
+BASELINE = {"views": 2, "loss": 0.5, "loss_3dgs": 0.5, "gradient_error": 1e-7}
 
 
 def make_comparison(folder: Path) -> None:
@@ -150,7 +213,7 @@ def make_comparison(folder: Path) -> None:
 
     scene = {"name": "a", "views": 2, "sha256": "0" * 16}
     base = TrainConfig(densify_grad_threshold=1e-3).as_dict()
-    settings = {"scene": scene, "path": "/nowhere", "images": None, "base": base, "baseline": {"loss": 0.5}}
+    settings = {"scene": scene, "path": "/nowhere", "images": None, "base": base, "baseline": BASELINE}
     write_json(folder / "comparison.json", settings)
     scores = {"psnr": 20.5, "ssim": 0.5}
     metrics = {"train": scores, "test": scores, "gaussians": 9, "mean_weight": 2.5, "seconds": 1.5, "iterations": 30}
@@ -166,12 +229,16 @@ def read_comparison(folder: Path) -> None:
     from legs_loss.experiments.arms import parse_arm
     from legs_loss.experiments.running import read_rows
     from legs_loss.experiments.tables import scores_table
+    from legs_loss.report import html
+    from legs_loss.report.html_pictures import Pictures
 
-    _, rows = read_rows(folder)
+    settings, rows = read_rows(folder)
     for row in rows:
         place = (folder / parse_arm(row["arm"]).folder / f"seed-{row['seed']}").resolve()
         assert folder.resolve() in place.parents, f"{place} is outside"
-    scores_table(rows, sorted({row["arm"] for row in rows}))
+    arms = sorted({row["arm"] for row in rows})
+    scores_table(rows, arms)
+    html._page(settings, rows, arms, [Pictures("a", 8, 6, {}, 1.0, 1.0, {})], {row["arm"]: row for row in rows}, folder)
 
 
 def make_checkout(folder: Path) -> None:
@@ -207,6 +274,19 @@ def read_store(folder: Path, entries: Optional[List[Entry]] = None) -> None:
         assert values.shape == (entry.height, entry.width) and values.min() >= 0 and values.max() <= 1
 
 
+def read_listed(folder: Path) -> None:
+    """Read a store of a damaged manifest whose checksum agrees with it, as a stranger would write it."""
+    path = folder / "store" / MANIFEST
+    path.write_bytes(with_checksum(path.read_bytes()))
+    read_store(folder)
+
+
+def with_checksum(manifest: bytes) -> bytes:
+    """Return a manifest with the checksum that it has to have."""
+    _, _, body = manifest.partition(b",\n")
+    return b'{"checksum": "%s",\n' % sha256(body[:-2]).hexdigest().encode() + body
+
+
 def read_images(folder: Path) -> None:
     for path in folder.iterdir():
         with contextlib.suppress(LegsError):
@@ -217,6 +297,11 @@ def read_points(folder: Path) -> None:
     scene = read_scene(folder)
     if scene.points is not None:
         assert np.isfinite(scene.points.xyz).all()
+
+
+def show(folder: Path) -> None:
+    for part in splats(read_ply(folder / "g.ply")):
+        assert np.isfinite(part).all()
 
 
 def patch(folder: Path) -> None:
@@ -257,13 +342,15 @@ READERS: Dict[str, Reader] = {
     "sources": (make_checkout, ["train.py", "utils.py"], patch),
     "journal": (make_patched, [JOURNAL], read_journal),
     "store": (make_store, ["store/manifest.json", "store/*.npy"], read_store),
+    "manifest": (make_store, ["store/manifest.json"], read_listed),
     "maps": (make_store, ["store/*.npy"], read_maps),
     "images": (make_images, ["a.*"], read_images),
     "colmap": (make_scene, ["sparse/0/*.bin"], read_points),
     "colmap text": (make_text_scene, ["sparse/0/*.txt"], read_points),
     "transforms": (make_transforms, ["transforms.json"], read_scene),
-    "ply": (lambda folder: write_ply(folder / "g.ply", some_gaussians()), ["g.ply"], lambda f: read_ply(f / "g.ply")),
-    "checkpoint": (make_checkpoint, ["c.npz"], lambda folder: read_state(folder / "c.npz")),
+    "ply": (lambda folder: write_ply(folder / "g.ply", some_gaussians()), ["g.ply"], show),
+    "checkpoint": (make_checkpoint, ["c.npz"], resume),
+    "arrays": (make_arrays, ["which"], read_arrays),
     "comparison": (make_comparison, ["comparison.json", "legs/seed-0/row.json"], read_comparison),
     "settings": (lambda folder: void((folder / "legs.toml").write_bytes(TOML)), ["legs.toml"], read_settings),
 }
@@ -296,11 +383,18 @@ class Watch:
         writes = event == "open" and isinstance(found[2], int) and found[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
         if writes or event in ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.chmod"):
             named = found[: 2 if event == "os.rename" else 1]
-            paths = [os.fsdecode(path) for path in named if isinstance(path, (str, bytes, os.PathLike))]
-            self.seen.update(path for path in map(os.path.abspath, paths)
+            folders = found[len(named) :] if event in ("os.rename", "os.remove") else (-1,)
+            self.seen.update(path for path in map(_place, named, folders)
                              if not path.startswith(self._inside) and "__pycache__" not in path)  # fmt: skip
         elif event == "subprocess.Popen" and os.path.basename(str(found[0])) != "git":
             self.seen.add(f"started {found[0]}")
+
+
+def _place(path: Any, folder: int) -> str:
+    """Return a path as a whole; its folder may be a descriptor. An open does not say which: it has none."""
+    if not isinstance(path, (str, bytes, os.PathLike)):
+        return os.devnull
+    return os.path.join(os.readlink(f"/proc/self/fd/{folder}") if folder >= 0 else "", os.fsdecode(path))
 
 
 def run_case(name: str, good: Path, work: Path, at: random.Random, watch: Watch) -> str:
@@ -328,7 +422,8 @@ def run_case(name: str, good: Path, work: Path, at: random.Random, watch: Watch)
     finally:
         signal.alarm(0)
         watch.on = False
-    return f"outside of its folder: {', '.join(sorted(watch.seen))}" if watch.seen else ""
+    outside = sorted(path for path in watch.seen if os.path.isabs(path) or os.path.lexists(path))
+    return f"outside of its folder: {', '.join(outside)}" if outside else ""
 
 
 def cases(names: List[str], seed: int, until: float, count: int) -> Iterator[Tuple[int, str, random.Random]]:
@@ -352,7 +447,7 @@ def main() -> int:
     counts, failed = dict.fromkeys(args.readers, 0), 0
     with tempfile.TemporaryDirectory(prefix="legs-fuzz-") as place:
         work = Path(place).resolve()
-        os.environ["XDG_STATE_HOME"] = str(work / "state")
+        os.environ["XDG_STATE_HOME"] = os.environ["MPLCONFIGDIR"] = str(work / "state")
         for name in args.readers:
             (work / "good" / name).mkdir(parents=True)
             READERS[name][0](work / "good" / name)

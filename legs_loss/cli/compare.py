@@ -25,6 +25,7 @@ HELP = "train and compare several losses on a scene, with seeds, controls and in
 
 # Of the embedded scene: small enough that a laptop trains the arms of a study in some minutes.
 VIEWS, WIDTH, HEIGHT = 56, 144, 108
+SEEDS = 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,6 +93,8 @@ def run(args: argparse.Namespace) -> int:
     for name in ("seeds", "processes"):
         if getattr(args, name) < 1:
             raise LegsError(f"--{name} must be at least 1, got {getattr(args, name)}")
+    if args.seeds > SEEDS:
+        raise LegsError(f"--seeds must be at most {SEEDS}: each is a training of every arm")
     study = STUDIES[args.study] if args.arms is None else these_arms(args.arms)
     check_writable(args.out)
     if args.upstream is not None:

@@ -10,6 +10,17 @@ from typing import Any, Callable, Dict, Iterable, Mapping, Optional
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.reference.training.config import TrainConfig
+from legs_loss.system.values import (
+    each,
+    is_count,
+    is_number,
+    is_pair,
+    is_scores,
+    is_text,
+    of_names,
+    optional,
+    with_names,
+)
 
 __all__ = ["PLAN", "ROW", "SETTINGS", "what_is_wrong"]
 
@@ -17,7 +28,6 @@ __all__ = ["PLAN", "ROW", "SETTINGS", "what_is_wrong"]
 SETTINGS = ("scene", "path", "images", "base", "baseline")
 PLAN = ("arm", "seed", "config", "caps")
 ROW = (*PLAN, "versions", "metrics")
-_LARGEST = 1 << 63
 
 
 def what_is_wrong(values: Any, names: Iterable[str]) -> Optional[str]:
@@ -42,42 +52,6 @@ def _holds(fits: Callable[[Any], bool], value: Any) -> bool:
         return False
 
 
-def _number(value: Any) -> bool:
-    return type(value) is float or (type(value) is int and abs(value) < _LARGEST)
-
-
-def _count(value: Any) -> bool:
-    return type(value) is int and 0 <= value < _LARGEST
-
-
-def _text(value: Any) -> bool:
-    return type(value) is str and "\0" not in value
-
-
-def _scores(value: Any) -> bool:
-    return isinstance(value, dict) and all(_text(name) and _number(score) for name, score in value.items())
-
-
-def _optional(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: value is None or fits(value)
-
-
-def _each(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and all(fits(one) for one in value)
-
-
-def _of_names(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, dict) and all(_text(name) and fits(one) for name, one in value.items())
-
-
-def _with(fits: Callable[[Any], bool], *names: str) -> Callable[[Any], bool]:
-    return lambda value: fits(value) and all(name in value for name in names)
-
-
-def _pair(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(_count, value))
-
-
 def _config(value: Any) -> bool:
     """Return whether the class accepts the settings, and each has the type of its field."""
     return _alike(TrainConfig.from_dict(value).as_dict(), TrainConfig().as_dict())
@@ -88,9 +62,9 @@ def _alike(found: Mapping[str, Any], like: Mapping[str, Any]) -> bool:
         if isinstance(value, dict):
             fits = isinstance(found[name], dict) and _alike(found[name], value)
         elif value is None:
-            fits = found[name] is None or _number(found[name])
+            fits = found[name] is None or is_number(found[name])
         else:
-            fits = _number(found[name]) if _number(value) else type(found[name]) is type(value)
+            fits = is_number(found[name]) if is_number(value) else type(found[name]) is type(value)
         if not fits:
             return False
     return True
@@ -98,16 +72,16 @@ def _alike(found: Mapping[str, Any], like: Mapping[str, Any]) -> bool:
 
 def _metrics(value: Any) -> bool:
     whole = {
-        "train": _optional(_with(_scores, "psnr")),
-        "test": _optional(_with(_scores, "psnr")),
-        "gaussians": _count,
-        "mean_weight": _number,
-        "seconds": _number,
-        "processor_seconds": _number,
-        "iterations": lambda number: _count(number) and number > 0,
-        "growth": _each(_pair),
-        "history": _each(_with(_scores, "iteration")),
-        "views": _with(_of_names(_of_names(_scores)), "train", "test"),
+        "train": optional(with_names(is_scores, "psnr")),
+        "test": optional(with_names(is_scores, "psnr")),
+        "gaussians": is_count,
+        "mean_weight": is_number,
+        "seconds": is_number,
+        "processor_seconds": is_number,
+        "iterations": lambda number: is_count(number) and number > 0,
+        "growth": each(is_pair),
+        "history": each(with_names(is_scores, "iteration")),
+        "views": with_names(of_names(of_names(is_scores)), "train", "test"),
     }
     needed = ("train", "test", "gaussians", "iterations", "growth", "history", "views")
     return all(name in value for name in needed) and all(
@@ -115,15 +89,20 @@ def _metrics(value: Any) -> bool:
     )
 
 
+def _proof(value: Any) -> bool:
+    ours, theirs = ("views", "loss", "loss_3dgs", "gradient_error"), ("plain_calls", "weighted_calls")
+    return with_names(is_scores, *(theirs if "plain_calls" in value else ours))(value)
+
+
 def _upstream(value: Any) -> bool:
     """Return whether what a row, or a comparison's settings, say of a codebase is valid."""
-    row = {"profile": _text, "threshold_factor": _number, "pictures": _of_names(_text)}
+    row = {"profile": is_text, "threshold_factor": is_number, "pictures": of_names(is_text)}
     settings = {
-        "profile": _text,
-        "resolution": _optional(lambda number: type(number) is int),
-        "iterations": _optional(_count),
-        "gaussians": _optional(_count),
-        "extra": _each(_text),
+        "profile": is_text,
+        "resolution": optional(lambda number: type(number) is int and is_number(number)),
+        "iterations": optional(is_count),
+        "gaussians": optional(is_count),
+        "extra": each(is_text),
         "cpu": lambda flag: type(flag) is bool,
     }
     whole: Dict[str, Callable[[Any], bool]] = row if "threshold_factor" in value else settings
@@ -132,15 +111,15 @@ def _upstream(value: Any) -> bool:
 
 _FIELDS: Dict[str, Callable[[Any], bool]] = {
     "arm": lambda value: parse_arm(value).name == value,
-    "seed": _count,
+    "seed": is_count,
     "config": _config,
-    "caps": _optional(_each(_pair)),
-    "versions": _of_names(_text),
+    "caps": optional(each(is_pair)),
+    "versions": of_names(is_text),
     "metrics": _metrics,
     "upstream": _upstream,
-    "scene": lambda value: _text(value["name"]) and _text(value["sha256"]),
-    "path": _text,
-    "images": _optional(_text),
+    "scene": lambda value: is_text(value["name"]) and is_text(value["sha256"]) and is_count(value["views"]),
+    "path": is_text,
+    "images": optional(is_text),
     "base": _config,
-    "baseline": _optional(lambda value: isinstance(value, dict)),
+    "baseline": optional(_proof),
 }

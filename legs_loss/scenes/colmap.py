@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from functools import partial
 from pathlib import Path
@@ -81,7 +82,7 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
             )
         name = image.name.replace("\\", "/")
         path = images / name
-        if not path.is_file() and (images / path.name).is_file():
+        if not os.path.isfile(str(path)) and os.path.isfile(str(images / path.name)):  # pathlib's raise for some names
             path, name = images / path.name, path.name
         intrinsics = cameras[image.camera_id]
         views.append(

@@ -30,6 +30,7 @@ __all__ = [
 
 WIDEST = 1600  # pixels; 3DGS shrinks wider photographs to this unless -r says otherwise
 STRIP_PIXELS = 1 << 16
+_WIDTH = 1 << 30  # pixels: no image is wider
 # Pillow identifies files by content, and runs other programs for some formats: Ghostscript for EPS. These formats are
 # decoded in this process; HEIF where pillow-heif is installed and registered.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM", "TGA", "GIF", "JPEG2000", "AVIF", "HEIF")
@@ -53,7 +54,7 @@ def training_size(width: int, height: int, resolution: int = -1) -> Tuple[int, i
     """
     if resolution in (1, 2, 4, 8):
         size = round(width / resolution), round(height / resolution)
-    elif resolution == -1 or resolution > 0:
+    elif resolution == -1 or 0 < resolution <= _WIDTH:
         wanted = min(width, WIDEST) if resolution == -1 else resolution
         scale = width / wanted
         size = int(width / scale), int(height / scale)

@@ -16,6 +16,7 @@ from typing import Any, Callable, Dict, Iterable, List, Optional, Tuple
 
 from legs_loss.errors import LegsError
 from legs_loss.system import read_regular
+from legs_loss.system.values import is_count, is_number, is_text
 
 __all__ = ["MANIFEST", "DamagedStoreError", "Entry", "is_map_name", "manifest_bytes", "read_manifest"]
 
@@ -91,18 +92,18 @@ def _is_level(value: Any) -> bool:
 
 # What a field may be. Type by type: JSON's true is an int, and 1.0 == 1.
 _FIELDS: Dict[str, Callable[[Any], bool]] = {
-    "view": lambda value: type(value) is str and value != "" and "\0" not in value,
+    "view": lambda value: is_text(value) and value != "",
     "width": lambda value: type(value) is int and 0 < value <= _SIDE,
     "height": lambda value: type(value) is int and 0 < value <= _SIDE,
     "operator": lambda value: type(value) is str,
     "p": lambda value: type(value) is float and value > 0,
-    "eps": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
+    "eps": lambda value: is_number(value) and 0 <= value < math.inf,
     "background": lambda value: value in (None, "black", "white"),
     "fingerprint": lambda value: type(value) is str,
-    "source_bytes": lambda value: type(value) is int and value >= 0,
-    "source_mtime_ns": lambda value: type(value) is int,
+    "source_bytes": is_count,
+    "source_mtime_ns": is_number,
     "file": lambda value: type(value) is str and is_map_name(value),
-    "bytes": lambda value: type(value) is int and value > 0,
+    "bytes": lambda value: is_count(value) and value > 0,
     "sha256": lambda value: type(value) is str and _CHECKSUM.fullmatch(value) is not None,
     "smooth": lambda value: type(value) is float and 0 <= value <= 100,
     **dict.fromkeys(_LEVELS, _is_level),
@@ -155,7 +156,7 @@ def read_manifest(folder: Path) -> List[Entry]:
         intact = not wrong and manifest_bytes(entries) == data
     except LegsError:
         raise
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError):
         intact = False
     if not intact:
         raise DamagedStoreError(

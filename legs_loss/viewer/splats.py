@@ -12,6 +12,9 @@ from legs_loss.reference.rasterizer import rotations
 
 __all__ = ["Splats", "left_of", "splats"]
 
+_FARTHEST = 1e9
+_LARGEST = float(np.finfo(np.float16).max)  # viser sends covariances as float16
+
 
 class Splats(NamedTuple):
     """Arguments of viser, float32: centers [N, 3], covariances [N, 3, 3], rgbs [N, 3], opacities [N, 1] in [0, 1]."""
@@ -23,11 +26,18 @@ class Splats(NamedTuple):
 
 
 def splats(gaussians: Gaussians) -> Splats:
-    """Return Gaussians for viser. Colours are of degree 0: they do not depend on the direction."""
+    """Return Gaussians for viser. Colours are of degree 0: they do not depend on the direction.
+
+    Those that are nowhere, or too far or too large to be drawn (infinite in float16), are left out.
+    """
     axes = rotations(gaussians.quaternions) * gaussians.scales[:, None, :]
     colours = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
     parts = (gaussians.means, axes @ axes.transpose(1, 2), colours, gaussians.opacities)
-    return Splats(*(part.detach().float().numpy() for part in parts))
+    found = [part.detach().float().numpy() for part in parts]
+    drawn = np.abs(found[0]).max(axis=1) < _FARTHEST
+    for part in found[1:]:
+        drawn &= np.abs(part).reshape(len(part), -1).max(axis=1) < _LARGEST  # of NaN, too, this is false
+    return Splats(*(part[drawn] for part in found))
 
 
 def left_of(

@@ -75,6 +75,18 @@ def test_a_row(place, value, compared):
     assert len(read_rows(compared)[1]) == 1
 
 
+@pytest.mark.parametrize("value", [[], {}, {"loss": 0.5}, {"views": 2, "loss": 10**400}, {"plain_calls": 10**400}])
+def test_what_settings_say_of_the_baseline(value, compared):
+    path = compared / "comparison.json"
+    good = path.read_text()
+    path.write_text(json.dumps(dict(json.loads(good), baseline=value)))
+    try:
+        with pytest.raises(LegsError, match=r"comparison.json: this file is damaged \(baseline\)"):
+            read_rows(compared)
+    finally:
+        path.write_text(good)
+
+
 @pytest.mark.parametrize("value", [{}, {"profile": "3dgs"}, {"extra": [7]}])
 def test_what_settings_say_of_a_codebase(value, compared):
     path = compared / "comparison.json"

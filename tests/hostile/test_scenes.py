@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import EpsImagePlugin, Image
 
+from legs_loss.cli import main
 from legs_loss.errors import LegsError
 from legs_loss.reference.training.checkpoint import read_state, write_checkpoint
 from legs_loss.scenes import View, image_size, load_training_image, read_scene
@@ -100,7 +101,7 @@ def state(**changes):
     sizes = {"means": (5, 3), "log_scales": (5, 3), "quaternions": (5, 4), "opacity_logits": (5, 1), "sh": (5, 4, 3)}
     arrays = {f"{label}.{name}": np.zeros(size, np.float32) for label in ("gaussians", "moment1", "moment2")
               for name, size in sizes.items()}  # fmt: skip
-    arrays.update(gradient_sum=np.zeros(5), times_seen=np.zeros(5), steps=np.array(3))
+    arrays.update(gradient_sum=np.zeros(5, np.float32), times_seen=np.zeros(5, np.float32), steps=np.array(3))
     arrays["generator"] = torch.Generator().get_state().numpy()
     facts = {
         "config": {},
@@ -123,13 +124,25 @@ CHECKPOINTS = [
     ({"moment1.sh": np.zeros((5, 9, 3), np.float32)}, "moment1.sh is float32"),
     ({"gaussians.sh": np.zeros((5, 3), np.float32)}, "gaussians.sh is float32"),
     ({"gaussians.sh": np.full((5, 4, 3), "text")}, "gaussians.sh is <U4"),
+    ({"gaussians.means": np.zeros((5, 3), np.int64)}, "gaussians.means is int64"),
+    ({"gaussians.means": np.zeros((5, 3))}, "gaussians.means is float64"),
+    ({"gaussians.means": np.zeros((5, 3), ">f4")}, "gaussians.means is >f4"),
+    ({"gaussians.means": np.full((5, 3), np.nan, np.float32)}, "gaussians.means has values that none can have"),
+    ({"moment1.sh": np.full((5, 4, 3), 3e38, np.float32)}, "moment1.sh has values that none can have"),
+    ({"moment2.sh": np.full((5, 4, 3), -1, np.float32)}, "moment2.sh has values that none can have"),
     ({"steps": np.zeros(2)}, "steps is float64"),
+    ({"steps": np.array(-1)}, "-1 steps"),
     ({"times_seen": None}, "no times_seen"),
     ({"generator": np.zeros(5056, np.uint8)}, "damaged"),
-    ({"iteration": -1}, "other numbers"),
+    ({"iteration": -1}, "iteration is -1"),
+    ({"iteration": True}, "iteration is True"),
+    ({"iteration": 10**30}, "iteration is 1000"),
+    ({"loss": 10**400}, "loss is 1000"),
+    ({"clocks": [0, 10**400]}, "clocks is"),
+    ({"growth": [7]}, "growth is"),
     ({"iteration": "many"}, "iteration is 'many'"),
     ({"order": [7]}, "other numbers"),
-    ({"clocks": ["now"]}, "its clocks are no numbers"),
+    ({"clocks": ["now"]}, "clocks is"),
     ({"config": None}, "no config"),
 ]
 
@@ -142,6 +155,26 @@ def test_a_checkpoint_in_good_form(changes, line, tmp_path):
     write_checkpoint(path, *state(**changes))
     with pytest.raises(LegsError, match=line):
         read_state(path)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["train", "--seed", 10**30], "seed must be an integer of 64 bits"),
+        (["train", "--iterations", 10**400], "iterations must be"),
+        (["train", "-r", 10**400], "resolution must be"),
+        (["precompute", "-r", 10**30], "resolution must be"),
+        (["compare", "--seeds", 10**12], "--seeds must be at most 1000"),
+    ],
+    ids=str,
+)
+def test_a_number_that_nothing_holds(words, line, tmp_path, tiny_scene, capsys):
+    pytest.importorskip("numba")
+    command, *options = map(str, words)
+    assert main([command, str(tiny_scene), *options, "--out", str(tmp_path / "out")]) == 2
+    errors = [text for text in capsys.readouterr().err.splitlines() if "error:" in text]
+    assert len(errors) == 1
+    assert line in errors[0]
 
 
 def test_a_compressed_checkpoint_is_none(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 import legs_loss
+from benchmarks import fuzz
 from legs_loss.errors import LegsError
 from legs_loss.precompute import precompute
 from legs_loss.scenes import View, image_tensor, load_training_image, read_scene
@@ -197,6 +199,14 @@ def test_a_manifest_in_good_form_of_bad_entries(field, value, scene, capsys):
     except (TypeError, ValueError):  # it cannot even be written so
         data = (scene / "legs_weights" / MANIFEST).read_bytes().replace(b'"bytes"', b'"byte"')
     (scene / "legs_weights" / MANIFEST).write_bytes(data)
+    is_one_error(scene, capsys)
+
+
+@pytest.mark.parametrize("value", [b"9" * 400, b"1e999", b"NaN"], ids=["400 digits", "1e999", "NaN"])
+@pytest.mark.parametrize("field", [b'"p": ', b'"source_mtime_ns": '])
+def test_a_number_of_a_manifest_that_nothing_holds(field, value, scene, capsys):
+    path = scene / "legs_weights" / MANIFEST
+    path.write_bytes(fuzz.with_checksum(re.sub(field + rb"[^,}\n]+", field + value, path.read_bytes())))
     is_one_error(scene, capsys)
 
 

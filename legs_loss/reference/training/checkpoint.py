@@ -7,13 +7,14 @@ import os
 import platform
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Dict, Iterator, Mapping, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, Mapping, Optional, Tuple
 
 import numpy as np
 import torch
 
 from legs_loss.errors import LegsError
 from legs_loss.system import FileLock, HeldError, open_regular, write_whole
+from legs_loss.system.values import each, is_count, is_number, is_pair, is_scores, is_text, optional, with_names
 
 __all__ = ["CHECKPOINT", "LOCK", "alone_in", "check_new", "read_checkpoint", "read_state", "write_checkpoint"]
 
@@ -64,17 +65,18 @@ def read_state(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:
 
 
 # What a checkpoint has to hold, and as what; the shapes of arrays with "n" Gaussians of "k" coefficients.
-FACTS: Dict[str, Tuple[type, ...]] = {
-    "config": (dict,),
-    "views": (list,),
-    "iteration": (int,),
-    "clocks": (list,),
-    "order": (list,),
-    "loss": (float, int, type(None)),
-    "psnr": (float, int, type(None)),
-    "growth": (list,),
-    "history": (list,),
+FACTS: Dict[str, Callable[[Any], bool]] = {
+    "config": lambda value: type(value) is dict,
+    "views": each(is_text),
+    "iteration": is_count,
+    "clocks": lambda value: each(is_number)(value) and len(value) == 2,
+    "order": each(is_count),
+    "loss": optional(is_number),
+    "psnr": optional(is_number),
+    "growth": each(is_pair),
+    "history": each(with_names(is_scores, "iteration")),
 }
+_MOST = 1e15  # of any value: a step from there is a number still
 _GAUSSIANS: Dict[str, Tuple[Any, ...]] = {
     "means": ("n", 3),
     "log_scales": ("n", 3),
@@ -88,13 +90,11 @@ def _what_is_wrong(arrays: Mapping[str, np.ndarray], facts: Any) -> Optional[str
     """Return why a checkpoint is not a training's state; None where it is valid."""
     if not isinstance(facts, dict):
         return "its facts are none"
-    for name, kinds in FACTS.items():
-        if not isinstance(facts.get(name, ...), kinds):
+    for name, fits in FACTS.items():
+        if name not in facts or not fits(facts[name]):
             return f"no {name}" if name not in facts else f"{name} is {facts[name]!r:.40}"
-    if facts["iteration"] < 0 or any(type(i) is not int or not 0 <= i < len(facts["views"]) for i in facts["order"]):
+    if any(index >= len(facts["views"]) for index in facts["order"]):
         return "its views have other numbers"
-    if not all(isinstance(seconds, (int, float)) for seconds in facts["clocks"]):
-        return "its clocks are no numbers"
     sets = ("gaussians", "moment1", "moment2")
     shapes = {f"{label}.{name}": shape for label in sets for name, shape in _GAUSSIANS.items()}
     shapes.update(gradient_sum=("n",), times_seen=("n",), steps=(), generator=(len(torch.Generator().get_state()),))
@@ -103,9 +103,16 @@ def _what_is_wrong(arrays: Mapping[str, np.ndarray], facts: Any) -> Optional[str
         return f"no {missing[0]}"
     count, coefficients = (arrays["gaussians.sh"].shape + (0, 0))[:2]
     sizes = {"n": count, "k": coefficients}
+    kinds = {"steps": np.dtype(np.int64), "generator": np.dtype(np.uint8)}
     for name, shape in shapes.items():
-        if arrays[name].shape != tuple(sizes.get(side, side) for side in shape) or arrays[name].dtype.kind not in "fiu":
-            return f"{name} is {arrays[name].dtype} of shape {list(arrays[name].shape)}"
+        array, kind = arrays[name], kinds.get(name, np.dtype(np.float32))
+        if array.shape != tuple(sizes.get(side, side) for side in shape) or array.dtype != kind:
+            return f"{name} is {array.dtype} of shape {list(array.shape)}"
+        least = 0.0 if name.startswith("moment2.") else -_MOST
+        if kind == np.float32 and not ((array >= least) & (array <= _MOST)).all():
+            return f"{name} has values that none can have"
+    if not 0 <= int(arrays["steps"]) < 1 << 31:
+        return f"{arrays['steps']} steps"
     if coefficients not in (1, 4, 9, 16):
         return f"gaussians.sh has {coefficients} coefficients"
     try:

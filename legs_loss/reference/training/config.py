@@ -56,7 +56,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "spec", as_spec(self.spec))
         for name, fits, wanted in (
-            ("iterations", self.iterations >= 1, "at least 1"),
+            ("iterations", 1 <= self.iterations < 1 << 31, "at least 1 and below 2^31"),
             ("sh_degree", self.sh_degree in (0, 1, 2, 3), "0, 1, 2 or 3"),
             ("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "in [0, 1]"),
             ("l1_scale", 0.0 <= self.l1_scale < float("inf"), "at least 0"),
@@ -72,6 +72,7 @@ class TrainConfig:
             ),
             ("shuffled", type(self.shuffled) is bool, "True or False"),
             ("max_gaussians", self.max_gaussians is None or self.max_gaussians >= 1, "at least 1"),
+            ("seed", -(1 << 63) <= self.seed < 1 << 63, "an integer of 64 bits"),
         ):
             if not fits:
                 raise LegsError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
@@ -101,7 +102,7 @@ class TrainConfig:
             return cls(**dict(values, spec=spec))
         except LegsError:
             raise
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise LegsError(f"these are not settings of a training: {error}") from None
 
     @property

@@ -11,7 +11,7 @@ from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 from legs_adapters.checkout.git import changed_files
 from legs_adapters.checkout.replace import locked, read_file, replace_files
 from legs_adapters.code.folders import why_left_out
-from legs_adapters.code.sources import check_root, read_files
+from legs_adapters.code.sources import Unreadable, check_root, read_files
 from legs_adapters.edit import Edit, apply_edits, rewrite
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_adapters.rules.find import find
@@ -77,8 +77,15 @@ def plan(
     """
     root = check_root(path)
     files = read_files(root, exclude)
+    edits: Dict[str, List[Edit]] = {}
     with _deep_recursion():
         findings = find(files.readable, by_hand, files.unread, ssim)
+        for name in sorted({site.path for site in findings.sites} | {call.path for call in findings.kept}):
+            try:
+                edits[name] = _edits(findings, name, in_place)
+            except RecursionError:
+                findings.without([name])
+                findings.unreadable.append(Unreadable(name, "is nested too deeply"))
     findings.unreadable[:0] = files.unreadable
     for name, line in by_hand:
         if not any(site.path == name and site.named_by(line) for site in findings.sites) and not any(
@@ -89,16 +96,17 @@ def plan(
             if why is not None:
                 raise LegsError(f"{name}:{line}: {why}")
             raise LegsError(f"there is no L1 term at {name}:{line} that can be rewritten")
-    edits: Dict[str, List[Edit]] = {}
-    after: Dict[str, bytes] = {}
-    for name in sorted({site.path for site in findings.sites} | {call.path for call in findings.kept}):
-        source, module = findings.program.sources[name], findings.program.module(name)
-        assert module is not None
-        sites = [site for site in findings.sites if site.path == name]
-        kept = [call for call in findings.kept if call.path == name]
-        edits[name] = rewrite(source, module, sites, kept, in_place)
-        after[name] = apply_edits(source.data, edits[name])
+    after = {name: apply_edits(findings.program.sources[name].data, made) for name, made in edits.items()}
     return Plan(root, findings, edits, after)
+
+
+def _edits(findings: Findings, name: str, in_place: bool) -> List[Edit]:
+    """Return the edits of one file."""
+    source, module = findings.program.sources[name], findings.program.module(name)
+    assert module is not None
+    sites = [site for site in findings.sites if site.path == name]
+    kept = [call for call in findings.kept if call.path == name]
+    return rewrite(source, module, sites, kept, in_place)
 
 
 def write(plan: Plan, force: bool = False) -> List[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 
-from legs_adapters.checkout.comparing import unified_diff
+from legs_adapters.checkout.comparing import Effort, unified_diff
 from legs_adapters.code.syntax import one_line
 from legs_adapters.plan import Plan
 from legs_adapters.settings import SETTINGS_FILE
@@ -114,17 +114,18 @@ def as_diff(plan: Plan, colour: bool) -> str:
 
 def changes_as_diff(changes: Mapping[str, Tuple[Optional[bytes], Optional[bytes]]], colour: bool) -> str:
     """Return a unified diff of files' bytes before and after; None is no file."""
+    effort = Effort()
     parts = [
         printable(line, lines=True)
         for path, (before, after) in changes.items()
-        for line in _unified(path, before, after)
+        for line in _unified(path, before, after, effort)
     ]
     return "".join(_coloured(line) if colour else line for line in parts)
 
 
-def _unified(path: str, before: Optional[bytes], after: Optional[bytes]) -> List[str]:
+def _unified(path: str, before: Optional[bytes], after: Optional[bytes], effort: Effort) -> List[str]:
     names = "/dev/null" if before is None else f"a/{path}", "/dev/null" if after is None else f"b/{path}"
-    lines = unified_diff(_lines(before), _lines(after), names)
+    lines = unified_diff(_lines(before), _lines(after), names, effort)
     shown = []
     for line in lines:
         shown.append(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n")

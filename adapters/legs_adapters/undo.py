@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
-from legs_adapters.checkout.comparing import matching_lines
+from legs_adapters.checkout.comparing import Effort, matching_lines
 from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
 from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL, Journal, digest
@@ -61,6 +61,7 @@ def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
     changes: Dict[str, Tuple[Optional[bytes], Optional[bytes]]] = {}
     done = Undone([], [], [], changes)
     edited: List[str] = []
+    effort = Effort()
     for name, layers in journal.files.items():
         current = read_file(root, name)
         if current is None:
@@ -75,7 +76,7 @@ def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
                 if digest(data) in (digest(earlier.original) for earlier in layers):
                     continue
                 edited.append(name)
-                data, missing = undo_edits(layer.original, layer.patched(), data)
+                data, missing = undo_edits(layer.original, layer.patched(), data, effort)
                 lost.extend(missing)
         if lost:
             shown = sorted(set(lost))
@@ -112,23 +113,27 @@ def _not_ours(root: Path, journal: Journal, path: object) -> str:
     )
 
 
-def undo_edits(original: bytes, patched: bytes, current: bytes) -> Tuple[bytes, List[str]]:
+def undo_edits(
+    original: bytes, patched: bytes, current: bytes, effort: Optional[Effort] = None
+) -> Tuple[bytes, List[str]]:
     """Restore the patched lines of a file that was edited since.
 
     Args:
         original, patched: the file before and after the patch.
         current: the file as it stands.
+        effort: what comparing it may take, with the other files.
 
     Returns:
         The file with the patch's lines as they were and the edits as they are; and the patched lines that are no
         longer there as the patch left them, which were left alone.
     """
     before, after, lines = (data.splitlines(keepends=True) for data in (original, patched, current))
+    effort = effort or Effort()
     lost: List[str] = []
-    where = {a + i: b + i for a, b, size in matching_lines(after, lines) for i in range(size)}
+    where = {a + i: b + i for a, b, size in matching_lines(after, lines, effort) for i in range(size)}
     changes: List[Tuple[int, int, Sequence[bytes]]] = []
     ended = 0, 0
-    for i2, j2, size in [*matching_lines(before, after), (len(before), len(after), 0)]:
+    for i2, j2, size in [*matching_lines(before, after, effort), (len(before), len(after), 0)]:
         (i1, j1), ended = ended, (i2 + size, j2 + size)
         if (i1, j1) == (i2, j2):
             continue

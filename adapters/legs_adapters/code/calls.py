@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Iterator, List, NamedTuple, Optional, Tuple
+from typing import Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
 
@@ -64,9 +64,13 @@ def _named(
 ) -> Iterator[Tuple[Function, cst.Call, List[object]]]:
     """Yield the calls of a function's name elsewhere, each with its caller and the functions it resolves to."""
     for caller in program.mentioning(function.name, called=True)[:most]:
-        for call in caller.flow.calls if caller is not function else ():
+        for call in _calls_in(caller) if caller is not function else ():
             if call_name(call) == function.name:
                 yield caller, call, [r.target for r in program.resolve(caller, call.func) if not r.guess]
+
+
+def _calls_in(caller: Function) -> Sequence[cst.Call]:
+    return caller.flow.calls if caller.module.spend(len(caller.flow.calls)) else ()
 
 
 def callees(program: Program, function: Function, call: cst.Call) -> List[Function]:
@@ -80,7 +84,7 @@ def given_to(
 ) -> Iterator[Tuple[Function, Optional[cst.BaseExpression]]]:
     """Yield callers of a function's name, each with its argument for a parameter, None where it is missing."""
     for caller in program.mentioning(function.name, called=True):
-        for call in caller.flow.calls if caller is not function else ():
+        for call in _calls_in(caller) if caller is not function else ():
             if call_name(call) == function.name:
                 yield caller, function.given(call, parameter)
 
@@ -163,7 +167,7 @@ def _mentions(module: Module, name: str, said: re.Pattern[str]) -> Iterator[_Men
     """Yield the mentions of a name in a file, without definitions, imports and keyword arguments."""
     for scope in module.scopes(said.search):
         stack: List[Tuple[cst.CSTNode, Tuple[cst.CSTNode, ...]]] = [(scope.body, ())]
-        while stack:
+        while stack and module.spend(1):
             node, around = stack.pop()
             if _says(node, around, name):
                 yield _Mention(scope, node, around)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import re
 from pathlib import PurePosixPath
-from typing import Callable, Dict, Iterable, List, Mapping, Optional, Set, Tuple
+from typing import Callable, Dict, Iterable, Iterator, List, Mapping, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.limits import ONE, TOGETHER, largest_over, pieces
+from legs_adapters.code.limits import Budget
 from legs_adapters.code.module import Function, Module, parse, said
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import dotted
 
 __all__ = ["Checkout", "imported_name"]
 
-_WHY_OVER = f"too large: all files have more than {TOGETHER} words and signs together; leave others out by --exclude"
 _DEFINED = re.compile(r"^[ \t]*(?:async[ \t]+)?(?:def|class)[ \t]+(\w+)", re.M)
 
 
@@ -30,7 +29,7 @@ class Checkout:
     def __init__(self, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> None:
         self.unread: Mapping[str, str] = unread or {}
         self.sources: Dict[str, Source] = {source.path: source for source in sources}
-        self._over = _over(self.sources)
+        self._budget = Budget()
         self._unreadable: Dict[str, Unreadable] = {}
         self._modules: Dict[str, Optional[Module]] = {}
         self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
@@ -50,7 +49,7 @@ class Checkout:
     def module(self, path: str) -> Optional[Module]:
         """Return a parsed file; None where it does not parse (it is then among ``unreadable``)."""
         if path not in self._modules:
-            parsed = Unreadable(path, _WHY_OVER) if path in self._over else parse(self.sources[path])
+            parsed = parse(self.sources[path], self._budget)
             if isinstance(parsed, Unreadable):
                 self._unreadable[path] = parsed
             self._modules[path] = parsed if isinstance(parsed, Module) else None
@@ -66,10 +65,12 @@ class Checkout:
         """Record a file as unreadable."""
         self._unreadable[path] = Unreadable(path, reason)
 
-    def matching(self, pattern: re.Pattern[str]) -> List[Module]:
-        """Return the modules whose text matches."""
-        found = [self.module(path) for path, source in self.sources.items() if pattern.search(source.text)]
-        return [module for module in found if module is not None]
+    def matching(self, pattern: re.Pattern[str]) -> Iterator[Module]:
+        """Yield the modules whose text matches, each parsed when it is reached."""
+        for path, source in self.sources.items():
+            module = self.module(path) if pattern.search(source.text) else None
+            if module is not None:
+                yield module
 
     def mentioning(self, name: str, called: bool = False) -> List[Function]:
         """Return the functions and top levels whose text mentions a name, or calls it."""
@@ -178,14 +179,6 @@ class Checkout:
         ends = [p for p in known if defines.search(self.sources[p].text)]
         ends = _nearest(module.path, ends)
         return self.module(ends[0]) if len(ends) == 1 else None
-
-
-def _over(sources: Mapping[str, Source]) -> Set[str]:
-    """Return the largest files, which are not parsed even if they are asked for, where all are too much together."""
-    if sum(len(source.text) for source in sources.values()) <= TOGETHER:  # the most pieces that they can have
-        return set()
-    sizes = {path: pieces(source.text) for path, source in sources.items()}
-    return largest_over({path: size for path, size in sizes.items() if size <= ONE}, TOGETHER)
 
 
 def imported_name(node: cst.ImportFrom) -> str:

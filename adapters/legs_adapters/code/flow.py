@@ -1,16 +1,26 @@
 """Walk one function body in the order of execution, and record what reaches each use.
 
-Branches are joined, a loop is walked twice, an assignment replaces the earlier definitions of a name.
+Branches are joined. A loop is walked twice, and once more for each further walk of a loop around it.
 """
 
 from __future__ import annotations
 
-from typing import Callable, Dict, Iterator, List, Optional, Sequence, Set, Tuple
+import math
+from typing import Callable, Dict, List, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.reaching import Definition, Env, Reaching, join
-from legs_adapters.code.syntax import call_name, children, constant, dotted, path_of
+from legs_adapters.code.syntax import (
+    call_name,
+    children,
+    constant,
+    dotted,
+    every_parameter,
+    names_where_false,
+    names_where_true,
+    path_of,
+)
 
 __all__ = ["Flow"]
 
@@ -23,6 +33,7 @@ class Flow(Reaching):
     Args:
         body: its statements.
         parameters: the function's parameters; None for a module.
+        most: the steps after which the walk ends.
 
     Attributes:
         calls: every call in the body, in source order, nested functions excepted.
@@ -31,10 +42,18 @@ class Flow(Reaching):
         contexts: by a node's id, the context managers around it: ``with torch.no_grad():``.
         reads: every name that is read, in source order.
         conditions: by a call's id, the names that must be true where it runs: ``if tracking:``.
+        steps: how many it took: nodes that were visited, and definitions that were copied, four a step.
     """
 
-    def __init__(self, body: cst.BaseSuite | cst.Module, parameters: Optional[cst.Parameters] = None) -> None:
+    def __init__(
+        self,
+        body: cst.BaseSuite | cst.Module,
+        parameters: Optional[cst.Parameters] = None,
+        most: float = math.inf,
+    ) -> None:
         super().__init__()
+        self.steps = 0
+        self._most = most
         self.calls: List[cst.Call] = []
         self.expressions: List[cst.CSTNode] = []
         self.returns: List[cst.BaseExpression] = []
@@ -45,11 +64,12 @@ class Flow(Reaching):
         self.reads: List[cst.Name] = []
         self._around: Tuple[cst.CSTNode, ...] = ()
         self._conditions: Tuple[str, ...] = ()
+        self._carried: Dict[int, Optional[Env]] = {}  # by a loop's id: what its end hands back to its start
         self._breaks: List[List[Env]] = []
         self._continues: List[List[Env]] = []
         env: Env = {}
         if parameters is not None:
-            for param in _parameters(parameters):
+            for param in every_parameter(parameters):
                 self._bind(env, Definition(param.name.value, "parameter", param, param.default))
         self._block(_statements(body), env)
 
@@ -104,6 +124,8 @@ class Flow(Reaching):
 
     def _block(self, statements: Sequence[cst.CSTNode], env: Optional[Env]) -> Optional[Env]:
         for statement in statements:
+            if self.steps > self._most:
+                return None
             if env is None:
                 # Unreachable (after a return or a continue), but its names are recorded.
                 self._statement(statement, {})
@@ -117,14 +139,14 @@ class Flow(Reaching):
         if isinstance(node, cst.If):
             self._visit(node.test, env)
             outer = self._conditions
-            self._conditions = outer + _true_names(node.test)
-            taken = self._block(_statements(node.body), dict(env))
-            self._conditions = outer + _true_names_else(node.test)
+            self._conditions = outer + names_where_true(node.test)
+            taken = self._block(_statements(node.body), self._copy(env))
+            self._conditions = outer + names_where_false(node.test)
             left: Optional[Env] = env
             if isinstance(node.orelse, cst.If):
-                left = self._statement(node.orelse, dict(env))
+                left = self._statement(node.orelse, self._copy(env))
             elif node.orelse is not None:
-                left = self._block(_statements(node.orelse.body), dict(env))
+                left = self._block(_statements(node.orelse.body), self._copy(env))
             self._conditions = outer
             return join([taken, left])
         if isinstance(node, (cst.For, cst.While)):
@@ -140,14 +162,14 @@ class Flow(Reaching):
             self._around = outside
             return after
         if isinstance(node, (cst.Try, cst.TryStar)):
-            before = dict(env)
+            before = self._copy(env)
             body = self._block(_statements(node.body), env)
             ends = []
             for handler in node.handlers:
-                entry = join([before, body]) or dict(before)
+                entry = join([before, body]) or self._copy(before)
                 if handler.name is not None:
                     self._assign(entry, handler.name.name, handler.type, handler, "with")
-                ends.append(self._block(_statements(handler.body), dict(entry)))
+                ends.append(self._block(_statements(handler.body), self._copy(entry)))
             if node.orelse is not None:
                 body = self._block(_statements(node.orelse.body), body)
             after = join([body, *ends])
@@ -170,7 +192,7 @@ class Flow(Reaching):
             self._visit(node.subject, env)  # type: ignore[attr-defined]
             ends = [env]
             for case in node.cases:  # type: ignore[attr-defined]
-                ends.append(self._block(_statements(case.body), dict(env)))
+                ends.append(self._block(_statements(case.body), self._copy(env)))
             return join(ends)
         return self._small(node, env)
 
@@ -224,22 +246,26 @@ class Flow(Reaching):
     def _loop(self, node: cst.For | cst.While, env: Env) -> Optional[Env]:
         if isinstance(node, cst.For):
             self._visit(node.iter, env)
-        entry: Optional[Env] = env
         breaks: List[Env] = []
-        for _ in range(2):  # the second pass starts with the definitions of the first
+        for _ in range(1 if id(node) in self._carried else 2):
             self._breaks.append([])
             self._continues.append([])
-            around: Env = dict(entry or {})
+            around: Env = self._copy(join([env, self._carried.get(id(node))]) or {})
             if isinstance(node, cst.For):
                 self._assign(around, node.target, node.iter, node, "element")
             else:
                 self._visit(node.test, around)
             end = self._block(_statements(node.body), around)
             breaks = breaks + self._breaks.pop()
-            entry = join([env, end, *self._continues.pop()])
+            self._carried[id(node)] = join([end, *self._continues.pop()])
+        entry = join([env, self._carried[id(node)]])
         if node.orelse is not None:
             entry = self._block(_statements(node.orelse.body), entry)
         return join([entry, *breaks])
+
+    def _copy(self, env: Env) -> Env:
+        self.steps += len(env) >> 2
+        return dict(env)
 
     def _mutation(self, node: cst.CSTNode, env: Env) -> None:
         if not isinstance(node, cst.Call) or not isinstance(node.func, cst.Attribute):
@@ -269,6 +295,7 @@ class Flow(Reaching):
 
     def _visit(self, node: cst.CSTNode, env: Env) -> None:
         """Record the definitions that reach an expression and its parts, in the order of evaluation."""
+        self.steps += 1
         if self._around:
             self.contexts[id(node)] = self._around
         visit = self._VISITS.get(type(node))  # by class: isinstance on every node takes half of the walk's time
@@ -294,7 +321,9 @@ class Flow(Reaching):
 
     def _call(self, node: cst.Call, env: Env) -> None:
         self.conditions[id(node)] = self._conditions
-        self._names.setdefault(id(node), []).append(dict(env))
+        if self._snapshot is None or self._snapshot[0] is not env:
+            self._snapshot = env, self._copy(env)
+        self._names.setdefault(id(node), []).append(self._snapshot[1])
         if self._is_first(node):
             self.expressions.append(node)
             self.calls.append(node)
@@ -331,13 +360,13 @@ class Flow(Reaching):
         self._parts(node, env)
 
     def _lambda(self, node: cst.Lambda, env: Env) -> None:
-        inner = dict(env)
-        for param in _parameters(node.params):
+        inner = self._copy(env)
+        for param in every_parameter(node.params):
             self._bind(inner, Definition(param.name.value, "parameter", param, param.default))
         self._visit(node.body, inner)
 
     def _comprehension(self, node: cst.BaseSimpleComp | cst.DictComp, env: Env) -> None:
-        inner = dict(env)
+        inner = self._copy(env)
         loop: Optional[cst.CompFor] = node.for_in
         while loop is not None:
             self._visit(loop.iter, inner)
@@ -369,26 +398,3 @@ def _statements(body: cst.BaseSuite | cst.Module) -> Sequence[cst.CSTNode]:
 def _counts(value: Optional[cst.CSTNode]) -> bool:
     """Return whether a loop iterates over several things together: ``enumerate(...)``, ``zip(...)``."""
     return isinstance(value, cst.Call) and call_name(value) in ("enumerate", "zip")
-
-
-def _parameters(parameters: cst.Parameters) -> Iterator[cst.Param]:
-    for group in (parameters.posonly_params, parameters.params, parameters.kwonly_params):
-        yield from group
-    for extra in (parameters.star_arg, parameters.star_kwarg):
-        if isinstance(extra, cst.Param):
-            yield extra
-
-
-def _true_names(test: cst.BaseExpression) -> Tuple[str, ...]:
-    """Return the names that are true where a test is true: for ``tracking and x > 0``: tracking."""
-    if isinstance(test, cst.BooleanOperation) and isinstance(test.operator, cst.And):
-        return _true_names(test.left) + _true_names(test.right)
-    name = dotted(test)
-    return () if name is None else (name.split(".")[-1],)
-
-
-def _true_names_else(test: cst.BaseExpression) -> Tuple[str, ...]:
-    """Return the names that are true where a test is false: for ``not tracking``: tracking."""
-    if isinstance(test, cst.UnaryOperation) and isinstance(test.operator, cst.Not):
-        return _true_names(test.expression)
-    return ()

@@ -1,10 +1,8 @@
-"""Limits of what is planned: a file over them is reported as not read, and the rest of the checkout is planned.
+"""Bound what a stranger's code may cost: a budget of steps, and limits of what a parser's stack holds.
 
-They are checked on the text, before it is parsed: deep code may crash a parser, and the walk of a long expression takes
-time quadratic in its parts. So the result does not depend on the machine or its load.
-
-LibCST takes up to 4 KB and 40 microseconds for each word, sign and line end. The maxima in 251 checkouts: 41,000 of
-them in a file, 693,000 in a checkout, whose Python files have 2.7 MB; of ``ASKED`` 439,000, and 916,000 together.
+What is over is one line of the report, unread, and the rest of the checkout is planned. A step is a node of a syntax
+tree that is looked at; a word, sign or line end that is parsed costs twenty. A step takes some 2 microseconds and at
+most 200 bytes. Steps are counted, so the result does not depend on the machine or its load.
 """
 
 from __future__ import annotations
@@ -13,29 +11,26 @@ import re
 from typing import Dict, List, Mapping, Set
 
 __all__ = [
-    "ASKED",
-    "ASKED_TOGETHER",
-    "LARGEST",
-    "ONE",
-    "READ",
-    "TOGETHER",
+    "MAX_BYTES",
+    "MAX_FILE_BYTES",
+    "Budget",
     "largest_over",
     "over_the_limits",
-    "pieces",
+    "parsing_steps",
     "too_deep",
 ]
 
-LARGEST = 1 << 20  # bytes of a file
-READ = 32 << 20  # bytes of all files
-ONE = 250_000  # words, signs and line ends of a file
-TOGETHER = 2_000_000  # of all files
-ASKED = 2_000_000  # of a function, times the places in it that speak of an L1: each is asked about all of it
-ASKED_TOGETHER = 20_000_000  # of all functions
-DEEPEST = 150  # brackets in brackets; Python itself refuses 200
-BLOCKS = 100  # in blocks; as Python
-PARTS = 2000  # of one expression: operators, calls, attributes, strings in a row, `elif` in a row
-INNER = 200  # functions in one function
+MAX_FILE_BYTES = 1 << 20
+MAX_BYTES = 32 << 20  # of all files
+MAX_FILE_STEPS = 3_000_000
+MAX_STEPS = 40_000_000  # of all files
+MAX_BRACKETS = 150  # in one another; Python itself refuses 200
+MAX_BLOCKS = 100  # in one another; as Python
+MAX_PARTS = 2000  # of one expression: operators, calls, attributes, strings in a row, `elif` in a row
 
+_TOKEN_STEPS = 20
+_LAMBDA = 3  # parts: LibCST's parser takes memory quadratic in lambdas in one another, 200 MB for 1,000
+_WHY_OVER = f"its analysis takes more than {MAX_FILE_STEPS} steps"
 _PIECE = re.compile(r"\w+|[^\w\s]|\n")
 _NO_BRACKETS = bytes(set(range(256)) - set(b"()[]{}"))
 _STRING = r"""\'\'\'(?:[^\\]|\\.)*?\'\'\'|\"\"\"(?:[^\\]|\\.)*?\"\"\"|'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*\""""
@@ -45,28 +40,52 @@ _TOKEN = re.compile(
     re.S,
 )
 _FIELD = re.compile(r"\{[^{}]*\}")
-_LINE = re.compile(r"^([ \t]*)(elif\b|else\b|(?:async[ \t]+)?def\b|[^\s#])", re.M)
+_LINE = re.compile(r"^([ \t]*)(elif\b|else\b|[^\s#])", re.M)
 
 
 def too_deep(data: bytes) -> str:
     """Return why a file's brackets are too deep for any parser, or "": by the brackets alone, in strings too."""
     brackets = data.translate(None, _NO_BRACKETS)
-    for _ in range(DEEPEST):
+    for _ in range(MAX_BRACKETS):
         inner = brackets.replace(b"()", b"").replace(b"[]", b"").replace(b"{}", b"")
         if len(inner) == len(brackets):
             # Unpaired brackets, in strings for example, are shallow unless many open in a row.
             runs = re.findall(rb"[(\[{]+", brackets)
-            return _DEEP if max(map(len, runs), default=0) > DEEPEST else ""
+            return _DEEP if max(map(len, runs), default=0) > MAX_BRACKETS else ""
         brackets = inner
     return _DEEP if brackets else ""
 
 
-_DEEP = f"brackets are nested more than {DEEPEST} deep"
+_DEEP = f"brackets are nested more than {MAX_BRACKETS} deep"
 
 
-def pieces(text: str) -> int:
-    """Count words, signs and line ends, in strings and comments too: they determine the cost of parsing."""
-    return len(_PIECE.findall(text))
+class Budget:
+    """The steps that the analysis of one checkout takes, each file's on its own account."""
+
+    def __init__(self) -> None:
+        self._spent: Dict[str, int] = {}
+        self._together = 0
+
+    def spend(self, path: str, steps: int) -> str:
+        """Count steps of a file; return why it may take no more, or ""."""
+        self._spent[path] = self._spent.get(path, 0) + steps
+        self._together += steps
+        return _WHY_OVER if self._spent[path] > MAX_FILE_STEPS else ""
+
+    def left(self, path: str) -> int:
+        """Return how many steps a file may still take."""
+        return MAX_FILE_STEPS - self._spent.get(path, 0)
+
+    def why_none_left(self) -> str:
+        """Return why no further file is read, or ""; what was read before stays."""
+        if self._together <= MAX_STEPS:
+            return ""
+        return f"all files together take more than {MAX_STEPS} steps: leave others out by --exclude"
+
+
+def parsing_steps(text: str) -> int:
+    """Return the steps of parsing a text: by words, signs and line ends, in strings and comments too."""
+    return _TOKEN_STEPS * len(_PIECE.findall(text))
 
 
 def largest_over(sizes: Mapping[str, int], most: int) -> Set[str]:
@@ -82,10 +101,10 @@ def largest_over(sizes: Mapping[str, int], most: int) -> Set[str]:
 
 
 def over_the_limits(text: str) -> str:
-    """Return why the code of a file is not analysed, or "" where it is within the limits."""
-    if len(text) > ONE and pieces(text) > ONE:
-        return f"more than {ONE} words and signs"
-    return _blocks(text) or (f"an expression of more than {PARTS} parts" if _longest(text) > PARTS else "")
+    """Return why a file is not parsed, or "": it is too long, or its blocks or an expression are too deep."""
+    if _TOKEN_STEPS * len(text) > MAX_FILE_STEPS and parsing_steps(text) > MAX_FILE_STEPS:
+        return _WHY_OVER
+    return _blocks(text) or (f"an expression of more than {MAX_PARTS} parts" if _longest(text) > MAX_PARTS else "")
 
 
 def _longest(text: str) -> int:
@@ -105,7 +124,7 @@ def _longest(text: str) -> int:
         elif kind == "signs":
             here[0] += len(found.group())
         elif kind == "lambda":
-            here[1] += 1
+            here[1] += _LAMBDA
         elif kind == "open":
             here[0] += 1
             before.append(here)
@@ -128,23 +147,14 @@ def _blocks(text: str) -> str:
     """Return which limit on blocks is exceeded, from the indentation of lines."""
     columns: List[int] = []  # of the blocks that a line is in
     branches: Dict[int, int] = {}  # `elif` in a row, by column
-    functions: List[int] = []  # the columns of `def` that a line is in
-    inner = 0
     for found in _LINE.finditer(text):
         column, word = len(found.group(1).expandtabs()), found.group(2)
         while columns and columns[-1] >= column:
             branches.pop(columns.pop(), None) if columns[-1] > column else columns.pop()
         columns.append(column)
-        if len(columns) > BLOCKS:
-            return f"blocks are nested more than {BLOCKS} deep"
+        if len(columns) > MAX_BLOCKS:
+            return f"blocks are nested more than {MAX_BLOCKS} deep"
         branches[column] = branches.get(column, 0) + 1 if word == "elif" else branches.get(column, 0) * (word == "else")
-        if branches[column] > PARTS:
-            return f"more than {PARTS} elif in a row"
-        while functions and functions[-1] >= column:
-            functions.pop()
-        if word.endswith("def"):
-            inner = inner + 1 if functions else 0
-            functions.append(column)
-            if inner > INNER:
-                return f"more than {INNER} functions in one function"
+        if branches[column] > MAX_PARTS:
+            return f"more than {MAX_PARTS} elif in a row"
     return ""

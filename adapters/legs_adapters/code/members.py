@@ -63,6 +63,8 @@ class Members(Checkout):
     ) -> None:
         super().__init__(sources, unread)
         self._conventions = conventions or Conventions()
+        # by expression and depth; each may be asked from many places, and asks for many others
+        self._resolved: Dict[Function, Dict[Tuple[int, int], Tuple[cst.CSTNode, List[Reference]]]] = {}
         self._common = _COMMON | self._conventions.common
 
     def resolve(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[Reference]:

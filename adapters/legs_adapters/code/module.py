@@ -8,7 +8,7 @@ from typing import Callable, Dict, Iterator, List, Optional, Sequence, Set, Tupl
 import libcst as cst
 
 from legs_adapters.code.flow import Flow
-from legs_adapters.code.limits import over_the_limits
+from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps
 from legs_adapters.code.parsing import Cut, Lines, Part, Place, body_part, outline_part
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
@@ -68,7 +68,7 @@ class Function:
         """Its statements, parsed on first use."""
         if self._body is None:
             self._body = self.node if isinstance(self.node, cst.Module) else self.node.body
-            if self._cut is not None:
+            if self._cut is not None and self.module.spend(parsing_steps(self.text)):
                 try:
                     self._part = body_part(self.module.lines, self._cut)
                     header = self._part.tree.body[0]
@@ -117,7 +117,12 @@ class Function:
         """Its reaching definitions, computed once."""
         if self._flow is None:
             parameters = self.node.params if isinstance(self.node, cst.FunctionDef) else None
-            self._flow = Flow(self.body, parameters)
+            try:
+                self._flow = Flow(self.body, parameters, self.module.budget.left(self.module.path))
+            except RecursionError as error:
+                self.module.failure = _failure(self.module.path, self.module.text, error)
+            if self._flow is None or not self.module.spend(self._flow.steps):
+                self._flow = Flow(cst.Module(body=[]), parameters)
         return self._flow
 
     @property
@@ -208,17 +213,20 @@ class Module:
         text, lines: the file's text.
         outline, outline_text: the file without the bodies of its functions.
         classes: every class in it, but for those that functions define.
-        failure: why a body of it could not be parsed.
+        failure: why a body of it could not be parsed, or is not analysed further.
+        budget: what its analysis may take, with that of the other files.
     """
 
-    def __init__(self, path: str, text: str) -> None:
+    def __init__(self, path: str, text: str, budget: Optional[Budget] = None) -> None:
         self.path = path
+        self.budget: Budget = budget or Budget()
         self.text = text
         self.lines: Lines = Lines(text.encode("utf-8"))
         outline, cuts = outline_part(self.lines)
         self.outline: Part = outline
         self.outline_text: str = self.outline.text.decode("utf-8")
         self.failure: Optional[Unreadable] = None
+        self.spend(parsing_steps(self.outline_text))
         self.classes: List[Class] = []
         self.by_node: Dict[int, Function | Class] = {}
         self.top: Function = Function(self, self.outline.tree)
@@ -249,6 +257,13 @@ class Module:
                 self.by_node[id(node)] = found
                 functions += self.collect(node.body.body, parent, found)
         return functions
+
+    def spend(self, steps: int) -> bool:
+        """Count steps of its analysis; return whether it goes on. A file that is over is as one that does not parse."""
+        why = self.budget.spend(self.path, steps)
+        if why and self.failure is None:
+            self.failure = Unreadable(self.path, why)
+        return self.failure is None
 
     def says(self, piece: str) -> bool:
         """Return whether a piece of text is in the file, cached: each of its functions may ask."""
@@ -302,13 +317,13 @@ def _chosen(
             yield from _chosen(function.inner, says, function.text)
 
 
-def parse(source: Source) -> Module | Unreadable:
+def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadable:
     """Parse one file; a file that does not parse or is over the limits is returned with the reason."""
-    over = over_the_limits(source.text)
+    over = (budget.why_none_left() if budget is not None else "") or over_the_limits(source.text)
     if over:
         return Unreadable(source.path, over)
     try:
-        return Module(source.path, source.text)
+        return Module(source.path, source.text, budget)
     except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
         return _failure(source.path, source.text, error)
 

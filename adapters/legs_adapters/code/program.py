@@ -27,6 +27,13 @@ class Program(Members):
         """Return what an expression may refer to; empty where it is unknown."""
         if depth > DEPTH:
             return []
+        known = self._resolved.setdefault(function, {})
+        if (id(node), depth) not in known:
+            found = self._resolve(function, node, depth) if function.module.spend(1) else []
+            known[id(node), depth] = node, found  # the node, lest another gets its id
+        return known[id(node), depth][1]
+
+    def _resolve(self, function: Function, node: cst.CSTNode, depth: int) -> List[Reference]:
         if isinstance(node, cst.Name):
             found = self._definitions(function, node)
             if found is None:
@@ -213,7 +220,10 @@ class Program(Members):
             return unique(references)
         if name in self._common:
             return []
-        return [Reference("function", method, True) for method in self.methods_named(name)]
+        methods = self.methods_named(name)
+        if not function.module.spend(len(methods)):
+            return []
+        return [Reference("function", method, True) for method in methods]
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> List[Reference]:
         definitions = self._definitions(function, node.value)

@@ -70,6 +70,7 @@ class Reaching:
         self.definitions: Dict[str, List[Definition]] = {}
         self._reaching: Dict[int, Set[Definition]] = {}
         self._names: Dict[int, List[Env]] = {}
+        self._snapshot: Optional[Tuple[Env, Env]] = None  # an environment, and a copy as it is now
         self._made: Dict[Tuple[int, str, str], Definition] = {}
         self._holders: Set[str] = set()  # places of which a part is defined: ``x`` and ``x.y`` of ``x.y['z']``
 
@@ -109,6 +110,7 @@ class Reaching:
 
     def _bind(self, env: Env, definition: Definition) -> None:
         definition = self._known(definition)
+        self._snapshot = None
         place = definition.place
         if place in self._holders:  # a top level may bind thousands of names, and few of them have parts
             for other in [other for other in env if other.startswith((place + ".", place + "["))]:
@@ -117,6 +119,7 @@ class Reaching:
 
     def _add(self, env: Env, definition: Definition) -> None:
         definition = self._known(definition)
+        self._snapshot = None
         env[definition.place] = env.get(definition.place, frozenset()) | {definition}
 
     def unchanged(self, *nodes: cst.CSTNode) -> bool:

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Dict, List, NamedTuple, Sequence
 
 from legs_adapters.code.folders import check_name, own_and_excluded
-from legs_adapters.code.limits import LARGEST, READ, largest_over, too_deep
+from legs_adapters.code.limits import MAX_BYTES, MAX_FILE_BYTES, largest_over, too_deep
 from legs_loss import LegsError
 from legs_loss.system import read_regular
 
 __all__ = ["BOM", "Files", "Source", "Unreadable", "check_root", "decode", "read_files", "read_source"]
 
-_UNREAD = 64 << 20  # bytes in total; files over it are not searched for names
+_MAX_UNREAD_BYTES = 64 << 20  # bytes in total; files over it are not searched for names
 BOM = b"\xef\xbb\xbf"
 
 _CODING = re.compile(rb"^[ \t\f]*#.*?coding[:=][ \t]*([-\w.]+)")
@@ -85,13 +85,13 @@ def check_root(path: str | os.PathLike[str]) -> Path:
 def read_files(root: Path, exclude: Sequence[str]) -> Files:
     """Read the Python files of a checkout, except for excluded ones."""
     own, excluded = own_and_excluded(root, exclude)
-    over = largest_over({path: size for path, size in _sizes(root, own).items() if size <= LARGEST}, READ)
-    why = f"too large: all files have more than {READ >> 20} MiB together; leave others out by --exclude"
+    over = largest_over({path: size for path, size in _sizes(root, own).items() if size <= MAX_FILE_BYTES}, MAX_BYTES)
+    why = f"too large: all files have more than {MAX_BYTES >> 20} MiB together; leave others out by --exclude"
     read = [Unreadable(path, why) if path in over else read_source(root, path) for path in own]
     unreadable = [source for source in read if isinstance(source, Unreadable)]
     sizes = _sizes(root, [*excluded, *(source.path for source in unreadable)])
     unread: Dict[str, str] = {}
-    for path in sorted(set(sizes) - largest_over(sizes, _UNREAD)):
+    for path in sorted(set(sizes) - largest_over(sizes, _MAX_UNREAD_BYTES)):
         with contextlib.suppress(OSError):
             unread[path] = read_regular(root / path, sizes[path]).decode("utf-8", "replace")
     return Files([source for source in read if isinstance(source, Source)], unreadable, unread)
@@ -109,12 +109,12 @@ def read_source(root: Path, path: str) -> Source | Unreadable:
     """Read one file; one that is not UTF-8, or has a name that is never written, is returned with the reason."""
     try:
         check_name(path)
-        data = read_regular(root / path, LARGEST)
+        data = read_regular(root / path, MAX_FILE_BYTES)
     except LegsError:
         return Unreadable(path, "legs-patch writes no file of this name: rename it")
     except OSError as error:
-        large = error.errno == errno.EFBIG
-        return Unreadable(path, f"larger than {LARGEST >> 20} MiB" if large else f"cannot be read: {error.strerror}")
+        large = f"larger than {MAX_FILE_BYTES >> 20} MiB" if error.errno == errno.EFBIG else ""
+        return Unreadable(path, large or f"cannot be read: {error.strerror}")
     deep = too_deep(data)
     return Unreadable(path, deep) if deep else decode(path, data)
 

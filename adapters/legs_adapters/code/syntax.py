@@ -18,8 +18,11 @@ __all__ = [
     "code",
     "constant",
     "dotted",
+    "every_parameter",
     "key_of",
     "loops_around",
+    "names_where_false",
+    "names_where_true",
     "one_line",
     "path_of",
     "root_of",
@@ -230,12 +233,36 @@ def _fields(kind: type) -> Tuple[str, ...]:
 
 def same(a: cst.CSTNode, b: cst.CSTNode) -> bool:
     """Return whether two expressions have the same text, brackets and spaces aside."""
-    return squeezed(a) == squeezed(b)
+    return a is b or squeezed(a) == squeezed(b)
 
 
 def squeezed(node: cst.CSTNode) -> str:
     """Return the text of an expression without brackets around it, spaces and comments."""
     return re.sub(r"\s+|#[^\n]*", "", strip_parens(code(node)))
+
+
+def names_where_true(test: cst.BaseExpression) -> Tuple[str, ...]:
+    """Return the names that are true where a test is true: for ``tracking and x > 0``: tracking."""
+    if isinstance(test, cst.BooleanOperation) and isinstance(test.operator, cst.And):
+        return names_where_true(test.left) + names_where_true(test.right)
+    name = dotted(test)
+    return () if name is None else (name.split(".")[-1],)
+
+
+def names_where_false(test: cst.BaseExpression) -> Tuple[str, ...]:
+    """Return the names that are true where a test is false: for ``not tracking``: tracking."""
+    if isinstance(test, cst.UnaryOperation) and isinstance(test.operator, cst.Not):
+        return names_where_true(test.expression)
+    return ()
+
+
+def every_parameter(parameters: cst.Parameters) -> Iterator[cst.Param]:
+    """Yield the parameters of a function, ``*args`` and ``**kwargs`` included."""
+    for group in (parameters.posonly_params, parameters.params, parameters.kwonly_params):
+        yield from group
+    for extra in (parameters.star_arg, parameters.star_kwarg):
+        if isinstance(extra, cst.Param):
+            yield extra
 
 
 def walk_all(node: cst.CSTNode) -> Iterator[cst.CSTNode]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple, Union
 
-from legs_adapters.code.limits import ASKED, ASKED_TOGETHER, over_the_limits, pieces
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.sources import Source
@@ -28,7 +27,7 @@ __all__ = ["find"]
 
 _Entry = Tuple[Place, Union[Site, Left, Problem]]
 
-_DEFINITION = re.compile(r"^[ \t]*(?:async[ \t]+)?def\b", re.M)
+_TEXT = 50  # letters of a text that are searched in a step
 _MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|\bunweighted\(")
 
 
@@ -46,38 +45,8 @@ def find(
         unread: by path, the text of files that are ignored or cannot be read.
         ssim: find the SSIM terms, too.
     """
-    read, searched, over = [], dict(unread or {}), {}
-    for source in sources:
-        why = _long_function(source.text)
-        if why:
-            searched[source.path], over[source.path] = source.text, why
-        else:
-            read.append(source)
-    analysis = Analysis.of(read, searched)
-    for path, why in over.items():
-        analysis.program.give_up(path, why)
-    found = _Finder(analysis, by_hand).run()
+    found = _Finder(Analysis.of(sources, unread), by_hand).run()
     return with_ssims(found, by_hand) if ssim else found
-
-
-def _long_function(text: str) -> str:
-    """Return why a file is not analysed, or "": a function over the limit, found in the text before it is parsed."""
-    if not _too_often(text) or over_the_limits(text):  # the second is reported where the file is parsed
-        return ""
-    return next(filter(None, map(_too_often, _DEFINITION.split(text))), "")
-
-
-def _too_often(text: str) -> str:
-    """Return why a function of this text is not analysed, or "": the time for each place grows with the whole text."""
-    if _asked(text) <= ASKED:
-        return ""
-    return f"a function of {pieces(text)} words and signs speaks of an L1 {len(_MAY_HAVE_L1.findall(text))} times"
-
-
-def _asked(text: str) -> int:
-    """Return how much is analysed for a text: its words and signs, once for each place that speaks of an L1."""
-    places = len(_MAY_HAVE_L1.findall(text))
-    return places * pieces(text) if places else 0
 
 
 class _Finder:
@@ -88,11 +57,11 @@ class _Finder:
         self.doubts = Doubts(analysis, self.verdicts)
         self.found = Findings([], [], [], [], [], [], analysis.program)
         self.doubtful: List[Doubt] = []
-        self.asked = 0  # of all functions that were looked at
 
     def run(self) -> Findings:
         for module in self.analysis.program.matching(_MAY_HAVE_L1):
             self._module(module)
+        self.found.without(self.analysis.program.unreadable)
         if not (self.found.sites or self.found.patched or self.found.problems or self.by_hand):
             self.found.problems.extend(doubt.problem for doubt in self.doubtful)
             quoted = {(problem.path, problem.line) for problem, _ in self.doubtful}
@@ -112,13 +81,15 @@ class _Finder:
         return trains and doubt.is_told_beside_sites and path not in settled
 
     def _module(self, module: Module) -> None:
+        over = module.budget.why_none_left()
+        if over:
+            self.analysis.program.give_up(module.path, over)
+            return
         entries: List[_Entry] = []
         patched: List[Left] = []
         try:
             for function in module.scopes(lambda text: self.analysis.prospects.of(text) or STRUCTURAL.search(text)):
-                over = self._over_the_limits(function)
-                if over:
-                    self.analysis.program.give_up(module.path, over)
+                if not module.spend(len(function.text) // _TEXT):
                     return
                 entries += self._entries(function)
                 nodes = patched_nodes(self.analysis.program, function)
@@ -140,16 +111,6 @@ class _Finder:
                 self.found.left.append(entry)
         self.found.patched.extend(sorted(patched, key=lambda entry: entry.line))
 
-    def _over_the_limits(self, function: Function) -> str:
-        """Return why a function is not looked at, or "": what each of its places takes grows with all of it."""
-        if function.parent is not None and function.text is function.parent.text:
-            return ""  # that one was asked
-        why = _too_often(function.text)
-        if why:
-            return why
-        self.asked += _asked(function.text)
-        return "too many places speak of an L1 in all files: leave others out" if self.asked > ASKED_TOGETHER else ""
-
     def _entries(self, function: Function) -> Iterator[_Entry]:
         """Yield the verdict on each L1 in a function, with its place."""
         # Elsewhere an L1 could only be reached through two names, and nothing trains on it.
@@ -164,6 +125,8 @@ class _Finder:
 
     def _of_forms(self, function: Function) -> Iterator[_Entry]:
         for form in self.analysis.forms.of(function):
+            if not function.module.spend(10 * function.flow.steps):  # some rules look at all of it
+                return
             place = function.place(form.node)
             chosen = self._is_chosen(function, place)
             verdict = self.verdicts.of(function, form, place, chosen)

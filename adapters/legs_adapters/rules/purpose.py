@@ -6,7 +6,7 @@ whose gradients are read and discarded scores Gaussians. Everything else is trai
 
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Optional, Set
+from typing import Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
@@ -53,14 +53,24 @@ class Purposes:
         self.program = program
         self.training = training
         self._optimised = Optimised(program)
+        self._known: Dict[Tuple[Function, Tuple[int, ...], int], Optional[Purpose]] = {}
 
     def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Purpose]:
-        """Return the purpose of an expression that does not train; None where it may."""
+        """Return the purpose of an expression that does not train, by the loops around it; None where it may."""
+        loops = loops_around(function.body, node)
+        known = function, tuple(map(id, loops)), depth
+        if known not in self._known:
+            self._known[known] = self._purpose(function, node, loops, depth)
+        return self._known[known]
+
+    def _purpose(
+        self, function: Function, node: cst.CSTNode, loops: Sequence[cst.CSTNode], depth: int
+    ) -> Optional[Purpose]:
         calls = {id(call): call for call in function.flow.calls}
         passes = [call for call in function.flow.calls if is_backward(call)]
         if not passes:
             return self._of_callers(function, depth)
-        scopes = [*loops_around(function.body, node), function.body]
+        scopes = [*loops, function.body]
         stepped = False
         for scope in scopes:
             inside = list(calls_in(scope, node, calls))

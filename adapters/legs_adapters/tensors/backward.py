@@ -40,6 +40,7 @@ class Training:
         self.sites: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
         self._trained: Set[int] = set()
         self._touched: Set[Function] = set()
+        self._met: Set[Tuple[Function, int]] = set()  # what ``sites`` has
         self._done: Set[Tuple[int, object]] = set()
         self._work: List[Tuple[Function, cst.CSTNode, object]] = []
         for module in program.matching(_BACKWARD):
@@ -99,8 +100,9 @@ class Training:
     def _run(self) -> None:
         while self._work:
             function, node, key = self._work.pop()
-            self._touched.add(function)
-            self._visit(function, node, key)
+            if function.module.spend(1):
+                self._touched.add(function)
+                self._visit(function, node, key)
 
     def _visit(self, function: Function, node: cst.CSTNode, key: object) -> None:
         """Mark what ``node`` (or, with a key, ``node[key]``) gets its value from."""
@@ -185,9 +187,9 @@ class Training:
 
     def _called(self, caller: Function, call: cst.Call, callee: Function) -> None:
         """Record a call through which a function contributes."""
-        sites = self.sites.setdefault(callee, [])
-        if (caller, call) not in sites:
-            sites.append((caller, call))
+        if (callee, id(call)) not in self._met:
+            self._met.add((callee, id(call)))
+            self.sites.setdefault(callee, []).append((caller, call))
 
     def _returned(self, function: Function, key: object = _ANY) -> None:
         if self._matters(function):
@@ -217,7 +219,7 @@ class Training:
 
     def _filled_in(self, function: Function, node: cst.Name, key: object) -> None:
         """Follow ``self.compute(image, output)``, which puts ``output["loss"]`` into the dictionary trained on."""
-        for call in function.flow.calls:
+        for call in function.flow.calls if function.module.spend(len(function.flow.calls)) else ():
             positional, keywords, starred = arguments(call)
             named: List[Tuple[object, cst.BaseExpression]] = [*enumerate(positional), *keywords.items()]
             for name, value in named:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
 
@@ -167,6 +167,13 @@ class Findings(NamedTuple):
     patched: List[Left]
     unreadable: List[Unreadable]
     program: Program
+
+    def without(self, paths: Iterable[str]) -> None:
+        """Remove what was found in files that were then given up."""
+        given_up = set(paths)
+        everything: Tuple[List[Any], ...] = (self.sites, self.left, self.problems, self.doubts, self.patched)
+        for entries in everything:
+            entries[:] = [entry for entry in entries if entry.path not in given_up]
 
     @property
     def kept(self) -> Dict[Kept, Site]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Dict, List, Sequence
 
 from legs_adapters.code.folders import PATCHABLE, TESTS, VENDORED, Skipped, folders_of
-from legs_adapters.code.limits import LARGEST
+from legs_adapters.code.limits import MAX_FILE_BYTES
 from legs_loss.system import read_regular
 
 __all__ = ["not_entered"]
@@ -32,7 +32,7 @@ def _mentions(root: Path, skipped: Skipped, found: Dict[Skipped, bool]) -> None:
     for files, folders in folders_of(root / skipped.path, ()):
         for file in files:
             try:
-                data = read_regular(root / skipped.path / file, LARGEST)
+                data = read_regular(root / skipped.path / file, MAX_FILE_BYTES)
             except OSError:
                 continue
             if _L1.search(data):

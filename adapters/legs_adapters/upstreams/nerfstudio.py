@@ -99,7 +99,7 @@ def _configure(config: Any) -> None:
     Raises:
         LegsError: a value is unknown or out of range.
     """
-    given = {flag[len("legs_") :]: getattr(config, flag, None) for flag in FLAGS}
+    given: Dict[str, Any] = {flag[len("legs_") :]: getattr(config, flag, None) for flag in FLAGS}
     given = {name: value for name, value in given.items() if value is not None}
     if given:
         preset = given.pop("preset", None)

@@ -272,9 +272,7 @@ def _proof(proof: Mapping[str, Any]) -> str:
 def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[int], run: Path) -> str:
     base = settings["base"]
     words = ["legs", "compare", settings["scene"]["name"], "--arms", *(arm for arm in arms if arm != BASELINE)]
-    if seeds[0] != 0:
-        words += ["--first_seed", str(seeds[0])]
-    words += ["--seeds", str(len(seeds))]
+    words += ["--seeds", str(seeds[-1] + 1)]
     words += ["--images", settings["images"]] if settings["images"] is not None else []
     own = settings.get("upstream", base)
     for flag, name in (("-r", "resolution"), ("--iterations", "iterations")):

@@ -6,13 +6,13 @@ import os
 import struct
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Tuple
+from typing import Any, BinaryIO, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Tuple
 
 import numpy as np
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
-from legs_loss.system import read_regular, write_whole
+from legs_loss.system import open_regular, read_regular, write_whole
 
 __all__ = ["find_model", "read_colmap", "read_points", "write_colmap"]
 
@@ -33,7 +33,8 @@ MODELS = (
 )
 
 
-_LARGEST = 16 << 30  # bytes: images.bin holds every feature of every image
+_LARGEST = 2 << 30  # bytes of a text, which is read whole; of a binary file as much is read as its counts say
+_LONGEST = 4096  # bytes of an image's name
 _SIDE = 1 << 20  # pixels
 _FARTHEST = float(np.finfo(np.float32).max)
 
@@ -134,9 +135,12 @@ def write_colmap(root: Path, cameras: Mapping[str, Camera], points: PointCloud) 
         write_whole(folder / f"{file}.bin", b"".join(parts))
 
 
-def _parse(path: Path, parser: Callable[[bytes], Any]) -> Any:
+def _parse(path: Path, parser: Callable[[Any], Any]) -> Any:
     try:
-        return parser(read_regular(path, _LARGEST))
+        if path.suffix == ".txt":
+            return parser(read_regular(path, _LARGEST))
+        with open_regular(path) as file:
+            return parser(file)
     except OSError as error:
         raise LegsError(f"cannot read {path}: {error.strerror}") from None
     except (struct.error, ValueError, IndexError, OverflowError) as error:
@@ -184,32 +188,34 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 class _Cursor:
     """Reads a binary file from front to back; the end of the file must be the end of the data."""
 
-    def __init__(self, data: bytes) -> None:
-        self.data, self.at = data, 0
+    def __init__(self, file: BinaryIO) -> None:
+        self.file, self.size = file, os.fstat(file.fileno()).st_size
 
     def take(self, layout: str) -> Tuple[Any, ...]:
-        values = struct.unpack_from(f"<{layout}", self.data, self.at)
-        self.at += struct.calcsize(f"<{layout}")
-        return values
+        return struct.unpack(f"<{layout}", self.file.read(struct.calcsize(f"<{layout}")))
 
     def name(self) -> str:
-        end = self.data.index(b"\0", self.at)
-        name = self.data[self.at : end].decode()
-        self.at = end + 1
-        return name
+        name = bytearray()
+        while name[-1:] != b"\0":
+            letter = self.file.read(1)
+            if not letter or len(name) > _LONGEST:
+                raise ValueError("a name does not end")
+            name += letter
+        return name[:-1].decode()
 
     def skip(self, size: int) -> None:
-        if size > len(self.data) - self.at:
-            raise ValueError(f"it ends {size - len(self.data) + self.at} bytes too early")
-        self.at += size
+        left = self.size - self.file.tell()
+        if size > left:
+            raise ValueError(f"it ends {size - left} bytes too early")
+        self.file.seek(size, os.SEEK_CUR)
 
     def finish(self) -> None:
-        if self.at != len(self.data):
-            raise ValueError(f"{len(self.data)} bytes where its own counts say {self.at}")
+        if self.file.tell() != self.size:
+            raise ValueError(f"{self.size} bytes where its own counts say {self.file.tell()}")
 
 
-def _cameras_bin(data: bytes) -> Dict[int, _Intrinsics]:
-    cursor, cameras = _Cursor(data), {}
+def _cameras_bin(file: BinaryIO) -> Dict[int, _Intrinsics]:
+    cursor, cameras = _Cursor(file), {}
     for _ in range(cursor.take("Q")[0]):
         number, model, width, height = cursor.take("iiQQ")
         if not 0 <= model < len(MODELS):
@@ -220,8 +226,8 @@ def _cameras_bin(data: bytes) -> Dict[int, _Intrinsics]:
     return cameras
 
 
-def _images_bin(data: bytes) -> List[_Image]:
-    cursor, images = _Cursor(data), []
+def _images_bin(file: BinaryIO) -> List[_Image]:
+    cursor, images = _Cursor(file), []
     for _ in range(cursor.take("Q")[0]):
         pose = cursor.take("i7d")
         (camera,) = cursor.take("i")
@@ -231,8 +237,8 @@ def _images_bin(data: bytes) -> List[_Image]:
     return images
 
 
-def _points_bin(data: bytes) -> PointCloud:
-    cursor, xyz, rgb = _Cursor(data), [], []
+def _points_bin(file: BinaryIO) -> PointCloud:
+    cursor, xyz, rgb = _Cursor(file), [], []
     for _ in range(cursor.take("Q")[0]):
         point = cursor.take("Q3d3BdQ")
         xyz.append(point[1:4])
@@ -285,6 +291,9 @@ def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) 
 def _image(name: str, camera_id: int, quaternion: Tuple[float, ...], translation: Tuple[float, ...]) -> _Image:
     if not name or "\0" in name:
         raise ValueError(f"an image has the name {name!r}, which no file can have")
+    parts = name.replace("\\", "/").split("/")
+    if ".." in parts or not parts[0] or os.path.isabs(name):
+        raise ValueError(f"an image has the name {name!r}, which leads out of the scene")
     if len(quaternion) != 4 or len(translation) != 3:
         raise ValueError(f"the pose of {name!r} has {len(quaternion) + len(translation)} numbers, not 7")
     largest = max(map(abs, quaternion))

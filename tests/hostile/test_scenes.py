@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+import time
 
 import numpy as np
 import pytest
@@ -30,6 +31,9 @@ COLMAP = [
     ("images.bin", at(12, struct.pack("<d", 1e300)), "the pose of"),
     ("images.bin", at(12, struct.pack("<4d", 0, 0, 0, 0)), "the pose of"),
     ("images.bin", at(44, struct.pack("<d", float("nan"))), "the pose of"),
+    ("images.bin", at(72, b"../../a"), "leads out of the scene"),
+    ("images.bin", at(72, b"/a"), "leads out of the scene"),
+    ("images.bin", at(72, b"a" * 9000), "a name does not end"),
     ("cameras.bin", at(0, HUGE), "cameras.bin is damaged"),
     ("cameras.bin", at(16, HUGE), "a camera of 1152921504606846976x"),
     ("cameras.bin", at(32, struct.pack("<d", float("inf"))), "with parameters"),
@@ -46,6 +50,19 @@ def test_colmap(name, change, line, tmp_path):
     file.write_bytes(change(file.read_bytes()))
     with pytest.raises(LegsError, match=line):
         _ = read_scene(root).points
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "cameras.txt"])
+def test_a_file_of_nine_gigabytes_is_not_read(name, tmp_path):
+    root = colmap_scene(tmp_path / "scene")
+    if name.endswith(".txt"):
+        for file in ("cameras", "images"):
+            (root / "sparse" / "0" / f"{file}.bin").rename(root / "sparse" / "0" / f"{file}.txt")
+    os.truncate(str(root / "sparse" / "0" / name), 9 << 30)  # a hole, which takes no room
+    began = time.process_time()
+    with pytest.raises(LegsError, match=r"where its own counts say|no file of its kind has more"):
+        _ = read_scene(root).points
+    assert time.process_time() - began < 5
 
 
 def frames(**changes):

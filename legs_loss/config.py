@@ -67,7 +67,7 @@ def find_config(
             root of its git checkout, the user's home folder, or the first legs.toml of another owner, which is not
             read. None: no file is searched.
         environ: in place of ``os.environ``: LEGS_PRESET, LEGS_BETA, LEGS_CURVE, LEGS_OPERATOR, LEGS_P,
-            LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_SCALE, LEGS_EPS, LEGS_ERROR, LEGS_ERROR_BLUR, LEGS_OVER,
+            LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_EPS, LEGS_OVER,
             LEGS_NOISE_FLOOR, LEGS_SMOOTH, LEGS_STORE, LEGS_OFF.
         argv: in place of ``sys.argv``: the scene after ``-s`` / ``--source_path`` is where the store is looked for.
 

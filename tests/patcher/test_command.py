@@ -64,6 +64,17 @@ class TestCommandLine:
         report = run("--check", root).stdout.partition("would change")[0]
         assert f"$ legs-patch my_gs\n{report}" in page
 
+    def test_the_documents_show_the_real_line_of_the_start(self, tmp_path, monkeypatch, capsys):
+        import torch
+
+        from legs_loss import l1_loss
+        from tests.support import start_run
+
+        start_run(monkeypatch, tmp_path)
+        l1_loss(torch.rand(3, 8, 8, requires_grad=True), torch.rand(3, 8, 8))
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"\n{line}\n" in (ROOT / "docs" / "patching.md").read_text(encoding="utf-8")
+
     def test_the_settings_reach_the_run(self, tmp_path, run):
         root = checkout(tmp_path, files("inria"))
         done = run(root, "--curve", "C5", "--operator", "sobel", "--beta", "2.5", "--store", root / "maps")

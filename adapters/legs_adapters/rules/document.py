@@ -46,11 +46,9 @@ def explain(name: str) -> str:
 def table() -> str:
     """Return the table of reasons in docs/patching.md."""
     reasons = dict.fromkeys(rule.reason for rule in RULES.values())
-    rows = [
-        (reason, rule.id, describe(rule).why) for reason in reasons for rule in RULES.values() if rule.reason == reason
-    ]
-    head = ["| reason | rule | a term is skipped where |", "| --- | --- | --- |"]
-    return "\n".join([*head, *(f"| {reason} | `{name}` | {_clause(why)} |" for reason, name, why in rows)]) + "\n"
+    rows = [(reason, [f"`{rule.id}`" for rule in RULES.values() if rule.reason == reason]) for reason in reasons]
+    head = ["| reason | rules |", "| --- | --- |"]
+    return "\n".join([*head, *(f"| {reason} | {', '.join(rules)} |" for reason, rules in rows)]) + "\n"
 
 
 def _explained(rule: Rule) -> str:
@@ -64,7 +62,3 @@ def listed() -> str:
     wide = max(map(len, RULES))
     lines: List[str] = [f"  {name:<{wide}}  {describe(rule).why}" for name, rule in RULES.items()]
     return "\n".join(["rules, in the order in which they are checked:", *lines, ""])
-
-
-def _clause(sentence: str) -> str:
-    return sentence[0].lower() + sentence[1:].rstrip(".")

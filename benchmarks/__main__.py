@@ -43,8 +43,8 @@ PARTS: Dict[str, List[str]] = {
     "rasterizer-2": ["rasterizer.py", "--threads", "2"],
     "cpu-1": ["cpu.py", "--threads", "1"],
 }
-# Needs the compilers of CUDA, no GPU.
-COMPILE = {"cuda-compile": ["cuda_compile.py"]}
+# Of CUDA, without a GPU: the first needs its compilers, the second g++.
+COMPILE = {"cuda-compile": ["cuda_compile.py"], "cuda-host": ["cuda_host.py"]}
 GPU = {
     f"gpu-{size}": ["loss.py", "--device", "cuda", "--parts", "loss", "memory", "--size", size]
     for size in ("800x533", "1297x840", "1600x1066", "3840x2160")

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from legs_loss.operators import OPERATORS
     from legs_loss.response import response
     from legs_loss.runtime import configure, l1_loss, unweighted
+    from legs_loss.similarity import d_ssim
     from legs_loss.spec import PRESETS, WeightSpec
-    from legs_loss.ssim import d_ssim, ssim
+    from legs_loss.ssim import ssim
     from legs_loss.upstreams import apply_to
     from legs_loss.weights import weight_map
 
@@ -35,7 +36,7 @@ _HOMES = {
     "__version__": "_version",
     "apply_to": "upstreams",
     "configure": "runtime",
-    "d_ssim": "ssim",
+    "d_ssim": "similarity",
     "l1_loss": "runtime",
     "legs_loss": "loss",
     "register_curve": "curves",

@@ -13,8 +13,8 @@ from legs_loss.kernels.backends import fused_loss
 from legs_loss.kernels.contract import Weights
 from legs_loss.levels import RunningLevels, response_levels
 from legs_loss.response import response
+from legs_loss.similarity import d_ssim
 from legs_loss.spec import Spec, WeightSpec, as_spec
-from legs_loss.ssim import d_ssim
 from legs_loss.weights import weight_map
 
 __all__ = ["LEGSLoss", "legs_loss", "weighted_l1"]

@@ -37,7 +37,7 @@ def test_every_public_name_is_there() -> None:
 def test_a_function_is_not_hidden_by_the_module_of_its_name() -> None:
     run(
         "import legs_loss.ssim, legs_loss.response\n"
-        "from legs_loss.ssim import d_ssim\n"
+        "from legs_loss.ssim import read_pair\n"
         "assert legs_loss.ssim.__module__ == 'legs_loss.ssim' and callable(legs_loss.ssim)\n"
         "from legs_loss import response, ssim\n"
         "assert callable(response) and ssim is legs_loss.ssim\n"

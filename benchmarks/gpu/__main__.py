@@ -4,11 +4,12 @@
     python -m benchmarks.gpu --stages machine tests                    # some of it; the file keeps the rest
     python -m benchmarks.gpu --emulate --fastgs FastGS/ --scene fox/   # its rehearsal on a CPU, with g++
 
-The stages, in this order: versions and the bandwidth of a copy; the tests of the kernels on the device; fused-ssim
-built from source; times of the losses for each size; waits for the device; CUDA graphs; a second stream; torch.compile;
-FastGS's modules built from source in a copy; FastGS trained on the scene, plain and with LEGS; gsplat's
-simple_trainer.py likewise. Each runs in a process of its own, with a time limit, and writes what it finds to the file
-at once. A stage that fails or cannot be done here is named with the reason, and the next one begins.
+The stages, in this order: versions and the bandwidth of a copy; the tests of the kernels on the device, then some of
+them under compute-sanitizer's racecheck and memcheck; fused-ssim built from source; times of the losses for each size;
+FastGS's modules built from source in a copy; FastGS trained on the scene, plain and with LEGS: these fit into the time
+together. Then, as far as it goes: waits for the device; CUDA graphs; a second stream; torch.compile; gsplat's
+simple_trainer.py trained likewise. Each runs in a process of its own, with a time limit, and writes what it finds to
+the file at once. A stage that fails or cannot be done here is named with the reason, and the next one begins.
 
 The package must be installed (`pip install -e ".[patch]"`) and the checkouts be fetched with their submodules; nothing
 is written into them, and nothing is downloaded. With --emulate the kernels' source is compiled with g++ and runs on

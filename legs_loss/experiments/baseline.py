@@ -9,7 +9,7 @@ import torch
 from legs_loss.errors import LegsError
 from legs_loss.reference.training.dataset import TrainingView
 from legs_loss.reference.training.trainer import TrainConfig, step_loss, step_weight
-from legs_loss.ssim import d_ssim
+from legs_loss.similarity import d_ssim
 
 __all__ = ["prove_unweighted"]
 

@@ -21,7 +21,7 @@ from numba import prange
 
 from legs_loss.kernels.compiling import compiled, inlined, multiply_add
 from legs_loss.kernels.numba_weights import weights_of_row
-from legs_loss.ssim import C1, C2, SIGMA, WINDOW_SIZE
+from legs_loss.similarity import C1, C2, SIGMA, WINDOW_SIZE
 
 __all__ = ["TILE_HEIGHT", "TILE_WIDTH", "all_tiles", "error_row"]
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.kernels.contract import Backend, Weights
+from legs_loss.similarity import d_ssim
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
 
@@ -46,8 +47,6 @@ def difference_from_torch(backend: Backend, device: torch.device) -> Optional[st
 
 def _operations(backend: Backend, target: Tensor) -> Iterator[Tuple[str, _Loss, _Loss]]:
     """Yield of each operation with each kind of weight: its name, the backend's function, and the reference."""
-    from legs_loss.ssim import d_ssim  # whose module itself asks backends.py
-
     exact = target.double()
     spec = WeightSpec()
     weights = weight_map(target, spec)

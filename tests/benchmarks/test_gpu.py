@@ -20,8 +20,9 @@ pytest.importorskip("numba")
 pytest.importorskip("libcst")
 
 from benchmarks.gpu import aims, building, imports, measured
+from benchmarks.gpu.__main__ import MINUTES
 from benchmarks.gpu.options import ROOT, Options, Skipped
-from benchmarks.gpu.stages import STAGES
+from benchmarks.gpu.stages import CERTAIN, STAGES
 from benchmarks.losses import timing
 from tests.cuda_emulation import COMPILER
 from tests.experiments.miniature import RENDER, RENDERER, TRAIN
@@ -82,7 +83,7 @@ def test_it_runs_to_its_end_with_the_emulated_kernels(tiny_scene: Path, tmp_path
     table = found["times"]["24x16"]
     assert table["LEGS L1 alone, remembered range"]["median ms"] > 0
     assert table["fused-ssim + L1"] == {"skipped": "needs CUDA"}
-    for name in ("synchronisation", "graph", "stream"):
+    for name in ("racecheck", "memcheck", "synchronisation", "graph", "stream"):
         assert found[name]["status"] == "skipped" and found[name]["reason"].startswith("needs CUDA")
     if torch.version.cuda is None:
         assert found["fused-ssim"]["reason"] == "needs a torch with CUDA"
@@ -132,6 +133,13 @@ def test_an_interrupt_leaves_no_process_and_a_whole_file(tmp_path: Path) -> None
 def test_it_says_that_there_is_no_gpu() -> None:
     done = run()
     assert done.returncode == 2 and "torch finds no CUDA GPU here" in done.stderr
+
+
+def test_what_every_run_must_have_fits_into_its_time_and_comes_first() -> None:
+    assert sum(stage.minutes for stage in CERTAIN.values()) < MINUTES
+    assert list(STAGES)[: len(CERTAIN)] == list(CERTAIN)
+    assert {"tests", "racecheck", "memcheck", "times", "fastgs"} <= set(CERTAIN)
+    assert all(callable(stage.load()) for stage in STAGES.values())
 
 
 def test_what_cub_no_longer_has_is_written_anew(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ static Context contexts[DEVICES];
 static std::mutex lock;
 static std::map<std::string, Failure> failures;
 static std::map<std::string, long long> calls;
-static int reversed = 0, capturing = 0, capture_valid = 1;
+static int reversed = 0, dry = 0, capturing = 0, capture_valid = 1;
 static thread_local Context* current = nullptr;
 static thread_local int capture_mode = 0;
 
@@ -109,6 +109,7 @@ Result cuLaunchKernel(Function* function, unsigned x, unsigned y, unsigned z, un
     if (x < 1 || x > 0x7fffffffu || y != 1 || z != 1 || threads_y != 1 || threads_z != 1 || shared || extra)
         return INVALID_VALUE;
     if (threads != THREADS) return OUT_OF_RESOURCES;  // __launch_bounds__
+    if (dry) return SUCCESS;
     std::vector<char> task(function->task);  // the argument is copied at once
     std::memcpy(task.data(), arguments[0], task.size());
     function->run(x, task.data(), reversed);
@@ -131,13 +132,14 @@ void test_reset() {
     std::lock_guard<std::mutex> guard(lock);
     failures.clear();
     calls.clear();
-    reversed = capturing = 0;
+    reversed = dry = capturing = 0;
     capture_valid = 1;
     for (Context& context : contexts) context.fault = SUCCESS;
 }
 void test_fail(const char* name, int code, int times) { failures[name] = Failure{code, times}; }
 long long test_calls(const char* name) { return calls[name]; }
 void test_reverse(int on) { reversed = on; }
+void test_dry(int on) { dry = on; }
 void test_capture(int on) { capturing = on; capture_valid = 1; }
 int test_capture_is_valid() { return capture_valid; }
 int test_current_device() { return current ? current->device : -1; }

@@ -7,8 +7,8 @@ import torch
 
 from legs_loss import weight_map
 from legs_loss.kernels.contract import Weights
+from legs_loss.similarity import d_ssim
 from legs_loss.spec import PRESETS
-from legs_loss.ssim import d_ssim
 from tests.kernels.support import images
 from tests.kernels.test_backward import backend, backend_named  # noqa: F401
 

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 
 from legs_loss import LegsError, d_ssim, ssim
 
-module = importlib.import_module("legs_loss.ssim")
+module = importlib.import_module("legs_loss.similarity")
 
 
 def formula_of_3dgs(first, second):

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+import html
 import os
 import re
+from pathlib import Path
 from typing import Any
+
+FILTER = """document.querySelector(".filter").addEventListener("input", (event) => {
+  const word = event.target.value.toLowerCase();
+  for (const row of document.querySelectorAll("#codebases tbody tr"))
+    row.hidden = !row.textContent.toLowerCase().includes(word);
+});"""
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
@@ -17,3 +26,19 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
         return link.group(0) if inside and not os.path.isdir(target) else link.group(1)
 
     return re.sub(r"(?<!!)\[([^\]]*)\]\((?!https?:|#)([^)\s]+)\)", kept, markdown)
+
+
+def on_page_content(content: str, page: Any, config: Any, **_: Any) -> str:
+    """Append the table of all codebases to its page, with a field that filters it."""
+    if page.file.src_uri != "compatibility.md":
+        return content
+    with Path(config["docs_dir"], "compatibility", "corpus.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    keys = ("codebase", "kind", "first", "now", "sites", "note")
+    head = "".join(f"<th>{key}</th>" for key in keys)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(row[key])}</td>" for key in keys) + "</tr>" for row in rows)
+    return (
+        f'{content}<h2 id="all">All of them</h2><div data-search-exclude><input class="filter" type="search" '
+        f'aria-label="Filter the codebases" placeholder="filter: a name, a kind, a verdict"><table id="codebases">'
+        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div><script>{FILTER}</script>"
+    )

@@ -41,6 +41,9 @@ class TestSite:
         assert "data:image/png;base64" in (site / "decision.html").read_text(encoding="utf-8")
         start = (site / "index.html").read_text(encoding="utf-8")
         assert start.index("legs-patch") < start.index("legs run")
+        listed = (site / "compatibility.html").read_text(encoding="utf-8")
+        rows = (ROOT / "docs/compatibility/corpus.csv").read_text(encoding="utf-8").splitlines()
+        assert listed.partition('id="codebases"')[2].count("<tr>") == len(rows)
         for page in site.glob("**/*.html"):
             text = page.read_text(encoding="utf-8")
             for host in ("fonts.googleapis.com", "unpkg.com/mermaid"):

@@ -4,6 +4,9 @@ SCENE is a folder with a COLMAP model, with transforms.json, or just with images
 .txt file with one of these a line. The maps go to SCENE/legs_weights, where a training script on that scene finds them.
 Give -r, -w and --images as for the training: a map is used only for exactly the image that it was made from. With
 --scheduler the workers of a dask cluster compute the scenes, which must have the same paths on all of them.
+
+--masks and --weights take maps of your own: PNG or other images, gray, named as their photographs (0001.png or
+0001.jpg.png), averaged to the training's size. In a mask white counts and black does not.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Dict, Iterable
+from typing import TYPE_CHECKING, Any, Dict, Iterable, Optional
 
 from legs_loss.system import cores, say
 
@@ -44,6 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-w", "--white_background", action="store_true", help="as in 3DGS: lay alpha over white")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="whose operator to use; default: legs")
+    parser.add_argument("--masks", metavar="DIR|alpha", help="a folder of masks, or the photographs' own alpha")
+    parser.add_argument("--weights", metavar="DIR", help="a folder of weights, .npy too, that multiply the preset's")
+    parser.add_argument(
+        "--weight_scale", type=float, default=1.0, metavar="W", help="of --weights: what white stands for; default: 1"
+    )
     parser.add_argument(
         "--out",
         metavar="DIR",
@@ -90,6 +98,7 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     from legs_loss.cli.checks import check_resolution, check_writable
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import SceneTask, find_scenes, stores_of
+    from legs_loss.precompute.own_maps import ALPHA, OwnMaps
     from legs_loss.scenes import read_scene
 
     workers = args.workers if args.workers is not None else cores() if args.scheduler is None else 1
@@ -111,16 +120,27 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     if args.scheduler is None:
         for store in stores:
             check_writable(store)
-    images = None if args.images is None or not os.path.isdir(args.images) else os.path.abspath(args.images)
+
+    def found(named: Optional[str], scene: Path) -> Optional[str]:
+        """Return a folder that is in the scene as it was named, and others with their whole path."""
+        if named is None or (scene / named).is_dir() or not os.path.isdir(named):
+            return named
+        return os.path.abspath(str(named))
+
     return {
         SceneTask(
             Path(os.path.abspath(str(scene))),
             Path(os.path.abspath(str(store))),
-            images if images is not None and not (scene / args.images).is_dir() else args.images,
+            found(args.images, scene),
             args.preset,
             args.resolution,
             args.white_background,
             workers,
+            OwnMaps(
+                args.masks if args.masks == ALPHA else found(args.masks, scene),
+                found(args.weights, scene),
+                args.weight_scale,
+            ),
         ): store
         for scene, store in zip(scenes, stores)
     }
@@ -173,6 +193,10 @@ def _say(store: Path, done: SceneDone) -> int:
             "map is normalised by its own range, so such photographs get larger weights",
             sys.stderr,
         )
+    if report.unmasked:
+        say(f"legs: note: counted whole, without a mask: {', '.join(report.unmasked)}", sys.stderr)
+    for kind, count in report.own.items():
+        say(f"{store}: {count} {kind if kind.endswith('s') else kind + 's'} of your own")
     say(f"{store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")
     if report.made and not (report.store / MANIFEST).is_file():
         say(

@@ -11,7 +11,7 @@ from typing import List, NamedTuple, Optional, Sequence
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
-from legs_loss.precompute import Report, precompute
+from legs_loss.precompute import OwnMaps, Report, precompute
 from legs_loss.scenes import read_scene
 from legs_loss.spec import Spec
 from legs_loss.system import read_regular
@@ -33,6 +33,7 @@ class SceneTask(NamedTuple):
     resolution: int
     white_background: bool
     workers: int
+    maps: OwnMaps = OwnMaps()
 
 
 class SceneDone(NamedTuple):
@@ -129,6 +130,7 @@ def precompute_scene(task: SceneTask, tell: Listener) -> SceneDone:
         task.white_background,
         task.workers,
         on_progress=on_progress,
+        maps=task.maps,
     )
     short = Counter(PurePosixPath(view.name).name.split(".")[0] for view in scene.views)
     return SceneDone(report, sum(count for count in short.values() if count > 1))

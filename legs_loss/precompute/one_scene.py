@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Callable, Dict, List, Optional, Union
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.precompute.one_view import Job, Task, make
+from legs_loss.precompute.own_maps import NO_MAPS, OwnMaps, is_below, stage_own
 from legs_loss.precompute.workers import in_processes
 from legs_loss.scenes import Scene, training_size
 from legs_loss.spec import Spec, as_spec
@@ -26,12 +28,17 @@ _COMMIT_SECONDS = 1.0
 
 @dataclass
 class Report:
-    """The result of :func:`precompute`, by names of views: maps made, maps kept, views skipped with the reason."""
+    """The result of :func:`precompute`, by names of views: maps made, maps kept, views skipped with the reason.
+
+    ``own`` are the numbers of the user's own maps, a kind each; ``unmasked`` has no mask where other views have.
+    """
 
     store: Path
     made: List[str] = field(default_factory=list)
     kept: List[str] = field(default_factory=list)
     skipped: Dict[str, str] = field(default_factory=dict)
+    own: Dict[str, int] = field(default_factory=dict)
+    unmasked: List[str] = field(default_factory=list)
 
 
 def precompute(
@@ -43,8 +50,9 @@ def precompute(
     workers: int = 1,
     progress: bool = False,
     on_progress: Optional[Callable[[int, int], None]] = None,
+    maps: OwnMaps = NO_MAPS,
 ) -> Report:
-    """Write the normalised response of every view of a scene to a store.
+    """Write the normalised response of every view of a scene to a store, and the user's own masks and weights.
 
     Args:
         scene: from :func:`~legs_loss.scenes.read_scene`.
@@ -57,12 +65,13 @@ def precompute(
         workers: processes; 1 computes in this one. With more, a script needs its ``if __name__ == "__main__"``.
         progress: show a bar on stderr.
         on_progress: called after each view with the number of views that are done, and of all.
+        maps: the user's masks and weights, of which all are checked before any is written.
 
     Returns:
         The maps that were made, kept and skipped. A photograph that cannot be read is skipped, not raised.
 
     Raises:
-        LegsError: the store cannot be written or is damaged; bad settings.
+        LegsError: the store cannot be written or is damaged; bad settings; a mask or a map that cannot be used.
     """
     from tqdm import tqdm
 
@@ -73,12 +82,16 @@ def precompute(
     spec = as_spec(spec)
     training_size(1 << 20, 1 << 20, resolution)  # a bad resolution is one error, not one a view
     report = Report(out)
+    views = {view.name: view for view in scene.views if not is_below(view.path, scene.root, maps)}
     with StoreWriter(out) as writer:
+        mine = stage_own(scene.root, list(views.values()), resolution, maps, writer.entries(), writer.staging)
+        if mine.added:  # all at once, before any response: what is found in the store is never without its mask
+            writer.commit(mine.added, mine.dropped)
+        report.own, report.unmasked = Counter(entry.operator for entry in mine.added), mine.unmasked
         job = Job(spec, resolution, white_background, out, writer.staging)
         known: Dict[str, List[Entry]] = {}
         for entry in writer.entries():
             known.setdefault(entry.view, []).append(entry)
-        views = {view.name: view for view in scene.views}
         tasks = [Task(view, known.get(name, [])) for name, view in views.items()]
         results = in_processes(job, tasks, workers) if workers > 1 else (make(job, task) for task in tasks)
         staged: List[Entry] = []
@@ -102,7 +115,7 @@ def precompute(
                         due = time.monotonic() + _COMMIT_SECONDS
             finally:
                 _commit(writer, staged)
-    if out.resolve().parent != scene.root.resolve():
+    if out.is_dir() and out.resolve().parent != scene.root.resolve():
         note_scene(out, scene)
     return report
 

@@ -78,7 +78,8 @@ class StoredWeights:
         """Return the store's entry that was made from an image [C, H, W]."""
         if self._misses >= _MISSES * len(store.entries):
             return None  # targets that are new at each step, and a lookup waits for a device
-        entry = store.find_image(image, self._config.spec)
+        found = store.find_image(image, self._config.spec)
+        entry = None if found is None else found.response
         self._misses = 0 if entry is not None else self._misses + 1
         if entry is None:
             height, width = image.shape[1:]

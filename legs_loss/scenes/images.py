@@ -19,6 +19,7 @@ from legs_loss.scenes.model import View
 from legs_loss.system import open_regular
 
 __all__ = [
+    "colour_mode",
     "image_size",
     "image_tensor",
     "load_training_image",
@@ -95,7 +96,7 @@ def load_training_image(view: View, resolution: int = -1, white_background: bool
         if view.composited:
             prepared = _on_background(image.convert("RGBA"), 255 if white_background else 0)
         else:
-            mode = _colour_mode(image)
+            mode = colour_mode(image)
             prepared = image if image.mode == mode else image.convert(mode)
         return resized_pixels(prepared, size)
 
@@ -173,7 +174,7 @@ def _pixels(image: Any) -> np.ndarray:
     return pixels
 
 
-def _colour_mode(image: Any) -> str:
+def colour_mode(image: Any) -> str:
     """Return the one of L, RGB and RGBA that keeps what the image shows."""
     if image.mode == "F":
         raise LegsError("an image of floats: save it with 8 or 16 bits")

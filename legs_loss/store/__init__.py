@@ -1,6 +1,7 @@
 """Stores of normalised responses on disk, from which the weight maps of every curve and beta are made.
 
-A store is a folder: ``manifest.json`` and one ``.npy`` a view, size and operator, float16 [H, W]. A map of 1 is exact;
+A store is a folder: ``manifest.json`` and one ``.npy`` a view, size and operator, float16 [H, W]. The user's own masks
+and weights lie beside the responses, so that curve and beta can still be chosen later. A map of 1 is exact;
 elsewhere float16 rounds E^ by at most 2^-12, and small values by at most 1 part in 2048.
 
 Readers open only the manifest, which is replaced atomically, so they need no lock. Writers stage maps in a
@@ -11,16 +12,19 @@ leftover of a killed writer, and the next writer deletes it.
 from __future__ import annotations
 
 from legs_loss.store.fingerprints import fingerprint, sampled_fingerprint
-from legs_loss.store.manifest import MANIFEST, DamagedStoreError, Entry
+from legs_loss.store.manifest import MANIFEST, MASK, WEIGHTS, DamagedStoreError, Entry
 from legs_loss.store.maps import is_intact, read_map, stage
-from legs_loss.store.reading import Damage, WeightStore
+from legs_loss.store.reading import Damage, Found, WeightStore
 from legs_loss.store.writing import StoreWriter
 
 __all__ = [
     "MANIFEST",
+    "MASK",
+    "WEIGHTS",
     "Damage",
     "DamagedStoreError",
     "Entry",
+    "Found",
     "StoreWriter",
     "WeightStore",
     "fingerprint",

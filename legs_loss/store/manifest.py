@@ -18,9 +18,19 @@ from legs_loss.errors import LegsError
 from legs_loss.system import read_regular
 from legs_loss.system.values import is_count, is_number, is_text
 
-__all__ = ["MANIFEST", "DamagedStoreError", "Entry", "is_map_name", "manifest_bytes", "read_manifest"]
+__all__ = [
+    "MANIFEST",
+    "MASK",
+    "WEIGHTS",
+    "DamagedStoreError",
+    "Entry",
+    "is_map_name",
+    "manifest_bytes",
+    "read_manifest",
+]
 
 MANIFEST = "manifest.json"
+MASK, WEIGHTS = "mask", "weights"  # in place of an operator: of the maps that are the user's own
 VERSION = 3  # 1 or 2 is written where no entry has what came later, so that older versions read it
 _LARGEST = 256 << 20  # bytes: some 500,000 entries
 _SIDE = 1 << 20  # pixels
@@ -39,7 +49,8 @@ class Entry:
     Attributes:
         view: the photograph's path relative to the scene, forward slashes.
         width, height: of the map in pixels.
-        operator, p, eps: the settings of its response.
+        operator, p, eps: the settings of its response. :data:`MASK` and :data:`WEIGHTS`, with p 1 and eps 0, are the
+            user's own maps: of a view at a size, whatever its photograph; they have no fingerprint and no source.
         background: "black" or "white" where the photograph was laid on one, else None.
         fingerprint: of the training image (:func:`fingerprint`).
         source_bytes, source_mtime_ns: size and time of the photograph's file.
@@ -47,9 +58,9 @@ class Entry:
         bytes, sha256: size and checksum of that file.
         smooth: of its response too: the Gaussian before the operator.
         low, span: the response that E^ was made from is low + span * E^; None, as the next ones, where the map was not
-            made to be normalised over its scene.
+            made to be normalised over its scene. Of the user's weights, too, whose map is divided by their largest.
         percentile: of the level ``strong``.
-        median, strong: the view's levels (:mod:`legs_loss.levels`).
+        median, strong: the view's levels (:mod:`legs_loss.levels`); of the user's weights 0 and ``span``.
         sample: of the training image (:func:`sampled_fingerprint`), "" from before version 3.
     """
 
@@ -73,6 +84,11 @@ class Entry:
     median: Optional[float] = None
     strong: Optional[float] = None
     sample: str = ""
+
+    @property
+    def is_own(self) -> bool:
+        """Return whether the map is a mask or weights of the user's."""
+        return self.operator in (MASK, WEIGHTS)
 
     @property
     def key(self) -> Tuple[Any, ...]:
@@ -118,7 +134,8 @@ def is_map_name(name: str) -> bool:
 
 def manifest_bytes(entries: Iterable[Entry]) -> bytes:
     """Return the manifest's one spelling for these entries."""
-    rows, version = [], 1
+    entries = list(entries)
+    rows, version = [], VERSION if any(entry.is_own for entry in entries) else 1
     for entry in sorted(entries, key=lambda entry: entry.key):
         values = dict(vars(entry), p=entry.p if math.isfinite(entry.p) else "inf")
         for name, (since, absent) in _ADDED.items():

@@ -16,10 +16,10 @@ from legs_loss.scenes.model import view_names
 from legs_loss.spec import WeightSpec
 from legs_loss.store.fingerprints import fingerprint, sampled_fingerprint
 from legs_loss.store.leftovers import leftovers
-from legs_loss.store.manifest import MANIFEST, Entry, read_manifest
+from legs_loss.store.manifest import MANIFEST, MASK, WEIGHTS, Entry, read_manifest
 from legs_loss.store.maps import is_intact, read_map
 
-__all__ = ["Damage", "WeightStore"]
+__all__ = ["Damage", "Found", "WeightStore"]
 
 
 class Damage(NamedTuple):
@@ -27,6 +27,14 @@ class Damage(NamedTuple):
 
     damaged: List[Entry]
     orphans: List[str]
+
+
+class Found(NamedTuple):
+    """The entries of a store for one training image: a response for a spec, the user's mask, the user's weights."""
+
+    response: Optional[Entry]
+    mask: Optional[Entry]
+    weights: Optional[Entry]
 
 
 class WeightStore:
@@ -48,11 +56,10 @@ class WeightStore:
             )
         self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in read_manifest(self.path)}
         self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
-        self._by_image: Dict[Tuple[Any, ...], Entry] = {}
+        self._by_image: Dict[Tuple[Any, ...], List[Entry]] = {}
         for entry in self.entries.values():
             for name in (entry.fingerprint, entry.sample):
-                image = (name, *entry.key[1:])
-                self._by_image[image] = entry
+                self._by_image.setdefault((name, entry.height, entry.width), []).append(entry)
             for name in view_names(entry.view):
                 key = (name, *entry.key[1:])
                 self._by_name[key] = None if key in self._by_name else entry
@@ -71,14 +78,43 @@ class WeightStore:
         entry = self._by_name.get((view.replace("\\", "/"), height, width, *_made_with(spec)))
         return entry if entry is not None and self.fits(entry, spec) else None
 
-    def find_image(self, image: Tensor, spec: WeightSpec) -> Optional[Entry]:
-        """Return the entry that was made from an image [C, H, W], whatever its view is called, or None.
+    def find_image(self, image: Tensor, spec: WeightSpec) -> Optional[Found]:
+        """Return what the store has of an image [C, H, W], whatever its view is called; None if that was never read.
 
         On the CPU every value of the image is compared; elsewhere a sample of them, which waits for the device.
+
+        Raises:
+            LegsError: two views have this very photograph, and different masks or weights.
         """
         name = fingerprint(image) if image.device.type == "cpu" else sampled_fingerprint(image)
-        entry = self._by_image.get((name, *image.shape[1:], *_made_with(spec)))
-        return entry if entry is not None and self.fits(entry, spec) else None
+        entries = self._by_image.get((name, *image.shape[1:]))
+        if not entries:
+            return None
+        fits = [entry for entry in entries if self.fits(entry, spec)]
+        return Found(fits[0] if fits else None, self._own(entries, MASK), self._own(entries, WEIGHTS))
+
+    def _own(self, entries: List[Entry], kind: str) -> Optional[Entry]:
+        found = {entry.view: self.own(entry, kind) for entry in entries}
+        first, *others = found.values()
+        if any((other and other.sha256) != (first and first.sha256) for other in others):
+            raise LegsError(f"{self.path}: {', '.join(found)} are the same photograph, with different maps ({kind})")
+        return first
+
+    def own(self, entry: Entry, kind: str) -> Optional[Entry]:
+        """Return the entry of the user's own map, a kind of :data:`MASK` or :data:`WEIGHTS`, for an entry's view."""
+        return self.entries.get((entry.view, entry.height, entry.width, kind, 1.0, 0.0, 0.0))
+
+    def of_kind(self, kind: str) -> List[Entry]:
+        """Return the user's own maps of a kind."""
+        return [entry for entry in self.entries.values() if entry.operator == kind]
+
+    def own_map(self, entry: Entry) -> np.ndarray:
+        """Return a mask, in [0, 1], or weights of the user's, float32 [H, W].
+
+        Raises:
+            DamagedStoreError: the file is missing or is not the one that was written.
+        """
+        return self.response(entry) if entry.operator == WEIGHTS else read_map(self.path, entry).astype(np.float32)
 
     @staticmethod
     def fits(entry: Entry, spec: WeightSpec) -> bool:

@@ -45,6 +45,7 @@ class StoreWriter:
 
     def __init__(self, path: Union[str, Path]) -> None:
         self.path: Path = Path(path)
+        self._is_new: bool = not os.path.lexists(str(path))
 
     def __enter__(self) -> StoreWriter:
         with self._locked():
@@ -57,12 +58,16 @@ class StoreWriter:
     def __exit__(self, *_: object) -> None:
         self._alive.release()
         remove(self.staging)
+        if self._is_new and os.listdir(str(self.path)) == [LOCK]:  # nothing came of it
+            remove(self.path)
 
-    def commit(self, staged: Sequence[Entry]) -> None:
-        """Move staged maps into the store and list them, in place of older ones with the same key."""
+    def commit(self, staged: Sequence[Entry], dropped: Sequence[Entry] = ()) -> None:
+        """Move staged maps into the store and list them, in place of ``dropped`` and of those with the same key."""
         with self._locked():
             entries = {entry.key: entry for entry in self.entries()}
             before = {entry.file for entry in entries.values()}
+            for entry in dropped:
+                entries.pop(entry.key, None)
             for entry in staged:
                 # Here, not at the write: only the commit waits for the disk.
                 _sync(self.staging / entry.file)

@@ -41,7 +41,7 @@ class TestMap:
         monkeypatch.setattr(images, "STRIP_PIXELS", 3 * 37)  # three rows at a time
         for height, width in ((50, 37), (1, 37), (37, 1), (2, 37), (7, 200)):
             image = photograph(width, height)
-            whole = normalise_response(response(image_tensor(image), operator, p), spec.eps)
+            whole = normalise_response(response(image_tensor(image), operator, p, channels_last=False), spec.eps)
             assert np.array_equal(normalised_map(image, spec), whole[0].half().numpy())
 
     def test_gray_deep_and_constant_images(self):

@@ -1,0 +1,148 @@
+"""The user's own maps, masks and weights: found by their photographs' names, read, and averaged to a size."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Dict, Iterable, List, Sequence, Tuple
+
+import numpy as np
+
+from legs_loss.errors import LegsError
+from legs_loss.scenes.folder import SUFFIXES
+from legs_loss.scenes.images import colour_mode, open_image
+from legs_loss.scenes.model import View
+from legs_loss.system import open_regular
+
+__all__ = ["averaged", "find_maps", "has_alpha", "read_alpha", "read_map_file"]
+
+_GRAY = 32  # of 255: the colours of a pixel of a gray JPEG differ less
+_LARGEST = 1 << 29  # values of a .npy
+_BOX = 4  # Image.BOX, whose home differs between versions of Pillow
+
+
+def find_maps(folder: Path, views: Iterable[View], suffixes: Sequence[str] = SUFFIXES) -> Dict[str, Path]:
+    """Return the map's file of each view that has one, by the view's name.
+
+    A file is a view's by the last parts of its path in the folder: ``0001.png`` or ``cam/0001.png`` for the photograph
+    ``images/cam/0001.jpg``, and ``0001.jpg.png`` as COLMAP names masks. Hidden files and folders are left out.
+
+    Raises:
+        LegsError: there is no folder or no map in it; a map fits no photograph, or several; a photograph has two maps.
+    """
+    if not folder.is_dir():
+        raise LegsError(f"there is no folder {folder}")
+    named: Dict[str, List[str]] = {}
+    for view in views:
+        parts = view.name.split("/")
+        for start in range(len(parts)):
+            last = "/".join(parts[start:])
+            for name in {last, os.path.splitext(last)[0]}:
+                named.setdefault(name, []).append(view.name)
+    found: Dict[str, Path] = {}
+    for path in sorted(_files(folder, suffixes)):
+        fits = named.get(os.path.splitext(path.relative_to(folder).as_posix())[0], [])
+        if len(fits) != 1:
+            what = f"fits {len(fits)} photographs: {', '.join(fits[:3])}" if fits else "is the map of no photograph"
+            raise LegsError(f"{path} {what}; maps have the name of their photograph: 0001.png or 0001.jpg.png")
+        if fits[0] in found:
+            raise LegsError(f"{found[fits[0]]} and {path} are both maps of {fits[0]}: remove one of them")
+        found[fits[0]] = path
+    if not found:
+        raise LegsError(f"{folder} has no maps ({', '.join(suffixes)})")
+    return found
+
+
+def _files(folder: Path, suffixes: Sequence[str]) -> Iterable[Path]:
+    for above, folders, files in os.walk(str(folder)):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for file in files:
+            if os.path.splitext(file)[1].lower() in suffixes and not file.startswith("."):
+                yield Path(above, file)
+
+
+def read_map_file(path: Path, size: Tuple[int, int]) -> np.ndarray:
+    """Return a map float32 [H, W]: of an image in [0, 1] (white is 1), of a .npy as it is.
+
+    Palettes, 1 bit, 8 and 16 bits are gray values; what is transparent is black. As of photographs, EXIF's orientation
+    is not applied.
+
+    Args:
+        path: the file.
+        size: width and height of its photograph, checked before the map's pixels are read.
+
+    Raises:
+        LegsError: it cannot be read, its ratio of sides is not the photograph's, it is in colour, or has negative
+            values, or ones that are no numbers.
+    """
+    if path.suffix.lower() == ".npy":
+        return _array(path, size)
+    with open_image(path) as image:
+        _check_ratio(image.size, size)
+        if image.mode.startswith("I"):
+            deep = np.asarray(image).astype(np.int64)
+            if deep.min() < 0 or deep.max() > 65535:
+                raise LegsError("more than 16 bits: save it with 8 or 16 bits")
+            return (deep / 65535.0).astype(np.float32)
+        mode = colour_mode(image)
+        pixels = np.asarray(image.convert(mode)).astype(np.int16)
+        if mode == "L":
+            return (pixels / 255.0).astype(np.float32)
+        opacity = pixels[..., 3] if mode == "RGBA" else np.full(pixels.shape[:2], 255, np.int16)
+        if (np.ptp(pixels[..., :3], -1)[opacity > 0] > _GRAY).any():
+            raise LegsError("in colour, and a map is gray (for a photograph's own alpha: --masks alpha)")
+        return (pixels[..., :3].mean(-1) / 255.0 * (opacity / 255.0)).astype(np.float32)
+
+
+def has_alpha(path: Path) -> bool:
+    """Return whether a photograph has an alpha channel, from its header."""
+    with open_image(path) as image:
+        return not image.mode.startswith(("I", "F")) and colour_mode(image) == "RGBA"
+
+
+def read_alpha(path: Path) -> np.ndarray:
+    """Return the alpha of a photograph that has one, float32 [H, W] in [0, 1]."""
+    with open_image(path) as image:
+        return (np.asarray(image.convert("RGBA"))[..., 3] / 255.0).astype(np.float32)
+
+
+def averaged(values: np.ndarray, size: Tuple[int, int]) -> np.ndarray:
+    """Return a map at a width and height; each value is the mean over the area that its pixel covers.
+
+    >>> averaged(np.float32([[0, 1, 1, 1], [0, 0, 1, 1]]), (2, 1))
+    array([[0.25, 1.  ]], dtype=float32)
+    """
+    from PIL import Image
+
+    if values.shape == (size[1], size[0]):
+        return values
+    return np.asarray(Image.fromarray(values).resize(size, _BOX))
+
+
+def _check_ratio(map_size: Tuple[int, int], size: Tuple[int, int]) -> None:
+    """Check that a map of one size can be of a photograph of another, up to the rounding of its sides to pixels."""
+    (across, down), (width, height) = map_size, size
+    if abs(across * height - down * width) > max(width, height):
+        raise LegsError(f"{across}x{down} pixels do not have the ratio of sides of its photograph, {width}x{height}")
+
+
+def _array(path: Path, size: Tuple[int, int]) -> np.ndarray:
+    try:
+        with open_regular(path) as file:
+            version = np.lib.format.read_magic(file)
+            if version != (1, 0):
+                raise LegsError("not the version 1.0 of .npy")
+            shape, by_columns, kind = np.lib.format.read_array_header_1_0(file)
+            if len(shape) != 2 or not 0 < shape[0] * shape[1] <= _LARGEST or kind.kind != "f" or by_columns:
+                raise LegsError(f"not floats of [height, width] by rows, but {kind} {list(shape)}")
+            _check_ratio((shape[1], shape[0]), size)
+            data = file.read(shape[0] * shape[1] * kind.itemsize)
+        values = np.frombuffer(data, kind).reshape(shape).astype(np.float32)
+        if not (np.isfinite(values).all() and values.min() >= 0):
+            raise LegsError("it has negative values, or ones that are no finite numbers")
+    except LegsError as error:
+        raise LegsError(f"{path}: {error}") from None
+    except Exception as error:  # numpy reads a header as Python, whose tokenizer and parser raise many kinds
+        why = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise LegsError(f"{path}: no array that can be read ({why})") from None
+    return values

@@ -19,7 +19,7 @@ class Study(NamedTuple):
 
     against: which arm each arm is measured against, where that is not the baseline.
     paper: the paper's training PSNR of an arm, where it gives one.
-    paper_says: in words, with its source.
+    paper_says: in words, with its source; empty for arms of the user's own.
     """
 
     title: str
@@ -89,6 +89,4 @@ def these_arms(names: Sequence[str]) -> Study:
     own = dict(zip((arm.name for arm in map(parse_arm, names)), names))
     arms = sorted(needed(parse_arms(["3dgs", *names])), key=lambda arm: arm.name != "3dgs")  # else as they were
     against = {arm.name: arm.at for arm in arms if arm.spec.beta == 0 and arm.at not in (None, "3dgs")}
-    return Study(
-        "These arms", tuple(own.get(arm.name, arm.name) for arm in arms), "The paper has no such table.", against
-    )
+    return Study("These arms", tuple(own.get(arm.name, arm.name) for arm in arms), "", against)

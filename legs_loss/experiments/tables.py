@@ -131,7 +131,7 @@ def paper_text(rows: Rows, study: Study) -> str:
 def study_text(rows: Rows, study: Study) -> str:
     """Return a study's tables and the paper's statements."""
     parts = [f"## {study.title}", scores_table(rows, study.arms), differences_table(rows, study)]
-    return "\n\n".join([*parts, paper_text(rows, study)])
+    return "\n\n".join([*parts, paper_text(rows, study)] if study.paper_says else parts)
 
 
 def _orders(rows: Rows, study: Study, gains: Mapping[str, Difference]) -> List[str]:

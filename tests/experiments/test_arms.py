@@ -80,6 +80,7 @@ def test_every_study_and_change_can_be_named() -> None:
 
 def test_a_users_arms_stand_beside_what_they_are_measured_against() -> None:
     study = these_arms(["C1", "beta=0", "3dgs@C3", "legs@3dgs", "C1"])
+    assert study.paper_says == ""  # the paper says nothing of arms of a user's own
     assert study.arms == ("beta=0", "legs", "C1", "3dgs@C3", "legs@3dgs")
     assert study.reference("3dgs@legs") == "legs"
     assert study.reference("legs@3dgs") == "3dgs"

@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from legs_loss._version import __version__
     from legs_loss.curves import register_curve
     from legs_loss.errors import LegsError
-    from legs_loss.loss import LEGSLoss, legs_loss, weighted_l1
+    from legs_loss.loss import legs_loss, weighted_l1
     from legs_loss.operators import OPERATORS
     from legs_loss.response import response
-    from legs_loss.runtime import configure, l1_loss, unweighted
+    from legs_loss.runtime import configure, l1_loss, masked, unweighted
+    from legs_loss.runtime.module import LEGSLoss
     from legs_loss.similarity import d_ssim
     from legs_loss.spec import PRESETS, WeightSpec
     from legs_loss.ssim import ssim
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "OPERATORS": "operators",
     "PRESETS": "spec",
-    "LEGSLoss": "loss",
+    "LEGSLoss": "runtime.module",
     "LegsError": "errors",
     "WeightSpec": "spec",
     "__version__": "_version",
@@ -38,6 +39,7 @@ _HOMES = {
     "configure": "runtime",
     "d_ssim": "similarity",
     "l1_loss": "runtime",
+    "masked": "runtime",
     "legs_loss": "loss",
     "register_curve": "curves",
     "response": "response",
@@ -59,6 +61,7 @@ __all__ = [
     "d_ssim",
     "l1_loss",
     "legs_loss",
+    "masked",
     "register_curve",
     "response",
     "ssim",

@@ -24,7 +24,7 @@ _DEFAULTS = "defaults"
 # The keys of legs.toml, and in capitals the variables LEGS_*. The preset is the first: the others change it.
 _SETTINGS = ("preset", "store", *(field.name for field in fields(WeightSpec)))
 _TEXT_FIELDS = ("operator", "curve", "normalise", "over")
-_OTHER_VARIABLES = ("off", "backend")
+_OTHER_VARIABLES = ("off", "backend", "masks")
 _LARGEST = 1 << 20  # bytes of a legs.toml
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("", "0", "false", "no", "off")
 
@@ -38,6 +38,7 @@ class Config:
         preset: the name of the preset that the spec is derived from, for the status line.
         store: the folder of precomputed maps, or None.
         off: whether LEGS_OFF selects the codebase's own loss, unweighted.
+        require_masks: whether LEGS_MASKS=require makes a training image without an entry in the store an error.
         source: where the settings were found, in words.
         notes: warnings for the user: an unknown variable LEGS_*, a legs.toml that was not read.
     """
@@ -46,6 +47,7 @@ class Config:
     preset: str = "legs"
     store: Optional[Path] = None
     off: bool = False
+    require_masks: bool = False
     source: str = _DEFAULTS
     notes: Tuple[str, ...] = ()
 
@@ -67,8 +69,8 @@ def find_config(
             root of its git checkout, the user's home folder, or the first legs.toml of another owner, which is not
             read. None: no file is searched.
         environ: in place of ``os.environ``: LEGS_PRESET, LEGS_BETA, LEGS_CURVE, LEGS_OPERATOR, LEGS_P,
-            LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_EPS, LEGS_OVER,
-            LEGS_NOISE_FLOOR, LEGS_SMOOTH, LEGS_STORE, LEGS_OFF.
+            LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_EPS, LEGS_OVER, LEGS_NOISE_FLOOR, LEGS_SMOOTH, LEGS_STORE, LEGS_OFF,
+            LEGS_MASKS.
         argv: in place of ``sys.argv``: the scene after ``-s`` / ``--source_path`` is where the store is looked for.
 
     Raises:
@@ -88,6 +90,10 @@ def find_config(
         config = _apply(config, {name: environ[variable] for name, variable in given.items()}, what, Path.cwd())
     if is_off(environ):
         config = replace(config, off=True)
+    masks = environ.get("LEGS_MASKS", "")
+    if masks not in ("", "require"):
+        raise LegsError(f"environment variable LEGS_MASKS must be require, or not set, got {masks!r}")
+    config = replace(config, require_masks=masks == "require")
     if config.store is None:
         config = replace(config, store=_store_of_scene(sys.argv if argv is None else argv))
     return config

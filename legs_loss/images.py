@@ -29,7 +29,7 @@ def shape_of(tensor: Tensor) -> str:
 
 
 class Layout(NamedTuple):
-    """What the axes of an image stand for: all of this package computes on [C, H, W] or [B, C, H, W].
+    """Meaning of an image's axes: all of this package computes on [C, H, W] or [B, C, H, W].
 
     Attributes:
         shape: of the image as it was given.

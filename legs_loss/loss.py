@@ -1,23 +1,21 @@
-"""The LEGS loss: the weighted L1 term and D-SSIM, as a function and as a Module."""
+"""The LEGS loss: the weighted L1 term and D-SSIM, as functions."""
 
 from __future__ import annotations
 
 from typing import Optional
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.images import read_pair
 from legs_loss.kernels.backends import fused_loss
 from legs_loss.kernels.contract import Weights
-from legs_loss.levels import RunningLevels, response_levels
-from legs_loss.response import response
 from legs_loss.similarity import d_ssim
-from legs_loss.spec import Spec, WeightSpec, as_spec
+from legs_loss.spec import Spec, as_spec
 from legs_loss.weights import weight_map
 
-__all__ = ["LEGSLoss", "legs_loss", "weighted_l1"]
+__all__ = ["legs_loss", "weighted_l1"]
 
 
 def weighted_l1(
@@ -90,7 +88,7 @@ def legs_loss(
         prediction: the rendering, floats in [0, 1], in a shape that :func:`weighted_l1` takes.
         target: the photograph of the same view, the same shape.
         spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own to the last bit. A spec that is normalised
-            over the scene uses the images of this call as the scene; :class:`LEGSLoss` and ``l1_loss`` use all so far.
+            over the scene uses the images of this call as the scene; ``LEGSLoss`` and ``l1_loss`` use all so far.
         weight: the target's weight map, if known; the spec is not used then.
         mask: zeroes the L1 weight where it is 0. SSIM is not masked, as in 3DGS's code.
         lambda_dssim: in [0, 1], the share of D-SSIM; 3DGS's name and value.
@@ -130,75 +128,3 @@ def legs_loss(
     if lambda_dssim == 0.0:
         return photometric
     return (1.0 - lambda_dssim) * photometric + lambda_dssim * d_ssim(prediction, target, padding, False)
-
-
-class LEGSLoss(nn.Module):
-    """:func:`legs_loss` as a Module: settings at construction, images at each call.
-
-    For a spec that is normalised over the scene, the targets of all calls so far are the scene. Repeated targets count
-    repeatedly, which changes a median little.
-
-    Args:
-        spec: as for :func:`legs_loss`, like the others.
-        lambda_dssim: the share of D-SSIM.
-        padding: of SSIM.
-        renormalise: divide the masked L1 term by the mask's mean.
-        channels_last: where the channel stands, for shapes that do not show it.
-
-    Shape:
-        prediction, target: [H, W], [C, H, W], [H, W, C] or batches; weight, mask: one value a pixel; output: a scalar.
-
-    Example:
-        >>> criterion = LEGSLoss("legs-l")
-        >>> target = torch.rand(3, 16, 16)
-        >>> criterion(target, target) < 1e-6
-        tensor(True)
-    """
-
-    def __init__(
-        self,
-        spec: Spec = "legs",
-        lambda_dssim: float = 0.2,
-        padding: str = "zeros",
-        renormalise: bool = False,
-        channels_last: Optional[bool] = None,
-    ) -> None:
-        super().__init__()
-        self.spec: WeightSpec = as_spec(spec)
-        self.lambda_dssim = lambda_dssim
-        self.padding = padding
-        self.renormalise = renormalise
-        self.channels_last = channels_last
-        self._seen = RunningLevels()
-
-    def forward(
-        self,
-        prediction: Tensor,
-        target: Tensor,
-        weight: Optional[Tensor] = None,
-        mask: Optional[Tensor] = None,
-    ) -> Tensor:
-        """Return the loss; see :func:`legs_loss`."""
-        if weight is None and self.spec.over == "scene" and not self.spec.unweighted:
-            weight = self._over_scene(target)
-        return legs_loss(
-            prediction,
-            target,
-            self.spec,
-            weight,
-            mask,
-            self.lambda_dssim,
-            self.padding,
-            self.renormalise,
-            self.channels_last,
-        )
-
-    def _over_scene(self, target: Tensor) -> Tensor:
-        strength = response(target, self.spec.operator, self.spec.p, self.channels_last, self.spec.smooth)
-        for levels in response_levels(strength, self.spec).reshape(-1, 2):
-            self._seen.add(levels)
-        return weight_map(target, self.spec, self.channels_last, self._seen.scene())
-
-    def extra_repr(self) -> str:
-        """Return the settings, for ``print(module)``."""
-        return f"{self.spec}, lambda_dssim={self.lambda_dssim}, padding={self.padding!r}"

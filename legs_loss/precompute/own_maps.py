@@ -23,7 +23,7 @@ _SUFFIXES = {MASK: SUFFIXES, WEIGHTS: (*SUFFIXES, ".npy")}
 
 
 class OwnMaps(NamedTuple):
-    """Where the user's own maps are: folders, in the scene or paths; None without.
+    """The places of the user's own maps: folders, in the scene or paths; None without.
 
     Attributes:
         masks: or "alpha", for that of the photographs. White counts, black does not.

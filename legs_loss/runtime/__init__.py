@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.images import is_compiling
+from legs_loss.images import is_compiling, read_pair
 from legs_loss.kernels.contract import Weights
 from legs_loss.runtime.call import Call, Own, View
-from legs_loss.runtime.sources import Counts
+from legs_loss.runtime.sources import MASK, Counts
 from legs_loss.runtime.state import active, configure, counted, counts, current_run, spec_to_compile, thread, version
 from legs_loss.weights import weight_map
 
-__all__ = ["Counts", "active", "configure", "counts", "l1_loss", "unweighted"]
+__all__ = ["Counts", "active", "configure", "counts", "l1_loss", "masked", "unweighted"]
 
 Result = TypeVar("Result")
 
@@ -45,7 +45,8 @@ def l1_loss(
             as in ``torch.abs(prediction - target)``.
         view: the name of the view, or its number (for a batch: one a view), for messages. Maps from ``legs precompute``
             are found by the target's fingerprint, and used only for the very image that they were made from.
-        mask: one value a pixel, zeroes the weight where it is 0.
+        mask: one value a pixel, zeroes the weight where it is 0. A mask of the store is applied beside it: the loss is
+            the mean over what that counts, and an image that the store does not know is said (docs/masks.md).
         channels_last: where the channel stands, for a shape that does not show it, as [3, 100, 4].
         reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.
         own: the codebase's own L1 of (prediction, target), where it is more than a mean: its mask or reduction is then
@@ -71,7 +72,7 @@ def l1_loss(
     call.check_options()
     if is_compiling():
         return _compiled(call)
-    if thread.unweighted or not call.trains() or not current_run().config.active:
+    if thread.unweighted or not call.trains() or not current_run().active:
         counted.plain += 1
         return call.plain()
     run, call = current_run(), call.aligned()
@@ -94,6 +95,46 @@ def _compiled(call: Call) -> Tensor:
         )
     call = call.aligned()
     return call.weighted(Weights(map=weight_map(call.target, spec, False)))
+
+
+def masked(prediction: Tensor, target: Tensor) -> Tensor:
+    """Return the prediction with the pixels that the store's mask leaves out replaced by the target's.
+
+    Written before the losses of a training step, it masks all of them, whatever computes them: where the mask is 0, no
+    loss sees a difference, and the gradient of the prediction is exactly 0. Elsewhere, under a grey mask too, the
+    prediction stays; ``l1_loss`` counts grey pixels in part.
+
+    Args:
+        prediction, target: the rendering and the photograph, as for :func:`l1_loss`.
+
+    Returns:
+        The prediction's shape; the prediction itself, the same tensor, where no mask leaves anything out: no store with
+        masks, LEGS_OFF, a prediction that is not trained on, a view without a mask.
+
+    Raises:
+        LegsError: as :func:`l1_loss`; with LEGS_MASKS=require a target that is not in the store.
+
+    Example:
+        >>> image, gt_image = torch.rand(3, 8, 8, requires_grad=True), torch.rand(3, 8, 8)
+        >>> masked(image, gt_image) is image
+        True
+    """
+    if is_compiling():
+        spec_to_compile(version[0])  # raises where there are masks
+        return prediction
+    if thread.unweighted or not (prediction.requires_grad and torch.is_grad_enabled()):
+        return prediction
+    run = current_run()
+    if run.config.off or not run.source.stored.has(MASK):
+        return prediction
+    layout, _, aligned = read_pair(prediction, target)
+    first = layout.channels_first(aligned)
+    with torch.no_grad():
+        mask = run.source.own(first, [None] * (first.shape[0] if first.dim() == 4 else 1), MASK)
+    if mask is None:
+        return prediction
+    left_out = layout.restored((mask == 0).expand_as(first)).reshape(prediction.shape)
+    return torch.where(left_out, aligned.reshape(prediction.shape).to(prediction.dtype), prediction)
 
 
 def unweighted(function: Callable[..., Result]) -> Callable[..., Result]:

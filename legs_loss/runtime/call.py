@@ -91,32 +91,41 @@ class Call(NamedTuple):
             return self.own(self.prediction, self.target)
         if self.is_mean() and self.mask is None:
             return torch.abs(self.prediction - self.target).mean()
-        return self.aligned()._with_map(None)
+        call = self.aligned()
+        return call._with_map(None, call.mask)
 
     def weighted(self, weights: Weights) -> Tensor:
         """Return the loss with these weights."""
+        if self.mask is not None and weights.mask is not None:  # the call's own is not renormalised: a factor
+            factor = self.mask.to(torch.float32)
+            weights = weights._replace(map=factor if weights.map is None else weights.map * factor)
+        elif self.mask is not None:
+            weights = weights._replace(mask=self.mask)
         if self.is_mean():
-            loss = fused_l1(self.prediction, self.target, weights._replace(mask=self.mask))
+            loss = fused_l1(self.prediction, self.target, weights)
             if loss is not None:
                 return loss
-        if weights.spec is None:
-            return self._with_map(weights.map)
-        with torch.no_grad():
-            weight = weight_map(self.target, weights.spec, False)
-        return self._with_map(weight)
+        weight = weights.map
+        if weights.spec is not None:
+            with torch.no_grad():
+                made = weight_map(self.target, weights.spec, False)
+            weight = made if weight is None else made * weight
+        return self._with_map(weight, weights.mask, weights.renormalise)
 
-    def _with_map(self, weight: Optional[Tensor]) -> Tensor:
+    def _with_map(self, weight: Optional[Tensor], mask: Optional[Tensor], renormalise: bool = False) -> Tensor:
         assert self.layout is not None
+        if self.reduction == "mean" and self.own is None:
+            return weighted_l1(self.prediction, self.target, weight, mask, renormalise, False)
+        if mask is not None:  # where a reduction of the codebase follows, its mean becomes the mean over what counts
+            mask = mask.to(torch.float32)
+            mask = mask / mask.mean().clamp(min=torch.finfo(torch.float32).tiny) if renormalise else mask
+            weight = mask if weight is None else weight * mask
         if self.own is not None:
-            assert weight is not None
+            if weight is None:
+                return self.own(self.layout.restored(self.prediction), self.layout.restored(self.target))
             # |F + W * (U - F) - F| = W * |U - F|: any L1 of the difference becomes the weighted one, and masks that the
             # codebase makes from the target stay as they are.
             moved = self.target + weight.to(self.prediction.dtype) * (self.prediction - self.target)
             return self.own(self.layout.restored(moved), self.layout.restored(self.target))
-        if self.reduction == "mean":
-            return weighted_l1(self.prediction, self.target, weight, self.mask, channels_last=False)
         error = torch.abs(self.prediction - self.target)
-        for factor in (weight, self.mask):
-            if factor is not None:
-                error = factor.to(error.dtype) * error
-        return self.layout.restored(error)
+        return self.layout.restored(error if weight is None else weight.to(error.dtype) * error)

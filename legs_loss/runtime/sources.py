@@ -8,12 +8,14 @@ least response and the span; torch needs the map.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Callable, Optional
+from functools import partial
+from typing import Callable, List, Optional, Sequence
 
 import torch
 from torch import Tensor
 
 from legs_loss.config import Config
+from legs_loss.errors import LegsError
 from legs_loss.images import check_values
 from legs_loss.kernels.available import is_capturing
 from legs_loss.kernels.backends import fused_range
@@ -22,10 +24,16 @@ from legs_loss.levels import RunningLevels, response_levels
 from legs_loss.response import response
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.memo import WeightMemo
-from legs_loss.runtime.stored import StoredWeights
+from legs_loss.runtime.stored import Stored
 from legs_loss.weights import weight_map, weight_over_scene
 
-__all__ = ["Counts", "WeightSource"]
+__all__ = ["MASK", "NOT_IN_A_GRAPH", "WEIGHTS", "Counts", "WeightSource"]
+
+MASK, WEIGHTS = "mask", "weights"  # the store's names of the user's own maps; it is imported only where there is one
+NOT_IN_A_GRAPH = (
+    "the store has masks or weights of your own, which are found by the image, and a compiled or captured graph cannot "
+    "look: leave the loss out of the graph, or name a store without them (LEGS_STORE)"
+)
 
 
 @dataclass
@@ -38,6 +46,8 @@ class Counts:
         remembered: images whose weight was taken from the memo.
         stored: images whose weight map was taken from the store.
         computed: images whose weight was computed from them.
+        masked: images that were trained on with a mask of the store.
+        unmasked: images that were not found in a store with masks, and counted whole.
     """
 
     weighted: int = 0
@@ -45,6 +55,8 @@ class Counts:
     remembered: int = 0
     stored: int = 0
     computed: int = 0
+    masked: int = 0
+    unmasked: int = 0
 
 
 class WeightSource:
@@ -62,13 +74,47 @@ class WeightSource:
         self.memo: WeightMemo = WeightMemo(memo_bytes)
         self._counts = counts
         self._say_once = say_once
-        self._stored: StoredWeights = StoredWeights(config, say_once)
+        self.stored: Stored = Stored(config, say_once)
         self._seen: RunningLevels = RunningLevels()
 
     def weights(self, call: Call) -> Weights:
-        """Return the weights of a call's target, and count their sources."""
+        """Return the weights of a call's target, with the user's own, and count their sources."""
         names = call.view_names()
-        images = [call.target] if call.target.dim() == 3 else [call.target[i] for i in range(len(names))]
+        weights = Weights() if self.config.spec.unweighted else self._made_weights(call, names)
+        own, mask = (self.own(call.target, names, kind) for kind in (WEIGHTS, MASK))
+        if own is not None:
+            weights = weights._replace(map=own if weights.map is None else weights.map * own)
+        return weights if mask is None else weights._replace(mask=mask, renormalise=True)
+
+    def has_own(self) -> bool:
+        """Return whether the store has masks or weights of the user's, which hold for every preset."""
+        return self.stored.has(MASK) or self.stored.has(WEIGHTS)
+
+    def own(self, target: Tensor, names: Sequence[Optional[str]], kind: str) -> Optional[Tensor]:
+        """Return the user's masks or weights of a target, [1, H, W] or [B, 1, H, W]; None where all counts whole.
+
+        Raises:
+            LegsError: they cannot be looked up in a CUDA graph; or as :meth:`Stored.own`.
+        """
+        if not self.stored.has(kind):
+            return None
+        if is_capturing(target.device):
+            raise LegsError(NOT_IN_A_GRAPH)
+        maps = [
+            self.memo.recall(image, partial(self.stored.own, image, name, kind), kind)
+            for image, name in zip(_images(target), names)
+        ]
+        if kind == MASK:
+            self._counts.masked += sum(one.dim() == 3 for one in maps)
+            self._counts.unmasked += sum(one.dim() == 2 for one in maps)
+        if not any(one.dim() == 3 for one in maps):
+            return None
+        ones = torch.ones((1, *target.shape[-2:]), device=target.device)
+        whole = [one if one.dim() == 3 else ones for one in maps]
+        return whole[0] if target.dim() == 3 else torch.stack(whole)
+
+    def _made_weights(self, call: Call, names: Sequence[Optional[str]]) -> Weights:
+        images = _images(call.target)
         found = [self._weight(image, name, call) for image, name in zip(images, names)]
         spec = self.config.spec
         if spec.over == "scene":
@@ -101,7 +147,7 @@ class WeightSource:
         return weight
 
     def _made(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
-        weight = self._stored.weight(image, view)
+        weight = self.stored.weight(image, view)
         if weight is not None:
             self._counts.stored += 1
             return weight
@@ -123,7 +169,7 @@ class WeightSource:
 
     def _scene_levels(self, pixels: int) -> Optional[Tensor]:
         """Return the levels of the scene: of all the store's views of this size, else of those seen so far."""
-        levels = self._stored.scene_levels(pixels)
+        levels = self.stored.scene_levels(pixels)
         if levels is not None:
             return levels
         self._say_once("running", _RUNNING)
@@ -134,6 +180,10 @@ _RUNNING = (
     "weights are normalised over the views seen so far, a running estimate; legs precompute --preset legs-robust knows "
     "all views from the first step"
 )
+
+
+def _images(target: Tensor) -> List[Tensor]:
+    return [target] if target.dim() == 3 else list(target)
 
 
 def _is_range(weight: Tensor) -> bool:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import atexit
 import sys
 import threading
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
-from typing import List, Optional, Set, Union
+from typing import Deque, List, Optional, Set, Union
 
 from legs_loss.config import Config, find_config
+from legs_loss.errors import LegsError
 from legs_loss.runtime.memo import DEFAULT_LIMIT
-from legs_loss.runtime.sources import Counts, WeightSource
+from legs_loss.runtime.sources import MASK, NOT_IN_A_GRAPH, Counts, WeightSource
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.system import is_first_process, say
 
@@ -44,6 +47,11 @@ class Run:
         for note in config.notes:
             self.say_once(note, note)
 
+    @property
+    def active(self) -> bool:
+        """Return whether anything is weighted or masked."""
+        return self.config.active or (not self.config.off and self.source.has_own())
+
     def say_once(self, kind: str, message: str) -> None:
         """Print a line on stderr, once for each kind of message; "active" only on rank 0."""
         if kind not in self._said:
@@ -57,12 +65,17 @@ class Run:
         if "active" in self._said:
             return
         spec = self.config.spec
-        if counted.stored == 0:
+        if spec.unweighted:
+            weights = f"own maps from {self.config.store}"
+        elif counted.stored == 0:
             weights = "weights computed from the training images"
         elif counted.computed == 0:
             weights = f"maps from {self.config.store}"
         else:
             weights = f"maps from {self.config.store}, but for {counted.computed} image(s), whose weight is computed"
+        if self.source.stored.has(MASK):
+            weights += f"; masks from {self.config.store}"
+            _masked.append(self)
         self.say_once(
             "active",
             f"L1 weighted, preset {self.config.preset}: {spec.operator}, {spec.curve}, beta {spec.beta:g}; {weights}; "
@@ -81,6 +94,7 @@ counted: Counts = Counts()
 thread: _Thread = _Thread()
 version: List[int] = [0]  # how often the settings were replaced; compiled code is recompiled then
 _run: Optional[Run] = None
+_masked: Deque[Run] = deque(maxlen=1)  # the last run with masks
 _lock = threading.RLock()
 
 
@@ -94,10 +108,19 @@ def current_run() -> Run:
     return _run
 
 
+@atexit.register
+def _say_masked() -> None:
+    """Print, as the process ends, what the masks of its last run were used for."""
+    if _masked:
+        say(f"legs-loss: {_masked[-1].source.stored.masked.summary(counted.unmasked)}", sys.stderr)
+
+
 def spec_to_compile(version: int) -> Optional[WeightSpec]:
     """Return the spec of a compiled call, None without a weight."""
-    config = current_run().config
-    return config.spec if config.active else None
+    run = current_run()
+    if not run.config.off and run.source.has_own():
+        raise LegsError(NOT_IN_A_GRAPH)
+    return run.config.spec if run.config.active else None
 
 
 # torch.compile calls it while it traces, and takes its result as a constant: it cannot trace a lock, or a file that is
@@ -110,6 +133,7 @@ def reset() -> None:
     global _run
     with _lock:
         _run = None
+        _masked.clear()
         version[0] += 1
         reset_counts()
 
@@ -156,12 +180,12 @@ def configure(
 
 
 def active() -> bool:
-    """Return whether ``l1_loss`` weights what is trained: not with beta 0, nor with LEGS_OFF.
+    """Return whether ``l1_loss`` weights or masks what is trained: not with beta 0 alone, nor with LEGS_OFF.
 
     Raises:
         LegsError: a setting in legs.toml or LEGS_* that is out of range.
     """
-    return current_run().config.active
+    return current_run().active
 
 
 def counts() -> Counts:

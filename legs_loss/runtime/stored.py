@@ -1,8 +1,9 @@
-"""Find the weight of an image in the store of a run, for exactly the image that a map was made from."""
+"""Find what the store of a run has of an image, for exactly the image that its maps belong to."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Callable, Dict, Optional
+import weakref
+from typing import TYPE_CHECKING, Callable, Dict, Optional, Set, Tuple
 
 import torch
 from torch import Tensor
@@ -12,38 +13,68 @@ from legs_loss.errors import LegsError
 from legs_loss.weights import weight_from_response
 
 if TYPE_CHECKING:
-    from legs_loss.store import Entry, WeightStore
+    from legs_loss.store import Found, WeightStore
 
-__all__ = ["StoredWeights"]
+__all__ = ["Masked", "Stored"]
 
-_MISSES = 2  # lookups for each view of the store
+_MISSES = 2  # lookups for each map of the store
 
 _ABSENT = (
-    "{store} has no map of the training image{view} of {width}x{height}: another size or other pixels than legs "
-    "precompute read; the weight of such images is computed (said once; see docs/precompute.md)"
+    "{store} has no map of the training image{view} of {size}: another size or other pixels than legs precompute "
+    "read; the weight of such images is computed (said once; see docs/precompute.md)"
+)
+_UNMASKED = (
+    "NOT MASKED: {store} has masks, but none for the training image{view} of {size}, which counts whole: {reason} "
+    "(said once; LEGS_MASKS=require stops instead; see docs/masks.md)"
+)
+_OTHER_SIZE = "the store has {sizes}; give legs precompute the training's -r and --images"
+_OTHER_PIXELS = (
+    "its pixels are no photograph's that legs precompute read, so it was changed on the way: augmented, shifted, "
+    "resized or laid on another background"
 )
 
 
-class StoredWeights:
+class Masked:
+    """The names of a run's views with a mask of the store, and of those without."""
+
+    def __init__(self) -> None:
+        self.views: Set[str] = set()
+        self.whole: Set[str] = set()
+
+    def summary(self, absent: int) -> str:
+        """Return the line of a run's end; ``absent`` is how often an image was not found."""
+        parts = [f"{len(self.views)} view(s) masked"]
+        parts += [f"{len(self.whole)} without a mask counted whole"] if self.whole else []
+        parts += [f"{absent} training image(s) were NOT FOUND in the store, so NOT MASKED"] if absent else []
+        return f"masks: {', '.join(parts)}"
+
+
+class Stored:
     """The store of a run, opened when it is first needed.
 
     Args:
         config: of the run.
         say_once: prints a line (kind of message, message) the first time that its kind occurs.
+
+    Raises:
+        LegsError: LEGS_MASKS=require, and there is no store with masks.
     """
 
     def __init__(self, config: Config, say_once: Callable[[str, str], None]) -> None:
+        self.masked = Masked()
         self._config = config
         self._say_once = say_once
         self._misses = 0  # since an image was found
+        self._last: Optional[Tuple[weakref.ref[Tensor], int, Optional[Found]]] = None
         self._levels: Dict[int, Optional[Tensor]] = {}
         self._store: Optional[WeightStore] = None
+        self._kinds: Set[str] = set()
         self._opened = False
 
     def weight(self, image: Tensor, view: Optional[str]) -> Optional[Tensor]:
         """Return an image's weight map [1, H, W], None if no map was made from this image.
 
-        Where weights follow the rendering's error it is E^; where they are normalised over the scene, E.
+        Where weights are normalised over the scene it is E.
 
         Args:
             image: [C, H, W].
@@ -52,20 +83,46 @@ class StoredWeights:
         store = self._open()
         if store is None:
             return None
+        found = self._find(store, image, view)
+        if found is None or found.response is None:
+            return None
+        over_scene = self._config.spec.over == "scene"
         try:
-            entry = self._entry(store, image, view)
-            if entry is None:
-                return None
-            over_scene = self._config.spec.over == "scene"
-            values = store.response(entry) if over_scene else store.normalised_response(entry)
+            values = store.response(found.response) if over_scene else store.normalised_response(found.response)
         except LegsError as error:
             self._say_once("damaged", f"{error}; the weights of such views are computed")
             return None
         known = torch.from_numpy(values).to(image.device).unsqueeze(0)
-        weight = known.float()
-        if not over_scene:
-            weight = weight_from_response(known, self._config.spec)
-        return weight
+        return known.float() if over_scene else weight_from_response(known, self._config.spec)
+
+    def has(self, kind: str) -> bool:
+        """Return whether the store has maps of the user's own of a kind."""
+        self._open()
+        return kind in self._kinds
+
+    def own(self, image: Tensor, view: Optional[str], kind: str) -> Tensor:
+        """Return the user's mask or weights of an image, float32 [1, H, W].
+
+        An image that has none counts whole: an empty tensor [0], or [0, 0] where the store does not know the image.
+
+        Raises:
+            LegsError: a file of the store is damaged; or LEGS_MASKS=require, and the image is not in the store.
+        """
+        from legs_loss.store import MASK
+
+        store = self._open()
+        assert store is not None
+        found = self._find(store, image, view)
+        if found is None:
+            if kind == MASK:
+                self._say_unmasked(store, image, view)
+            return torch.empty(0, 0)
+        entry = found.mask if kind == MASK else found.weights
+        if kind == MASK:
+            (self.masked.whole if entry is None else self.masked.views).add(found.view)
+        if entry is None:
+            return torch.empty(0)
+        return torch.from_numpy(store.own_map(entry)).to(image.device).unsqueeze(0)
 
     def scene_levels(self, pixels: int) -> Optional[Tensor]:
         """Return the levels of all the store's views of this size, None where it lacks them."""
@@ -74,27 +131,52 @@ class StoredWeights:
             self._levels[pixels] = store.scene_levels(self._config.spec, pixels)
         return self._levels.get(pixels)
 
-    def _entry(self, store: WeightStore, image: Tensor, view: Optional[str]) -> Optional[Entry]:
-        """Return the store's entry that was made from an image [C, H, W]."""
-        if self._misses >= _MISSES * len(store.entries):
+    def _find(self, store: WeightStore, image: Tensor, view: Optional[str]) -> Optional[Found]:
+        """Return what the store has of an image [C, H, W]; with masks or weights of the user's it is always asked."""
+        if not self._kinds and self._misses >= _MISSES * len(store.entries):
             return None  # targets that are new at each step, and a lookup waits for a device
+        version = 0 if image.is_inference() else image._version
+        last = self._last  # one lookup a step; on the CPU memory that numpy shares changes without a new version
+        if last is not None and last[0]() is image and last[1] == version and image.device.type != "cpu":
+            return last[2]
         found = store.find_image(image, self._config.spec)
-        entry = None if found is None else found.response
-        self._misses = 0 if entry is not None else self._misses + 1
-        if entry is None:
-            height, width = image.shape[1:]
-            named = "" if view is None else f" of view {view!r}"
-            self._say_once("absent", _ABSENT.format(store=store.path, view=named, width=width, height=height))
-        return entry
+        self._last = weakref.ref(image), version, found
+        self._misses = 0 if found is not None else self._misses + 1
+        if found is None and not self._kinds:
+            self._say_once("absent", _ABSENT.format(store=store.path, view=_named(view), size=_size(image)))
+        return found
+
+    def _say_unmasked(self, store: WeightStore, image: Tensor, view: Optional[str]) -> None:
+        sizes = sorted({f"{entry.width}x{entry.height}" for entry in store.entries.values()})
+        reason = _OTHER_PIXELS if _size(image) in sizes else _OTHER_SIZE.format(sizes=", ".join(sizes[:4]))
+        message = _UNMASKED.format(store=store.path, view=_named(view), size=_size(image), reason=reason)
+        if self._config.require_masks:
+            raise LegsError(message)
+        self._say_once("unmasked", message)
 
     def _open(self) -> Optional[WeightStore]:
-        if not self._opened:
-            self._opened = True
-            if self._config.store is not None:
-                from legs_loss.store import WeightStore
+        if self._opened:
+            return self._store
+        if self._config.store is not None:
+            from legs_loss.store import WeightStore
 
-                try:
-                    self._store = WeightStore(self._config.store)
-                except LegsError as error:
-                    self._say_once("damaged", f"{error}; weights are computed instead")
+            try:
+                self._store = WeightStore(self._config.store)
+                self._kinds = {entry.operator for entry in self._store.entries.values() if entry.is_own}
+            except LegsError as error:
+                if self._config.require_masks:
+                    raise
+                self._say_once("damaged", f"{error}; weights are computed instead")
+        if self._config.require_masks and "mask" not in self._kinds:
+            where = "there is no store" if self._store is None else f"{self._store.path} has no masks"
+            raise LegsError(f"LEGS_MASKS=require, but {where}: legs precompute SCENE --masks DIR makes one")
+        self._opened = True
         return self._store
+
+
+def _named(view: Optional[str]) -> str:
+    return "" if view is None else f" of view {view!r}"
+
+
+def _size(image: Tensor) -> str:
+    return f"{image.shape[2]}x{image.shape[1]}"

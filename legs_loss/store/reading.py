@@ -30,8 +30,9 @@ class Damage(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The entries of a store for one training image: a response for a spec, the user's mask, the user's weights."""
+    """The view of one training image, and the entries for it: a response for a spec, the user's mask and weights."""
 
+    view: str
     response: Optional[Entry]
     mask: Optional[Entry]
     weights: Optional[Entry]
@@ -91,7 +92,7 @@ class WeightStore:
         if not entries:
             return None
         fits = [entry for entry in entries if self.fits(entry, spec)]
-        return Found(fits[0] if fits else None, self._own(entries, MASK), self._own(entries, WEIGHTS))
+        return Found(entries[0].view, fits[0] if fits else None, self._own(entries, MASK), self._own(entries, WEIGHTS))
 
     def _own(self, entries: List[Entry], kind: str) -> Optional[Entry]:
         found = {entry.view: self.own(entry, kind) for entry in entries}

@@ -98,7 +98,7 @@ class TestWhenItWeights:
         ("shapes", "options", "message"),
         [
             (((3, 9, 8), (3, 9, 7)), {}, r"\[3, 9, 8\] and target \[3, 9, 7\]"),
-            (((5,), (5,)), {}, r"got \[5\]"),
+            (((5,), (5,)), {}, r"\[5\] is a list of pixels"),
             (((2, 3, 9, 8), (2, 3, 9, 8)), {"view": ["a"]}, r"\[2, 3, 9, 8\] holds 2, got \['a'\]"),
             (((2, 3, 9, 8), (2, 3, 9, 8)), {"view": "a"}, "one name a view"),
             (((3, 9, 8), (3, 9, 8)), {"view": 7.5}, "got 7.5"),

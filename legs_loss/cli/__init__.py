@@ -12,13 +12,26 @@ import sys
 from typing import Any, Callable, Dict, Optional, Sequence
 
 from legs_loss._version import __version__
-from legs_loss.cli.parser import Parser
+from legs_loss.cli.shared.parser import Parser
 from legs_loss.errors import LegsError
 from legs_loss.system import never_fail_to_print, plugins, say, say_error
 
 __all__ = ["Parser", "main"]
 
-COMMANDS = ("scene", "precompute", "show", "info", "train", "demo", "compare", "report", "view", "env")
+COMMANDS = (
+    "scene",
+    "masks",
+    "precompute",
+    "export",
+    "show",
+    "info",
+    "train",
+    "demo",
+    "compare",
+    "report",
+    "view",
+    "env",
+)
 
 EXIT_CODES = "exit codes: 0 done; 1 done, but some items failed; 2 bad input or usage; 130 interrupted"
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Dict, Sequence
 
-from legs_loss.cli.affordable import add_scene_arguments, default_resolution
+from legs_loss.cli.shared.affordable import add_scene_arguments, default_resolution
 from legs_loss.system import say
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     """Train what is missing and print the tables."""
     from tqdm import tqdm
 
-    from legs_loss.cli.checks import check_writable
+    from legs_loss.cli.shared.checks import check_writable
     from legs_loss.cli.train import COMPILING, set_threads
     from legs_loss.errors import LegsError
     from legs_loss.experiments.arms import needed, parse_arms

@@ -15,7 +15,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Dict, List
 
-from legs_loss.cli.affordable import add_scene_arguments, default_resolution
+from legs_loss.cli.shared.affordable import add_scene_arguments, default_resolution
 from legs_loss.system import say, write_whole
 
 HELP = "weight maps, four trainings, a table and pictures, on the embedded scene or your own"
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make or read the scene, precompute, train, print the table and save the pictures."""
-    from legs_loss.cli.checks import check_writable
+    from legs_loss.cli.shared.checks import check_writable
     from legs_loss.cli.train import progress_bar, set_threads
     from legs_loss.errors import LegsError
     from legs_loss.precompute import precompute

@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     """Check the arguments before anything is computed; return the tasks, and their stores as they were named."""
-    from legs_loss.cli.checks import check_resolution, check_writable
+    from legs_loss.cli.shared.checks import check_resolution, check_writable
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import SceneTask, find_scenes, stores_of
     from legs_loss.precompute.own_maps import ALPHA, OwnMaps

@@ -1,4 +1,4 @@
-"""Draw a contact sheet (PNG): photograph, response and weight map of some views, and the curves.
+"""Draw a contact sheet (PNG): photograph, mask, response and weight map of some views, and the curves.
 
 The maps of a SCENE or an IMAGE are computed; those of a STORE are drawn with the photographs of its scene.
 """
@@ -101,7 +101,7 @@ def _levels(views: Sequence[View], spec: WeightSpec) -> Optional[Tensor]:
 def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
     from legs_loss.errors import LegsError
     from legs_loss.report.sheet import Shown
-    from legs_loss.store import WeightStore
+    from legs_loss.store import MASK, WEIGHTS, WeightStore
     from legs_loss.store.origin import scene_of_store
 
     store, scene = WeightStore(path), scene_of_store(path)
@@ -111,7 +111,9 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
         view = views.get(entry.view)
         photograph = None if view is None else _photograph(view, entry)
         normalised = store.normalised_response(entry) if spec.over == "image" else over_scene(entry)
-        return Shown(f"{entry.view}\n{entry.width}x{entry.height}", photograph, normalised)
+        own = [store.own(entry, kind) for kind in (MASK, WEIGHTS)]
+        mask, weights = (None if one is None else store.own_map(one) for one in own)
+        return Shown(f"{entry.view}\n{entry.width}x{entry.height}", photograph, normalised, mask, weights)
 
     def over_scene(entry: Entry) -> np.ndarray:
         import torch

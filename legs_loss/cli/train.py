@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, or resume a training, and print the scores."""
-    from legs_loss.cli.checks import check_trainable, check_writable
+    from legs_loss.cli.shared.checks import check_trainable, check_writable
     from legs_loss.errors import LegsError
     from legs_loss.reference.training.checkpoint import CHECKPOINT, check_new
     from legs_loss.reference.training.trainer import TrainConfig, point_cloud, train

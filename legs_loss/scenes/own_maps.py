@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Dict, Iterable, List, Sequence, Tuple
+from typing import Dict, Iterable, List, Sequence, Tuple, Type
 
 import numpy as np
 
@@ -12,9 +12,9 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.folder import SUFFIXES
 from legs_loss.scenes.images import colour_mode, open_image
 from legs_loss.scenes.model import View
-from legs_loss.system import open_regular
+from legs_loss.system import open_regular, write_whole
 
-__all__ = ["averaged", "find_maps", "has_alpha", "read_alpha", "read_map_file"]
+__all__ = ["averaged", "file_names", "find_maps", "has_alpha", "read_alpha", "read_map_file", "write_gray"]
 
 _GRAY = 32  # of 255: the colours of a pixel of a gray JPEG differ less
 _LARGEST = 1 << 29  # values of a .npy
@@ -104,6 +104,26 @@ def read_alpha(path: Path) -> np.ndarray:
     """Return the alpha of a photograph that has one, float32 [H, W] in [0, 1]."""
     with open_image(path) as image:
         return (np.asarray(image.convert("RGBA"))[..., 3] / 255.0).astype(np.float32)
+
+
+def file_names(views: Iterable[str]) -> Dict[str, str]:
+    """Return the names of the views' maps, as PNG: as photographs are called in the scene's folder of photographs.
+
+    >>> file_names(["images/cam/1.jpg", "images/2.jpg"])
+    {'images/cam/1.jpg': 'cam/1.png', 'images/2.jpg': '2.png'}
+    """
+    views = list(views)
+    folders = {view.split("/")[0] if "/" in view else "" for view in views}
+    skipped = len(next(iter(folders))) + 1 if len(folders) == 1 and folders != {""} else 0
+    return {view: f"{os.path.splitext(view[skipped:])[0]}.png" for view in views}
+
+
+def write_gray(path: Path, values: np.ndarray, kind: Type[np.unsignedinteger] = np.uint8) -> None:
+    """Write a map in [0, 1] as a gray PNG."""
+    from PIL import Image
+
+    whole = np.rint(values * np.iinfo(kind).max).astype(kind)
+    write_whole(path, lambda file: Image.fromarray(whole).save(file, "PNG"), folders=True)
 
 
 def averaged(values: np.ndarray, size: Tuple[int, int]) -> np.ndarray:

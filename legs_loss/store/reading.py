@@ -18,6 +18,7 @@ from legs_loss.store.fingerprints import fingerprint, sampled_fingerprint
 from legs_loss.store.leftovers import leftovers
 from legs_loss.store.manifest import MANIFEST, MASK, WEIGHTS, Entry, read_manifest
 from legs_loss.store.maps import is_intact, read_map
+from legs_loss.weights import weight_from_response, weight_over_scene
 
 __all__ = ["Damage", "Found", "WeightStore"]
 
@@ -151,6 +152,18 @@ class WeightStore:
             DamagedStoreError: the file is missing or is not the one that was written.
         """
         return read_map(self.path, entry)
+
+    def final_weight(self, entry: Entry, spec: WeightSpec) -> np.ndarray:
+        """Return the weight map of an entry that fits a spec, times the user's weights and mask, float32 [H, W]."""
+        if spec.over == "scene":
+            scene = self.scene_levels(spec, entry.width * entry.height)
+            made = weight_over_scene(torch.from_numpy(self.response(entry))[None], spec, scene)
+        else:
+            made = weight_from_response(torch.from_numpy(self.normalised_response(entry))[None], spec)
+        weight: np.ndarray = made[0].numpy()
+        for own in filter(None, (self.own(entry, kind) for kind in (MASK, WEIGHTS))):
+            weight = weight * self.own_map(own)
+        return weight
 
     def check(self) -> Damage:
         """Read every map and compare checksums."""

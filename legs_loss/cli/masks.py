@@ -1,0 +1,113 @@
+"""Make masks of a scene's photographs by what needs no network, one PNG a photograph; white counts, black does not.
+
+WHAT is a folder of masks of your own, alpha (of the photographs), saturated or dark (over- or under-exposed in all
+channels; black borders of undistorted photographs are dark), or sharpness (regions without contrast: out of focus, and
+flat ones, too). With several a pixel counts where it counts in all. A program that finds people or a paint program
+writes the same folder: legs precompute SCENE --masks DIR reads it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Dict, List
+
+from legs_loss.system import say
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from legs_loss.scenes import View
+
+HELP = "make masks of photographs: alpha, exposure, sharpness"
+
+_KINDS = ("alpha", "saturated", "dark", "sharpness")
+_CLIPPED = 5  # of 255, from either end
+_BLUNT = 0.1  # of the contrast that a tenth of the photograph has
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("scene", metavar="SCENE", type=Path, help="a scene, or a folder of photographs")
+    parser.add_argument(
+        "--from", dest="kinds", nargs="+", required=True, metavar="WHAT", help=f"DIR, {', '.join(_KINDS)}"
+    )
+    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
+    parser.add_argument("--out", type=Path, metavar="DIR", help="an empty or new folder; default: SCENE/masks")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the masks; 1 when a photograph was skipped."""
+    from tqdm import tqdm
+
+    from legs_loss.errors import LegsError
+    from legs_loss.scenes import read_scene
+    from legs_loss.scenes.own_maps import file_names, find_maps, write_gray
+
+    out = args.out or args.scene / "masks"
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise LegsError(f"{out} is not empty: name another folder with --out")
+    views = read_scene(args.scene, args.images).views
+    folders = {}
+    for kind in args.kinds:
+        if kind not in _KINDS:
+            folder = args.scene / kind if (args.scene / kind).is_dir() else Path(kind)
+            views = tuple(view for view in views if folder.resolve() not in view.path.resolve().parents)
+            folders[kind] = find_maps(folder, views)
+    names = file_names(view.name for view in views)
+    mostly: List[str] = []
+    skipped = 0
+    for view in tqdm(views, "masks", unit="view"):
+        try:
+            mask = _mask(view, args.kinds, folders)
+            if not mask.any():
+                raise LegsError("nothing of it would count")
+        except LegsError as error:
+            say(f"legs: skipped {view.name}: {error}", sys.stderr)
+            skipped += 1
+            continue
+        if mask.mean() < 0.5:
+            mostly.append(view.name)
+        write_gray(out / names[view.name], mask)
+    if mostly:
+        say(f"legs: note: masked by more than half: {', '.join(mostly)}", sys.stderr)
+    say(f"{out}: {len(views) - skipped} masks, {skipped} skipped")
+    return 1 if skipped else 0
+
+
+def _mask(view: View, kinds: List[str], folders: Dict[str, Dict[str, Path]]) -> np.ndarray:
+    """Return the mask of a photograph at its own size, float32 [H, W]."""
+    import numpy as np
+
+    from legs_loss.scenes import load_training_image
+    from legs_loss.scenes.own_maps import averaged, has_alpha, read_alpha, read_map_file
+
+    photograph = load_training_image(view, 1)
+    unit = photograph / np.float32(np.iinfo(photograph.dtype).max)
+    height, width = unit.shape[:2]
+    mask = np.ones((height, width), np.float32)
+    for kind in kinds:
+        if kind == "alpha":
+            mask *= read_alpha(view.path) if has_alpha(view.path) else 1
+        elif kind == "saturated":
+            mask *= unit.min(-1) <= 1 - _CLIPPED / 255
+        elif kind == "dark":
+            mask *= unit.max(-1) >= _CLIPPED / 255
+        elif kind == "sharpness":
+            mask *= _is_sharp(unit)
+        elif view.name in folders[kind]:
+            mask *= averaged(read_map_file(folders[kind][view.name], (width, height)), (width, height)).clip(0, 1)
+    return mask
+
+
+def _is_sharp(unit: np.ndarray) -> np.ndarray:
+    """Return where an image [H, W, C] has contrast: its response, averaged over a fiftieth of its height."""
+    import numpy as np
+    import torch
+
+    from legs_loss.response import gaussian_blur, response
+
+    image = torch.from_numpy(np.ascontiguousarray(unit.transpose(2, 0, 1)))
+    contrast = gaussian_blur(response(image, channels_last=False), max(1.0, unit.shape[0] / 50))[0].numpy()
+    return contrast >= _BLUNT * np.quantile(contrast, 0.9)

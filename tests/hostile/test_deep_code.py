@@ -148,7 +148,7 @@ LABORIOUS = {
     "20 loops": (loops(20), True),
     "95 loops": (loops(95), True),
     "a sum of 100 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 100)), True),
-    "a sum of 601 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 601)), False),
+    "a sum of 601 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 601)), True),
     "650 lambdas": ("def f():\n    g = " + "lambda: " * 650 + "0\n", True),
     "1,500 lambdas": ("def f():\n    g = " + "lambda: " * 1500 + "0\n", False),
     "1,000 functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(1000)), True),

@@ -12,7 +12,7 @@ from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps
 from legs_adapters.code.parsing import Cut, Lines, Part, Place, body_part, outline_part
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
-from legs_adapters.code.syntax import arguments, dotted
+from legs_adapters.code.syntax import arguments, dotted, loops_by_node
 
 __all__ = ["CALLED", "Class", "Function", "Module", "parse", "said"]
 
@@ -55,6 +55,7 @@ class Function:
         self._body: Optional[cst.BaseSuite | cst.Module] = None
         self._inner: List[Function] = []
         self._flow: Optional[Flow] = None
+        self._loops: Optional[Dict[int, Tuple[cst.CSTNode, ...]]] = None
         if cut is not None:
             self.text: str = module.lines.data[cut.start : cut.end].decode("utf-8")
         else:
@@ -111,6 +112,12 @@ class Function:
             if found is not None and found.start(1) == end:
                 return self.module.lines.place(start, start).line
         return self.parent.place(self.node).line
+
+    def loops_around(self, node: cst.CSTNode) -> Tuple[cst.CSTNode, ...]:
+        """Return the loops around a node of its body, the innermost first."""
+        if self._loops is None:
+            self._loops = loops_by_node(self.body)
+        return self._loops.get(id(node), ())
 
     @property
     def flow(self) -> Flow:

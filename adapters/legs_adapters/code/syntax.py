@@ -20,7 +20,7 @@ __all__ = [
     "dotted",
     "every_parameter",
     "key_of",
-    "loops_around",
+    "loops_by_node",
     "names_where_false",
     "names_where_true",
     "one_line",
@@ -200,16 +200,16 @@ def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
         stack.extend(reversed(below))
 
 
-def loops_around(root: cst.CSTNode, node: cst.CSTNode) -> List[cst.CSTNode]:
-    """Return the loops around an expression, the innermost first."""
+def loops_by_node(root: cst.CSTNode) -> Dict[int, Tuple[cst.CSTNode, ...]]:
+    """Return the loops around each node, the innermost first, by the node's id."""
+    found: Dict[int, Tuple[cst.CSTNode, ...]] = {}
     stack: List[Tuple[cst.CSTNode, Tuple[cst.CSTNode, ...]]] = [(root, ())]
     while stack:
         part, loops = stack.pop()
-        if part is node:
-            return list(reversed(loops))
-        inner = (*loops, part) if isinstance(part, (cst.For, cst.While)) else loops
+        found[id(part)] = loops
+        inner = (part, *loops) if isinstance(part, (cst.For, cst.While)) else loops
         stack.extend((child, inner) for child in children(part))
-    return []
+    return found
 
 
 def _is_node(kind: type) -> bool:

@@ -125,7 +125,7 @@ class _Finder:
 
     def _of_forms(self, function: Function) -> Iterator[_Entry]:
         for form in self.analysis.forms.of(function):
-            if not function.module.spend(10 * function.flow.steps):  # some rules look at all of it
+            if not function.module.spend(function.flow.steps):  # some rules look at all of it
                 return
             place = function.place(form.node)
             chosen = self._is_chosen(function, place)

@@ -13,7 +13,7 @@ import libcst as cst
 from legs_adapters.code.calls import likely_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import attribute_chain, call_name, loops_around, walk_all, words
+from legs_adapters.code.syntax import attribute_chain, call_name, walk_all, words
 from legs_adapters.lexicon.optimised import Optimised
 from legs_adapters.lexicon.words import EMBEDDINGS, GAUSSIANS, MODELS, POSES
 from legs_adapters.tensors.backward import Training
@@ -57,7 +57,7 @@ class Purposes:
 
     def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Purpose]:
         """Return the purpose of an expression that does not train, by the loops around it; None where it may."""
-        loops = loops_around(function.body, node)
+        loops = function.loops_around(node)
         known = function, tuple(map(id, loops)), depth
         if known not in self._known:
             self._known[known] = self._purpose(function, node, loops, depth)

@@ -7,7 +7,7 @@ from typing import List
 
 import libcst as cst
 
-from legs_adapters.code.syntax import attribute_chain, code, loops_around, walk_expressions, words
+from legs_adapters.code.syntax import attribute_chain, code, walk_expressions, words
 from legs_adapters.lexicon.masks import picked_from
 from legs_adapters.lexicon.renderings import is_of_mesh, is_rendering
 from legs_adapters.lexicon.words import OF_VIEWS, RAY_BUNDLES, RAY_COLOURS
@@ -53,7 +53,7 @@ class FixedTarget(_Other):
 
     def evidence(self, term: Term) -> List[Decider]:
         function, target = term.function, term.target
-        loops = loops_around(function.body, term.call)
+        loops = function.loops_around(term.call)
         made = function.flow.reaching(list(attribute_chain(target))[-1])
         values = [d.value for d in made if d.kind == "assign" and isinstance(d.value, cst.Call)]
         if not loops or not values or len(values) != len(made) or is_rendering(function, term.prediction):

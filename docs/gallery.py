@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from legs_loss import WeightSpec, response, weight_map
+from legs_loss.cli.masks import mask_of
 from legs_loss.operators import OPERATORS
 from legs_loss.reference.embedded import write_embedded_scene
 from legs_loss.response import normalise_response
@@ -36,10 +37,11 @@ def sheet(name: str, columns: int, pictures: List[Tuple[str, Tensor, str, float]
 
 
 def main() -> None:
-    """Draw operators, curves and betas on the same photograph."""
+    """Draw operators, curves, betas and a mask on the same photograph."""
     with tempfile.TemporaryDirectory() as folder:
         view = read_scene(write_embedded_scene(Path(folder) / "scene", views=9, width=320, height=240)).views[4]
         image = image_tensor(load_training_image(view))
+        mask = torch.from_numpy(mask_of(view, ["sharpness"], {}))[None]
     photograph = ("photograph", image, "", 1.0)
     strengths = [(name, normalise_response(response(image, name))) for name in OPERATORS]
     most = float(torch.quantile(strengths[0][1], 0.99))
@@ -52,6 +54,8 @@ def main() -> None:
     betas = [(beta, weight_map(image, WeightSpec(beta=float(beta)))) for beta in (1, 4, 10, 20)]
     titled = [(f"beta {beta}: mean {float(weight.mean()):.2f}", weight, "viridis", 21.0) for beta, weight in betas]
     sheet("beta", 2, titled)
+    masked = ("weight times mask", mask * weight_map(image), "viridis", 11.0)
+    sheet("masks", 3, [photograph, ("mask: legs masks --from sharpness", mask, "gray", 1.0), masked])
 
 
 if __name__ == "__main__":

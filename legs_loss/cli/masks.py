@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     skipped = 0
     for view in tqdm(views, "masks", unit="view"):
         try:
-            mask = _mask(view, args.kinds, folders)
+            mask = mask_of(view, args.kinds, folders)
             if not mask.any():
                 raise LegsError("nothing of it would count")
         except LegsError as error:
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     return 1 if skipped else 0
 
 
-def _mask(view: View, kinds: List[str], folders: Dict[str, Dict[str, Path]]) -> np.ndarray:
+def mask_of(view: View, kinds: List[str], folders: Dict[str, Dict[str, Path]]) -> np.ndarray:
     """Return the mask of a photograph at its own size, float32 [H, W]."""
     import numpy as np
 

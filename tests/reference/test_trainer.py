@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, List, Optional
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from legs_loss import PRESETS, LegsError, WeightSpec, legs_loss, ssim, weight_map
-from legs_loss.precompute import precompute
+from legs_loss.precompute import OwnMaps, precompute
 from legs_loss.reference.ply import read_ply
 from legs_loss.reference.training import trainer
 from legs_loss.reference.training.adam import Adam
@@ -89,6 +90,16 @@ def test_weights_come_from_the_store_only_for_the_very_image(scene: Scene, tmp_p
     assert load_dataset(scene, PRESETS["3dgs"], store=tmp_path).train[0].weight is None
 
 
+def test_a_store_with_masks_is_refused_since_they_are_not_applied_here(scene: Scene, tmp_path: Path) -> None:
+    name = PurePosixPath(scene.views[0].name).stem
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (64, 48), 255).save(str(tmp_path / f"masks/{name}.png"))
+    precompute(scene, tmp_path / "store", maps=OwnMaps(str(tmp_path / "masks")))
+    for preset in ("legs", "3dgs"):
+        with pytest.raises(LegsError, match="masks or weights of your own, which this trainer does not apply"):
+            load_dataset(scene, PRESETS[preset], store=tmp_path / "store")
+
+
 def test_explicit_maps_are_taken_and_checked(scene: Scene) -> None:
     names = [view.name for view in split_views(scene)[0]]
     maps = {name: torch.full((1, 48, 64), 2.0) for name in names}
@@ -102,8 +113,6 @@ def test_explicit_maps_are_taken_and_checked(scene: Scene) -> None:
 
 
 def test_a_gray_photograph_trains_as_rgb(scene: Scene, tmp_path: Path) -> None:
-    from PIL import Image
-
     path = tmp_path / "gray.png"
     Image.open(str(scene.views[0].path)).convert("L").save(str(path))
     view = load_view(scene, replace(scene.views[0], path=path))

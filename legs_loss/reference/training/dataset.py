@@ -88,17 +88,23 @@ def load_dataset(
         weights: explicit maps [1, H, W] by view name, in place of the spec's: for experiments.
 
     Raises:
-        LegsError: a view has no pinhole camera, a photograph cannot be read, or an explicit map is missing or does
-            not fit.
+        LegsError: a view has no pinhole camera, a photograph cannot be read, an explicit map is missing or does not
+            fit, or the store has masks, which are not applied here.
     """
     train, test = (
         [load_view(scene, view, resolution, white_background) for view in views] for views in split_views(scene)
     )
     if weights is not None:
         train = [replace(view, weight=_explicit(weights, view)) for view in train]
-    elif not spec.unweighted:
-        maps = _weights(_open_store(scene, store), train, spec)
-        train = [replace(view, weight=weight) for view, weight in zip(train, maps)]
+        return Dataset(train, test)
+    opened = _open_store(scene, store)
+    if opened is not None and any(entry.is_own for entry in opened.entries.values()):
+        raise LegsError(
+            f"{opened.path} has masks or weights of your own, which this trainer does not apply: train with a "
+            "codebase's own script (legs run), or give the trainer a store without them (--store)"
+        )
+    if not spec.unweighted:
+        train = [replace(view, weight=weight) for view, weight in zip(train, _weights(opened, train, spec))]
     return Dataset(train, test)
 
 

@@ -28,14 +28,14 @@ def run(args: argparse.Namespace) -> int:
     """Write the images; the largest size of each view."""
     import numpy as np
 
+    from legs_loss.cli.shared.checks import check_empty
     from legs_loss.config import STORE_FOLDER
     from legs_loss.errors import LegsError
     from legs_loss.scenes.own_maps import file_names, write_gray
     from legs_loss.spec import as_spec
     from legs_loss.store import MASK, Entry, WeightStore
 
-    if args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
-        raise LegsError(f"{args.out} is not empty: name another folder")
+    check_empty(args.out)
     folder = args.store / STORE_FOLDER
     store, spec = WeightStore(folder if folder.is_dir() else args.store), as_spec(args.preset)
     fits = sorted((entry for entry in store.entries.values() if store.fits(entry, spec)), key=lambda entry: entry.width)

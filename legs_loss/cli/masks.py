@@ -41,18 +41,19 @@ def run(args: argparse.Namespace) -> int:
     """Write the masks; 1 when a photograph was skipped."""
     from tqdm import tqdm
 
+    from legs_loss.cli.shared.checks import check_empty
     from legs_loss.errors import LegsError
+    from legs_loss.precompute.own_maps import own_folder
     from legs_loss.scenes import read_scene
     from legs_loss.scenes.own_maps import file_names, find_maps, write_gray
 
     out = args.out or args.scene / "masks"
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise LegsError(f"{out} is not empty: name another folder with --out")
+    check_empty(out)
     views = read_scene(args.scene, args.images).views
     folders = {}
     for kind in args.kinds:
         if kind not in _KINDS:
-            folder = args.scene / kind if (args.scene / kind).is_dir() else Path(kind)
+            folder = own_folder(args.scene, kind)
             views = tuple(view for view in views if folder.resolve() not in view.path.resolve().parents)
             folders[kind] = find_maps(folder, views)
     names = file_names(view.name for view in views)

@@ -81,6 +81,7 @@ def test_from_masks_to_images_for_other_programs(scene, tmp_path):
         assert abs(int(first[20, 30]) - most * 0.5 / 11) <= step
     np.testing.assert_array_equal(np.asarray(Image.open(out / "masks/cam/a.png")), made(scene))
     assert "is not empty" in legs("export", scene, out, code=2)
+    assert "cannot write to" in legs("export", scene, scene / "images/cam/a.png", code=2)
     assert "no manifest.json" in legs("export", tmp_path / "mine", tmp_path / "new", code=2)
     assert not (tmp_path / "new").exists()
 

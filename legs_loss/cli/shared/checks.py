@@ -12,7 +12,7 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes import Scene, View, image_size, training_size
 from legs_loss.system import say
 
-__all__ = ["check_resolution", "check_trainable", "check_writable"]
+__all__ = ["check_empty", "check_resolution", "check_trainable", "check_writable"]
 
 _TINY = 64  # pixels: a smaller width was probably meant as a divisor
 
@@ -50,6 +50,17 @@ def check_trainable(scene: Scene, resolution: int) -> None:
             "sparse/0/points3D.bin"
         )
     check_resolution(resolution, scene.views)
+
+
+def check_empty(folder: Path) -> None:
+    """Check that a folder for images is new or empty, so that none of the user's is replaced, and can be written.
+
+    Raises:
+        LegsError: it is not; the message says why.
+    """
+    check_writable(folder)
+    if folder.exists() and any(folder.iterdir()):
+        raise LegsError(f"{folder} is not empty: name another folder")
 
 
 def check_writable(folder: Path) -> None:

@@ -25,9 +25,9 @@ __all__ = ["main"]
 HELP = "add the LEGS loss to a codebase, or remove it; the same as legs-patch"
 
 EXIT_CODES = (
-    "exit codes: 0 done, or nothing to do; 1 --check: something would change, or --partial: a term needs a manual "
+    "exit codes: 0 done, or nothing to do; 1 --check: something would change, or a term needs a manual "
     "edit, or --verify: a check failed; "
-    "2 nothing was changed: bad usage, a term that cannot be decided, no term found, uncommitted changes; "
+    "2 nothing was changed: bad usage, no term that can be decided (--strict: one that cannot), uncommitted changes; "
     "130 interrupted"
 )
 
@@ -129,7 +129,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     settings.add_argument("--operator", metavar="NAME", help=f"one of {', '.join(OPERATORS)}")
     settings.add_argument("--store", metavar="DIR", help="weight maps that legs precompute wrote")
     terms = parser.add_argument_group("advanced: which terms")
-    terms.add_argument("--partial", action="store_true", help="patch the terms that can be decided, and no others")
+    terms.add_argument("--strict", action="store_true", help="patch nothing where a term cannot be decided")
     terms.add_argument(
         "--site", action="append", default=[], metavar="FILE:LINE", help="patch this term, and no other; repeatable"
     )
@@ -186,14 +186,14 @@ def _patch(args: argparse.Namespace) -> int:
     if not found.findings.sites and not found.findings.patched:
         settings = None
     found = found._replace(settings=settings)
-    if problems and not args.partial:
+    if problems and (args.strict or (not found.findings.sites and not found.findings.patched)):
         if args.json:
             say(as_json(found, []), end="", lines=True)
         else:
             say(as_table(found), end="", lines=True)
         _left_to_the_user(problems)
         say(
-            "legs-patch: nothing was changed (--partial patches the rest, --exclude leaves files out)",
+            "legs-patch: nothing was changed (--site FILE:LINE takes your word, --exclude leaves files out)",
             stream=sys.stderr,
         )
         return 2

@@ -78,12 +78,11 @@ def _parses(text: str) -> bool:
 
 
 def _site_edits(text: Text, site: Site, package: str) -> List[Edit]:
-    """Return the edits of one site, and of the reads of its error map that keep the plain one."""
+    """Return the edits of one site."""
     form = site.form.moved(on_one_line(site.form.selection))
     where = f"{site.path}:{site.line}"
     writing = Writing(package, site.swapped, on_one_line(site.selection), where)
-    plain = on_one_line(text.of(form.node, True)) if site.aside else ""
-    return [*form.edits(text, writing), *(text.replace(*text.span(read, True), plain) for read in site.aside)]
+    return form.edits(text, writing)
 
 
 def _kept_edits(text: Text, kept: Kept, package: str) -> List[Edit]:

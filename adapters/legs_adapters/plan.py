@@ -95,7 +95,10 @@ def plan(
             why = why_left_out(root, name, exclude) or why
             if why is not None:
                 raise LegsError(f"{name}:{line}: {why}")
-            raise LegsError(f"there is no L1 term at {name}:{line} that can be rewritten")
+            for problem in findings.problems:
+                if (problem.path, problem.line) == (name, line):
+                    raise LegsError(f"{name}:{line}: {problem.reason}; write there: {problem.advice}")
+            raise LegsError(f"there is no difference, absolute value or call of two images at {name}:{line}")
     after = {name: apply_edits(findings.program.sources[name].data, made) for name, made in edits.items()}
     return Plan(root, findings, edits, after)
 

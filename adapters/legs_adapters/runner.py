@@ -55,8 +55,8 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
         The exit code, where the script does not leave by ``sys.exit`` (which goes on as it is).
 
     Raises:
-        LegsError: there is no such script; or a setting is wrong; or its codebase has a term that cannot be decided,
-            or, unless ``cpu``, none; or, with ``cpu``, the script uses a CUDA feature that has no shim.
+        LegsError: there is no such script; or a setting is wrong; or its codebase has only terms that cannot be
+            decided, or, unless ``cpu``, none; or, with ``cpu``, the script uses a CUDA feature that has no shim.
     """
     path = Path(script)
     if not path.is_file():
@@ -64,9 +64,11 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
     find_config(path, argv=[])  # report wrong settings now, not at the first training step
     root = check_root(checkout_of(path))
     found = plan(root, in_place=True, ssim=ssim)
-    if found.findings.problems:
-        problem = found.findings.problems[0]
-        raise LegsError(f"{problem.path}:{problem.line}: {problem.reason}; edit it by hand: {problem.advice}")
+    for problem in found.findings.problems:
+        text = f"{problem.path}:{problem.line}: {problem.reason}; edit it by hand: {problem.advice}"
+        if not found.after and not found.findings.patched:
+            raise LegsError(text)
+        _say(f"not weighted: {text}")
     if not found.after and not found.findings.patched:
         if not cpu:
             raise LegsError(f"no photometric L1 term was found in {root}")

@@ -149,7 +149,16 @@ def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path)
     assert problem.advice == "legs_loss.l1_loss(pred, target, own=self.l1_loss), in a copy of MaskedL1 for train.py:9"
 
 
-def test_the_advice_for_a_difference_weights_it_where_its_absolute_value_is_taken(tmp_path):
-    weighted_before, taken = plan(checkout(tmp_path, files("difference_from_callee_error"))).findings.problems
-    assert weighted_before.advice == "torch.abs(legs_loss.weight_map(gt_image) * value).mean()"
-    assert taken.advice == "robust(legs_loss.weight_map(gt_image * cam.seen) * residual, cam.scale)"
+def test_a_difference_that_is_filtered_before_its_absolute_value_is_quoted(tmp_path):
+    texts = files("inria")
+    texts["train.py"] = texts["train.py"].replace(
+        "        Ll1 = l1_loss(image, gt_image)\n",
+        "        delta = image - gt_image\n"
+        "        if opt.clamp > 0:\n"
+        "            delta = delta[delta ** 2 < opt.clamp]\n"
+        "        Ll1 = delta.abs().mean()\n",
+    )
+    [problem] = plan(checkout(tmp_path, texts)).findings.problems
+    assert problem.text == "Ll1 = delta.abs().mean()"
+    assert problem.reason == "image - gt_image is changed before its absolute value is taken"
+    assert problem.advice == "torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))"

@@ -14,7 +14,15 @@ from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.usage import draws, is_box
 from legs_adapters.lexicon.words import LOADING, MATCHED, OF_DIFFUSION, RENDERERS, STATISTICS
-from legs_adapters.tensors.operations import EXTREMES, JOINS, MODULES, NUMBERS, PICTURE_FUNCTIONS, PICTURE_METHODS
+from legs_adapters.tensors.operations import (
+    EXTREMES,
+    JOINS,
+    MODULES,
+    NUMBERS,
+    PICTURE_FUNCTIONS,
+    PICTURE_METHODS,
+    REDUCES,
+)
 
 __all__ = ["meaning_of_call"]
 
@@ -44,6 +52,13 @@ def meaning_of_call(meanings: Meanings, function: Function, node: cst.Call, dept
         if meaning.kind == "image" and ("dim" in keywords or isinstance(constant(axes[0] if axes else None), int)):
             return meaning._replace(kind="parameter")  # the brightest channel of a photograph: a prior
         return meaning
+    if name in REDUCES:
+        axes = [
+            *positional[1 if module or base is None else 0 :],
+            *(keywords[k] for k in ("dim", "axis") if k in keywords),
+        ]
+        if all(isinstance(constant(axis), tuple) for axis in axes):
+            return Meaning("parameter", None)  # a number of the whole image, or one a channel
     if name == "where" and len(values) == 3:
         return mix([meanings.of(function, value, depth) for value in values[1:]])
     if set(words(name)) & STATISTICS and not set(words(name)) & MATCHED and values:

@@ -7,62 +7,18 @@ from typing import List, Optional, Set
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, words
+from legs_adapters.code.syntax import arguments, call_name, constant, key_of, words
 from legs_adapters.lexicon.names import role_of_words
-from legs_adapters.lexicon.words import MESH_RASTERIZERS
 from legs_adapters.tensors.operations import KEEPS_VALUES, MODULES
 
-__all__ = ["is_of_mesh", "is_rendering"]
+__all__ = ["is_rendering"]
 
 
 def is_rendering(function: Function, node: cst.CSTNode) -> bool:
     """Return whether a value was produced by functions that render, on every path."""
     makers = _makers(function, node, set())
     return bool(makers) and all(maker is not None and _renders(maker) for maker in makers)
-
-
-def is_of_mesh(program: Program, function: Function, node: cst.CSTNode) -> bool:
-    """Return whether a rasterizer of triangles may have produced a value, or it is sampled from a texture."""
-    return any(
-        _draws_mesh(maker) or _rasterizes_mesh(program, function, maker, 0)
-        for maker in _makers(function, node, set())
-        if maker is not None
-    )
-
-
-def _rasterizes_mesh(program: Program, function: Function, call: cst.Call, depth: int) -> bool:
-    """Return whether a call runs a rasterizer of triangles, directly or in a method."""
-    for reference in program.resolve(function, call.func):
-        if reference.kind in ("external", "made by") and str(reference.target).startswith(MESH_RASTERIZERS):
-            return True
-        callee = reference.target
-        if depth == 0 and isinstance(callee, Function) and not reference.guess:
-            draws = [inner for inner in callee.flow.calls if "raster" in call_name(inner).lower()]
-            if draws and all(_rasterizes_mesh(program, callee, inner, depth + 1) for inner in draws):
-                return True
-            if not draws and _samples_texture(callee):
-                return True
-    return False
-
-
-def _samples_texture(function: Function) -> bool:
-    """Return whether what it returns is ``grid_sample(texture, uv)``."""
-    makers = [maker for value in function.flow.returns for maker in _makers(function, value, set())]
-    return bool(makers) and all(
-        maker is not None
-        and call_name(maker) == "grid_sample"
-        and len(arguments(maker)[0]) > 1
-        and "uv" in words(code(arguments(maker)[0][1]))
-        for maker in makers
-    )
-
-
-def _draws_mesh(call: cst.Call) -> bool:
-    """Return whether a call draws a mesh, by its name: ``render_mesh(...)``, ``mesh_renderer(...)``."""
-    spoken = words(call_name(call))
-    return "mesh" in spoken and any(word.startswith(("render", "raster")) for word in spoken)
 
 
 def _renders(call: cst.Call) -> bool:

@@ -30,7 +30,7 @@ WORDS = {
     "feature": """
         feature features feat feats semantic semantics sem language lang clip dino dinov2 lseg sam embedding embeddings
         latent latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors
-        classes objects wavelet wavelets haar dwt fft rfft dct census
+        classes obj objects intensity wavelet wavelets haar dwt fft rfft dct census
         stokes aolp dolp phasor phasors
     """,
     # sds, inpaint, edit: GaussianDreamer, GaussianEditor; pseudo, unseen, virtual: codebases with few views
@@ -45,7 +45,8 @@ WORDS = {
     """,
     # of Gaussians, cameras, light and materials (GS-IR, GaussianShader), bodies and faces (GaussianAvatar)
     "parameter": """
-        scaling scalings scale scales xyz xyzs rotation rotations rot rots quat quats sh shs sh0 shn offset offsets grid
+        pointmap pointmaps scaling scalings scale scales xyz xyzs
+        rotation rotations rot rots quat quats sh shs sh0 shn offset offsets grid
         grids plane planes pose poses deform deformation delta deltas residual means mean2d pts points point light
         lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds c2w w2c intrinsics
         extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints vertex vertices verts
@@ -60,7 +61,7 @@ KINDS = tuple(WORDS)
 KIND_OF = {word: kind for kind in reversed(KINDS) for word in WORDS[kind].split()}
 COMPARED = {"image", "depth", "normal", "flow"}  # the kinds that a loss class is named for
 LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}  # the kinds that a photograph's name may speak of, too
-TARGET = word_set("gt gts target targets tgt ground truth original orig real true observed obs reference pixels")
+TARGET = word_set("gt gts target targets tgt ground truth original orig real true observed reference pixels")
 RENDERERS = word_set("render rendering rasterize rasterization rasterizer renderer raster splat splatting")
 RENDER = RENDERERS | word_set(
     """
@@ -78,12 +79,6 @@ LIT_BY = word_set("light lights")
 OF_ONE = word_set("scale scales scaling scalings offset offsets center centers mean light lights")  # scaled or shifted
 HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
 BACKGROUND = word_set("bg bkgd background backgrounds")  # a colour to lay things over, whoever keeps it
-# Which photograph it is, or which part of one; and what is said of anything.
-OF_PHOTOGRAPHS = (
-    WHICH
-    | HELD_IN
-    | word_set("blur blurred blurry sharp hdr ldr nir infrared raw patch crop face head hand hands lips")
-)
 PICKING = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
 MASKED = word_set("mask masked")  # of a function that takes a mask beside two pictures
 STATISTICS = word_set("histc histogram bincount entropy gram moments")  # of a picture, no picture
@@ -91,6 +86,8 @@ MATCHED = word_set("match matching matched equalize equalized")  # histogram_mat
 LOADING = word_set("load read get open fetch")
 OF_DIFFUSION = word_set("guidance_scale negative_prompt num_inference_steps strength")  # arguments where it paints
 PERCEPTUAL = word_set("vgg perceptual lpips gram")
+MESH = word_set("mesh meshhead texture")  # of triangles: what they draw is no splat
+ROBUST = word_set("huber tukey cauchy")  # a weight would move their thresholds
 
 # -- cameras, models and what optimisers move
 
@@ -99,7 +96,6 @@ CAMERAS = _CAMERA | word_set("view views viewpoint viewpoints")
 DATA = CAMERAS | word_set(
     "data batch sample item items datum info infos keyframe frame dataset input inputs entry"
 )  # what holds photographs
-OF_VIEWS = DATA | word_set("frames scene")
 LOADERS = word_set("loader dataloader")
 POSES = _CAMERA | word_set("pose poses c2w w2c extrinsic extrinsics camtoworld camtoworlds tracking se3")
 EMBEDDING = word_set("embedding embeddings")
@@ -112,8 +108,7 @@ MODELS = GAUSSIANS | word_set(
     """
 )
 PARAMETERS = word_set("params param parameters variables splats gauss_params")  # names of what holds a model's
-GAUSSIAN_MODEL = word_set("get_xyz oneupSHdegree")  # methods of Inria's GaussianModel, in every fork
-PLUMBING = word_set("torch optim adam params lr name eps self")  # around what an optimiser is given
+PLUMBING = word_set("torch optim adam params parameters lr name eps self")  # around what an optimiser is given
 POINTS = word_set("point points")
 
 # -- purposes
@@ -134,7 +129,7 @@ FITTING = word_set("optimize optimise fit optim eval")  # an embedding, to a tes
 SCORING = word_set(
     "score scores scoring importance densify densification prune pruning sensitivity sample sampling error"
 )
-TRACKING = word_set("tracking track tracker localize localization relocalize relocalization")  # SLAM
+TRACKING = word_set("tracking track tracker localize localization relocalize relocalization aligner")  # SLAM
 MAPPING = word_set("mapping map mapper")  # a class that tracks and maps does not decide for its methods
 
 # -- words in texts
@@ -145,10 +140,8 @@ DRAWS_SPLATS = re.compile(SPLATS.pattern + r"|rasteriz|render_pkg", re.I)
 # Rays of a NeRF: nerfstudio's bundles, rays_o and rays_d of others, and their colours in avatars made of both.
 RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
 RAY_BUNDLES = word_set("ray_bundle ray_samples")
-RAY_COLOURS = re.compile(r"\brgb_(map|coarse|fine)\b|\bcomp_rgb\b")
 OF_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
 FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
-MESH_RASTERIZERS = ("nvdiffrast.", "kaolin.render.", "pytorch3d.renderer")
 STRUCTURAL = re.compile("ssim", re.I)
 SPEAKS_OF_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(")
 SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)

@@ -1,10 +1,9 @@
-"""Describe the rules, from their docstrings: for ``--explain``, for the documentation, for the tests."""
+"""Describe the rules, from what they say of themselves: for ``--explain``, for the documentation, for the tests."""
 
 from __future__ import annotations
 
 import difflib
 import inspect
-import re
 from textwrap import dedent, indent
 from typing import List, NamedTuple
 
@@ -16,17 +15,18 @@ __all__ = ["Description", "describe", "explain", "listed", "table"]
 
 
 class Description(NamedTuple):
-    """The docstring of a rule: why it skips a term, an example that it skips, and one that is weighted."""
+    """What a rule says of itself: why it skips a term, code that it skips, and code that is weighted."""
 
     why: str
-    left: str
-    weighted: str
+    left: List[str]
+    weighted: List[str]
 
 
 def describe(rule: Rule) -> Description:
-    """Return the docstring of a rule in its three parts."""
-    why, left, weighted = re.split(r"^(?:left|weighted):", inspect.getdoc(rule) or "", flags=re.M)
-    return Description(" ".join(why.replace("``", "`").split()), dedent(left).strip(), dedent(weighted).strip())
+    """Return why a rule skips a term, and its snippets."""
+    why = rule.why or inspect.getdoc(rule) or ""
+    snippets = ([dedent(text).strip() for text in texts] for texts in (rule.INVALID, rule.VALID))
+    return Description(" ".join(why.replace("``", "`").split()), *snippets)
 
 
 def explain(name: str) -> str:
@@ -53,8 +53,10 @@ def table() -> str:
 
 def _explained(rule: Rule) -> str:
     why, left, weighted = describe(rule)
-    parts = [f"{rule.id}: skipped ({rule.reason})", f"  {why}", "\n  skipped:", indent(left, "    ")]
-    return "\n".join([*parts, "\n  weighted:", indent(weighted, "    "), ""])
+    parts = [f"{rule.id}: skipped ({rule.reason})", f"  {why}"]
+    for title, snippets in (("skipped", left), ("weighted", weighted)):
+        parts += [f"\n  {title}:", "\n\n".join(indent(snippet, "    ") for snippet in snippets)]
+    return "\n".join([*parts, ""])
 
 
 def listed() -> str:

@@ -6,11 +6,11 @@ from typing import Iterator, NamedTuple, Optional
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
-from legs_adapters.code.syntax import one_line
+from legs_adapters.code.syntax import one_line, words
 from legs_adapters.lexicon.meaning import swapped
+from legs_adapters.lexicon.words import EVALUATING
 from legs_adapters.rules.analysis import Analysis
-from legs_adapters.rules.causes.evaluation import is_of_evaluating_class
-from legs_adapters.rules.order import HUBER, RULES, first
+from legs_adapters.rules.order import RULES
 from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.rules.verdict import Verdicts
 from legs_adapters.terms.error_maps import is_asked, is_measured
@@ -45,7 +45,7 @@ class Doubts:
         rule, term = _rule(left), Term(self.analysis, function, form)
         if rule is None or not rule.may_be_loss(term):
             return False
-        if is_measured(function, form) or is_of_evaluating_class(term):
+        if is_measured(function, form) or EVALUATING & set(words(term.class_name)):
             return False
         pair = term.pair
         pictures = "image" in (pair.a.kind, pair.b.kind)
@@ -58,13 +58,8 @@ class Doubts:
         term, rule = Term(self.analysis, function, form), _rule(left)
         beside = rule is None or rule.is_doubted_beside_sites
         flipped = bool(swapped(term.pair.a, term.pair.b))
-        if first(term, HUBER) is None:
-            why = f"nothing shows that this is the loss ({left.reason})"
-            return Doubt(self._verdicts.problem(function, form, place, why, flipped), beside)
-        why = "this is a Huber loss: a weight in it would move its threshold"
-        target = one_line(form.first if flipped else form.second)
-        advice = f"legs_loss.weight_map({target}) times the loss, before its mean"
-        return Doubt(self._verdicts.problem(function, form, place, why)._replace(advice=advice), True)
+        why = f"nothing shows that this is the loss ({left.reason})"
+        return Doubt(self._verdicts.problem(function, form, place, why, flipped), beside)
 
     def of_uncalled(self, function: Function) -> Iterator[Doubt]:
         """Yield L1 functions that are assigned to names without a call in the codebase: ``base = F.l1_loss``."""

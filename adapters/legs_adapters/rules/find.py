@@ -12,14 +12,15 @@ from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple,
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.sources import Source
+from legs_adapters.code.syntax import arguments
 from legs_adapters.lexicon.words import SPEAKS_OF_L1, STRUCTURAL
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.doubts import Doubt, Doubts
 from legs_adapters.rules.structural import with_ssims
 from legs_adapters.rules.verdict import Verdicts
 from legs_adapters.terms.findings import Findings, Left, Problem, Site
+from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.kinds.fused import fused_losses
-from legs_adapters.terms.kinds.run_time import chosen_at_run_time
 from legs_adapters.terms.patched import patched_nodes
 from legs_adapters.upstreams import registered
 
@@ -118,8 +119,8 @@ class _Finder:
             yield from self._of_forms(function)
             if not self.by_hand:
                 yield from fused_losses(self.analysis.program, self.analysis.training, function)
-        if STRUCTURAL.search(function.text):
-            yield from self._of_chosen(function)
+        if self.by_hand:
+            yield from self._of_named_lines(function)
         yield from self._of_callables(function)
         self.doubtful.extend(self.doubts.of_uncalled(function))
 
@@ -137,14 +138,17 @@ class _Finder:
             if not (isinstance(verdict, Left) and self.doubts.is_noise(function, form, verdict)):
                 yield place, verdict
 
-    def _of_chosen(self, function: Function) -> Iterator[_Entry]:
-        program, training, known = self.analysis.program, self.analysis.training, self.analysis.forms.of(function)
-        for form in chosen_at_run_time(program, training, function, known):
-            place = function.place(form.node)
-            if self._is_chosen(function, place):
+    def _of_named_lines(self, function: Function) -> Iterator[_Entry]:
+        """Yield the first call of two arguments on a line that the user named and that has no other term."""
+        taken = [function.place(form.node) for form in self.analysis.forms.of(function)]
+        for call in function.flow.calls:
+            place, (values, keywords, starred) = function.place(call), arguments(call)
+            if not self._is_chosen(function, place) or len(values) != 2 or keywords or starred:
+                continue
+            if not any(place.line <= other.last_line and other.line <= place.last_line for other in taken):
+                form = Called(call, call, values[0], values[1], call.func)
                 yield place, self.verdicts.of(function, form, place, True)
-            elif not self.by_hand:
-                yield place, self.verdicts.of_any(function, form, place)
+                return
 
     def _of_callables(self, function: Function) -> Iterator[_Entry]:
         verdicts = self.verdicts

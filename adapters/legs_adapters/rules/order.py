@@ -7,67 +7,31 @@ from typing import Optional, Tuple
 from legs_adapters.rules.causes import (
     definition,
     distillation,
-    evaluation,
-    features,
-    huber,
     kinds,
+    names,
     other,
-    regulariser,
+    steps,
     structural,
-    tracking,
     unknown,
     untrained,
-    weighting,
 )
 from legs_adapters.rules.rule import CallOfTerm, Rule, Term
 from legs_adapters.terms.findings import Evidence
 
-__all__ = ["AMBIGUOUS", "DEFINITION", "HUBER", "ORDER", "RULES", "SSIM", "UNREAD", "first", "first_of_call"]
+__all__ = ["DEFINITION", "ORDER", "RULES", "SSIM", "first", "first_of_call"]
 
 DEFINITION = (definition.Definition(),)
+_UNTRAINED = (untrained.Scoring(), untrained.Evaluation(), untrained.Untrained())
+_OF_THE_STEP = (names.Tracking(), names.EvaluationName(), steps.PoseStep(), steps.EmbeddingStep(), steps.NoStep())
 ORDER: Tuple[Rule, ...] = (
-    # What is compared, as names say.
-    kinds.Depth(),
-    kinds.Normals(),
-    kinds.Features(),
-    kinds.Flow(),
-    kinds.Mask(),
-    kinds.Synthetic(),
-    kinds.Gradients(),
-    kinds.Parameters(),
-    regulariser.Literal(),
-    # Whether it is trained.
-    untrained.Scoring(),
-    untrained.Evaluation(),
-    untrained.Untrained(),
-    other.NotTorch(),
-    # What is compared, at a closer look.
+    *kinds.KINDS,
+    *_UNTRAINED,
+    *names.NAMES,
     unknown.Unknown(),
-    regulariser.Statistic(),
-    features.Scan(),
-    kinds.ImageChange(),
-    untrained.Leaf(),
     distillation.Distillation(),
-    regulariser.OfModel(),
-    other.FixedTarget(),
-    weighting.Weighting(),
-    # What the names around it say.
-    tracking.Tracking(),
-    evaluation.EvaluationName(),
-    kinds.Warping(),
-    features.Network(),
-    evaluation.EmbeddingFit(),
+    *_OF_THE_STEP,
     other.NotSplats(),
-    features.NamedMap(),
-    # What its optimiser moves.
-    tracking.PoseStep(),
-    evaluation.EmbeddingStep(),
-    untrained.NoStep(),
 )
-# Checked by verdict.py separately: HUBER and UNREAD also for a term that the user named.
-AMBIGUOUS = (unknown.Ambiguous(),)
-HUBER = (huber.Huber(),)
-UNREAD = (weighting.ErrorMask(), weighting.UnreadError())
 # For SSIM terms, with legs-patch --ssim: nothing is weighted, so the compared images do not matter.
 _OF_SSIM = (
     structural.Library(),
@@ -76,24 +40,8 @@ _OF_SSIM = (
     structural.Unproven(),
     structural.Twice(),
 )
-_OF_TRAINING = (
-    untrained.Scoring,
-    untrained.Evaluation,
-    untrained.Untrained,
-    other.NotTorch,
-    tracking.Tracking,
-    evaluation.EvaluationName,
-    evaluation.EmbeddingFit,
-    tracking.PoseStep,
-    evaluation.EmbeddingStep,
-    untrained.NoStep,
-)
-SSIM: Tuple[Rule, ...] = (
-    structural.Definition(),
-    *(rule for rule in ORDER if isinstance(rule, _OF_TRAINING)),
-    *_OF_SSIM,
-)
-RULES = {rule.id: rule for rule in (*DEFINITION, *ORDER, *AMBIGUOUS, *HUBER, *UNREAD, *SSIM)}
+SSIM: Tuple[Rule, ...] = (structural.Definition(), *_UNTRAINED, *_OF_THE_STEP, *_OF_SSIM)
+RULES = {rule.id: rule for rule in (*DEFINITION, *ORDER, *SSIM)}
 
 
 def first(term: Term, rules: Tuple[Rule, ...] = ORDER) -> Optional[Evidence]:

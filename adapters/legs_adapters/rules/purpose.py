@@ -1,43 +1,34 @@
 """Find the purpose of a backward pass from the optimiser that steps after it: of Gaussians, poses, an embedding, none.
 
-An L1 whose gradients update only a pose is tracking; one that updates only an embedding fits a view for evaluation; one
-whose gradients are read and discarded scores Gaussians. Everything else is training.
+An L1 whose gradients update only poses is tracking, only an embedding evaluation; one that no optimiser follows scores.
 """
 
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
+import re
+from typing import Dict, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import likely_calls
+from legs_adapters.code.calls import given_to, likely_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import attribute_chain, call_name, walk_all, words
-from legs_adapters.lexicon.optimised import Optimised
-from legs_adapters.lexicon.words import EMBEDDINGS, GAUSSIANS, MODELS, POSES
+from legs_adapters.code.syntax import call_name, dotted, walk_all, words, words_in
+from legs_adapters.lexicon.words import EMBEDDINGS, MODELS, PLUMBING, POSES
 from legs_adapters.tensors.backward import Training
-from legs_adapters.tensors.operations import OPTIMISERS
-from legs_adapters.tensors.steps import (
-    calls_in,
-    gradients_read,
-    has_step,
-    is_backward,
-    is_step,
-    may_step,
-    only_reads_gradients,
-)
+from legs_adapters.tensors.steps import gradients_read, has_step, is_backward, is_step, may_step
 
 __all__ = ["Purpose", "Purposes"]
 
 _DEPTH = 3
+_OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 
 
 class Purpose(NamedTuple):
-    """The purpose of a backward pass that does not train: "tracking", "evaluation" or "scoring"; with the evidence.
+    """The purpose of a backward pass that does not train the Gaussians: with the evidence.
 
     Attributes:
-        word: the purpose.
+        word: the purpose: "tracking", "evaluation" or "scoring".
         function, node: the step of the optimiser, or the backward pass that no step follows.
     """
 
@@ -52,137 +43,38 @@ class Purposes:
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
-        self._optimised = Optimised(program)
         self._known: Dict[Tuple[Function, Tuple[int, ...], int], Optional[Purpose]] = {}
 
     def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Purpose]:
         """Return the purpose of an expression that does not train, by the loops around it; None where it may."""
-        loops = function.loops_around(node)
-        known = function, tuple(map(id, loops)), depth
+        known = function, tuple(map(id, function.loops_around(node))), depth
         if known not in self._known:
-            self._known[known] = self._purpose(function, node, loops, depth)
+            self._known[known] = self._purpose(function, node, depth)
         return self._known[known]
 
-    def _purpose(
-        self, function: Function, node: cst.CSTNode, loops: Sequence[cst.CSTNode], depth: int
-    ) -> Optional[Purpose]:
-        calls = {id(call): call for call in function.flow.calls}
+    def _purpose(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[Purpose]:
         passes = [call for call in function.flow.calls if is_backward(call)]
         if not passes:
             return self._of_callers(function, depth)
-        scopes = [*loops, function.body]
-        stepped = False
-        for scope in scopes:
-            inside = list(calls_in(scope, node, calls))
-            stepped = stepped or any(is_step(call) for call, _ in inside)
-            if not any(is_backward(call) for call, _ in inside):
-                continue
-            optimisers = [call for call, elsewhere in inside if is_step(call) and not elsewhere]
-            if optimisers:
-                spoken = [self._optimised.words(function, call) for call in optimisers]
-                for word, moved in (("tracking", POSES), ("evaluation", EMBEDDINGS)):
-                    if all(some & moved and not some & MODELS for some in spoken):
-                        return Purpose(word, function, optimisers[0])
+        at = function.place(node).start
+        own = next((call for call in passes if function.place(call).end > at), passes[0])
+        follows = self._follows(function, own, 0, False)
+        inner: Set[int] = set()  # what the innermost loop with a backward pass calls
+        for scope in [*function.loops_around(node), function.body]:
+            inside = {id(part) for part in walk_all(scope)}
+            calls = [call for call in function.flow.calls if id(call) in inside]
+            back = [call for call in calls if is_backward(call)]
+            steps = [call for call in calls if is_step(call)]
+            if inner and follows == "reset" and any(id(call) not in inner for call in back):
+                break  # the step is of the other backward pass
+            if back and steps:
+                moved = [self._moved(function, step) for step in steps]
+                for word, others in (("tracking", POSES), ("evaluation", EMBEDDINGS)):
+                    if all(some & others and not some & MODELS for some in moved):
+                        return Purpose(word, function, steps[0])
                 return None
-            here = {id(call) for call, _ in inside}
-            if self._is_stepped_later(function, node, here, calls):
-                continue
-            asked = [call for call in function.flow.calls if id(call) in here]
-            for_good = self._nobody_steps(function, 0)
-            if (
-                only_reads_gradients(scope, asked, for_good)
-                or (for_good and self._read_by_callers(function))
-                or self._emptied_by_callers(function)
-                or self._reads_its_own(function, scope)
-            ):
-                return Purpose("scoring", function, next(call for call in asked if is_backward(call)))
-        # At a module's top level no caller can take the step.
-        return Purpose("scoring", function, passes[0]) if stepped or function.parent is None else None
-
-    @staticmethod
-    def _is_stepped_later(function: Function, node: cst.CSTNode, here: Set[int], calls: Dict[int, cst.Call]) -> bool:
-        """Return whether a loop further out has a step, and no backward pass but these: one of a batch of views."""
-        around = list(calls_in(function.body, node, calls))
-        other = [call for call, elsewhere in around if is_backward(call) and not elsewhere and id(call) not in here]
-        return not other and any(is_step(call) and not elsewhere for call, elsewhere in around)
-
-    def _nobody_steps(self, function: Function, depth: int) -> bool:
-        """Return whether neither a function nor its known callers can step an optimiser."""
-        if may_step(function.flow.calls):
-            return False
-        if function.parent is None:
-            return True
-        callers = self._callers(function)
-        return bool(callers) and depth < _DEPTH and all(self._nobody_steps(c, depth + 1) for c in callers)
-
-    def _callers(self, function: Function) -> List[Function]:
-        return list(dict.fromkeys(caller for caller, _ in likely_calls(self.program, function)))
-
-    def _emptied_by_callers(self, function: Function) -> bool:
-        """Return whether each caller reads the gradients, and resets them, before an optimiser can step."""
-        calls = list(likely_calls(self.program, function))
-        return bool(calls) and all(self._is_emptied_after(caller, call) for caller, call in calls)
-
-    def _is_emptied_after(self, caller: Function, call: cst.Call) -> bool:
-        """Return whether gradients are read, then reset, after a call: ``prune()``, then ``zero_grad()``."""
-        at = caller.place(call).last_line
-        after = sorted((caller.place(other).line, i) for i, other in enumerate(caller.flow.calls))
-        read = False
-        for line, i in after:
-            later = caller.flow.calls[i]
-            if line <= at:
-                continue
-            if call_name(later) == "zero_grad":
-                return read
-            called = [r.target for r in self.program.resolve(caller, later.func) if isinstance(r.target, Function)]
-            if may_step([later]) or any(map(has_step, called)):
-                return False
-            read = read or any("grad" in each.text and gradients_read(list(walk_all(each.body))) for each in called)
-        return False
-
-    def _read_by_callers(self, function: Function) -> bool:
-        """Return whether a caller also reads gradients: ``accumulate(scene)``, then ``gaussians.prune(count)``."""
-        called = self._called(function, *self._callers(function))
-        read = any("grad" in each.text and gradients_read(list(walk_all(each.body))) for each in called)
-        return read and not any(map(has_step, called))
-
-    def _called(self, *functions: Function) -> List[Function]:
-        """Return the callees of functions: one may step under any name, ``gaussians.post_backward()``."""
-        called = [
-            reference.target
-            for function in functions
-            for call in function.flow.calls
-            for reference in self.program.resolve(function, call.func)
-        ]
-        return [each for each in called if isinstance(each, Function)]
-
-    def _reads_its_own(self, function: Function, scope: cst.CSTNode) -> bool:
-        """Return whether the gradients that are read are of local models, which no other function can update."""
-        roots = [list(attribute_chain(part))[-1] for part in gradients_read(list(walk_all(scope)))]
-        names = [root for root in roots if isinstance(root, cst.Name)]
-        given = {
-            part.value for value in function.flow.returns for part in walk_all(value) if isinstance(part, cst.Name)
-        }
-        own = bool(roots) and len(names) == len(roots) and not given & {name.value for name in names}
-        own = own and all(self._made_here(function, name) for name in names)
-        return own and not any(map(has_step, self._called(function)))
-
-    def trains_its_own(self, function: Function) -> bool:
-        """Return whether it makes a Gaussian model and steps that model's optimiser: it trains, in any file."""
-        steps = [call.func for call in function.flow.calls if is_step(call)]
-        stepped = [step.value for step in steps if isinstance(step, cst.Attribute)]
-        return any(
-            isinstance(optimiser, cst.Attribute)
-            and optimiser.attr.value in OPTIMISERS
-            and isinstance(optimiser.value, cst.Name)
-            and self._made_here(function, optimiser.value)
-            for optimiser in stepped
-        )
-
-    def _made_here(self, function: Function, model: cst.Name) -> bool:
-        """Return whether a model is created here, ``gaussians = GaussianModel(3)``."""
-        made = [definition.value for definition in function.flow.reaching(model) if definition.kind != "store"]
-        return bool(made) and all(isinstance(v, cst.Call) and set(words(call_name(v))) & GAUSSIANS for v in made)
+            inner = inner or ({id(call) for call in calls} if back else inner)
+        return Purpose("scoring", function, own) if follows in ("reset", "nothing") else None
 
     def _of_callers(self, function: Function, depth: int) -> Optional[Purpose]:
         sites = self.training.sites.get(function, [])
@@ -190,3 +82,65 @@ class Purposes:
             return None
         purposes = [self.purpose(caller, call, depth + 1) for caller, call in sites]
         return purposes[0] if len({purpose and purpose.word for purpose in purposes}) == 1 else None
+
+    def _follows(self, function: Function, call: cst.Call, depth: int, read: bool) -> str:
+        """Return what is first after a call, in its function or then in the callers.
+
+        That is "step", a "reset" of gradients that were read, "nothing" at the end of the script, or "unknown".
+        """
+        at = function.place(call).start
+        calls = sorted(function.flow.calls, key=lambda each: function.place(each).start)
+        read = read or _reads_gradients(function)
+        for later in (each for each in calls if function.place(each).start > at):
+            resolved = [r.target for r in self.program.resolve(function, later.func)]
+            called = [each for each in resolved if isinstance(each, Function)]
+            if may_step([later]) or any(map(has_step, called)):
+                return "step"
+            read = read or any(map(_reads_gradients, called))
+            if call_name(later) == "zero_grad":
+                return "reset" if read else "unknown"
+        if may_step(calls):
+            return "step"  # of the loop's next round
+        if function.parent is None:
+            return "nothing"
+        sites = list(likely_calls(self.program, function)) if depth < _DEPTH else []
+        found = {self._follows(caller, site, depth + 1, read) for caller, site in sites}
+        return found.pop() if len(found) == 1 else "unknown"
+
+    def _moved(self, function: Function, step: cst.Call) -> Set[str]:
+        """Return the words in an optimiser's name, and in the parameters that it was made with."""
+        assert isinstance(step.func, cst.Attribute)
+        optimiser = step.func.value
+        name = set(words(optimiser.attr.value)) if isinstance(optimiser, cst.Attribute) else set()
+        found = name if name & POSES else words_in(walk_all(optimiser))  # gaussians.optimizer_cam moves cameras
+        owner = self.program.owner_of(function)
+        stored = isinstance(optimiser, cst.Attribute) and dotted(optimiser.value) == "self" and owner is not None
+        definitions = self.program.lookup(function, optimiser)
+        if not definitions and stored and owner is not None and isinstance(optimiser, cst.Attribute):
+            definitions = owner.stores(optimiser.attr.value)
+        for where, definition in definitions or ():
+            made = definition.value
+            if definition.kind == "parameter":
+                given = [value for _, value in given_to(self.program, where, definition.place) if value is not None]
+                found |= words_in(part for value in given for part in walk_all(value))
+            if isinstance(made, cst.Call) and _OPTIMISER.search(call_name(made)) and made.args:
+                parts = [part for value in _listed(where, made.args[0].value) for part in walk_all(value)]
+                found |= words_in(parts) | self._pose_classes(where, parts)
+        return found - PLUMBING
+
+    def _pose_classes(self, where: Function, parts: List[cst.CSTNode]) -> Set[str]:
+        """Return the words for poses in the classes of what is optimised, ``model._rot`` of a ``PoseModel``."""
+        held = [part.value for part in parts if isinstance(part, cst.Attribute) and isinstance(part.value, cst.Name)]
+        classes = [r for value in held for r in self.program.resolve(where, value) if r.kind == "instance"]
+        return {word for each in classes for word in words(getattr(each.target, "name", ""))} & POSES
+
+
+def _reads_gradients(function: Function) -> bool:
+    return "grad" in function.text and bool(gradients_read(list(walk_all(function.body))))
+
+
+def _listed(function: Function, node: cst.CSTNode) -> List[cst.CSTNode]:
+    """Return an argument of an optimiser, with what is appended to the list that it names."""
+    parts = function.flow.definitions.get(node.value, []) if isinstance(node, cst.Name) else []
+    kept = [d.value for d in parts if d.kind == "mutate" or isinstance(d.value, cst.List)]
+    return [node, *(value for value in kept if value is not None)]

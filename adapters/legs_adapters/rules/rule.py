@@ -1,7 +1,7 @@
 """The base class of the rules that skip terms, and the terms and calls that they are given.
 
-A rule is a class in ``causes/``. Its docstring says why in one sentence, then shows a term that it skips and one that
-is weighted; both are tests. ``order.py`` lists the rules in the order in which they are checked.
+A rule is a class in ``causes/``, or a row of one. Its docstring says why in one sentence, `INVALID` are terms that it
+skips, `VALID` terms that are weighted; all are tests. ``order.py`` lists the rules as they are asked.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from legs_adapters.terms.sides import Pair, pair_of
 if TYPE_CHECKING:
     from legs_adapters.rules.analysis import Analysis
 
-__all__ = ["Asked", "ByPurpose", "CallOfTerm", "Rule", "Term", "header", "source_of"]
+__all__ = ["CallContext", "CallOfTerm", "Rule", "Term", "header", "source_of"]
 
 _DEPTH = 3
 
 
-class Asked:
+class CallContext:
     """A call in a function, and the analyses of its program.
 
     Attributes:
@@ -40,11 +40,6 @@ class Asked:
         self.function = function
         self.call = call
         self.here: List[Decider] = [(function, call)]
-
-    def serves(self, purpose: str) -> List[Decider]:
-        """Return the evidence that its backward pass has this purpose; nothing where it may train."""
-        found = self.analysis.purposes.purpose(self.function, self.call)
-        return [(found.function, found.node)] if found is not None and found.word == purpose else []
 
     @property
     def class_name(self) -> str:
@@ -61,7 +56,7 @@ class Asked:
             yield owner.name, (owner.parent, owner.node.name)
 
 
-class Term(Asked):
+class Term(CallContext):
     """A photometric term.
 
     Attributes:
@@ -91,7 +86,7 @@ class Term(Asked):
         return self.pair.second if swapped(self.pair.a, self.pair.b) else self.pair.first
 
 
-class CallOfTerm(Asked):
+class CallOfTerm(CallContext):
     """A call of a function that compares two of its parameters.
 
     Attributes:
@@ -109,6 +104,9 @@ class Rule:
     Attributes:
         id: its name, for ``--explain`` and the report.
         reason: the word in the report; several rules may share it.
+        why: why a term is skipped, a sentence; default: the docstring.
+        VALID, INVALID: code whose terms are weighted, and code with a term that the rule skips; the body of a training
+            step, or functions.
         is_picture: the term compares pictures in a training step, of another kind than photographs.
         is_always_listed: the report lists the term, also where it is a bare absolute difference.
         is_listed_for_pictures: the report lists a bare absolute difference where it is of a rendering and a photograph.
@@ -118,6 +116,9 @@ class Rule:
 
     id = ""
     reason = ""
+    why = ""
+    VALID: Sequence[str] = ()
+    INVALID: Sequence[str] = ()
     is_picture = False
     is_always_listed = False
     is_listed_for_pictures = False
@@ -139,18 +140,6 @@ class Rule:
     def may_be_loss(self, term: Term) -> bool:
         """Return whether a term that this rule skipped needs a warning, if nothing else is found."""
         return False
-
-
-class ByPurpose(Rule):
-    """A rule that skips a term, or a call, by the purpose of its backward pass: the rule's reason."""
-
-    def evidence(self, term: Asked) -> List[Decider]:
-        """Return the step, or the backward pass without one, that shows the purpose."""
-        return term.serves(self.reason)
-
-    def of_call(self, call: CallOfTerm) -> List[Decider]:
-        """Return the same of a call."""
-        return self.evidence(call)
 
 
 def header(function: Function) -> Decider:

@@ -13,10 +13,10 @@ from legs_adapters.code.syntax import arguments, code, one_line
 from legs_adapters.lexicon.masks import is_rows, picked_from
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.analysis import Analysis
-from legs_adapters.rules.order import AMBIGUOUS, DEFINITION, HUBER, ORDER, RULES, UNREAD, first, first_of_call
+from legs_adapters.rules.order import DEFINITION, ORDER, RULES, first, first_of_call
 from legs_adapters.rules.rule import CallOfTerm, Term
 from legs_adapters.rules.uses import Use, Uses
-from legs_adapters.terms.error_maps import shared_of
+from legs_adapters.terms.error_maps import reads_of
 from legs_adapters.terms.findings import Kept, Left, Problem, Site
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import Callback
@@ -38,7 +38,7 @@ class Verdicts:
         """Return the verdict on a form; ``by_hand`` where the user named it as the loss."""
         term = Term(self.analysis, function, form)
         pair = term.pair
-        evidence = None if by_hand else first(term, (*DEFINITION, *ORDER, *AMBIGUOUS))
+        evidence = None if by_hand else first(term, (*DEFINITION, *ORDER))
         if evidence is not None:
             return Left.at(function, place, evidence)
         target_first = swapped(pair.a, pair.b)
@@ -47,6 +47,9 @@ class Verdicts:
             why = f"cannot tell which of {sides} is the rendering and which the photograph"
             return self.problem(function, form, place, why)
         flipped = bool(target_first)
+        if not by_hand and "target" not in (pair.a.role, pair.b.role):
+            why = f"nothing shows that {one_line(pair.first if flipped else pair.second)} is a photograph"
+            return self.problem(function, form, place, why, flipped)
         picked = None if pair.selection else self._picked(function, form)
         if picked is not None:
             form = Named.of(form, picked[0].value, picked[1].value, _index(picked[0]))
@@ -57,9 +60,6 @@ class Verdicts:
         ):
             why = "the sides are lists of pixels: a weight map needs whole images"
             return self.problem(function, form, place, why, flipped)
-        evidence = first(term, HUBER)
-        if evidence is not None:
-            return Left.at(function, place, evidence)
         if form.why_by_hand():
             return self.problem(function, form, place, form.why_by_hand(), flipped)
         if form.is_named and not function.flow.unchanged_at(form.call, form.first, form.second):
@@ -75,32 +75,20 @@ class Verdicts:
             why += f"; the purpose of the call at {unsettled} is unknown" if unsettled != use.where else ""
             problem = self.problem(function, form, place, why, flipped)
             return problem._replace(advice=problem.advice + _in_a_copy(function, uses))
-        evidence = first(Term(self.analysis, function, form), UNREAD)
-        if evidence is not None:
-            return Left.at(function, place, evidence)
-        shared = shared_of(self.analysis.training, function, form)
-        aside: Tuple[cst.Name, ...] = ()
-        if shared is not None and shared.loss:
-            form = Reread.of(form, shared.loss[0])
+        loss, others_read = reads_of(self.analysis.training, function, form)
+        if others_read and not loss:
+            return Left.at(function, place, RULES["untrained"].found(term.here))
+        if others_read:
+            alone = len(loss) == 1 and loss[0] not in others_read and len(function.flow.reaching(loss[0])) == 1
+            if not alone or not function.flow.unchanged(form.first, form.second):
+                why = f"{one_line(form.node)} has other uses than the loss"
+                return self.problem(function, form, place, why, flipped)
+            form = Reread.of(form, loss[0])
             place = function.place(form.node)
-        elif shared is not None and shared.aside:
-            aside = tuple(shared.aside)
-        elif shared is not None:
-            return self.problem(function, form, place, f"{one_line(form.node)} has other uses than the loss", flipped)
         stands = (function.module.path, place.line, place.column, place.last_line)
         kept = tuple(self._kept(function, use, other.reason) for use, other in others)
         selection, why = pair.selection + form.selection, self._why(function, target)
-        return Site(*stands, form, flipped, selection, why, function, aside, kept)
-
-    def of_any(self, function: Function, form: Form, place: Place) -> Left | Problem:
-        """Return the verdict on a call whose function is chosen by settings: a problem, unless a rule applies."""
-        term = Term(self.analysis, function, form)
-        evidence = first(term)
-        if evidence is not None:
-            return Left.at(function, place, evidence)
-        assert form.callee is not None
-        why = f"{one_line(form.callee)} is chosen at run time, and may not be an L1"
-        return self.problem(function, form, place, why, bool(swapped(term.pair.a, term.pair.b)))
+        return Site(*stands, form, flipped, selection, why, function, kept)
 
     def of_callback(self, holder: Function, callback: Callback) -> Site | Left:
         """Return the verdict on an L1 function that is passed as a callback, from the arguments of its call."""

@@ -26,7 +26,6 @@ filters       abs conv2d einsum relu sigmoid
 resamples     avg_pool2d center_crop crop gaussian_blur grid_sample interpolate max_pool2d pad resize
 passes        DataLoader checkpoint enumerate iter list next no_grad reversed tqdm tuple zip
 joins         cat concat concatenate hstack stack vstack
-constant      eye full full_like ones ones_like zeros zeros_like
 like          expand_as reshape_as to type_as view_as
 asks          isfinite isinf isnan ones_like zeros_like
 sizes         device dim dtype is_cuda ndim numel shape size
@@ -69,7 +68,6 @@ AXES = _ROWS["axes"]  # the same values in another order or shape
 JOINS = _ROWS["joins"]  # several values as one
 KEEPS_AXES = MOVES | LIMITS  # every value keeps its place
 KEEPS_VALUES = KEEPS_AXES | MAKES | AXES | JOINS  # the values are kept, in any order
-CONSTANT = _ROWS["constant"]  # made from a size only
 LIKE = _ROWS["like"]  # uses a tensor's type or shape, not its values
 ASKS = _ROWS["asks"]  # tests of values
 SIZES = _ROWS["sizes"]  # properties that do not depend on the values

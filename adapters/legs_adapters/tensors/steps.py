@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, Iterable, Iterator, List, Tuple
+from typing import Iterable, List
 
 import libcst as cst
 
@@ -11,13 +11,11 @@ from legs_adapters.code.syntax import call_name, children, constant, walk_all, w
 from legs_adapters.tensors.operations import BACKWARD, OPTIMISERS, SCHEDULES, STEPS
 
 __all__ = [
-    "calls_in",
     "gradients_read",
     "has_step",
     "is_backward",
     "is_step",
     "may_step",
-    "only_reads_gradients",
 ]
 
 _NOTHING = object()
@@ -50,21 +48,6 @@ def has_step(function: Function) -> bool:
     return "step" in function.text and any(map(is_step, function.flow.calls))
 
 
-def only_reads_gradients(scope: cst.CSTNode, calls: List[cst.Call], for_good: bool) -> bool:
-    """Return whether the gradients are read after each backward pass, and nothing can have stepped.
-
-    They have to be reset then, except ``for_good``, where no caller can step.
-    """
-    last = max(i for i, call in enumerate(calls) if is_backward(call))
-    if may_step(calls):
-        return False
-    parts = list(walk_all(scope))
-    again = isinstance(scope, (cst.For, cst.While)) and any(_empties(part) for part in parts)
-    if not for_good and not again and "zero_grad" not in [call_name(call) for call in calls[last:]]:
-        return False
-    return bool(gradients_read(parts))
-
-
 def gradients_read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
     """Return the gradients that are read, ``xyz.grad``; none where a manual step uses one of them."""
     asked = {id(p) for part in parts if _asks(part) for p in walk_all(part)}
@@ -94,16 +77,3 @@ def _taken(node: cst.CSTNode) -> List[cst.CSTNode]:
         return [node.right] if isinstance(node.operator, cst.Subtract) and not of_grads else []
     in_place = isinstance(node, cst.Call) and call_name(node).endswith("_")
     return [child.value for child in children(node) if in_place and isinstance(child, cst.Arg)]
-
-
-def calls_in(scope: cst.CSTNode, node: cst.CSTNode, calls: Dict[int, cst.Call]) -> Iterator[Tuple[cst.Call, bool]]:
-    """Yield the calls in a scope; each with whether it belongs to another training loop in it."""
-    stack: List[Tuple[cst.CSTNode, bool]] = [(scope, False)]
-    while stack:
-        part, elsewhere = stack.pop()
-        if id(part) in calls:
-            yield calls[id(part)], elsewhere
-        if part is not scope and isinstance(part, (cst.For, cst.While)) and not elsewhere:
-            below = list(walk_all(part))
-            elsewhere = node not in below and any(isinstance(p, cst.Call) and is_backward(p) for p in below)
-        stack.extend((child, elsewhere) for child in children(part))

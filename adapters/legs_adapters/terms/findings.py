@@ -49,7 +49,6 @@ class Site(NamedTuple):
             difference of them is taken with; empty without.
         why: what is known of it, in words.
         scope: the function that it stands in.
-        aside: other reads of the same error map, which keep the plain map.
         kept: calls of that function that are not the loss.
     """
 
@@ -62,7 +61,6 @@ class Site(NamedTuple):
     selection: str
     why: str
     scope: Function
-    aside: Tuple[cst.Name, ...] = ()
     kept: Tuple[Kept, ...] = ()
 
     @property

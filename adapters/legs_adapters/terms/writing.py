@@ -50,10 +50,6 @@ class Writing(NamedTuple):
         parts += [f"own={own}"] if own else []
         return "".join(f", {part}" for part in parts)
 
-    def weight_map(self, target: str) -> str:
-        """Return the call that makes the weight map of a target."""
-        return f"{self.package}.weight_map({target})"
-
     def own(self, callee: cst.BaseExpression, extras: Sequence[cst.Arg]) -> str:
         """Return the codebase's own function of (prediction, target), with its further arguments."""
         name = on_one_line(code(callee))

@@ -13,14 +13,15 @@ __all__ = ["Definition"]
 
 
 class Definition(Rule):
-    """The term is in the body of the codebase's own L1 function, whose calls are decided one by one.
+    """The term is in the body of the codebase's own L1 function, whose calls are decided one by one."""
 
-    left:
+    VALID = ["loss = l1_loss(image, gt)"]
+    INVALID = [
+        """
         def photometric(image, gt):
             return torch.abs(image - gt).mean()
-
-    weighted: loss = l1_loss(image, gt)
-    """
+        """
+    ]
 
     id = reason = "definition"
     is_always_listed = True

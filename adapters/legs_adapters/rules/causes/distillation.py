@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import List
 
-from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.lexicon.renderings import is_rendering
 from legs_adapters.rules.rule import CallOfTerm, Rule, Term, source_of
 from legs_adapters.tensors.gradients import detaches
@@ -14,14 +13,15 @@ __all__ = ["Distillation"]
 
 
 class Distillation(Rule):
-    """The target is a rendering: of another model, of another view, or of the same model at an earlier step.
+    """The target is a rendering: of another model, of another view, or of the same model at an earlier step."""
 
-    left:
+    VALID = ["loss = l1_loss(image, gt)"]
+    INVALID = [
+        """
         teacher_image = render(camera, teacher, None, None)["render"]
         loss = l1_loss(image, teacher_image)
-
-    weighted: loss = l1_loss(image, gt)
-    """
+        """
+    ]
 
     id = reason = "distillation"
     is_always_listed = True
@@ -31,10 +31,8 @@ class Distillation(Rule):
         pair, meanings = term.pair, term.analysis.meanings
         rendered = pair.a.role == pair.b.role == "render"
         rendered = rendered or meanings.origin(term.function, term.target).role == "render"
-        sure = swapped(pair.a, pair.b) is not None
-        if not rendered and not (sure and is_rendering(term.function, term.target)):
-            return []
-        return [source_of(term.function, term.target) or term.here[0]]
+        rendered = rendered or is_rendering(term.function, term.target)
+        return [source_of(term.function, term.target) or term.here[0]] if rendered else []
 
     def of_call(self, call: CallOfTerm) -> List[Decider]:
         return call.here if call.given[-1].role == "render" else []

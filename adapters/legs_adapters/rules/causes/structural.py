@@ -14,15 +14,16 @@ __all__ = ["Definition", "Library", "Settings", "Twice", "Unproven", "Value"]
 
 
 class Definition(Rule):
-    """With `--ssim`: the call is in the body of the codebase's own SSIM function, whose calls are decided one by one.
+    """With `--ssim`: the call is in the body of the codebase's own SSIM, whose calls are decided one by one."""
 
-    left:
+    VALID = ["loss = 1.0 - ssim(image, gt)"]
+    INVALID = [
+        """
         def ssim_of_pair(image, gt):
             window = torch.tensor([0.2, 0.6, 0.2])
             return ssim(image, gt, window)
-
-    weighted: loss = 1.0 - ssim(image, gt)
-    """
+        """
+    ]
 
     id = "ssim-definition"
     reason = "definition"
@@ -46,9 +47,11 @@ class _Lacking(Rule):
 
 
 class Library(_Lacking):
-    """With `--ssim`: the function is a library's (fused_ssim, torchmetrics), not the checkout's.
+    """With `--ssim`: the function is a library's (fused_ssim, torchmetrics), not the checkout's."""
 
-    left:
+    VALID = ["loss = 1.0 - ssim(image, gt)"]
+    INVALID = [
+        """
         import torch
         from fused_ssim import fused_ssim
         from gaussian_renderer import render
@@ -59,27 +62,27 @@ class Library(_Lacking):
             loss = 1.0 - fused_ssim(image.unsqueeze(0), camera.original_image.unsqueeze(0))
             loss.backward()
             gaussians.optimizer.step()
-
-    weighted: loss = 1.0 - ssim(image, gt)
-    """
+        """
+    ]
 
     id = "ssim-library"
 
 
 class Settings(_Lacking):
-    """With `--ssim`: the call has another window, a mask, one value per image, or an argument that is not a literal.
+    """With `--ssim`: the call has another window, a mask, one value per image, or an argument that is not a literal."""
 
-    left: loss = 1.0 - ssim(image, gt, window_size=7)
-    weighted: loss = 1.0 - ssim(image, gt, window_size=11)
-    """
+    VALID = ["loss = 1.0 - ssim(image, gt, window_size=11)"]
+    INVALID = ["loss = 1.0 - ssim(image, gt, window_size=7)"]
 
     id = "ssim-settings"
 
 
 class Value(_Lacking):
-    """With `--ssim`: the function computes another value: another window, padding or constant, or not the mean.
+    """With `--ssim`: the function computes another value: another window, padding or constant, or not the mean."""
 
-    left:
+    VALID = ["loss = 1.0 - ssim(image, gt)"]
+    INVALID = [
+        """
         def ssim_of_patches(image, gt):
             return (image * gt).mean()
 
@@ -88,17 +91,18 @@ class Value(_Lacking):
             loss = 1.0 - ssim_of_patches(image, camera.original_image)
             loss.backward()
             gaussians.optimizer.step()
-
-    weighted: loss = 1.0 - ssim(image, gt)
-    """
+        """
+    ]
 
     id = "ssim-value"
 
 
 class Unproven(_Lacking):
-    """With `--ssim`: the source does not show which function is called, or what it computes.
+    """With `--ssim`: the source does not show which function is called, or what it computes."""
 
-    left:
+    VALID = ["loss = 1.0 - ssim(image, gt)"]
+    INVALID = [
+        """
         def ssim_clamped(image, gt):
             return (image.clamp(0, 1) * gt).mean()
 
@@ -107,23 +111,23 @@ class Unproven(_Lacking):
             loss = 1.0 - ssim_clamped(image, camera.original_image)
             loss.backward()
             gaussians.optimizer.step()
-
-    weighted: loss = 1.0 - ssim(image, gt)
-    """
+        """
+    ]
 
     id = "ssim-unproven"
     reason = "unproven SSIM"
 
 
 class Twice(Rule):
-    """With `--ssim`: the loss is differentiated twice; `legs_loss.ssim` is differentiable once.
+    """With `--ssim`: the loss is differentiated twice; `legs_loss.ssim` is differentiable once."""
 
-    left:
+    VALID = ["loss = 1.0 - ssim(image, gt)"]
+    INVALID = [
+        """
         loss = 1.0 - ssim(image, gt)
         torch.autograd.grad(loss, image, create_graph=True)
-
-    weighted: loss = 1.0 - ssim(image, gt)
-    """
+        """
+    ]
 
     id = "ssim-twice"
     reason = "second derivative"

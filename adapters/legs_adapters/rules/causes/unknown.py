@@ -6,42 +6,29 @@ from typing import List
 
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.rule import Rule, Term
+from legs_adapters.tensors.absolute import is_difference
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import are_counterparts
 
-__all__ = ["Ambiguous", "Unknown"]
+__all__ = ["Unknown"]
 
 
-class _Unknown(Rule):
-    reason = "unknown"
+class Unknown(Rule):
+    """Neither side is known to be an image, or nothing shows which is the photograph and not both names are images."""
+
+    id = reason = "unknown"
+    VALID = ["loss = l1_loss(image, gt)"]
+    INVALID = [
+        "loss = l1_loss(network(camera), camera.something)",
+        "loss = l1_loss(fused_image(camera), other(camera))",
+    ]
+
+    def evidence(self, term: Term) -> List[Decider]:
+        pair = term.pair
+        pictures = "image" in (pair.a.kind, pair.b.kind) or are_counterparts(term.form)
+        sure = swapped(pair.a, pair.b) is not None or pair.speaks_of_images
+        changes = all(map(is_difference, term.sides))  # of two views, or of neighbours
+        return [] if pictures and sure and not changes else term.here
 
     def may_be_loss(self, term: Term) -> bool:
         return True
-
-
-class Unknown(_Unknown):
-    """Neither side is known to be an image.
-
-    left: loss = l1_loss(network(camera), camera.something)
-    weighted: loss = l1_loss(image, camera.something)
-    """
-
-    id = "unknown"
-
-    def evidence(self, term: Term) -> List[Decider]:
-        pictures = "image" in (term.pair.a.kind, term.pair.b.kind) or are_counterparts(term.form)
-        return [] if pictures else term.here
-
-
-class Ambiguous(_Unknown):
-    """Neither side is known to be the rendering or the photograph, and not both names are about images.
-
-    left: loss = l1_loss(fused_image(camera), other(camera))
-    weighted: loss = l1_loss(image, gt)
-    """
-
-    id = "ambiguous"
-
-    def evidence(self, term: Term) -> List[Decider]:
-        sure = swapped(term.pair.a, term.pair.b) is not None
-        return [] if sure or term.pair.speaks_of_images else term.here

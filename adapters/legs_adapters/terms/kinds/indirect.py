@@ -1,0 +1,64 @@
+"""``torch.abs((a - b) * w)``, ``delta = a - b``, ``delta = delta[mask]``, ``delta.abs()``: by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Iterator, Optional
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.syntax import one_line
+from legs_adapters.tensors.absolute import absolute_value, is_difference
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.functions import L1Functions
+from legs_adapters.terms.writing import Writing
+
+__all__ = ["Indirect"]
+
+_DEPTH = 4
+
+
+@dataclass(frozen=True)
+class Indirect(Form):
+    """The absolute value of a difference that was changed before: filtered, scaled, weighted.
+
+    Example:
+        before: diff = image - gt_image; diff = diff[diff ** 2 < 0.1]; loss = diff.abs().mean()
+        advice: torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))
+    """
+
+    order = 40
+
+    @classmethod
+    def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
+        """Find ``abs`` of what is made of a difference, in the expression or by its definitions."""
+        found = absolute_value(call)
+        made = next(_differences(function, found.argument, 0), None) if found is not None else None
+        if found is None or made is None:
+            return None
+        return cls(call, found.call, made.left, made.right, difference=made, makes=found.makes)
+
+    def why_by_hand(self) -> str:
+        """Return that the difference is changed."""
+        assert self.difference is not None
+        return f"{one_line(self.difference)} is changed before its absolute value is taken"
+
+    def _advice(self, writing: Writing, prediction: str, target: str, rows: bool) -> str:
+        assert self.difference is not None
+        made = one_line(self.difference)
+        return f"torch.abs({writing.package}.weight_map({target}) * {made if made.startswith('(') else f'({made})'})"
+
+
+def _differences(function: Function, node: cst.CSTNode, depth: int) -> Iterator[cst.BinaryOperation]:
+    """Yield the differences that an expression is a multiple, a quotient or a part of."""
+    if isinstance(node, cst.BinaryOperation) and is_difference(node):
+        yield node
+    elif isinstance(node, cst.BinaryOperation) and isinstance(node.operator, (cst.Multiply, cst.Divide)):
+        yield from _differences(function, node.left, depth)
+        yield from _differences(function, node.right, depth)
+    elif isinstance(node, cst.Subscript):
+        yield from _differences(function, node.value, depth)
+    elif isinstance(node, cst.Name) and depth < _DEPTH:
+        for value in function.flow.assigned(node):
+            yield from _differences(function, value, depth + 1)

@@ -30,7 +30,7 @@ WORDS = {
     "feature": """
         feature features feat feats semantic semantics sem language lang clip dino dinov2 lseg sam embedding embeddings
         latent latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors
-        classes obj objects intensity wavelet wavelets haar dwt fft rfft dct census
+        classes obj objects wavelet wavelets haar dwt fft rfft dct census
         stokes aolp dolp phasor phasors
     """,
     # sds, inpaint, edit: GaussianDreamer, GaussianEditor; pseudo, unseen, virtual: codebases with few views

@@ -162,3 +162,38 @@ def test_a_difference_that_is_filtered_before_its_absolute_value_is_quoted(tmp_p
     assert problem.text == "Ll1 = delta.abs().mean()"
     assert problem.reason == "image - gt_image is changed before its absolute value is taken"
     assert problem.advice == "torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))"
+
+
+def test_a_method_is_not_resolved_by_its_bare_name(tmp_path):
+    texts = files("inria")
+    texts["losses.py"] = (
+        "import torch\n\n\nclass L1Loss(torch.nn.Module):\n"
+        "    def forward(self, prediction, target):\n        return torch.abs(prediction - target).mean()\n"
+    )
+    texts["train.py"] = texts["train.py"].replace(
+        "        loss = ", "        extra = lpips_model.forward(image, gt_image)\n        loss = extra + ", 1
+    )
+    found = plan(checkout(tmp_path, texts)).findings
+    assert [site.form.callee.value for site in found.sites] == ["l1_loss"]
+    assert found.problems == []
+
+
+def test_depth_by_another_name_is_left(tmp_path):
+    texts = files("inria")
+    texts["losses.py"] = (
+        "import torch\nfrom utils.loss_utils import l1_loss\n\n\n"
+        "def masked_rgb_l1(rgb, photo, mask):\n    return (rgb - photo).abs()[:, mask].mean()\n\n\n"
+        "def range_loss(prediction_range_m, target_range_m, mask):\n"
+        "    return (prediction_range_m[mask] - target_range_m[mask]).abs().mean()\n"
+    )
+    texts["train.py"] = texts["train.py"].replace(
+        "        loss = ",
+        "        lidar = range_loss(package['render'][0, ..., 3], viewpoint_cam.sensor, viewpoint_cam.mask)\n"
+        "        lidar = lidar + torch.abs(package['render'][0, ..., 3] - viewpoint_cam.sensor_z).mean()\n"
+        "        loss = lidar + ",
+        1,
+    )
+    texts["train.py"] = "import torch\nfrom losses import range_loss\n" + texts["train.py"]
+    found = plan(checkout(tmp_path, texts)).findings
+    assert [(site.path, site.form.callee is not None) for site in found.sites] == [("train.py", True)]
+    assert found.problems == []

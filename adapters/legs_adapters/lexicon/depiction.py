@@ -25,7 +25,7 @@ from legs_adapters.code.returned import (
     stored,
     written,
 )
-from legs_adapters.code.syntax import arguments, call_name, key_of, root_of, words
+from legs_adapters.code.syntax import arguments, call_name, constant, key_of, root_of, words
 from legs_adapters.lexicon.depicted_calls import meaning_of_call
 from legs_adapters.lexicon.holders import role_of_holder
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
@@ -275,6 +275,9 @@ class Meanings:
         key = key_of(node) or formatted_key(node) or default_key(function, node)
         if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in PARAMETERS:
             return Meaning("parameter", None)
+        last = node.slice[-1].slice
+        if len(node.slice) > 1 and isinstance(last, cst.Index) and constant(last.value) == 3:
+            return Meaning("depth", self.of(function, node.value, depth).role)  # of RGB+D, render[0, ..., 3]
         if isinstance(key, str):
             here = bool(function.flow.reaching(node))
             local = self.flow(function, node, depth) if here else self._entry(function, node.value, key, depth)

@@ -24,7 +24,8 @@ WORDS = {
     """,
     "normal": "normal normals nrm",
     "depth": """
-        depth depths disp disparity disparities invdepth inverse idepth zbuf lidar distortion dist monodepth midas tof
+        depth depths range ranges z disp disparity disparities invdepth inverse idepth zbuf lidar distortion dist
+        monodepth midas tof
     """,
     # LangSplat, Feature 3DGS, Gaussian Grouping; polarised light, phasors of time-of-flight cameras
     "feature": """
@@ -85,7 +86,7 @@ STATISTICS = word_set("histc histogram bincount entropy gram moments")  # of a p
 MATCHED = word_set("match matching matched equalize equalized")  # histogram_matching(image, photo) is a picture
 LOADING = word_set("load read get open fetch")
 OF_DIFFUSION = word_set("guidance_scale negative_prompt num_inference_steps strength")  # arguments where it paints
-PERCEPTUAL = word_set("vgg perceptual lpips gram")
+PERCEPTUAL = word_set("vgg perceptual lpips gram dists clip dino")
 MESH = word_set("mesh meshhead texture")  # of triangles: what they draw is no splat
 ROBUST = word_set("huber tukey cauchy")  # a weight would move their thresholds
 

@@ -42,7 +42,7 @@ modules       F TF einops functional nn np numpy torch
 module_self   cpu cuda double eval float half requires_grad_ to train
 module_wraps  DDP DataParallel DistributedDataParallel compile convert_sync_batchnorm fabric.setup prepare
 everyday      clamp clone cpu cuda detach eval item mean permute reshape size squeeze step sum to train unsqueeze
-everyday      view zero_grad
+everyday      forward view zero_grad
 transparent   autocast classmethod compile jaxtyped script staticmethod typechecked
 holders       ModuleDict OrderedDict dict functools.partial nn.ModuleDict partial torch.nn.ModuleDict
 hooks         get_loss_dict get_train_loss_dict training_step

@@ -12,8 +12,9 @@ from legs_adapters.code.calls import given_to
 from legs_adapters.code.members import Reference
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, call_name, code, constant
+from legs_adapters.code.syntax import arguments, call_name, code, constant, words
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
+from legs_adapters.lexicon.words import PERCEPTUAL
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
@@ -45,6 +46,10 @@ class Called(Form):
         ):
             return None  # patched before
         name = call_name(call)
+        if any(reference.guess for reference in references) and not is_l1_name(name):
+            return None  # a method of an object of unknown class: its name alone proves nothing
+        if PERCEPTUAL & set(words(code(call.func))):
+            return None  # lpips_model.forward(image, gt)
         references = references or _handed_on(functions.program, function, call)
         if not references:
             if not is_l1_name(name):

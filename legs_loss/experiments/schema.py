@@ -53,8 +53,12 @@ def _holds(fits: Callable[[Any], bool], value: Any) -> bool:
 
 
 def _config(value: Any) -> bool:
-    """Return whether the class accepts the settings, and each has the type of its field."""
-    return _alike(TrainConfig.from_dict(value).as_dict(), TrainConfig().as_dict())
+    """Return whether the class accepts the settings, each has the type of its field, and what pages show is there."""
+    default = TrainConfig().as_dict()
+    known = _alike(TrainConfig.from_dict(value).as_dict(), default)
+    return (
+        known and set(default) - {"position_lr_max_steps"} <= set(value) and set(default["spec"]) <= set(value["spec"])
+    )
 
 
 def _alike(found: Mapping[str, Any], like: Mapping[str, Any]) -> bool:

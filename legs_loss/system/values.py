@@ -5,6 +5,7 @@ Python reads JSON's integers of any length, its truths as integers, and 1e999 as
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Any, Callable
 
 __all__ = ["each", "is_count", "is_number", "is_pair", "is_scores", "is_text", "of_names", "optional", "with_names"]
@@ -14,8 +15,8 @@ _LARGEST = 1 << 63
 
 
 def is_number(value: Any) -> bool:
-    """Return whether it is a float, or an integer of 64 bits."""
-    return type(value) is float or (type(value) is int and abs(value) < _LARGEST)
+    """Return whether it is a number of at most 64 bits before the point, or a float that is infinite or NaN."""
+    return type(value) in (int, float) and (abs(value) < _LARGEST or (type(value) is float and not isfinite(value)))
 
 
 def is_count(value: Any) -> bool:

@@ -34,13 +34,17 @@ EXIT_CODES = (
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
+    args = argparse.Namespace(folder="", undo=False)
+    return _reporting_errors(args, lambda: _run(_parsed(argv, args)))
+
+
+def _parsed(argv: Optional[Sequence[str]], args: argparse.Namespace) -> argparse.Namespace:
     never_fail_to_print()
     parser = Parser(prog="legs-patch", description=__doc__)
     add_arguments(parser)
     parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
     parser.offer_completion()
-    args = argparse.Namespace(folder="", undo=False)
-    return _reporting_errors(args, lambda: _run(parser.parse_args(argv, args)))
+    return parser.parse_args(argv, args)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -51,12 +51,12 @@ def test_a_missing_gpu_is_said() -> None:
 
 
 def test_the_bytes_that_must_move(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 10x10 pixels: three values of float32 are read twice and written once; a copy of one byte moves two."""
+    """Of 10x10 pixels: three float32 read twice, written once, with the weights; a copy moves two."""
     monkeypatch.setattr(timing, "COPIED", 1 << 20)
     monkeypatch.setattr(timing, "timed", lambda step, device: step() is None or 1e-3)
     table = {name: {"median ms": 1.0} for name in NAMES}
     at_bandwidth(table, (10, 10), torch.device("cpu"))
-    assert [row["bytes"] for row in table.values()] == [3 * 16 * 100, (3 * 12 + 4) * 100, 3 * 12 * 100]
-    at_that = 1e3 * 4800 / (2 * (1 << 20) / 1e-3)
+    assert [row["bytes"] for row in table.values()] == [(3 * 16 + 16) * 100, (3 * 12 + 4) * 100, 3 * 12 * 100]
+    at_that = 1e3 * 6400 / (2 * (1 << 20) / 1e-3)
     assert table[NAMES[0]]["ms at a copy's bandwidth"] == pytest.approx(at_that)
     assert table[NAMES[0]]["share of a copy's bandwidth"] == pytest.approx(at_that / 1.0)

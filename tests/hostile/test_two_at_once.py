@@ -220,7 +220,7 @@ class TestAtAnyLine:
             write(plan(root))
         count = lines_of(arguments)
         assert count > 100
-        for number in range(3, count + 1, max(1, count // 30)):
+        for number in range(4, count + 1, max(1, count // 30)):
             fresh = checkout(tmp_path / str(number), SOURCES)
             if what == "undo":
                 write(plan(fresh))
@@ -279,7 +279,7 @@ def test_a_folder_that_becomes_a_link_at_any_line(what, tmp_path):
     arguments = ["--undo"] if what == "undo" else ["--force"]
     count = lines_of([*arguments, fresh("count")[0]])
     said_all = set()
-    for number in range(3, count + 1, max(1, count // 40)):
+    for number in range(4, count + 1, max(1, count // 40)):
         root, outside, precious = fresh(str(number))
         _, said = traced([*arguments, root], number, lambda root=root, outside=outside: swap(root, outside))
         assert "Traceback" not in said, (number, said)

@@ -192,7 +192,7 @@ class TestInputs:
         ("bad", "message"),
         [
             (torch.zeros(3, 4, 4, dtype=torch.uint8), "uint8.*255"),
-            (torch.zeros(9, 4), r"\[9, 4\] may be a list of pixels"),
+            (torch.zeros(9, 4), r"\[9, 4\] is a list of pixels"),
             (torch.zeros(3, 0, 4), r"\[3, 0, 4\]"),
             (np.zeros((3, 4, 4)), "ndarray"),
         ],

@@ -193,11 +193,11 @@ class TestStore:
     def test_the_manifest_says_so_and_one_without_is_as_before(self, scene, tmp_path):
         precompute(read_scene(scene), tmp_path, "legs")
         plain = json.loads((tmp_path / MANIFEST).read_text())
-        assert plain["version"] == 1
+        assert plain["version"] == 3
         assert set(plain["entries"][0]).isdisjoint({"smooth", "low", "span", "percentile", "median", "strong"})
         precompute(read_scene(scene), tmp_path, "legs-robust")
         both = json.loads((tmp_path / MANIFEST).read_text())
-        assert both["version"] == 2
+        assert both["version"] == 3
         assert len(both["entries"]) == 10
         assert {entry.percentile for entry in read_manifest(tmp_path)} == {None, 99.0}
         again = precompute(read_scene(scene), tmp_path, "legs-robust")

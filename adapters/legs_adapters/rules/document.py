@@ -15,7 +15,7 @@ __all__ = ["Description", "describe", "explain", "listed", "table"]
 
 
 class Description(NamedTuple):
-    """What a rule says of itself: why it skips a term, code that it skips, and code that is weighted."""
+    """A rule in words: why it skips a term, code that it skips, and code that is weighted."""
 
     why: str
     left: List[str]

@@ -127,10 +127,7 @@ def lists(path):
 
 
 LAYERS = ("tensors", "lexicon", "terms", "rules", "upstreams")
-
-
-# structural/ computes what a function returns: what it keeps are operations that it carries out, no words.
-FILES = [path for layer in LAYERS for path in sorted((ROOT / layer).rglob("*.py")) if "structural" not in path.parts]
+FILES = [path for layer in LAYERS for path in sorted((ROOT / layer).rglob("*.py"))]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Iterable, Mapping, Optional, Pattern
+from typing import Iterable, Mapping, Optional, Pattern
 
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
@@ -15,9 +15,7 @@ from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.kinds.callback import Callbacks
 from legs_adapters.terms.prospects import Prospects
-
-if TYPE_CHECKING:
-    from legs_adapters.terms.structural.calls import SsimCalls
+from legs_adapters.terms.structural.calls import SsimCalls
 
 __all__ = ["Analysis"]
 
@@ -65,9 +63,7 @@ class Analysis:
 
     @property
     def ssims(self) -> SsimCalls:
-        """The SSIM functions of the program, by evaluation."""
+        """The SSIM functions of the program, by their code."""
         if self._ssims is None:
-            from legs_adapters.terms.structural.calls import SsimCalls  # NumPy is not needed without --ssim
-
             self._ssims = SsimCalls(self.program)
         return self._ssims

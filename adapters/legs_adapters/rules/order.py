@@ -36,7 +36,6 @@ ORDER: Tuple[Rule, ...] = (
 _OF_SSIM = (
     structural.Library(),
     structural.Settings(),
-    structural.Value(),
     structural.Unproven(),
     structural.Twice(),
 )

@@ -10,7 +10,7 @@ from legs_adapters.tensors.steps import is_backward
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.ssim import STRUCTURAL
 
-__all__ = ["Definition", "Library", "Settings", "Twice", "Unproven", "Value"]
+__all__ = ["Definition", "Library", "Settings", "Twice", "Unproven"]
 
 
 class Definition(Rule):
@@ -32,7 +32,7 @@ class Definition(Rule):
         function, ssims = term.function, term.analysis.ssims
         if not STRUCTURAL.search(function.name) and not STRUCTURAL.search(term.class_name):
             return []
-        inside = ssims.is_own(function) or ssims.proof(function, term.form).lack in ("settings", "unproven")
+        inside = ssims.is_ssim(function) or ssims.proof(function, term.form).lack in ("settings", "unproven")
         return [header(function)] if inside else []
 
 
@@ -77,8 +77,8 @@ class Settings(_Lacking):
     id = "ssim-settings"
 
 
-class Value(_Lacking):
-    """With `--ssim`: the function computes another value: another window, padding or constant, or not the mean."""
+class Unproven(_Lacking):
+    """With `--ssim`: the function is no known form of 3DGS's SSIM, or the source does not show which one is called."""
 
     VALID = ["loss = 1.0 - ssim(image, gt)"]
     INVALID = [
@@ -89,26 +89,6 @@ class Value(_Lacking):
         def training(gaussians, camera):
             image = render(camera, gaussians, None, None)["render"]
             loss = 1.0 - ssim_of_patches(image, camera.original_image)
-            loss.backward()
-            gaussians.optimizer.step()
-        """
-    ]
-
-    id = "ssim-value"
-
-
-class Unproven(_Lacking):
-    """With `--ssim`: the source does not show which function is called, or what it computes."""
-
-    VALID = ["loss = 1.0 - ssim(image, gt)"]
-    INVALID = [
-        """
-        def ssim_clamped(image, gt):
-            return (image.clamp(0, 1) * gt).mean()
-
-        def training(gaussians, camera):
-            image = render(camera, gaussians, None, None)["render"]
-            loss = 1.0 - ssim_clamped(image, camera.original_image)
             loss.backward()
             gaussians.optimizer.step()
         """

@@ -1,1 +1,1 @@
-"""Find the functions of a checkout that are 3DGS's SSIM, by their values on small images."""
+"""Find the functions of a checkout that are 3DGS's SSIM, by the forms that its code is met in."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List, NamedTuple, Optional
+from typing import Dict, List, NamedTuple, Optional
 
 import libcst as cst
 
 from legs_adapters.code.module import Class, Function
 from legs_adapters.code.program import Program, Reference
-from legs_adapters.code.syntax import constant
+from legs_adapters.code.syntax import constant, every_parameter
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.form import Form
-from legs_adapters.terms.structural.functions import SsimFunctions
+from legs_adapters.terms.structural.forms import FORMS, form_of
 
 __all__ = ["Proof", "SsimCalls"]
 
@@ -23,7 +23,7 @@ class Proof(NamedTuple):
 
     Attributes:
         lack: why it is not 3DGS's SSIM, or not provably: "library" (the function is not of this checkout), "settings"
-            (of this call), "value" (it computes something else), "unproven"; empty where it is.
+            (of this call), "unproven"; empty where it is.
         deciders: the evidence.
         function: the function that is 3DGS's SSIM.
     """
@@ -44,7 +44,7 @@ class SsimCalls:
 
     def __init__(self, program: Program) -> None:
         self.program = program
-        self.functions: SsimFunctions = SsimFunctions(program)
+        self._known: Dict[Function, bool] = {}
 
     def proof(self, function: Function, form: Form) -> Proof:
         """Return what a call in a function computes, with the evidence."""
@@ -57,28 +57,17 @@ class SsimCalls:
         if len(references) != 1 or references[0].guess or not isinstance(references[0].target, Function):
             return Proof("unproven", [_class_of(references) or here])
         target = references[0].target
-        extras: List[Any] = []
-        keywords: Dict[str, Any] = {}
-        for arg in form.extras:
-            value = constant(arg.value, _MISSING)
-            if value is _MISSING:
-                return Proof("settings", [(function, arg.value)])
-            if arg.keyword is None:
-                extras.append(value)
-            else:
-                keywords[arg.keyword.value] = value
-        answer = self.functions.answer(target, tuple(extras), keywords)
-        if answer.is_ssim:
-            return Proof("", [], target)
-        if form.extras and self.functions.answer(target).is_ssim:
-            return Proof("settings", [(function, form.extras[0].value)])
-        if answer.is_ssim is None:
-            return Proof("unproven", [answer.decider or here])
-        return Proof("value", [(target, target.node)])
+        settings = [arg for arg in form.extras if not _is_default(arg, form, target)]
+        dynamic = [arg for arg in settings if constant(arg.value, _MISSING) is _MISSING]
+        if dynamic or (settings and self.is_ssim(target)):
+            return Proof("settings", [(function, (dynamic or settings)[0].value)])
+        return Proof("", [], target) if self.is_ssim(target) else Proof("unproven", [(target, target.node)])
 
-    def is_own(self, function: Function) -> bool:
+    def is_ssim(self, function: Function) -> bool:
         """Return whether a function is 3DGS's SSIM as it stands."""
-        return len(function.parameters) >= 2 and bool(self.functions.answer(function).is_ssim)
+        if function not in self._known:
+            self._known[function] = len(function.parameters) >= 2 and form_of(self.program, function) in FORMS
+        return self._known[function]
 
     def _import(self, function: Function, callee: cst.BaseExpression) -> Optional[Decider]:
         """Return the import, or the object, that a called name refers to."""
@@ -90,6 +79,18 @@ class SsimCalls:
                 if definition.kind in ("import", "assign") and definition.value is not None:
                     return where, definition.value
         return None
+
+
+def _is_default(arg: cst.Arg, form: Form, function: Function) -> bool:
+    """Return whether an argument of a call is the default of its parameter."""
+    assert isinstance(form.call, cst.Call) and isinstance(function.node, cst.FunctionDef)
+    name = arg.keyword.value if arg.keyword is not None else ""
+    position = form.call.args.index(arg)
+    if not name and position < len(function.parameters):
+        name = function.parameters[position]
+    defaults = {param.name.value: param.default for param in every_parameter(function.node.params)}
+    value, default = constant(arg.value, _MISSING), constant(defaults.get(name), _MISSING)
+    return value is not _MISSING and (type(value), value) == (type(default), default)
 
 
 def _class_of(references: List[Reference]) -> Optional[Decider]:

@@ -77,6 +77,14 @@ def stage_own(
     if not 0.0 < maps.scale <= _LARGEST:
         raise LegsError(f"--weight_scale must be above 0 and at most {_LARGEST:g}, got {maps.scale:g}")
     result = Staged([], [], [])
+    given = {kind: named for kind, named in ((MASK, maps.masks), (WEIGHTS, maps.weights)) if named is not None}
+    for entry in known:
+        if entry.is_own and entry.operator not in given:
+            raise LegsError(
+                f"the store has maps of {_OPTIONS[entry.operator]}: give that option again, or delete the store"
+            )
+    if not given:
+        return result
     sizes: Dict[str, Tuple[int, int]] = {}
     for view in views:
         with suppress(LegsError):  # its photograph is skipped later, with the reason
@@ -86,14 +94,7 @@ def stage_own(
     for entry in known:
         if not entry.is_own and entry.view in trained:
             trained[entry.view].add((entry.width, entry.height))
-    for kind, named in ((MASK, maps.masks), (WEIGHTS, maps.weights)):
-        before = [entry for entry in known if entry.operator == kind]
-        if named is None:
-            if before:
-                raise LegsError(
-                    f"the store has maps of {_OPTIONS[kind]}: give that option again, or delete the store's folder"
-                )
-            continue
+    for kind, named in given.items():
         is_alpha = kind == MASK and named == ALPHA
         files = _with_alpha(views) if is_alpha else find_maps(own_folder(root, named), views, _SUFFIXES[kind])
         for view in views:
@@ -104,7 +105,7 @@ def stage_own(
                     result.added.append(_staged(kind, view, file, averaged(values, size), maps.scale, staging))
             elif kind == MASK:
                 result.unmasked.append(view.name)
-        result.dropped.extend(before)
+        result.dropped.extend(entry for entry in known if entry.operator == kind)
     return result
 
 

@@ -61,7 +61,7 @@ class Stored:
     """
 
     def __init__(self, config: Config, say_once: Callable[[str, str], None]) -> None:
-        self.masked = Masked()
+        self.masked: Masked = Masked()
         self._config = config
         self._say_once = say_once
         self._misses = 0  # since an image was found

@@ -52,7 +52,7 @@ class Flow(Reaching):
         most: float = math.inf,
     ) -> None:
         super().__init__()
-        self.steps = 0
+        self.steps: int = 0
         self._most = most
         self.calls: List[cst.Call] = []
         self.expressions: List[cst.CSTNode] = []

@@ -114,11 +114,11 @@ class Rule:
         is_doubted_beside_sites: warn of the term also where the codebase has other terms.
     """
 
-    id = ""
-    reason = ""
-    why = ""
-    VALID: Sequence[str] = ()
-    INVALID: Sequence[str] = ()
+    id: str = ""
+    reason: str = ""
+    why: str = ""
+    VALID: List[str] = []
+    INVALID: List[str] = []
     is_picture = False
     is_always_listed = False
     is_listed_for_pictures = False

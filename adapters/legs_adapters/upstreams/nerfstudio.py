@@ -26,7 +26,7 @@ DESCRIPTION = "Gaussian Splatting with the LEGS loss: splatfacto, its L1 weighte
 
 
 # Settings as flags of ns-train, --pipeline.model.legs-beta 5; None leaves them to legs.toml and LEGS_*.
-FLAGS = {"legs_preset": str, "legs_beta": float, "legs_curve": str}
+FLAGS: Dict[str, type] = {"legs_preset": str, "legs_beta": float, "legs_curve": str}
 
 
 def __getattr__(name: str) -> Any:

@@ -33,8 +33,11 @@ class OtherKind(Rule):
     is_picture = True
 
     def __init__(self, id: str, kind: str, what: str, invalid: List[str], reason: str = "") -> None:
-        self.id, self.kind, self.reason = id, kind, reason or id
-        self.why, self.INVALID = f"One side is {what}.", invalid
+        self.id: str = id
+        self.kind: str = kind
+        self.reason: str = reason or id
+        self.why: str = f"One side is {what}."
+        self.INVALID: List[str] = invalid
 
     def evidence(self, term: Term) -> List[Decider]:
         """Return what shows the kind of the first side that is of any of these kinds."""

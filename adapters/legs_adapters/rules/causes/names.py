@@ -101,7 +101,11 @@ class OtherName(Rule):
     VALID = ["loss = l1_loss(image, gt)"]
 
     def __init__(self, id: str, reason: str, words: AbstractSet[str], why: str, invalid: str) -> None:
-        self.id, self.reason, self.words, self.why, self.INVALID = id, reason, words, why, [invalid]
+        self.id: str = id
+        self.reason: str = reason
+        self.words: AbstractSet[str] = words
+        self.why: str = why
+        self.INVALID: List[str] = [invalid]
 
     def evidence(self, term: Term) -> List[Decider]:
         """Return the first name that has one of the words."""

@@ -14,7 +14,7 @@ from string import Template
 HERE = Path(__file__).resolve().parent
 DOCS = HERE.parent
 PAGE = DOCS / "compatibility.md"
-KINDS = ("static", "dynamic", "avatar", "SLAM", "framework", "other")
+KINDS = ("static", "dynamic", "avatar", "SLAM", "feed-forward", "framework", "other")
 
 # A row with several failures carries the gravest of them: this order, after "right".
 VERDICTS = {
@@ -24,6 +24,7 @@ VERDICTS = {
     "wrong form": "a line that stops at the first step, or weights the wrong axes",
     "wrong view": "a `view=` that no view has, or that several have",
     "error": "an error that quotes a line; nothing is written",
+    "false alarm": "an error on a line that is not the loss; nothing is written",
     "timeout": "no answer within 500 s",
 }
 
@@ -65,6 +66,12 @@ def right_of(rows):
     return f"{right} of {len(rows)} ({rate(right, len(rows))})"
 
 
+def by_kind(rows):
+    """Return the rows of each kind that has any."""
+    kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in KINDS}
+    return {kind: of for kind, of in kinds.items() if of}
+
+
 def names(rows):
     """Return the codebases' names without their owners, separated by commas."""
     return ", ".join(row["codebase"].split("/")[1] for row in rows)
@@ -79,14 +86,24 @@ def verdict_table(blind):
 
 
 def round_table(blind):
-    """Return the table of rounds, with the rules that each of them met."""
+    """Return the table of rounds, with the rules that each of them met; the older ones in one row."""
     lines = ["| round | rules of | codebases | right |", "| --- | --- | --- | --- |"]
+    recent = recent_from(blind)
+    older = [row for row in blind if int(row["round"]) < recent]
+    rounds = [(f"1 to {recent - 1}", "commits 77fafa3 to 5b5f38e: [rounds.csv](compatibility/rounds.csv)", older)]
     for entry in read("rounds.csv"):
-        rows = [row for row in blind if row["round"] == entry["round"]]
-        if rows:
-            right = sum(row["first"] == "right" for row in rows)
-            lines.append(f"| {entry['round']} | {entry['rules']} | {len(rows)} | {right} |")
+        if int(entry["round"]) >= recent:
+            rounds.append((entry["round"], entry["rules"], [row for row in blind if row["round"] == entry["round"]]))
+    lines += [
+        f"| {name} | {rules} | {len(rows)} | {sum(r['first'] == 'right' for r in rows)} |"
+        for name, rules, rows in rounds
+    ]
     return "\n".join(lines)
+
+
+def recent_from(blind):
+    """Return the first of the last thirteen rounds."""
+    return max(int(row["round"]) for row in blind) - 12
 
 
 def parts_that_decide(kind):
@@ -107,7 +124,8 @@ def figures():
     blind = [row for row in rows if row["round"] != "0"]
     known = [row for row in rows if row["known"]]
     last = max(int(row["round"]) for row in blind)
-    recent = [row for row in blind if int(row["round"]) > last - 13]
+    recent = [row for row in blind if int(row["round"]) >= recent_from(blind)]
+    latest = [row for row in blind if int(row["round"]) == last]
     split = [row for row in blind if 6 <= int(row["round"]) <= 11]
     first = Counter(row["first"] for row in blind)
     now = Counter(row["now"] for row in rows)
@@ -121,10 +139,15 @@ def figures():
         "now_right": now["right"],
         "now_right_rate": rate(now["right"], len(rows)),
         "recent": right_of(recent),
-        "recent_first": last - 12,
+        "recent_first": recent_from(blind),
         "recent_last": last,
         "recent_wrong": sum(row["first"] == "wrong term" for row in recent),
         "latest": right_of([row for row in blind if int(row["round"]) > last - 4]),
+        "last": right_of(latest),
+        "last_wrong": sum(row["first"] == "wrong term" for row in latest),
+        "last_alarms": sum(row["first"] == "false alarm" for row in latest),
+        "last_now": sum(row["now"] == "right" for row in latest),
+        "last_kinds": ", ".join(f"{kind} {right_of(rows)}" for kind, rows in by_kind(latest).items()),
         "static": right_of([row for row in split if row["kind"] == "static"]),
         "rest": right_of([row for row in split if row["kind"] != "static"]),
         "verdicts": verdict_table(blind),

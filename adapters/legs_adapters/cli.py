@@ -147,6 +147,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "provably the SSIM of 3DGS",
     )
     terms.add_argument(
+        "--masks",
+        action="store_true",
+        help="also write the line that hides masked pixels from every other term of the step",
+    )
+    terms.add_argument(
         "--explain", action=_Explain, nargs="?", metavar="RULE", help="explain a rule, or list the rules, and exit"
     )
     safety = parser.add_argument_group("advanced: safety and scripts")
@@ -185,7 +190,7 @@ def _patch(args: argparse.Namespace) -> int:
     chosen = any(value is not None for value in given.values())
     if not chosen and (root / SETTINGS_FILE).exists():
         settings = None  # the user's, or an earlier run's: it stays
-    found = plan(root, args.exclude, [_site(root, text) for text in args.site], ssim=args.ssim)
+    found = plan(root, args.exclude, [_site(root, text) for text in args.site], ssim=args.ssim, masks=args.masks)
     problems, nothing = found.findings.problems, not found.after
     if not found.findings.sites and not found.findings.patched:
         settings = None

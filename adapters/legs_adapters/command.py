@@ -20,6 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--cpu", action="store_true", help="run without a GPU, with shims for CUDA modules")
     parser.add_argument("--ssim", action="store_true", help="also compute the SSIM of the loss by legs_loss.ssim")
+    parser.add_argument("--masks", action="store_true", help="also hide masked pixels from the other terms of the loss")
     parser.add_argument("script", metavar="SCRIPT", help="the training script")
     parser.add_argument("arguments", metavar="...", nargs=argparse.REMAINDER, help="its own arguments")
 
@@ -37,12 +38,12 @@ def run(args: argparse.Namespace) -> int:
         if error.name != "libcst":
             raise
         raise LegsError("legs run needs LibCST: pip install 'legs-loss[patch]'") from None
-    return run_script(args.script, args.arguments, args.cpu, args.ssim)
+    return run_script(args.script, args.arguments, args.cpu, args.ssim, args.masks)
 
 
 def _refuse_ours(script: str, arguments: Sequence[str]) -> None:
     """Raise for `legs run train.py --cpu`: what stands behind the script is the script's own."""
-    ours = [word for word in arguments if word in ("--cpu", "--ssim")]
+    ours = [word for word in arguments if word in ("--cpu", "--ssim", "--masks")]
     if ours and os.path.isfile(script):
         with open(script, encoding="utf-8", errors="replace") as file:
             text = file.read()

@@ -54,7 +54,7 @@ def rewrite(
         LegsError: an edit would not parse (a bug of legs-patch; nothing is written then).
     """
     name, imported = _package_name(module)
-    edits = [edit for site in sites for edit in _site_edits(Text(source, site.scope), site, name)]
+    edits = [edit for site in sites for edit in _site_edits(Text(source, site.scope), site, name, in_place)]
     edits += [edit for call in kept for edit in _kept_edits(Text(source, call.scope), call, name)]
     if (sites or kept) and not imported:
         edits.append(_Import(Text(source, module.top)).edit(name, in_place))
@@ -77,11 +77,11 @@ def _parses(text: str) -> bool:
     return True
 
 
-def _site_edits(text: Text, site: Site, package: str) -> List[Edit]:
+def _site_edits(text: Text, site: Site, package: str, in_place: bool) -> List[Edit]:
     """Return the edits of one site."""
     form = site.form.moved(on_one_line(site.form.selection))
     where = f"{site.path}:{site.line}"
-    writing = Writing(package, site.swapped, on_one_line(site.selection), where)
+    writing = Writing(package, site.swapped, on_one_line(site.selection), where, in_place)
     return form.edits(text, writing)
 
 

@@ -62,6 +62,7 @@ def plan(
     by_hand: Sequence[Tuple[str, int]] = (),
     in_place: bool = False,
     ssim: bool = False,
+    masks: bool = False,
 ) -> Plan:
     """Compute a patch, and write nothing.
 
@@ -71,6 +72,7 @@ def plan(
         by_hand: (relative path, line) of the sites; the others are not sites then.
         in_place: keep every line's number (for running in memory).
         ssim: rewrite the SSIM terms, too.
+        masks: mask the renderings of every term, too.
 
     Raises:
         LegsError: no such folder; a site named by hand is not there; an expression that is nested too deeply.
@@ -79,7 +81,7 @@ def plan(
     files = read_files(root, exclude)
     edits: Dict[str, List[Edit]] = {}
     with _deep_recursion():
-        findings = find(files.readable, by_hand, files.unread, ssim)
+        findings = find(files.readable, by_hand, files.unread, ssim, masks)
         for name in sorted({site.path for site in findings.sites} | {call.path for call in findings.kept}):
             try:
                 edits[name] = _edits(findings, name, in_place)

@@ -61,7 +61,7 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
                 "column": site.column,
                 "function": site.function,
                 "code": one_line(site.form.node),
-                **({} if site.form.weighs else {"term": "ssim"}),
+                **({} if site.form.weighs else {"term": site.form.term}),
             }
             for site in found.sites
         ],

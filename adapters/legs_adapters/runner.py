@@ -42,7 +42,9 @@ def checkout_of(script: Path) -> Path:
     return folder
 
 
-def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bool = False, ssim: bool = False) -> int:
+def run_script(
+    script: str | os.PathLike[str], arguments: Sequence[str], cpu: bool = False, ssim: bool = False, masks: bool = False
+) -> int:
     """Run a script as ``python script arguments`` does, with the LEGS loss in it.
 
     Args:
@@ -50,6 +52,7 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
         arguments: its arguments.
         cpu: run it without a GPU: CUDA calls run on the CPU, and a shim replaces its rasterizer.
         ssim: let legs_loss.ssim compute the training step's SSIM where that is 3DGS's.
+        masks: hide masked pixels from every other term of the step.
 
     Returns:
         The exit code, where the script does not leave by ``sys.exit`` (which goes on as it is).
@@ -63,7 +66,7 @@ def run_script(script: str | os.PathLike[str], arguments: Sequence[str], cpu: bo
         raise LegsError(f"{script} is not a file: give the training script")
     find_config(path, argv=[])  # report wrong settings now, not at the first training step
     root = check_root(checkout_of(path))
-    found = plan(root, in_place=True, ssim=ssim)
+    found = plan(root, in_place=True, ssim=ssim, masks=masks)
     for problem in found.findings.problems:
         text = f"{problem.path}:{problem.line}: {problem.reason}; edit it by hand: {problem.advice}"
         if not found.after and not found.findings.patched:

@@ -14,12 +14,12 @@ CASES = ROOT / "tests" / "patching"
 SITE = "        Ll1 = l1_loss(image, gt_image)\n"
 PATCHED = "        Ll1 = legs_loss.l1_loss(image, gt_image)\n"
 NAMES = sorted(path.stem for path in CASES.glob("*.txt") if path.stem != "common")
-_MARK = re.compile(r"^\s*# (weighted|plain|fused|left|error): (.*)$")
+_MARK = re.compile(r"^\s*# (weighted|plain|fused|masked|left|error): (.*)$")
 
 
-def with_ssim(name):
-    """Return whether a case is of legs-patch --ssim."""
-    return name.startswith("ssim")
+def options(name):
+    """Return what a case is planned with: those of --ssim and of --masks are named so."""
+    return {"ssim": name.startswith("ssim"), "masks": name.startswith("masks")}
 
 
 def files(name):
@@ -32,13 +32,16 @@ def files(name):
     return found
 
 
-def expected(texts):
-    """Return {(path, line): (verdict, detail)} from the comments."""
+def expected(texts, masked=False):
+    """Return {(path, line): (verdict, detail)} from the comments; on request of the lines that mask, and no others."""
     marks = {}
     for path, text in texts.items():
-        for number, line in enumerate(text.splitlines(), 1):
+        lines = text.splitlines()
+        for number, line in enumerate(lines, 1):
             match = _MARK.match(line)
-            if match:
+            if match and (match.group(1) == "masked") == masked:
+                while masked and lines[number].lstrip().startswith("#"):
+                    number += 1
                 marks[path, number + 1] = match.group(1), match.group(2)
     return marks
 

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from legs_adapters.code.sources import decode
 from legs_adapters.plan import plan
 from legs_adapters.terms.functions import L1Functions
 
-from tests.patcher.support import NAMES, checkout, expected, files, legs_patch, with_ssim
+from tests.patcher.support import NAMES, checkout, expected, files, legs_patch, options
+
+MASKS = re.compile(r"\s*\w+ = legs_loss\.masked\(")
 
 
 def changed_lines(found, path):
-    """Return the lines of a file after the patch, without the import: numbered as before."""
+    """Return the lines of a file after the patch, without those that it adds: numbered as before."""
     lines = decode(path, found.after[path]).text.splitlines()
-    return [line for line in lines if not line.startswith("import legs_loss")]
+    return [line for line in lines if not line.startswith("import legs_loss") and not MASKS.match(line)]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_term_gets_the_verdict_that_its_comment_asks_for(name, tmp_path):
     texts = files(name)
-    found = plan(checkout(tmp_path, texts), ssim=with_ssim(name))
+    found = plan(checkout(tmp_path, texts), **options(name))
     verdicts = {}
-    for site in found.findings.sites:
+    for site in (site for site in found.findings.sites if site.form.term != "mask"):
         becomes = "weighted" if site.form.weighs else "fused"
         verdicts[site.path, site.line] = becomes, changed_lines(found, site.path)[site.line - 1].strip()
     for kept in found.findings.kept:
@@ -41,27 +45,45 @@ def test_every_term_gets_the_verdict_that_its_comment_asks_for(name, tmp_path):
             assert verdicts[where][1] == detail
 
 
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("masks")])
+def test_the_line_of_masks_is_written_where_its_comment_says(name, tmp_path):
+    texts = files(name)
+    found = plan(checkout(tmp_path, texts), masks=True)
+    written, waiting, plain = {}, "", 1
+    for line in found.after["train.py"].decode().splitlines():
+        if MASKS.match(line):
+            waiting = line.strip()
+        elif not line.startswith("import legs_loss"):
+            if waiting and not line.lstrip().startswith("#"):
+                written["train.py", plain], waiting = ("masked", waiting), ""
+            plain += 1
+    assert written == expected(texts, masked=True)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_the_patched_files_compile_and_a_second_patch_finds_nothing(name, tmp_path):
-    found = plan(checkout(tmp_path, files(name)), ssim=with_ssim(name))
+    found = plan(checkout(tmp_path, files(name)), **options(name))
     for path, data in found.after.items():
         compile(data, path, "exec")
         (tmp_path / path).write_bytes(data)
-    assert plan(tmp_path, ssim=with_ssim(name)).after == {}
+    assert plan(tmp_path, **options(name)).after == {}
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_in_place_every_line_keeps_its_number(name, tmp_path):
     root = checkout(tmp_path, files(name))
-    ssim = with_ssim(name)
-    here, on_disk = plan(root, in_place=True, ssim=ssim), plan(root, ssim=ssim)
+    here, on_disk = (plan(root, in_place=in_place, **options(name)) for in_place in (True, False))
     assert sorted(here.after) == sorted(on_disk.after)
     for path, data in here.after.items():
         before = (root / path).read_bytes()
-        if name != "legs_loss_name_taken_weighted":  # nothing to put the import on: its own line
+        # nothing to put the import on: its own line; or, between two compound statements, the line of masks
+        if name not in ("legs_loss_name_taken_weighted", "masks_in_other_shapes_masked"):
             assert data.count(b"\n") == before.count(b"\n")
-        edits = [edit for edit in here.edits[path] if b"import legs_loss" not in edit.after]
-        assert edits == [edit for edit in on_disk.edits[path] if b"import legs_loss" not in edit.after]
+        edits, others = (
+            [edit for edit in made.edits[path] if not re.search(rb"import legs_loss|legs_loss.masked", edit.after)]
+            for made in (here, on_disk)
+        )
+        assert edits == others
 
 
 def test_a_site_chosen_by_hand_is_the_only_one(tmp_path):

@@ -14,7 +14,7 @@ from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import arguments, dotted, loops_by_node
 
-__all__ = ["CALLED", "Class", "Function", "Module", "parse", "said"]
+__all__ = ["CALLED", "Class", "Function", "Module", "blocks_of", "parse", "said"]
 
 CALLED = ("forward", "__call__")  # what calling an instance runs: a torch module's own, and Python's
 
@@ -350,17 +350,17 @@ def _definitions(statements: Sequence[cst.CSTNode]) -> Iterator[cst.FunctionDef 
         if isinstance(node, (cst.FunctionDef, cst.ClassDef)):
             yield node
         elif isinstance(node, cst.BaseCompoundStatement):
-            for body in _bodies(node):
+            for body in blocks_of(node):
                 yield from _definitions(body)
 
 
-def _bodies(node: cst.CSTNode) -> Iterator[Sequence[cst.CSTNode]]:
-    """Yield the blocks of a compound statement."""
-    if hasattr(node, "body"):
-        yield node.body.body
+def blocks_of(node: cst.CSTNode) -> Iterator[Sequence[cst.CSTNode]]:
+    """Yield the blocks of a statement: of a compound one those of all its branches."""
+    if isinstance(getattr(node, "body", None), cst.BaseSuite):
+        yield node.body.body  # type: ignore[attr-defined]
     for clause in (*getattr(node, "handlers", ()), *getattr(node, "cases", ())):
         yield clause.body.body
     for name in ("orelse", "finalbody"):
         clause = getattr(node, name, None)
         if clause is not None:
-            yield from _bodies(clause)
+            yield from blocks_of(clause)

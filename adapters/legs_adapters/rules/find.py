@@ -16,6 +16,7 @@ from legs_adapters.code.syntax import arguments
 from legs_adapters.lexicon.words import SPEAKS_OF_L1, STRUCTURAL
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.doubts import Doubt, Doubts
+from legs_adapters.rules.masks import with_masks
 from legs_adapters.rules.structural import with_ssims
 from legs_adapters.rules.verdict import Verdicts
 from legs_adapters.terms.findings import Findings, Left, Problem, Site
@@ -37,6 +38,7 @@ def find(
     by_hand: Sequence[Tuple[str, int]] = (),
     unread: Optional[Mapping[str, str]] = None,
     ssim: bool = False,
+    masks: bool = False,
 ) -> Findings:
     """Find the photometric terms of a checkout.
 
@@ -45,9 +47,12 @@ def find(
         by_hand: (path, line) of the L1 terms that the user named as sites; nothing else is a site then.
         unread: by path, the text of files that are ignored or cannot be read.
         ssim: find the SSIM terms, too.
+        masks: find where their renderings are masked, too.
     """
-    found = _Finder(Analysis.of(sources, unread), by_hand).run()
-    return with_ssims(found, by_hand) if ssim else found
+    finder = _Finder(Analysis.of(sources, unread), by_hand)
+    found = finder.run()
+    found = with_ssims(found, by_hand) if ssim else found
+    return with_masks(found, finder.analysis) if masks else found
 
 
 class _Finder:

@@ -36,6 +36,7 @@ class Form:
         order: of several kinds that recognise a call, the one with the lowest order is used.
         is_named: whether the difference is assigned to a name first, so that no single expression can be replaced.
         weighs: whether the edit weights the term.
+        term: what it is a term of, in the JSON report.
         done: what the edit does to it, in words.
     """
 
@@ -52,6 +53,7 @@ class Form:
     order: ClassVar[int] = 0
     is_named: ClassVar[bool] = False
     weighs: ClassVar[bool] = True
+    term: ClassVar[str] = "l1"
     done: ClassVar[str] = "is weighted"
 
     @classmethod

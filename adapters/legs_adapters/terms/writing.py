@@ -24,12 +24,14 @@ class Writing(NamedTuple):
         swapped: whether the target is the first of the two sides.
         selection: the index by a mask that both images carry, with its brackets; empty without.
         where: the file and line, for errors.
+        in_place: whether every line has to keep its number.
     """
 
     package: str = PACKAGE
     swapped: bool = False
     selection: str = ""
     where: str = ""
+    in_place: bool = False
 
     def ordered(self, first: _Side, second: _Side) -> Tuple[_Side, _Side]:
         """Return the two sides as prediction and target."""

@@ -31,6 +31,7 @@ class Structural(Form):
     """
 
     weighs: ClassVar[bool] = False
+    term: ClassVar[str] = "ssim"
     done: ClassVar[str] = "is computed by legs_loss.ssim"
 
     @classmethod

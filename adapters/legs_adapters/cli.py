@@ -7,6 +7,7 @@ scoring and every other L1 are not changed. Writes legs.toml to FOLDER, and a jo
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shlex
 import sys
@@ -18,12 +19,15 @@ from legs_loss.cli import Parser
 from legs_loss.system import never_fail_to_print, say, say_error
 
 if TYPE_CHECKING:
+    from legs_adapters.code.sources import Unreadable
+    from legs_adapters.plan import Plan
     from legs_adapters.terms.findings import Problem
 
 __all__ = ["main"]
 
 HELP = "add the LEGS loss to a codebase, or remove it; the same as legs-patch"
 
+SETTINGS = ("preset", "beta", "curve", "operator", "store")
 EXIT_CODES = (
     "exit codes: 0 done, or nothing to do; 1 --check: something would change, or a term needs a manual "
     "edit, or --verify: a check failed; "
@@ -35,21 +39,21 @@ EXIT_CODES = (
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
     args = argparse.Namespace(folder="", undo=False)
-    return _reporting_errors(args, lambda: _run(_parsed(argv, args)))
+    return _exit_code(args, lambda: _run(_parser().parse_args(argv, args)))
 
 
-def _parsed(argv: Optional[Sequence[str]], args: argparse.Namespace) -> argparse.Namespace:
+def run(args: argparse.Namespace) -> int:
+    """Patch, undo or verify, as the arguments say, and return the exit code."""
+    return _exit_code(args, lambda: _run(args))
+
+
+def _parser() -> Parser:
     never_fail_to_print()
     parser = Parser(prog="legs-patch", description=__doc__)
     add_arguments(parser)
     parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
     parser.offer_completion()
-    return parser.parse_args(argv, args)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Patch, undo or verify, as the arguments say, and return the exit code."""
-    return _reporting_errors(args, lambda: _run(args))
+    return parser
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -58,21 +62,22 @@ def _run(args: argparse.Namespace) -> int:
     if args.trust is not None and not args.undo:
         raise LegsError("--trust requires --undo")
     args.before = _journal(args.folder)
-    if args.verify:
-        from legs_adapters.verify import check_verifiable
+    if args.undo:
+        return _undo(args)
+    if not args.verify:
+        return _patch(args)
+    from legs_adapters.verify import check_verifiable
 
-        check_verifiable(args.folder, args.script, args.arguments)
-        return _patch(args) or _verify(args)
-    return _undo(args) if args.undo else _patch(args)
+    script = check_verifiable(args.folder, args.script, args.arguments)
+    return _patch(args) or _verify(args, script)
 
 
-def _reporting_errors(args: argparse.Namespace, work: Callable[[], int]) -> int:
+def _exit_code(args: argparse.Namespace, work: Callable[[], int]) -> int:
     """Return the exit code of ``work``, which runs with these arguments; an error is a line on stderr."""
     try:
         return work()
     except LegsError as error:
         say_error("legs-patch", error)
-        return 2
     except KeyboardInterrupt:
         say(f"legs-patch: interrupted; {_so_far(args)}", sys.stderr)
         return 130
@@ -82,12 +87,11 @@ def _reporting_errors(args: argparse.Namespace, work: Callable[[], int]) -> int:
     except OSError as error:  # a full disk under --verify, a folder that went away
         where = f"{error.filename}: " if error.filename is not None else ""
         say(f"legs-patch: error: {where}{error.strerror or str(error)[:500]}; {_so_far(args)}", sys.stderr)
-        return 2
     except ModuleNotFoundError as error:
         if error.name != "libcst":
             raise
         say("legs-patch: error: LibCST is missing: pip install 'legs-loss[patch]'", sys.stderr)
-        return 2
+    return 2
 
 
 def _so_far(args: argparse.Namespace) -> str:
@@ -181,62 +185,60 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.code.sources import check_root
     from legs_adapters.plan import plan, write
-    from legs_adapters.report import as_diff, as_json, as_table
+    from legs_adapters.report import as_diff
     from legs_adapters.settings import SETTINGS_FILE, settings_text
 
     root = check_root(args.folder)
-    given = {name: getattr(args, name) for name in ("preset", "beta", "curve", "operator", "store")}
-    settings: Optional[str] = settings_text(root, **given)
-    chosen = any(value is not None for value in given.values())
-    if not chosen and (root / SETTINGS_FILE).exists():
-        settings = None  # the user's, or an earlier run's: it stays
+    settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
+    text = settings_text(root, settings)
     found = plan(root, args.exclude, [_site(root, text) for text in args.site], ssim=args.ssim, masks=args.masks)
-    problems, nothing = found.findings.problems, not found.after
-    if not found.findings.sites and not found.findings.patched:
-        settings = None
-    found = found._replace(settings=settings)
-    if problems and (args.strict or (not found.findings.sites and not found.findings.patched)):
-        if args.json:
-            say(as_json(found, []), end="", lines=True)
-        else:
-            say(as_table(found), end="", lines=True)
-        _left_to_the_user(problems)
-        say(
-            "legs-patch: nothing was changed (--site FILE:LINE takes your word, --exclude leaves files out)",
-            stream=sys.stderr,
-        )
+    problems, is_decided = found.findings.problems, bool(found.findings.sites or found.findings.patched)
+    if is_decided and (settings or not (root / SETTINGS_FILE).exists()):  # else the user's, or an earlier run's, stays
+        found = found._replace(settings=text)
+    if not is_decided or (problems and args.strict):
+        _show(args, found)
+        if not problems:
+            raise LegsError(
+                f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
+                + _not_read(found.findings.unreadable)
+                + _not_searched(root, args.exclude)
+            )
+        _advise(problems)
+        hint = "(--site FILE:LINE takes your word, --exclude leaves files out)"
+        say(f"legs-patch: nothing was changed {hint}", sys.stderr)
         return 2
-    if nothing and not found.findings.patched and not problems:
-        say(as_json(found, []) if args.json else as_table(found), end="", lines=True)
-        raise LegsError(
-            f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
-            + _not_looked_into(root, args.exclude)
-        )
-    changes = bool(found.after) or settings is not None
-    _left_in_doubt(found.findings.doubts)
-    if args.diff:
-        print(as_json(found, []) if args.json else as_diff(found, _colour()), end="")
-        return _left_to_the_user(problems)
-    if args.check:
-        say(as_json(found, []) if args.json else as_table(found), end="", lines=True)
-        if not args.json:
-            say("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
-        return _left_to_the_user(problems) or (1 if found.after else 0)
-    wrote = write(found, args.force) if changes else []
-    if args.json:
-        say(as_json(found, wrote), end="", lines=True)
+    for doubt in found.findings.doubts:
+        where = f"{doubt.path}:{doubt.line}"
+        say(f"legs-patch: warning: a possible loss was not weighted: {where}: {doubt.reason}", sys.stderr)
+        say(f"    {doubt.text}", sys.stderr)
+        say(f"  if it is the loss between rendering and photograph, edit it by hand: {doubt.advice}", sys.stderr)
+    wrote = [] if args.diff or args.check else write(found, args.force)
+    if args.diff and not args.json:
+        print(as_diff(found.changes(), _is_coloured()), end="")
     else:
-        say(as_table(found), end="", lines=True)
-        if wrote:
-            say("")
-            say(f"wrote {', '.join(wrote)}; undo it with: legs-patch --undo {shlex.quote(args.folder)}")
-        else:
-            say("")
-            say(f"nothing to do: {'it is patched' if found.findings.patched else 'nothing could be decided'}")
-    return _left_to_the_user(problems)
+        _show(args, found, wrote)
+    if args.check and not args.json:
+        say("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
+    elif wrote and not args.json:
+        say(f"\nwrote {', '.join(wrote)}; undo it with: legs-patch --undo {shlex.quote(args.folder)}", lines=True)
+    elif not (args.diff or args.json):
+        say("\nnothing to do: it is patched", lines=True)
+    return _advise(problems) or (1 if args.check and found.after else 0)
 
 
-def _not_looked_into(root: Path, exclude: Sequence[str]) -> str:
+def _show(args: argparse.Namespace, found: Plan, wrote: Sequence[str] = ()) -> None:
+    from legs_adapters.report import as_json, as_table
+
+    say(as_json(found, wrote) if args.json else as_table(found), end="", lines=True)
+
+
+def _not_read(files: Sequence[Unreadable]) -> str:
+    """Name the first of the files that may have the term and could not be read."""
+    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return f"; not read: {files[0].path}: {files[0].reason}{more}" if files else ""
+
+
+def _not_searched(root: Path, exclude: Sequence[str]) -> str:
     """Name the folders that may have the term and that legs-patch skips by default."""
     from legs_adapters.terms.other_folders import not_entered
 
@@ -249,23 +251,19 @@ def _not_looked_into(root: Path, exclude: Sequence[str]) -> str:
     return f"; not searched: {shown}{more}: run legs-patch on {which}"
 
 
-def _verify(args: argparse.Namespace) -> int:
-    import json
-
+def _verify(args: argparse.Namespace, script: str) -> int:
     from legs_adapters.verify import verify
 
-    verdict = verify(args.folder, args.script, args.arguments, args.iterations)
+    verdict = verify(args.folder, script, args.arguments, args.iterations)
     if args.json:
         say(json.dumps({"holds": verdict.claims, "runs": {name: run._asdict() for name, run in verdict.runs.items()}}))
     else:
         say("\n" + verdict.text(), end="", lines=True)
-    return 0 if verdict.holds else 1
+    return 0 if all(verdict.claims.values()) else 1
 
 
 def _undo(args: argparse.Namespace) -> int:
-    import json
-
-    from legs_adapters.report import changes_as_diff
+    from legs_adapters.report import as_diff
     from legs_adapters.undo import undo
 
     done = undo(args.folder, args.force, args.trust, look=args.diff)
@@ -273,11 +271,11 @@ def _undo(args: argparse.Namespace) -> int:
         say(json.dumps({"restored": done.restored, "removed": done.removed, "kept": done.kept}, indent=2), lines=True)
         return 0
     if args.diff:
-        print(changes_as_diff(done.changes, _colour()), end="")
-    for name in () if args.diff else done.restored:
-        say(f"restored {name}")
-    for name in () if args.diff else done.removed:
-        say(f"removed {name}")
+        print(as_diff(done.changes, _is_coloured()), end="")
+    else:
+        for what, names in (("restored", done.restored), ("removed", done.removed)):
+            for name in names:
+                say(f"{what} {name}")
     for name, reason in done.kept:
         say(f"kept {name}: {reason}", stream=sys.stderr if args.diff else sys.stdout)
     return 0
@@ -292,7 +290,7 @@ def _journal(folder: str) -> bytes:
     return repr((found.st_ino, found.st_size, found.st_mtime_ns)).encode()
 
 
-def _left_to_the_user(problems: Sequence[Problem]) -> int:
+def _advise(problems: Sequence[Problem]) -> int:
     """Print the terms that need a manual edit to stderr; return the exit code."""
     for problem in problems:
         say(f"legs-patch: error: {problem.path}:{problem.line}: {problem.reason}", sys.stderr)
@@ -300,15 +298,6 @@ def _left_to_the_user(problems: Sequence[Problem]) -> int:
         say(f"  if this is the loss between rendering and photograph, edit it by hand: {problem.advice}", sys.stderr)
         say("  (rendering first), and import legs_loss at the top", sys.stderr)
     return 1 if problems else 0
-
-
-def _left_in_doubt(doubts: Sequence[Problem]) -> None:
-    """Warn on stderr of skipped terms in training files that have no weighted term."""
-    for doubt in doubts:
-        where = f"{doubt.path}:{doubt.line}"
-        say(f"legs-patch: warning: a possible loss was not weighted: {where}: {doubt.reason}", sys.stderr)
-        say(f"    {doubt.text}", sys.stderr)
-        say(f"  if it is the loss between rendering and photograph, edit it by hand: {doubt.advice}", sys.stderr)
 
 
 def _site(root: Path, text: str) -> Tuple[str, int]:
@@ -322,7 +311,7 @@ def _site(root: Path, text: str) -> Tuple[str, int]:
     raise LegsError(f"--site {text}: there is no such file in {root}")
 
 
-def _colour() -> bool:
+def _is_coloured() -> bool:
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 

@@ -14,17 +14,18 @@ import zlib
 from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 
-from legs_adapters.checkout.replace import LARGEST, read_file
+from legs_adapters.checkout.replace import MAX_FILE_BYTES, read_file
 from legs_adapters.checkout.seal import is_sealed, seal
 from legs_adapters.code.folders import check_name
+from legs_adapters.code.limits import MAX_BYTES
 from legs_adapters.settings import SETTINGS_FILE
 from legs_loss import LegsError
 
 __all__ = ["JOURNAL", "Journal", "Layer", "digest"]
 
 JOURNAL = ".legs-patch.json"
+MAX_EDITS = 100_000
 _VERSION = 1
-_MOST = 1000  # patches of one file
 _NOTE = "What legs-patch changed here, and the bytes from before. legs-patch --undo needs it; do not edit it."
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
@@ -45,71 +46,73 @@ class Layer(NamedTuple):
         return b"".join([*parts, self.original[at:]])
 
 
-class Journal:
+class Journal(NamedTuple):
     """The patches of one checkout.
 
     Attributes:
         files: for each patched path its layers, the oldest first.
         created: files that a patch created, with the checksum of what it wrote.
         data: the file's bytes as they were read; None where there was no journal.
-        ours: whether this user wrote it; an empty journal is.
+        is_own: whether this user wrote it; an empty journal is.
     """
 
-    def __init__(
-        self, files: Dict[str, List[Layer]], created: Dict[str, str], data: Optional[bytes] = None, ours: bool = True
-    ) -> None:
-        self.files = files
-        self.created = created
-        self.data = data
-        self.ours = ours
+    files: Dict[str, List[Layer]]
+    created: Dict[str, str]
+    data: Optional[bytes] = None
+    is_own: bool = True
 
     @classmethod
     def read(cls, root: Path) -> Journal:
         """Read a checkout's journal, of any author; an empty one if there is no file.
 
         Raises:
-            LegsError: it cannot be read, or names files that legs-patch never writes.
+            LegsError: it cannot be read, has too many edits, or names files that legs-patch never writes.
         """
         data = read_file(root, JOURNAL)
         if data is None:
             return cls({}, {})
-        path = root / JOURNAL
         try:
+            if data.count(b"[") + data.count(b"{") > MAX_EDITS:  # before any of it is an object in memory
+                raise ValueError(f"more than {MAX_EDITS} edits")
             content = json.loads(data.decode("utf-8"))
             if content["version"] != _VERSION:
-                raise LegsError(f"{path} was written by another version of legs-patch: undo with that version")
-            claimed = content.pop("seal", None)
-            ours = is_sealed(_canonical(content), claimed, root)
-            files, created = _read_files(content["files"]), _read_created(content["created"])
-        except LegsError as error:
-            raise LegsError(f"{error}; {path}: nothing was changed" if str(path) not in str(error) else error) from None
-        except (ValueError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
-            raise LegsError(f"{path} cannot be read ({error}): restore the files from git, and remove it") from None
-        return cls(files, created, data, ours)
+                raise ValueError("written by another version of legs-patch: undo with that version")
+            is_own = is_sealed(_canonical(content), content.pop("seal", None), root)
+            files = _read_files(content["files"])
+            created = {_only(name, name == SETTINGS_FILE): _checksum(at) for name, at in content["created"].items()}
+        except (LegsError, ValueError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
+            advice = "nothing was changed; restore the files from git, and remove it"
+            raise LegsError(f"{root / JOURNAL} cannot be read ({error}): {advice}") from None
+        return cls(files, created, data, is_own)
 
     def dump(self, root: Path) -> bytes:
         """Return the file's content, sealed; without a seal where this machine keeps no key."""
-        content: Dict[str, Any] = {
-            "note": _NOTE,
-            "version": _VERSION,
-            "files": {
-                name: [
-                    {"after": layer.after, "edits": layer.edits, "original": _pack(layer.original)} for layer in layers
-                ]
-                for name, layers in sorted(self.files.items())
-            },
-            "created": dict(sorted(self.created.items())),
+        files = {
+            path: [
+                {
+                    "after": layer.after,
+                    "edits": layer.edits,
+                    "original": base64.b64encode(zlib.compress(layer.original, 9)).decode("ascii"),
+                }
+                for layer in layers
+            ]
+            for path, layers in sorted(self.files.items())
         }
+        content: Dict[str, Any] = {"note": _NOTE, "version": _VERSION, "files": files, "created": self.created}
         sealed = seal(_canonical(content), root)
         if sealed is not None:
             content["seal"] = sealed
-        return (json.dumps(content, indent=1) + "\n").encode("utf-8")
+        data = (json.dumps(content, indent=1) + "\n").encode("utf-8")
+        if len(data) > MAX_FILE_BYTES:
+            raise LegsError(
+                f"{JOURNAL} would be larger than {MAX_FILE_BYTES >> 20} MiB: undo the earlier patches first"
+            )
+        return data
 
-    def wrote(self, path: str, data: bytes) -> bool:
+    def is_as_written(self, path: str, data: bytes) -> bool:
         """Return whether a file's bytes are as the patch left them."""
         layers = self.files.get(path)
-        known = layers[-1].after if layers else self.created.get(path)
-        return known == digest(data)
+        return (layers[-1].after if layers else self.created.get(path)) == digest(data)
 
     @property
     def name(self) -> str:
@@ -122,20 +125,17 @@ def digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _canonical(content: Any) -> bytes:
-    return json.dumps(content, sort_keys=True, separators=(",", ":")).encode("ascii")
+def _canonical(content: Dict[str, Any]) -> bytes:
+    unsealed = {key: value for key, value in content.items() if key != "seal"}
+    return json.dumps(unsealed, sort_keys=True, separators=(",", ":")).encode("ascii")
 
 
 def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
     files: Dict[str, List[Layer]] = {}
-    room = LARGEST
+    room = MAX_BYTES
     for name, layers in content.items():
         check_name(name)
-        if not name.endswith(".py"):
-            raise LegsError(f"{name!r} is not a Python file, and legs-patch patches no others")
-        files[name] = []
-        if len(layers) > _MOST:
-            raise ValueError(f"{name} was patched {len(layers)} times")
+        files[_only(name, name.endswith(".py"))] = []
         for layer in layers:
             files[name].append(_read_layer(layer, room))
             room -= len(files[name][-1].original)
@@ -143,7 +143,11 @@ def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
 
 
 def _read_layer(content: Dict[str, Any], room: int) -> Layer:
-    original = _unpack(content["original"], room)
+    """Read a layer whose file has at most ``room`` bytes."""
+    stream = zlib.decompressobj()
+    original = stream.decompress(base64.b64decode(content["original"], validate=True), room + 1)
+    if len(original) > room or not stream.eof:
+        raise ValueError(f"a file is cut off, or all are larger than {MAX_BYTES >> 20} MiB")
     edits: List[Tuple[int, int, str]] = []
     at = 0
     for start, end, text in sorted(content["edits"]):
@@ -155,29 +159,13 @@ def _read_layer(content: Dict[str, Any], room: int) -> Layer:
     return Layer(original, tuple(edits), _checksum(content["after"]))
 
 
-def _read_created(content: Dict[str, Any]) -> Dict[str, str]:
-    for name in content:
-        if name != SETTINGS_FILE:
-            raise LegsError(f"{name!r} is not {SETTINGS_FILE}, and legs-patch creates no other file")
-    return {name: _checksum(value) for name, value in content.items()}
+def _only(name: str, is_written: bool) -> str:
+    if not is_written:
+        raise ValueError(f"{name!r} is not a Python file or {SETTINGS_FILE}, and legs-patch writes no others")
+    return name
 
 
 def _checksum(value: Any) -> str:
     if not isinstance(value, str) or not _DIGEST.fullmatch(value):
         raise ValueError("an invalid checksum")
     return value
-
-
-def _pack(data: bytes) -> str:
-    return base64.b64encode(zlib.compress(data, 9)).decode("ascii")
-
-
-def _unpack(text: str, room: int) -> bytes:
-    """Decompress a file, up to a size limit."""
-    stream = zlib.decompressobj()
-    data = stream.decompress(base64.b64decode(text, validate=True), max(room, 0) + 1)
-    if len(data) > room:
-        raise ValueError(f"its files are larger than {LARGEST >> 20} MiB")
-    if not stream.eof:
-        raise ValueError("a file is truncated")
-    return data

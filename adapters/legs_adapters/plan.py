@@ -12,7 +12,7 @@ from legs_adapters.checkout.git import changed_files
 from legs_adapters.checkout.replace import locked, read_file, replace_files
 from legs_adapters.code.folders import why_left_out
 from legs_adapters.code.sources import Unreadable, check_root, read_files
-from legs_adapters.edit import Edit, apply_edits, rewrite
+from legs_adapters.edit import Edit, apply_edits, rewrite, why_not_compiled
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_adapters.rules.find import find
 from legs_adapters.settings import SETTINGS_FILE
@@ -38,6 +38,21 @@ class Plan(NamedTuple):
     edits: Dict[str, List[Edit]]
     after: Dict[str, bytes]
     settings: Optional[str] = None
+
+    def source(self, path: str) -> bytes:
+        """Return a file's bytes as they were read."""
+        return self.findings.program.sources[path].data
+
+    def changes(self) -> Dict[str, Tuple[Optional[bytes], bytes]]:
+        """Return by path the bytes before (None: no file) and after, of files that differ."""
+        changes: Dict[str, Tuple[Optional[bytes], bytes]] = {
+            path: (self.source(path), after) for path, after in self.after.items()
+        }
+        if self.settings is not None:
+            before, after = read_file(self.root, SETTINGS_FILE), self.settings.encode("utf-8")
+            if before != after:
+                changes[SETTINGS_FILE] = before, after
+        return changes
 
 
 @contextlib.contextmanager
@@ -82,36 +97,51 @@ def plan(
     edits: Dict[str, List[Edit]] = {}
     with _deep_recursion():
         findings = find(files.readable, by_hand, files.unread, ssim, masks)
-        for name in sorted({site.path for site in findings.sites} | {call.path for call in findings.kept}):
+        for name in _files_to_edit(findings):
+            why = why_not_compiled(findings.program.sources[name].data)
+            if why:
+                _give_up(findings, name, why)
+        for name in _files_to_edit(findings):
+            sites = [site for site in findings.sites if site.path == name]
+            kept = [call for call in findings.kept if call.path == name]
             try:
-                edits[name] = _edits(findings, name, in_place)
+                edits[name] = rewrite(findings.program, name, sites, kept, in_place)
             except RecursionError:
-                findings.without([name])
-                findings.unreadable.append(Unreadable(name, "is nested too deeply"))
+                _give_up(findings, name, "is nested too deeply")
     findings.unreadable[:0] = files.unreadable
     for name, line in by_hand:
-        if not any(site.path == name and site.named_by(line) for site in findings.sites) and not any(
-            left.path == name and left.line == line for left in findings.patched
-        ):
-            why = next((entry.reason for entry in findings.unreadable if entry.path == name), None)
-            why = why_left_out(root, name, exclude) or why
-            if why is not None:
-                raise LegsError(f"{name}:{line}: {why}")
-            for problem in findings.problems:
-                if (problem.path, problem.line) == (name, line):
-                    raise LegsError(f"{name}:{line}: {problem.reason}; write there: {problem.advice}")
-            raise LegsError(f"there is no difference, absolute value or call of two images at {name}:{line}")
+        _check_named(root, findings, name, line, exclude)
     after = {name: apply_edits(findings.program.sources[name].data, made) for name, made in edits.items()}
     return Plan(root, findings, edits, after)
 
 
-def _edits(findings: Findings, name: str, in_place: bool) -> List[Edit]:
-    """Return the edits of one file."""
-    source, module = findings.program.sources[name], findings.program.module(name)
-    assert module is not None
-    sites = [site for site in findings.sites if site.path == name]
-    kept = [call for call in findings.kept if call.path == name]
-    return rewrite(source, module, sites, kept, in_place)
+def _check_named(root: Path, findings: Findings, name: str, line: int, exclude: Sequence[str]) -> None:
+    """Raise a LegsError that says why a site that was named by hand is none."""
+    is_site = any(site.path == name and site.named_by(line) for site in findings.sites)
+    if is_site or (name, line) in [(entry.path, entry.line) for entry in findings.patched]:
+        return
+    reasons = [why_left_out(root, name, exclude), *(one.reason for one in findings.unreadable if one.path == name)]
+    reasons += [
+        f"{problem.reason}; write there: {problem.advice}"
+        for problem in findings.problems
+        if (problem.path, problem.line) == (name, line)
+    ]
+    found = next((reason for reason in reasons if reason is not None), None)
+    raise LegsError(
+        f"{name}:{line}: {found}"
+        if found is not None
+        else f"there is no difference, absolute value or call of two images at {name}:{line}"
+    )
+
+
+def _files_to_edit(findings: Findings) -> List[str]:
+    return sorted({site.path for site in findings.sites} | {call.path for call in findings.kept})
+
+
+def _give_up(findings: Findings, name: str, why: str) -> None:
+    """Leave a file out that was found in, and report it as not read."""
+    findings.without([name])
+    findings.unreadable.append(Unreadable(name, why))
 
 
 def write(plan: Plan, force: bool = False) -> List[str]:
@@ -126,26 +156,26 @@ def write(plan: Plan, force: bool = False) -> List[str]:
         return []
     with locked(root, f"legs-patch {root}"):
         journal = Journal.read(root)
-        dirty = [] if force else [name for name in changed_files(root) if not _is_patched(root, name, journal)]
-        changes: Dict[str, Tuple[Optional[bytes], Optional[bytes]]] = {}
-        for path, data in plan.after.items():
-            source = plan.findings.program.sources[path]
-            edits = tuple((edit.start, edit.end, edit.after.decode("utf-8")) for edit in sorted(plan.edits[path]))
-            journal.files.setdefault(path, []).append(Layer(source.data, edits, digest(data)))
-            changes[path] = (source.data, data)
-        settings = _settings_change(plan, journal)
-        if settings is not None:
-            changes[SETTINGS_FILE] = settings
+        changed = [] if force else [name for name in changed_files(root) if not _is_patched(root, name, journal)]
+        changes = plan.changes()
+        if SETTINGS_FILE in changes:
+            current, data = changes[SETTINGS_FILE]
+            if current is not None and not journal.is_as_written(SETTINGS_FILE, current):
+                raise LegsError(f"{SETTINGS_FILE} exists and is not as legs-patch wrote it: change the settings in it")
+            journal.created[SETTINGS_FILE] = digest(data)
         if not changes:
             return []
-        if not journal.ours:
+        if not journal.is_own:
             raise LegsError(
                 f"{root / JOURNAL} is not yours: this checkout was patched by someone else, or on another machine; "
                 f"nothing was changed. Undo that patch first: see legs-patch --undo {root}"
             )
-        if dirty:
-            shown = ", ".join(dirty[:5]) + (f" and {len(dirty) - 5} more" if len(dirty) > 5 else "")
+        if changed:
+            shown = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
             raise LegsError(f"the git tree has uncommitted changes ({shown}): commit them, or use --force")
+        for path, data in plan.after.items():
+            edits = tuple((edit.start, edit.end, edit.after.decode("utf-8")) for edit in sorted(plan.edits[path]))
+            journal.files.setdefault(path, []).append(Layer(plan.source(path), edits, digest(data)))
         # The journal is written first, so that --undo works whatever happens next.
         replace_files(root, {JOURNAL: (journal.data, journal.dump(root)), **changes})
     return list(changes)
@@ -157,17 +187,4 @@ def _is_patched(root: Path, path: str, journal: Journal) -> bool:
         data = read_file(root, path)
     except LegsError:
         return False
-    return data is not None and journal.wrote(path, data)
-
-
-def _settings_change(plan: Plan, journal: Journal) -> Optional[Tuple[Optional[bytes], Optional[bytes]]]:
-    if plan.settings is None:
-        return None
-    data = plan.settings.encode("utf-8")
-    current = read_file(plan.root, SETTINGS_FILE)
-    if current == data:
-        return None
-    if current is not None and not journal.wrote(SETTINGS_FILE, current):
-        raise LegsError(f"{SETTINGS_FILE} exists and is not as legs-patch wrote it: change the settings in it")
-    journal.created[SETTINGS_FILE] = digest(data)
-    return current, data
+    return data is not None and journal.is_as_written(path, data)

@@ -3,55 +3,53 @@
 from __future__ import annotations
 
 import json
-from typing import Dict, List, Mapping, Optional, Sequence, Tuple
+import re
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
-from legs_adapters.checkout.comparing import Effort, unified_diff
+from legs_adapters.checkout.comparing import Comparison
+from legs_adapters.checkout.replace import Changes
 from legs_adapters.code.syntax import one_line
 from legs_adapters.plan import Plan
-from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.terms.findings import Left
 from legs_loss.system import printable
 
-__all__ = ["as_diff", "as_json", "as_table", "changes_as_diff"]
+__all__ = ["as_diff", "as_json", "as_table"]
 
-
-_RED, _GREEN, _CYAN, _BOLD, _PLAIN = "\033[31m", "\033[32m", "\033[36m", "\033[1m", "\033[0m"
+_COLOURS = {"+++": 1, "---": 1, "+": 32, "-": 31, "@": 36}  # by how a line begins: bold, green, red, cyan
 
 
 def as_table(plan: Plan) -> str:
     """Return one line for every L1 term: its place, the verdict, and the reason."""
-    rows: List[Tuple[str, int, str, str]] = []
     found = plan.findings
-    for site in found.sites:
-        rows.append((site.path, site.line, "patched", site.why))
+    rows: List[Tuple[str, int, str, str]] = [(site.path, site.line, "patched", site.why) for site in found.sites]
     for kept, site in found.kept.items():
         why = f"{kept.reason}: {kept.function} is weighted at {site.path}:{site.line}, in this call it is not"
         rows.append((kept.path, kept.line, "plain", why))
     rows += [(entry.path, entry.line, "already patched", "") for entry in found.patched]
-    rows += [(entry.path, entry.line, f"skipped ({entry.reason})", _decided(entry)) for entry in found.left]
+    rows += [(entry.path, entry.line, f"skipped ({entry.reason})", _why_left(entry)) for entry in found.left]
     rows += [(entry.path, entry.line, "ERROR", entry.reason) for entry in found.problems]
-    rows.sort()
-    table = [(printable(f"{path}:{line}"), what, printable(why)) for path, line, what, why in rows]
+    table = [(printable(f"{path}:{line}"), what, printable(why)) for path, line, what, why in sorted(rows)]
     table += [(printable(entry.path), "not read", printable(entry.reason)) for entry in found.unreadable]
-    if not table:
-        return ""
-    wide, wider = (max(len(row[column]) for row in table) for column in (0, 1))
+    wide, wider = (max((len(row[column]) for row in table), default=0) for column in (0, 1))
     return "".join(f"{where:<{wide}}  {what:<{wider}}  {why}".rstrip() + "\n" for where, what, why in table)
 
 
-def _decided(left: Left) -> str:
+def _why_left(left: Left) -> str:
     """Return the rule that skips a term, and the first deciding line."""
     if left.evidence is None:
         return ""
     path, line, text = left.because[0]
     here = f"line {line}" if path == left.path else f"{path}:{line}"
-    text = text if len(text) <= 60 else text[:57] + "..."
-    return f"rule {left.evidence.rule}, {here}: {text}"
+    return f"rule {left.evidence.rule}, {here}: {text if len(text) <= 60 else text[:57] + '...'}"
 
 
 def as_json(plan: Plan, wrote: Sequence[str]) -> str:
     """Return all of it for a script; see docs/patching.md for the fields."""
     found = plan.findings
+
+    def line(entry: Any, **more: object) -> Dict[str, object]:
+        return {"file": entry.path, "line": entry.line, "code": entry.text, **more}
+
     content: Dict[str, object] = {
         "root": str(plan.root),
         "sites": [
@@ -66,85 +64,43 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
             for site in found.sites
         ],
         "plain": [
-            {
-                "file": kept.path,
-                "line": kept.line,
-                "code": kept.text,
-                "reason": kept.reason,
-                "weighted_at": f"{site.path}:{site.line}",
-            }
-            for kept, site in found.kept.items()
+            line(kept, reason=kept.reason, weighted_at=f"{site.path}:{site.line}") for kept, site in found.kept.items()
         ],
         "left": [
-            {
-                "file": e.path,
-                "line": e.line,
-                "code": e.text,
-                "reason": e.reason,
-                "rule": e.evidence.rule if e.evidence else None,
-                "because": [{"file": at.path, "line": at.line, "code": at.text} for at in e.because],
-            }
-            for e in found.left
+            line(
+                left,
+                reason=left.reason,
+                rule=left.evidence.rule if left.evidence else None,
+                because=[line(at) for at in left.because],
+            )
+            for left in found.left
         ],
-        "patched": [{"file": e.path, "line": e.line, "code": e.text} for e in found.patched],
-        "problems": [
-            {"file": e.path, "line": e.line, "code": e.text, "reason": e.reason, "advice": e.advice}
-            for e in found.problems
-        ],
-        "doubts": [
-            {"file": e.path, "line": e.line, "code": e.text, "reason": e.reason, "advice": e.advice}
-            for e in found.doubts
-        ],
-        "unreadable": [{"file": e.path, "reason": e.reason} for e in found.unreadable],
+        "patched": [line(entry) for entry in found.patched],
+        "problems": [line(entry, reason=entry.reason, advice=entry.advice) for entry in found.problems],
+        "doubts": [line(entry, reason=entry.reason, advice=entry.advice) for entry in found.doubts],
+        "unreadable": [{"file": entry.path, "reason": entry.reason} for entry in found.unreadable],
         "would_change": sorted(plan.after),
         "wrote": list(wrote),
     }
     return json.dumps(content, indent=2) + "\n"
 
 
-def as_diff(plan: Plan, colour: bool) -> str:
-    """Return a unified diff of what would be written."""
-    changes: Dict[str, Tuple[Optional[bytes], Optional[bytes]]] = {
-        path: (plan.findings.program.sources[path].data, after) for path, after in plan.after.items()
-    }
-    if plan.settings is not None:
-        changes[SETTINGS_FILE] = (None, plan.settings.encode("utf-8"))
-    return changes_as_diff(changes, colour)
-
-
-def changes_as_diff(changes: Mapping[str, Tuple[Optional[bytes], Optional[bytes]]], colour: bool) -> str:
+def as_diff(changes: Changes, colour: bool) -> str:
     """Return a unified diff of files' bytes before and after; None is no file."""
-    effort = Effort()
-    parts = [
-        printable(line, lines=True)
-        for path, (before, after) in changes.items()
-        for line in _unified(path, before, after, effort)
-    ]
-    return "".join(_coloured(line) if colour else line for line in parts)
-
-
-def _unified(path: str, before: Optional[bytes], after: Optional[bytes], effort: Effort) -> List[str]:
-    names = "/dev/null" if before is None else f"a/{path}", "/dev/null" if after is None else f"b/{path}"
-    lines = unified_diff(_lines(before), _lines(after), names, effort)
-    shown = []
-    for line in lines:
-        shown.append(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n")
-    return shown
+    comparison = Comparison()
+    shown: List[str] = []
+    for path, (before, after) in changes.items():
+        names = "/dev/null" if before is None else f"a/{path}", "/dev/null" if after is None else f"b/{path}"
+        for line in comparison.unified_diff(_lines(before), _lines(after), names):
+            text = printable(line, lines=True).rstrip("\n")
+            code = _COLOURS.get(text[:3], _COLOURS.get(text[:1]))
+            shown.append(f"\033[{code}m{text}\033[0m\n" if colour and code is not None else f"{text}\n")
+            if not line.endswith("\n"):
+                shown.append("\\ No newline at end of file\n")
+    return "".join(shown)
 
 
 def _lines(data: Optional[bytes]) -> List[str]:
+    """Return the lines of a file, each with "\\n"; splitlines() would also split at form feeds."""
     text = (data or b"").decode("utf-8-sig", "replace")
-    # splitlines() would also split at form feeds and at letters that only look like line ends
-    return (
-        text.replace("\r\n", "\n").replace("\r", "\n").splitlines(keepends=True)
-        if "\f" not in text
-        else [line + "\n" for line in text.replace("\r\n", "\n").split("\n")]
-    )
-
-
-def _coloured(line: str) -> str:
-    colour = {"+": _GREEN, "-": _RED, "@": _CYAN}.get(line[:1], "")
-    if line.startswith(("+++", "---")):
-        colour = _BOLD
-    body = line.rstrip("\n")
-    return f"{colour}{body}{_PLAIN}{line[len(body) :]}" if colour else line
+    return re.findall(r"[^\n]*\n|[^\n]+", text.replace("\r\n", "\n").replace("\r", "\n"))

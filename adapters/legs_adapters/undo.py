@@ -6,13 +6,13 @@ import os
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
-from legs_adapters.checkout.comparing import Effort, matching_lines
+from legs_adapters.checkout.comparing import Comparison
 from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
 from legs_adapters.code.sources import check_root
-from legs_adapters.journal import JOURNAL, Journal, digest
+from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_loss import LegsError
 
-__all__ = ["Undone", "undo", "undo_edits"]
+__all__ = ["Undone", "undo"]
 
 
 class Undone(NamedTuple):
@@ -49,19 +49,25 @@ def undo(path: str | os.PathLike[str], force: bool = False, trust: Optional[str]
         journal = Journal.read(root)
         if journal.data is None:
             raise LegsError(f"{root}: nothing to undo: there is no {JOURNAL}")
-        if not (journal.ours or look or trust == journal.name):
-            raise LegsError(_not_ours(root, journal, path))
-        done = _work_out(root, journal, force)
+        if not (journal.is_own or look or trust == journal.name):
+            covered = _first([*journal.files, *journal.created], 3)
+            raise LegsError(
+                f"{root / JOURNAL} was not written by your legs-patch on this machine (or by a version without seals, "
+                f"or its key is gone): nothing was changed. It covers {covered}, which git can restore. To use it "
+                f"anyway, check its changes with `legs-patch --undo --diff {path}`, then run "
+                f"`legs-patch --undo --trust {journal.name} {path}`"
+            )
+        done = _undone(root, journal, force)
         if not look:
             replace_files(root, {**done.changes, JOURNAL: (journal.data, None)})
     return done
 
 
-def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
+def _undone(root: Path, journal: Journal, force: bool) -> Undone:
     changes: Dict[str, Tuple[Optional[bytes], Optional[bytes]]] = {}
     done = Undone([], [], [], changes)
     edited: List[str] = []
-    effort = Effort()
+    comparison = Comparison()
     for name, layers in journal.files.items():
         current = read_file(root, name)
         if current is None:
@@ -72,17 +78,13 @@ def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
         for layer in reversed(layers):
             if digest(data) == layer.after:
                 data = layer.original
-            elif data != layer.original:  # as before already: the write was interrupted, or git took it back
-                if digest(data) in (digest(earlier.original) for earlier in layers):
-                    continue
+            elif data not in (earlier.original for earlier in layers):  # else it is as before: git took it back
                 edited.append(name)
-                data, missing = undo_edits(layer.original, layer.patched(), data, effort)
-                lost.extend(missing)
+                data, missing = _undo_edits(layer, data, comparison)
+                lost += missing
         if lost:
-            shown = sorted(set(lost))
-            more = f" and {len(shown) - 20} more" if len(shown) > 20 else ""
-            listed = "; ".join(line[:200] for line in shown[:20])
-            done.kept.append((name, f"these lines were edited since and are kept: {listed}{more}"))
+            shown = _first([line[:200] for line in sorted(set(lost))], 20, "; ")
+            done.kept.append((name, f"these lines were edited since and are kept: {shown}"))
         if data != current:
             changes[name] = (current, data)
             done.restored.append(name)
@@ -91,57 +93,41 @@ def _work_out(root: Path, journal: Journal, force: bool) -> Undone:
             f"{', '.join(sorted(set(edited)))}: edited since it was patched; --undo --force restores the patched lines "
             "and keeps the edits"
         )
-    for name, wrote in journal.created.items():
+    for name in journal.created:
         current = read_file(root, name)
-        if current is None:
-            continue
-        if digest(current) == wrote:
+        if current is not None and journal.is_as_written(name, current):
             changes[name] = (current, None)
             done.removed.append(name)
-        else:
+        elif current is not None:
             done.kept.append((name, "it was edited since"))
     return done
 
 
-def _not_ours(root: Path, journal: Journal, path: object) -> str:
-    names = [*journal.files, *journal.created]
-    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-    return (
-        f"{root / JOURNAL} was not written by your legs-patch on this machine (or by a version without seals, or its "
-        f"key is gone): nothing was changed. It covers {shown}, which git can restore. To use it anyway, check its "
-        f"changes with `legs-patch --undo --diff {path}`, then run `legs-patch --undo --trust {journal.name} {path}`"
-    )
+def _first(names: Sequence[str], most: int, between: str = ", ") -> str:
+    return between.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def undo_edits(
-    original: bytes, patched: bytes, current: bytes, effort: Optional[Effort] = None
-) -> Tuple[bytes, List[str]]:
+def _undo_edits(layer: Layer, current: bytes, comparison: Comparison) -> Tuple[bytes, List[str]]:
     """Restore the patched lines of a file that was edited since.
-
-    Args:
-        original, patched: the file before and after the patch.
-        current: the file as it stands.
-        effort: what comparing it may take, with the other files.
 
     Returns:
         The file with the patch's lines as they were and the edits as they are; and the patched lines that are no
         longer there as the patch left them, which were left alone.
     """
-    before, after, lines = (data.splitlines(keepends=True) for data in (original, patched, current))
-    effort = effort or Effort()
+    before, after, lines = (data.splitlines(keepends=True) for data in (layer.original, layer.patched(), current))
     lost: List[str] = []
-    where = {a + i: b + i for a, b, size in matching_lines(after, lines, effort) for i in range(size)}
+    where = {a + i: b + i for a, b, size in comparison.matching_lines(after, lines) for i in range(size)}
     changes: List[Tuple[int, int, Sequence[bytes]]] = []
     ended = 0, 0
-    for i2, j2, size in [*matching_lines(before, after, effort), (len(before), len(after), 0)]:
+    for i2, j2, size in [*comparison.matching_lines(before, after), (len(before), len(after), 0)]:
         (i1, j1), ended = ended, (i2 + size, j2 + size)
         if (i1, j1) == (i2, j2):
             continue
         places = [where[j] for j in range(j1, j2) if j in where]
         if j1 == j2 or len(places) < j2 - j1 or places[-1] - places[0] >= j2 - j1:
-            lost.extend(line.decode("utf-8", "replace").strip() for line in after[j1:j2])
+            lost += [line.decode("utf-8", "replace").strip() for line in after[j1:j2]]
         else:
             changes.append((places[0], places[-1] + 1, before[i1:i2]))
-    for start, end, put in reversed(changes):
-        lines[start:end] = put
+    for start, end, restored in reversed(changes):
+        lines[start:end] = restored
     return b"".join(lines), lost

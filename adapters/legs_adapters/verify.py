@@ -27,9 +27,8 @@ from legs_adapters.shims.packages import check_imports
 from legs_adapters.undo import undo
 from legs_loss import LegsError
 
-__all__ = ["ITERATIONS", "Run", "Verdict", "check_verifiable", "verify"]
+__all__ = ["Run", "Verdict", "check_verifiable", "verify"]
 
-ITERATIONS = 40
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 96, 64, 800  # of the embedded scene
 SECONDS = 1800  # that a run may take
 FIRST_STEP, LATER_STEPS = 1e-5, 1e-3  # relative differences of losses that rounding explains
@@ -58,15 +57,15 @@ class Run(NamedTuple):
     """
 
     code: int
-    losses: List[str]
-    seconds: List[float]
-    weighted: int
-    weighted_without_gradient: int
-    plain: int
-    stored: int
-    computed: int
-    remembered: int
-    error: str
+    losses: Sequence[str] = ()
+    seconds: Sequence[float] = ()
+    weighted: int = 0
+    weighted_without_gradient: int = 0
+    plain: int = 0
+    stored: int = 0
+    computed: int = 0
+    remembered: int = 0
+    error: str = ""
     ssims: int = 0
 
 
@@ -76,82 +75,69 @@ class Verdict(NamedTuple):
     runs: Dict[str, Run]
     claims: Dict[str, bool]
 
-    @property
-    def holds(self) -> bool:
-        """Return whether all claims hold."""
-        return all(self.claims.values())
-
     def text(self) -> str:
         """Return the report."""
-        lines = []
+        rows = []
         for name, run in self.runs.items():
             step = f"{1000 * statistics.median(run.seconds):.0f} ms a step" if run.seconds else "no step"
-            ended = "" if run.code == 0 else f", exit code {run.code}"
-            lines.append(f"{name:<10} {len(run.losses)} steps, {step}{ended}")
+            rows.append((name, f"{len(run.losses)} steps, {step}" + (f", exit code {run.code}" if run.code else "")))
         if "patched" in self.runs:
-            lines += self._patched_lines()
-        lines += [f"{'holds' if held else 'FAILS':<10} {claim}" for claim, held in self.claims.items()]
+            patched, unpatched = self.runs["patched"], self.runs["unpatched"]
+            if patched.seconds and unpatched.seconds:
+                ratio = statistics.median(patched.seconds) / statistics.median(unpatched.seconds)
+                rows.append(("step", f"patched takes {ratio:.2f} times the unpatched one's time (medians)"))
+            without = f"{patched.weighted_without_gradient} in no-grad code"
+            rows.append(("l1_loss", f"{patched.weighted} calls weighted in training, {without}; {patched.plain} plain"))
+            rows += [("ssim", f"{patched.ssims} calls in training")] if patched.ssims else []
+            computed = f"{patched.computed} computed; {patched.remembered} reused"
+            rows.append(("maps", f"{patched.stored} from the store, {computed}"))
+        rows += [("holds" if held else "FAILS", claim) for claim, held in self.claims.items()]
+        lines = [f"{name:<10} {what}" for name, what in rows]
         for name, run in self.runs.items():
             if run.code != 0 and run.error:
                 lines += [f"{name} ended with:", *(f"    {line}" for line in run.error.splitlines())]
         return "\n".join(lines) + "\n"
 
-    def _patched_lines(self) -> List[str]:
-        patched, unpatched = self.runs["patched"], self.runs["unpatched"]
-        lines = []
-        if patched.seconds and unpatched.seconds:
-            ratio = statistics.median(patched.seconds) / statistics.median(unpatched.seconds)
-            lines.append(f"{'step':<10} patched takes {ratio:.2f} times the unpatched one's time (medians)")
-        lines.append(
-            f"{'l1_loss':<10} {patched.weighted} calls weighted in training, {patched.weighted_without_gradient} in "
-            f"no-grad code; {patched.plain} plain"
-        )
-        if patched.ssims:
-            lines.append(f"{'ssim':<10} {patched.ssims} calls in training")
-        lines.append(
-            f"{'maps':<10} {patched.stored} from the store, {patched.computed} computed; {patched.remembered} reused"
-        )
-        return lines
 
+def check_verifiable(folder: str | os.PathLike[str], script: Optional[str], arguments: Optional[str]) -> str:
+    """Return the training script, after checking before anything is patched that it can be run.
 
-def check_verifiable(folder: str | os.PathLike[str], script: Optional[str], arguments: Optional[str]) -> None:
-    """Check before anything is patched that the training script can be run; arguments as for :func:`verify`.
+    Args:
+        folder: the checkout.
+        script: the training script in it; None: the file of its one weighted term, or its train.py.
+        arguments: as for :func:`verify`.
 
     Raises:
         LegsError: it is ambiguous or not there, imports what is not installed, or its arguments name what is unknown.
     """
     root = check_root(folder)
-    script = _script(root, script)
+    script = _script(root) if script is None else script
+    if not (root / script).is_file():
+        raise LegsError(f"there is no {script} in {root}")
     check_imports(root, script)
     _arguments(root / script, arguments, 1, scene=root, output=root)
+    return script
 
 
-def verify(
-    folder: str | os.PathLike[str],
-    script: Optional[str] = None,
-    arguments: Optional[str] = None,
-    iterations: int = ITERATIONS,
-) -> Verdict:
+def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str], iterations: int) -> Verdict:
     """Train a patched checkout and its unpatched self on the CPU, and compare.
 
     Args:
         folder: the patched checkout; nothing is written there.
-        script: the training script in it; default: the file of its one weighted term, or its train.py.
-        arguments: the script's arguments, with {scene}, {output}, {iterations} and {port} filled in; default: those of
+        script: the training script in it.
+        arguments: the script's arguments, with {scene}, {output}, {iterations} and {port} filled in; None: those of
             Inria's train.py that its source knows.
         iterations: how many steps are compared; the script is ended then.
 
     Raises:
-        LegsError: the folder is not patched; or the training script is ambiguous.
+        LegsError: the folder is not patched any more.
     """
     from legs_loss.precompute import precompute
     from legs_loss.reference.embedded import write_embedded_scene
     from legs_loss.scenes import read_scene
 
     root = check_root(folder)
-    if not (root / JOURNAL).is_file():
-        raise LegsError(f"{root} is not patched: nothing to verify")
-    script = _script(root, script)
+    runs: Dict[str, Run] = {}
     with tempfile.TemporaryDirectory(prefix="legs-verify-") as work:
         scene = write_embedded_scene(
             Path(work) / "scene", views=VIEWS, width=WIDTH, height=HEIGHT, points=POINTS, samples=1
@@ -161,21 +147,19 @@ def verify(
         with locked(root, f"legs-patch --verify {folder}"):
             for copy in (patched, unpatched):
                 shutil.copytree(str(root), str(copy), symlinks=True, ignore=_unneeded)
-            if not (root / JOURNAL).is_file():  # taken back by another one, before this one had the lock
+            if not (root / JOURNAL).is_file():  # undone by another one, before this one had the lock
                 raise LegsError(f"{root} is not patched any more: nothing to verify")
         undo(unpatched, force=True)
-        runs: Dict[str, Run] = {}
-        for name, (copy, settings) in {
-            "unpatched": (unpatched, {}),
-            "patched": (patched, {}),
-            "LEGS_OFF": (patched, {"LEGS_OFF": "1"}),
-            "beta 0": (patched, {"LEGS_BETA": "0"}),
-        }.items():
+        for name, copy, settings in (
+            ("unpatched", unpatched, {}),
+            ("patched", patched, {}),
+            ("LEGS_OFF", patched, {"LEGS_OFF": "1"}),
+            ("beta 0", patched, {"LEGS_BETA": "0"}),
+        ):
             if name == "beta 0" and not runs["patched"].ssims:
                 continue
-            output = Path(work) / f"output-{name}"
-            given = _arguments(copy / script, arguments, iterations, scene=scene, output=output)
-            runs[name] = _run(copy, script, given, iterations, Path(work) / f"{name}.json", settings)
+            given = _arguments(copy / script, arguments, iterations, scene=scene, output=Path(work) / f"output-{name}")
+            runs[name] = _run(copy, [script, *given], iterations, Path(work) / f"{name}.json", settings)
             if not runs["unpatched"].losses:
                 return Verdict(runs, {"the unpatched script trained": False})
     return Verdict(runs, _claims(runs))
@@ -187,8 +171,7 @@ def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
     claims = {
         "all three trained": all(run.code == 0 and run.losses for run in runs.values()),
         "as many steps each": steps == len(patched.losses) == len(off.losses),
-        "with LEGS_OFF=1 every loss is the unpatched one, to the last bit": steps > 0
-        and off.losses == unpatched.losses,
+        "with LEGS_OFF=1 every loss is the unpatched one, bit for bit": steps > 0 and off.losses == unpatched.losses,
         "with LEGS every loss is another": steps > 0
         and all(first != second for first, second in zip(unpatched.losses, patched.losses)),
         "every step was weighted": patched.weighted >= len(patched.losses) > 0,
@@ -210,14 +193,10 @@ def _are_close(losses: Sequence[str], others: Sequence[str]) -> bool:
     )
 
 
-def _script(root: Path, given: Optional[str]) -> str:
-    if given is not None and not (root / given).is_file():
-        raise LegsError(f"there is no {given} in {root}")
-    if given is not None:
-        return given
+def _script(root: Path) -> str:
     found = plan(root).findings
     files = sorted({site.path for site in found.sites} | {site.path for site in found.patched})
-    trains = [name for name in files if "__main__" in (root / name).read_text(encoding="utf-8", errors="replace")]
+    trains = [name for name in files if "__main__" in _text(root / name)]
     if len(trains) == 1:
         return trains[0]
     if "train.py" in trains or (not trains and (root / "train.py").is_file()):
@@ -225,16 +204,16 @@ def _script(root: Path, given: Optional[str]) -> str:
     raise LegsError(f"cannot tell which script trains: use --script; weighted files: {', '.join(files) or 'none'}")
 
 
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+
+
 def _arguments(script: Path, given: Optional[str], iterations: int, **places: Path) -> List[str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     if given is None:
-        source = "\n".join(
-            path.read_text(encoding="utf-8", errors="replace")
-            for path in (script, *script.parent.glob("arguments/*.py"))
-            if path.is_file()
-        )
+        source = "\n".join(_text(path) for path in (script, *script.parent.glob("arguments/*.py")))
         given = " ".join(words for word, words in ARGUMENTS if word in source)
     values = {"iterations": iterations, "port": port, **places}
     try:
@@ -256,41 +235,23 @@ def _unneeded(folder: str, names: List[str]) -> List[str]:
     return sorted(left)
 
 
-def _run(
-    root: Path, script: str, arguments: Sequence[str], iterations: int, report: Path, settings: Dict[str, str]
-) -> Run:
+def _run(root: Path, words: Sequence[str], iterations: int, report: Path, settings: Dict[str, str]) -> Run:
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
-    environment.update(
-        {
-            "CUDA_VISIBLE_DEVICES": "",
-            "PYTHONHASHSEED": "0",
-            "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-        }
-    )
-    environment.update(settings)
-    command = [
-        sys.executable,
-        "-m",
-        "legs_adapters.watched",
-        str(report),
-        str(iterations),
-        str(root),
-        script,
-        *arguments,
-    ]
-    with tempfile.TemporaryFile() as said:
+    environment.update(CUDA_VISIBLE_DEVICES="", PYTHONHASHSEED="0", **settings)
+    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    command = [sys.executable, "-m", "legs_adapters.watched", str(report), str(iterations), str(root), *words]
+    with tempfile.TemporaryFile() as errors:
         try:
             code = subprocess.run(
-                command, cwd=str(root), env=environment, stdout=subprocess.DEVNULL, stderr=said,
+                command, cwd=str(root), env=environment, stdout=subprocess.DEVNULL, stderr=errors,
                 stdin=subprocess.DEVNULL, timeout=SECONDS,
             ).returncode  # fmt: skip
         except subprocess.TimeoutExpired:
             code = -1
-        said.seek(0)
-        error = said.read().decode("utf-8", "replace")
+        errors.seek(0)
+        lines = errors.read().decode("utf-8", "replace").replace("\r", "\n").strip().splitlines()
     try:
         found = json.loads(report.read_text())
-    except (OSError, ValueError):
-        counted = [field for field in Run._fields if field not in ("code", "error")]
-        found = {field: [] if field in ("losses", "seconds") else 0 for field in counted}
-    return Run(code=code, error="\n".join(error.replace("\r", "\n").strip().splitlines()[-12:]), **found)
+    except (OSError, ValueError):  # it was killed
+        found = {}
+    return Run(code=code, error="\n".join(lines[-12:]), **found)

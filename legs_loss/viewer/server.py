@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from pathlib import Path
 from typing import Any, Dict, Tuple
 
 import numpy as np
@@ -11,6 +13,7 @@ from legs_loss.errors import LegsError
 from legs_loss.reference.ply import read_ply
 from legs_loss.scenes import View, image_tensor, load_training_image
 from legs_loss.spec import as_spec
+from legs_loss.system import say
 from legs_loss.viewer.content import Content
 from legs_loss.viewer.guard import Guard, check_address
 from legs_loss.viewer.splats import Splats, left_of, splats
@@ -31,10 +34,11 @@ def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port:
         host, port: where it listens; the next free port is taken if this one is in use.
 
     Raises:
-        LegsError: viser is missing, a .ply cannot be read, or the address is none of this machine's.
+        LegsError: viser is missing, a .ply cannot be read or has no Gaussian that can be drawn, or the address is none
+            of this machine's.
     """
     check_address(host, port)
-    loaded = {name: splats(read_ply(path)) for name, path in content.methods.items()}
+    loaded = {name: _drawable(path) for name, path in content.methods.items()}
     server, address = _start(host, port)
     server.gui.add_markdown(f"### {content.title}")
     _Methods(server, loaded)
@@ -44,6 +48,19 @@ def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port:
     else:
         _look_at_all(server, loaded)
     return server, address
+
+
+def _drawable(path: Path) -> Splats:
+    """Read a .ply's Gaussians for viser; say how many of them are left out."""
+    gaussians = read_ply(path)
+    drawn = splats(gaussians)
+    left = len(gaussians) - len(drawn.centers)
+    why = "not finite, or too far or too large to be drawn"
+    if not len(drawn.centers):
+        raise LegsError(f"{path}: none of its {len(gaussians):,} Gaussians can be shown: {why}")
+    if left:
+        say(f"legs: {path}: {left:,} of {len(gaussians):,} Gaussians are left out: {why}", sys.stderr)
+    return drawn
 
 
 def _start(host: str, port: int) -> Tuple[Any, str]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import socket
+import sys
 from pathlib import Path
 
 import pytest
@@ -117,3 +119,35 @@ def look(root, script, *_):
     patched = "legs_loss.l1_loss" in (root / script).read_text()
     wanted = root.parent.name == "patched"
     return run_of_none()._replace(code=0 if patched == wanted else 1)
+
+
+# Added to a training script: what LibCST reads, all or in part, and Python does not compile.
+NOT_COMPILED = {
+    "Python 2's except": "try:\n    x = 1\nexcept ValueError, error:\n    pass\n",
+    "a statement cut short": "x = 1 2\n",
+    "a return outside of a function": "return\n",
+    "a name both own and outer": "def f():\n    nonlocal x\n",
+    "an argument twice": "def f(a, a):\n    pass\n",
+    "an assignment to a call": "f() = 1\n",
+    "indentation of nothing": "def f():\n    x = 1\n      y = 2\n",
+}
+
+
+@pytest.mark.parametrize("what", NOT_COMPILED, ids=lambda what: what.replace(" ", "_"))
+def test_what_python_cannot_compile_is_not_patched(what, tmp_path, capsys):
+    """One line says so; the checkout's other scripts are patched, and alone it is an error."""
+    if what.startswith("Python 2") and sys.version_info >= (3, 14):
+        pytest.skip("Python has this syntax again")
+    good = files("inria")
+    bad = {"train2.py": good["train.py"] + "\n\n" + NOT_COMPILED[what]}
+    root = checkout(tmp_path / "both", {**good, **bad})
+    assert main([str(root)]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("train2.py")]
+    assert re.match(r"train2.py +not read +(Python 3.* cannot compile it|does not parse) \(line \d+", line)
+    assert (root / "train2.py").read_text() == bad["train2.py"]
+    assert "legs_loss" in (root / "train.py").read_text()
+    alone = checkout(tmp_path / "alone", {**good, "train.py": bad["train2.py"]})
+    assert main([str(alone)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "not read: train.py: " in error
+    assert sorted(os.listdir(str(alone))) == sorted(os.listdir(str(checkout(tmp_path / "as before", good))))

@@ -296,6 +296,8 @@ DAMAGED = {
     "edits over one another": layers({"edits": [[0, 1, ""], [0, 1, ""]]}),
     "60,000 patches of a file": layers(*[{}] * 60_000),
     "no checksum": layers({"after": "z"}),
+    "a million edits": layers({"original": pack(b"x" * (1 << 20)), "edits": [[i, i, "y"] for i in range(1 << 19)]}),
+    "100 MB": " " * (100 << 20),
     "huge numbers": '{"version": ' + "9" * 5000 + "}",
 }
 
@@ -341,7 +343,7 @@ def shuffled(count, kinds):
 
 
 LABORIOUS = {
-    "a million edits": (b"x" * (1 << 20), [[i, i, "y"] for i in range(1 << 20)], b"z\n"),
+    "50,000 edits": (b"x" * 50_000, [[i, i, "y"] for i in range(50_000)], b"z\n"),
     "lines of ninety kinds": (shuffled(200_000, 90), [[0, 0, shuffled(200_001, 90).decode()]], shuffled(200_002, 90)),
     "lines of one kind": (b"\n" * 500_000 + b"a\n" + b"\n" * 500_000, [[9, 9, "b"]], b"c\n" + b"\n" * 900_000 + b"d\n"),
     "lines in another order": (shuffled(200_000, 1 << 30), [[0, 9, ""]], shuffled(200_000, 0)),

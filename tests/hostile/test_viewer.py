@@ -171,3 +171,33 @@ def test_a_share_request_opens_no_tunnel(page, monkeypatch):
 def test_an_address_of_another_machine(host, port):
     with pytest.raises(LegsError, match=r"--(host|port)"):
         check_address(host, port)
+
+
+NOWHERE = {
+    "a place that is no number": ("means", float("nan")),
+    "an infinite place": ("means", float("inf")),
+    "a place of 1e38": ("means", 1e38),
+    "an infinite size": ("log_scales", 1e4),
+    "a turn that is no number": ("quaternions", float("nan")),
+    "an opacity that is no number": ("opacity_logits", float("nan")),
+    "a colour that is no number": ("sh", float("nan")),
+}
+
+
+@pytest.mark.parametrize("what", NOWHERE, ids=lambda what: what.replace(" ", "_"))
+def test_what_is_left_out_is_counted(what, tmp_path, capsys):
+    from legs_loss.viewer.server import serve
+
+    name, value = NOWHERE[what]
+    gaussians = some((255, 0, 0), 16)
+    getattr(gaussians, name)[[2, 3, 11]] = value
+    write_ply(tmp_path / "g.ply", gaussians)
+    server, _ = serve(find_content(tmp_path / "g.ply"), port=free_port())
+    server.stop()
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"{tmp_path / 'g.ply'}: 3 of 16 Gaussians are left out: not finite, or too far or too large" in said
+    getattr(gaussians, name)[:] = value
+    write_ply(tmp_path / "g.ply", gaussians)
+    with pytest.raises(LegsError, match="none of its 16 Gaussians can be shown"):
+        serve(find_content(tmp_path / "g.ply"), port=free_port())

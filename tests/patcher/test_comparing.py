@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("libcst")
 
 from legs_adapters.checkout import comparing
-from legs_adapters.checkout.comparing import Effort, matching_lines, unified_diff
+from legs_adapters.checkout.comparing import Comparison
 
 HUNK = re.compile(r"@@ -(\d+)(?:,(\d+))? \+(\d+)(?:,(\d+))? @@\n")
 
@@ -34,9 +34,9 @@ def applied(before, diff):
     return after + before[at:]
 
 
-@pytest.mark.parametrize("steps", [comparing._MAX_STEPS, 0], ids=["compared", "not compared"])
+@pytest.mark.parametrize("steps", [comparing.MAX_STEPS, 0], ids=["compared", "not compared"])
 def test_random_texts(steps, monkeypatch):
-    monkeypatch.setattr(comparing, "_MAX_STEPS", steps)
+    monkeypatch.setattr(comparing, "MAX_STEPS", steps)
     at = random.Random(0)
     for _ in range(500):
         before = [f"{at.randrange(8)}\n" for _ in range(at.randrange(40))]
@@ -44,8 +44,8 @@ def test_random_texts(steps, monkeypatch):
         for _ in range(at.randrange(4)):
             place = at.randrange(len(after) + 1)
             after[place : place + at.randrange(3)] = [f"{at.randrange(8)}\n" for _ in range(at.randrange(3))]
-        assert applied(before, unified_diff(before, after, ("a", "b"), Effort())) == after
+        assert applied(before, Comparison().unified_diff(before, after, ("a", "b"))) == after
         here = there = 0
-        for a, b, size in matching_lines(before, after, Effort()):
+        for a, b, size in Comparison().matching_lines(before, after):
             assert a >= here and b >= there and before[a : a + size] == after[b : b + size]
             here, there = a + size, b + size

@@ -215,7 +215,7 @@ def test_depth_by_another_name_is_left(tmp_path):
         "        loss = lidar + ",
         1,
     )
-    texts["train.py"] = "import torch\nfrom losses import range_loss\n" + texts["train.py"]
+    texts["train.py"] = texts["train.py"].replace("import torch\n", "import torch\nfrom losses import range_loss\n", 1)
     found = plan(checkout(tmp_path, texts)).findings
     assert [(site.path, site.form.callee is not None) for site in found.sites] == [("train.py", True)]
     assert found.problems == []

@@ -15,12 +15,12 @@ from legs_adapters.code.folders import check_name
 from legs_loss import LegsError
 from legs_loss.system import FileLock, HeldError, held_back, read_regular
 
-__all__ = ["LARGEST", "Changes", "locked", "read_file", "replace_files"]
+__all__ = ["MAX_FILE_BYTES", "Changes", "locked", "read_file", "replace_files"]
 
 # By relative path, in order: the bytes expected there now (None: no file), and the bytes to put there (None: remove).
 Changes = Mapping[str, Tuple[Optional[bytes], Optional[bytes]]]
 
-LARGEST = 64 << 20  # bytes of a file that is read here: no source, no journal is larger
+MAX_FILE_BYTES = 8 << 20  # of a file that is read here: no source, no journal is larger
 _LOCK, _STAGING = ".legs-patch.lock", ".legs-patch.tmp"
 _WAIT = 30.0  # seconds: a command holds the lock while it writes, and while git looks for changes
 
@@ -92,7 +92,7 @@ def read_file(root: Path, path: str) -> Optional[bytes]:
         raise LegsError(f"{path} is a link or below one: legs-patch does not follow links")
     try:
         with folder_of(root, path) as (folder, name):
-            return read_regular(name, LARGEST, folder)
+            return read_regular(name, MAX_FILE_BYTES, folder)
     except FileNotFoundError:
         return None
     except OSError as error:

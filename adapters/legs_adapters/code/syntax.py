@@ -46,6 +46,8 @@ _FIELDS: Dict[type, Tuple[str, ...]] = {}
 
 def code(node: cst.CSTNode) -> str:
     """Return a node's source text, exactly."""
+    if isinstance(node, cst.Name) and not node.lpar:
+        return node.value
     return _EMPTY.code_for_node(node)
 
 

@@ -114,9 +114,9 @@ def test_verify_beside_another(other, number, tmp_path, monkeypatch):
     assert found == {**SOURCES, "train.py": SOURCES["one.py"]}
 
 
-def look(root, script, *_):
+def look(root, words, *_):
     """Stand in for a training: exit code 0 where the copy is wholly patched, or wholly not."""
-    patched = "legs_loss.l1_loss" in (root / script).read_text()
+    patched = "legs_loss.l1_loss" in (root / words[0]).read_text()
     wanted = root.parent.name == "patched"
     return run_of_none()._replace(code=0 if patched == wanted else 1)
 

@@ -185,8 +185,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.code.sources import check_root
     from legs_adapters.plan import plan, write
-    from legs_adapters.report import as_diff
+    from legs_adapters.report import as_diff, as_table
     from legs_adapters.settings import SETTINGS_FILE, settings_text
+    from legs_adapters.terms.instead import said_instead
 
     root = check_root(args.folder)
     settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
@@ -201,7 +202,8 @@ def _patch(args: argparse.Namespace) -> int:
             raise LegsError(
                 f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
                 + _not_read(found.findings.unreadable)
-                + _not_searched(root, args.exclude)
+                + _not_searched(root, args.exclude),
+                *said_instead(found.findings.program.sources.values()),
             )
         _advise(problems)
         hint = "(--site FILE:LINE takes your word, --exclude leaves files out)"
@@ -213,7 +215,8 @@ def _patch(args: argparse.Namespace) -> int:
         say(f"    {doubt.text}", sys.stderr)
         say(f"  if it is the loss between rendering and photograph, edit it by hand: {doubt.advice}", sys.stderr)
     wrote = [] if args.diff or args.check else write(found, args.force)
-    if args.diff and not args.json:
+    if args.diff and not args.json:  # the diff alone on the standard output: git apply takes it
+        say(as_table(found), sys.stderr, end="", lines=True)
         print(as_diff(found.changes(), _is_coloured()), end="")
     else:
         _show(args, found, wrote)

@@ -10,6 +10,8 @@ from legs_adapters.checkout.comparing import Comparison
 from legs_adapters.checkout.replace import Changes
 from legs_adapters.code.syntax import one_line
 from legs_adapters.plan import Plan
+from legs_adapters.rules.document import describe
+from legs_adapters.rules.order import RULES
 from legs_adapters.terms.findings import Left
 from legs_loss.system import printable
 
@@ -26,7 +28,7 @@ def as_table(plan: Plan) -> str:
         why = f"{kept.reason}: {kept.function} is weighted at {site.path}:{site.line}, in this call it is not"
         rows.append((kept.path, kept.line, "plain", why))
     rows += [(entry.path, entry.line, "already patched", "") for entry in found.patched]
-    rows += [(entry.path, entry.line, f"skipped ({entry.reason})", _why_left(entry)) for entry in found.left]
+    rows += [(entry.path, entry.line, "skipped", _why_left(entry)) for entry in found.left]
     rows += [(entry.path, entry.line, "ERROR", entry.reason) for entry in found.problems]
     table = [(printable(f"{path}:{line}"), what, printable(why)) for path, line, what, why in sorted(rows)]
     table += [(printable(entry.path), "not read", printable(entry.reason)) for entry in found.unreadable]
@@ -35,12 +37,13 @@ def as_table(plan: Plan) -> str:
 
 
 def _why_left(left: Left) -> str:
-    """Return the rule that skips a term, and the first deciding line."""
+    """Return why a term is skipped: the sentence of its rule, and the first deciding line."""
     if left.evidence is None:
-        return ""
+        return left.reason
     path, line, text = left.because[0]
     here = f"line {line}" if path == left.path else f"{path}:{line}"
-    return f"rule {left.evidence.rule}, {here}: {text if len(text) <= 60 else text[:57] + '...'}"
+    rule, text = left.evidence.rule, text if len(text) <= 60 else text[:57] + "..."
+    return f"{describe(RULES[rule]).why.rstrip('.')} (rule {rule}, {here}: {text})"
 
 
 def as_json(plan: Plan, wrote: Sequence[str]) -> str:

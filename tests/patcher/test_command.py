@@ -35,12 +35,15 @@ class TestCommandLine:
         assert "+" + PATCHED in diff.stdout
         assert "+import legs_loss\n" in diff.stdout
         assert "\033[" not in diff.stdout
+        rows = legs_patch("--check", root).stdout.partition("would change")[0]
+        assert rows in diff.stderr
+        assert "train.py:32            skipped  No backward pass reaches the term, and it is under" in rows
         assert legs_patch("--check", root).returncode == 1
         assert snapshot(root) == before
 
         done = legs_patch(root, "--preset", "legs-l", "--beta", "4")
         assert done.returncode == 0, done.stderr
-        assert "patched               gt_image is the photograph\n" in done.stdout
+        assert "patched  gt_image is the photograph\n" in done.stdout
         assert "legs-patch --undo" in done.stdout
         assert 'preset = "legs-l"' in (root / "legs.toml").read_text()
         assert "\nbeta = 4.0" in (root / "legs.toml").read_text()
@@ -294,6 +297,44 @@ class TestCommandLine:
         assert "legs.toml exists and is not as legs-patch wrote it" in refused.stderr
         assert run("--undo", root).returncode == 0
         assert (root / "legs.toml").read_text() == "beta = 3.0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "what"),
+    [
+        ("import jax\n", 1, "the loss is written in JAX"),
+        ("# mse_loss(image, gt)\nloss = F.mse_loss(image, gt_image)\n", 2, "the image loss is squared"),
+        ("delta = image - photo\nloss = (delta**2).mean()\n", 2, "the image loss is squared"),
+        ("loss += self.guidance(images, prompts)['loss_sds']\n", 1, "the gradient is a diffusion model's (SDS)"),
+        ("loss = fused_ssim.fused_l1_ssim_loss(img, gt)\n", 1, "legs_loss.d_ssim(image, gt)"),
+        (
+            "class M(S):\n    def get_loss_dict(self, *a):\n        return super().get_loss_dict(*a)\n",
+            3,
+            "ns-train splatfacto-legs",
+        ),
+    ],
+)
+def test_what_is_not_ours_is_one_line(text, line, what, tmp_path, run):
+    done = run(checkout(tmp_path, {"train.py": text}))
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[0].startswith("legs-patch: error: no photometric L1 term was found")
+    (said,) = done.stderr.splitlines()[1:]
+    assert said.startswith(f"train.py:{line}: ")
+    assert what in said
+
+
+def test_squares_of_poses_and_definitions_are_not_the_image_loss(tmp_path, run):
+    text = "def mse_loss(image, gt):\n    return 0\n\nloss = F.mse_loss(poses, poses_gt)\nx = F.mse_loss(image, gt)\n"
+    assert run(checkout(tmp_path, {"train.py": text})).stderr.count("\n") == 1
+
+
+def test_models_that_are_only_used_are_not_searched_and_a_script_by_the_name_of_a_test_is(tmp_path, run):
+    texts = files("inria")
+    elsewhere = {"src/dust3r/croco/criterion.py": texts["train.py"], "splat_test.py": texts["train.py"], **texts}
+    shown = run("--check", checkout(tmp_path, elsewhere)).stdout
+    patched = [row.split(":")[0] for row in shown.splitlines() if " patched " in row]
+    assert patched == ["splat_test.py", "train.py"]
+    assert "dust3r" not in shown
 
 
 def test_the_pre_commit_hook_fails_until_the_checkout_is_patched(tmp_path):

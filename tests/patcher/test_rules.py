@@ -91,7 +91,8 @@ def test_every_rule_in_the_causes_has_a_place_in_the_order():
 def test_the_report_names_the_rule_and_the_line_that_decided(tmp_path):
     root = checkout(tmp_path, files("inria"))
     shown = legs_patch("--check", root).stdout
-    assert "train.py:32            skipped (evaluation)  rule evaluation, line 29: with torch.no_grad():\n" in shown
+    why = describe(RULES["evaluation"]).why.rstrip(".")
+    assert f"train.py:32            skipped  {why} (rule evaluation, line 29: with torch.no_grad():)\n" in shown
     left = json.loads(legs_patch("--check", "--json", root).stdout)["left"]
     assert left[0]["rule"] == left[0]["reason"] == "evaluation"
     assert left[0]["because"] == [{"file": "train.py", "line": 29, "code": "with torch.no_grad():"}]

@@ -32,6 +32,7 @@ _FOREIGN = {
     name: why
     for why, names in (
         (VENDORED, "submodules third_party third-party thirdparty external externals extern SIBR_viewers"),
+        ("a model that it only uses", "croco dust3r mast3r vggt"),
         (TESTS, "tests test testing"),
         ("installed packages", "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs"),
         ("tool output", ".git .hg .svn __pycache__ .ipynb_checkpoints build dist .mypy_cache .pytest_cache"),
@@ -40,7 +41,7 @@ _FOREIGN = {
 }
 PATCHABLE = (VENDORED, TESTS, SUBMODULE, _CHECKOUT)
 _LARGEST = 1 << 20  # bytes of a .gitmodules
-_TEST_FILE = re.compile(r"^(test_.*|.*_test|conftest)\.py$")
+_TEST_FILE = re.compile(r"^(test_.*|conftest)\.py$")
 
 
 class Skipped(NamedTuple):

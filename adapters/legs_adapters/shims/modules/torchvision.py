@@ -1,5 +1,7 @@
 """The few helpers of torchvision that training scripts use, for machines without it.
 
+PyPI's wheels of torchvision are built for CUDA: beside a torch for the CPU their import ends in an error.
+
 ToTensor, ToPILImage, Compose, Resize; save_image, make_grid; reading and writing pictures. Everything else can be
 imported, and raises an error when it is used.
 """

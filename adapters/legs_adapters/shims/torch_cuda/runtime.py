@@ -17,45 +17,24 @@ from legs_adapters.shims.torch_cuda.streams import Event, Nowhere, Stream
 
 __all__ = ["redirect"]
 
-MEMORY_NUMBERS = (
-    "memory_allocated",
-    "max_memory_allocated",
-    "memory_reserved",
-    "max_memory_reserved",
-    "memory_cached",
-    "max_memory_cached",
-    "memory_usage",
-    "utilization",
-)
-NOTHING = (
-    "synchronize",
-    "empty_cache",
-    "set_device",
-    "init",
-    "ipc_collect",
-    "reset_peak_memory_stats",
-    "reset_max_memory_allocated",
-    "reset_max_memory_cached",
-    "reset_accumulated_memory_stats",
-    "set_per_process_memory_fraction",
-    "set_stream",
-    "set_sync_debug_mode",
-    "set_rng_state",
-    "set_rng_state_all",
-    "manual_seed",
-    "manual_seed_all",
-    "seed",
-    "seed_all",
-)
+MEMORY_NUMBERS = """
+    memory_allocated max_memory_allocated memory_reserved max_memory_reserved memory_cached max_memory_cached
+    memory_usage utilization
+"""
+NOTHING = """
+    synchronize empty_cache set_device init ipc_collect reset_peak_memory_stats reset_max_memory_allocated
+    reset_max_memory_cached reset_accumulated_memory_stats set_per_process_memory_fraction set_stream
+    set_sync_debug_mode set_rng_state set_rng_state_all manual_seed manual_seed_all seed seed_all
+"""
 
 
 def redirect(redirection: Redirection) -> None:
     """Redirect the functions of torch.cuda, mixed precision and the building of extensions."""
     _mixed_precision(redirection)
     cuda = torch.cuda
-    for name in NOTHING:
+    for name in NOTHING.split():
         redirection.wrap(cuda, name, lambda old: constant(None))
-    for name in MEMORY_NUMBERS:
+    for name in MEMORY_NUMBERS.split():
         redirection.wrap(cuda, name, lambda old: constant(0))
         redirection.wrap(cuda.memory, name, lambda old: constant(0))
     total = memory()

@@ -12,42 +12,12 @@ from legs_adapters.shims.torch_cuda.redirection import Redirection, on_cpu, redi
 __all__ = ["redirect"]
 
 # torch.utils._device knows today's; before torch 2.0 there is no such list.
-CONSTRUCTORS = (
-    "arange",
-    "as_tensor",
-    "asarray",
-    "bartlett_window",
-    "blackman_window",
-    "empty",
-    "empty_permuted",
-    "empty_quantized",
-    "empty_strided",
-    "eye",
-    "full",
-    "hamming_window",
-    "hann_window",
-    "kaiser_window",
-    "linspace",
-    "logspace",
-    "normal",
-    "ones",
-    "rand",
-    "randint",
-    "randn",
-    "randperm",
-    "range",
-    "scalar_tensor",
-    "sparse_bsc_tensor",
-    "sparse_bsr_tensor",
-    "sparse_compressed_tensor",
-    "sparse_coo_tensor",
-    "sparse_csc_tensor",
-    "sparse_csr_tensor",
-    "tensor",
-    "tril_indices",
-    "triu_indices",
-    "zeros",
-)
+CONSTRUCTORS = """
+    arange as_tensor asarray bartlett_window blackman_window empty empty_permuted empty_quantized empty_strided
+    eye full hamming_window hann_window kaiser_window linspace logspace normal ones rand randint randn randperm
+    range scalar_tensor sparse_bsc_tensor sparse_bsr_tensor sparse_compressed_tensor sparse_coo_tensor
+    sparse_csc_tensor sparse_csr_tensor tensor tril_indices triu_indices zeros
+"""
 
 
 def redirect(redirection: Redirection) -> None:
@@ -60,11 +30,11 @@ def redirect(redirection: Redirection) -> None:
 def _tensors(redirection: Redirection) -> None:
     signal = getattr(torch, "signal", None)
     owners = [torch, torch.fft, getattr(torch, "nested", None), getattr(signal, "windows", None)]
-    known = _known_constructors()
+    known, named = _known_constructors(), set(CONSTRUCTORS.split())
     for owner in filter(None, owners):
         for name, value in list(vars(owner).items()):
             is_constructor = value in known if _hashable(value) else False
-            if is_constructor or (owner is torch and (name in CONSTRUCTORS or name.endswith("_like"))):
+            if is_constructor or (owner is torch and (name in named or name.endswith("_like"))):
                 redirection.wrap(owner, name, redirected)
     for name in dir(Tensor):
         if name == "new" or name.startswith("new_"):

@@ -14,7 +14,7 @@ from legs_loss import WeightSpec, response, weight_map
 from legs_loss.cli.masks import mask_of
 from legs_loss.operators import OPERATORS
 from legs_loss.reference.embedded import write_embedded_scene
-from legs_loss.response import normalise_response
+from legs_loss.responses import normalise_response
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
 
 PICTURES = Path(__file__).resolve().parent / "pictures"

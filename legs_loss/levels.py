@@ -19,7 +19,7 @@ from typing import Deque, Iterable, Optional
 import torch
 from torch import Tensor
 
-from legs_loss.response import response
+from legs_loss.responses import response
 from legs_loss.spec import WeightSpec
 
 __all__ = ["RunningLevels", "levels_of", "over_scene", "percentile", "response_levels", "scene_levels"]

@@ -11,7 +11,7 @@ from legs_loss.curves import curve
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, is_compiling, read_layout
 from legs_loss.levels import levels_of, over_scene, percentile
-from legs_loss.response import normalise_response, response
+from legs_loss.responses import normalise_response, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
 __all__ = ["curved", "weight_from_response", "weight_map", "weight_maps", "weight_over_scene"]
@@ -65,7 +65,7 @@ def weight_maps(images: Iterable[Tensor], spec: Spec = "legs") -> List[Tensor]:
 
     Example:
         >>> sharp = (torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) > 0.9).float()
-        >>> from legs_loss.response import gaussian_blur
+        >>> from legs_loss.responses import gaussian_blur
         >>> blurred = gaussian_blur(sharp, 2.0)
         >>> [round(float(weight.mean()), 1) for weight in weight_maps([sharp, sharp, blurred], "legs-robust")]
         [1.3, 1.3, 1.0]

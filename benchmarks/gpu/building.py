@@ -14,7 +14,7 @@ import torch
 
 from benchmarks.gpu.imports import need
 from benchmarks.gpu.options import Options, Record, Skipped
-from legs_loss.experiments.upstream.training import copy_checkout
+from examples.reproduce_paper.codebases.training import copy_checkout
 
 __all__ = ["copied", "fastgs_modules", "fused_ssim", "mend"]
 

@@ -3,7 +3,7 @@
     python -m benchmarks.gpu.measured REPORT EQUAL [--emulate] [--cpu] SCRIPT ...
 
 A step is the time from one call of `Tensor.backward` to the next. The report is that of
-`legs_loss.experiments.upstream.launch`, with the number of steps, their times, and the peak of the memory. The times
+`examples/reproduce_paper/launch.py`, with the number of steps, their times, and the peak of the memory. The times
 are told twice: of the first EQUAL steps, in which no Gaussian is added yet, so that two losses have as many to draw;
 and of all steps, in which a loss that adds more of them takes longer for that.
 """
@@ -20,7 +20,7 @@ from typing import Any, Dict, List
 import torch
 
 from benchmarks.gpu.options import emulate
-from legs_loss.experiments.upstream import launch
+from examples.reproduce_paper import launch
 
 EQUAL = "ms a step before Gaussians are added"
 FIRST = 0.03  # the share of the steps that is not timed: loading, compiling, first touches of memory

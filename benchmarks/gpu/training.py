@@ -13,8 +13,8 @@ from benchmarks.gpu.building import copied
 from benchmarks.gpu.imports import need
 from benchmarks.gpu.measured import EQUAL
 from benchmarks.gpu.options import Options, Record, Skipped
-from legs_loss.experiments.upstream.profile import find_profile
-from legs_loss.experiments.upstream.training import Checkout, train_and_score
+from examples.reproduce_paper.codebases.profile import find_profile
+from examples.reproduce_paper.codebases.training import Checkout, train_and_score
 from legs_loss.reference.training.densify import Schedule
 from legs_loss.spec import PRESETS
 

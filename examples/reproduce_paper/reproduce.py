@@ -2,8 +2,8 @@
 
     python reproduce.py --inria gaussian-splatting --fastgs FastGS --nerficg nerficg --data datasets --dry-run
 
-DATA holds tanksandtemples/{truck,train} and mipnerf360/{bicycle,...}. Each codebase and scene is one `legs compare
---upstream`, with the codebase's own official settings: the four losses, LEGS's maps of mean 1, and the unweighted
+DATA holds tanksandtemples/{truck,train} and mipnerf360/{bicycle,...}. Each codebase and scene is one run of
+compare.py, with the codebase's own official settings: the four losses, LEGS's maps of mean 1, and the unweighted
 codebase at LEGS's number of Gaussians, over several seeds. The paper scores training views: this scores them and those
 held out.
 The same command goes on after an interruption. --dry-run prints every command and runs none.
@@ -66,8 +66,8 @@ def arguments() -> argparse.Namespace:
 
 def command(args: argparse.Namespace, profile: str, root: Path, dataset: str, name: str) -> List[str]:
     """Return the comparison of a codebase on a scene, with the settings that its authors give for that scene."""
-    words = [sys.executable, "-m", "legs_loss", "compare", str(args.data / dataset / name), "--study", "codebase"]
-    words += ["--upstream", str(root), "--profile", profile, "--seeds", str(args.seeds)]
+    words = [sys.executable, str(Path(__file__).with_name("compare.py")), str(args.data / dataset / name), str(root)]
+    words += ["--profile", profile, "--seeds", str(args.seeds)]
     words += ["-m", str(args.out / profile / name)]
     extra: List[str] = []
     if profile == "3dgs" and dataset == "mipnerf360":  # as its full_eval.py

@@ -5,7 +5,6 @@ Each training runs in a separate process with one thread. An arm is LOSS[:CHANGE
 gives it the number of Gaussians of another arm, densification by densification ("legs@3dgs"). The baseline 3dgs is
 always among the arms, and is checked to be unweighted first. Run the command again with the same --out to resume an
 interrupted comparison, or to add arms and seeds. Without SCENE it makes and uses a small version of the embedded scene.
-With --upstream another codebase's own script trains the arms, in a copy of its checkout, with its own density control.
 """
 
 from __future__ import annotations
@@ -13,13 +12,10 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Dict, Sequence
+from typing import Dict, Sequence
 
-from legs_loss.cli.shared.affordable import add_scene_arguments, default_resolution
+from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution
 from legs_loss.system import say
-
-if TYPE_CHECKING:
-    from legs_loss.experiments.studies import Study
 
 HELP = "train and compare several losses on a scene, with seeds, controls and intervals"
 
@@ -30,28 +26,22 @@ SEEDS = 1000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    from legs_loss.experiments.arms import CHANGES
-    from legs_loss.experiments.studies import STUDIES
+    from legs_loss.experiments.arms import CHANGES, STUDIES
 
     changes = ", ".join(f"{name} ({what})" for name, what in CHANGES.items())
     parser.description = (__doc__ or "").format(changes=changes)
     add_scene_arguments(parser)
+    studies = (f"{name}: {' '.join(arms)}" for name, arms in STUDIES.items())
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--arms", nargs="+", metavar="ARM", help="default: those of --study")
     what.add_argument(
         "--study",
         choices=STUDIES,
         default="main",
-        help=f"a built-in list of arms, with the paper's numbers; default: main. "
-        f"{'; '.join(f'{name}: {study.title}' for name, study in STUDIES.items())}",
+        help=f"a built-in list of arms; default: main. {'; '.join(studies)}",
     )
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="of each arm; default: 3")
-    parser.add_argument(
-        "--iterations",
-        type=int,
-        metavar="N",
-        help="of each training; default: 2000, with --upstream the codebase's own",
-    )
+    parser.add_argument("--iterations", type=int, default=2000, metavar="N", help="of each training; default: 2000")
     parser.add_argument(
         "-m", "--out", type=Path, default=Path("legs_compare"), metavar="DIR", help="default: legs_compare"
     )
@@ -63,16 +53,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     advanced.add_argument(
         "--scheduler", metavar="ADDRESS", help="of a dask cluster that shares the file system; a training is a task"
     )
-    upstream = parser.add_argument_group("advanced: another codebase's trainings, one at a time")
-    upstream.add_argument("--upstream", type=Path, metavar="FOLDER", help="a checkout, which is copied to OUT/upstream")
-    upstream.add_argument(
-        "--profile", metavar="NAME|FILE", help="how it is trained: built in, or a TOML file; default: the one that fits"
-    )
-    upstream.add_argument("--cpu", action="store_true", help="without a GPU, by legs run --cpu: for small scenes")
-    upstream.add_argument("--gaussians", type=int, metavar="N", help="for codebases that train to a fixed number")
-    upstream.add_argument(
-        "--extra", default="", metavar="WORDS", help="added to every training: --extra='--sh_degree 1'"
-    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -82,30 +62,20 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.cli.shared.checks import check_writable
     from legs_loss.cli.train import COMPILING, set_threads
     from legs_loss.errors import LegsError
-    from legs_loss.experiments.arms import needed, parse_arms
-    from legs_loss.experiments.running import BASELINE, Comparison
-    from legs_loss.experiments.studies import STUDIES, these_arms
+    from legs_loss.experiments.arms import STUDIES, needed, parse_arms, these_arms
+    from legs_loss.experiments.running import Comparison
     from legs_loss.reference.training.trainer import Progress, TrainConfig
     from legs_loss.report.tensorboard import tensorboard_log
     from legs_loss.scenes import read_scene
 
     set_threads(None)  # fail now if numba is missing
-    for name in ("seeds", "processes"):
-        if getattr(args, name) < 1:
-            raise LegsError(f"--{name} must be at least 1, got {getattr(args, name)}")
-    if args.seeds > SEEDS:
-        raise LegsError(f"--seeds must be at most {SEEDS}: each is a training of every arm")
-    study = STUDIES[args.study] if args.arms is None else these_arms(args.arms)
+    if args.processes < 1:
+        raise LegsError(f"--processes must be at least 1, got {args.processes}")
+    seeds = seeds_of(args)
+    names = these_arms(STUDIES[args.study] if args.arms is None else args.arms)
     check_writable(args.out)
-    if args.upstream is not None:
-        return _upstream(args, study)
-    for name in ("profile", "cpu", "gaussians", "extra"):
-        if getattr(args, name):
-            raise LegsError(f"--{name} is for --upstream")
-    arms = needed(parse_arms([BASELINE, *study.arms]))
-    seeds = range(args.seeds)
-    iterations = 2000 if args.iterations is None else args.iterations
-    base = TrainConfig(iterations=iterations, densify_grad_threshold=args.densify_grad_threshold)
+    arms = needed(parse_arms(names))
+    base = TrainConfig(iterations=args.iterations, densify_grad_threshold=args.densify_grad_threshold)
     root = _embedded(args.out / "scene") if args.scene is None else Path(args.scene)
     resolution = args.resolution
     if resolution is None:
@@ -130,58 +100,35 @@ def run(args: argparse.Namespace) -> int:
             log(name, progress)
 
         comparison.train(arms, seeds, args.processes, show, args.scheduler)
-    _say_scores(args.out, study, seeds)
+    say_scores(args.out, names, seeds)
     return 0
 
 
-def _say_scores(out: Path, study: Study, seeds: Sequence[int]) -> None:
+def seeds_of(args: argparse.Namespace) -> Sequence[int]:
+    """Return the seeds that --seeds says.
+
+    Raises:
+        LegsError: none, or more than anyone trains.
+    """
+    from legs_loss.errors import LegsError
+
+    if not 1 <= args.seeds <= SEEDS:
+        bound = "at least 1" if args.seeds < 1 else f"at most {SEEDS}: each is a training of every arm"
+        raise LegsError(f"--seeds must be {bound}, got {args.seeds}")
+    return range(args.seeds)
+
+
+def say_scores(out: Path, arms: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print the tables of a comparison's rows, and how to read them."""
     from legs_loss.experiments.running import read_rows
-    from legs_loss.experiments.tables import study_text
+    from legs_loss.experiments.tables import tables
     from legs_loss.reference.training.metrics import left_out
 
-    say(study_text([row for row in read_rows(out)[1] if row["seed"] in seeds], study), lines=True)
+    say(tables([row for row in read_rows(out)[1] if row["seed"] in seeds], arms), lines=True)
     say(f"\n{READING}", lines=True)
     if left_out():
         say(left_out())
     say(f"Rows: {out}; as a page: legs report {out}")
-
-
-def _upstream(args: argparse.Namespace, study: Study) -> int:
-    from legs_loss.errors import LegsError
-    from legs_loss.experiments.arms import needed, parse_arms
-    from legs_loss.experiments.running import BASELINE
-    from legs_loss.experiments.upstream.comparison import UpstreamComparison
-    from legs_loss.experiments.upstream.profile import find_profile, split
-
-    if args.scene is None:
-        raise LegsError("--upstream needs a SCENE")
-    if not args.upstream.is_dir():
-        raise LegsError(f"there is no folder {args.upstream}: --upstream takes a checkout of the codebase")
-    if args.scheduler is not None:
-        raise LegsError("--upstream trains here, one run at a time: do not give --scheduler")
-    if args.tensorboard is not None:
-        raise LegsError("--upstream trains by the codebase's own script: do not give --tensorboard")
-    if args.densify_grad_threshold is not None:
-        raise LegsError("with --upstream give the codebase's own threshold option, by --extra")
-    profile = find_profile(args.upstream, args.profile)
-    comparison = UpstreamComparison(
-        args.upstream,
-        profile,
-        Path(args.scene),
-        args.out,
-        images=args.images,
-        resolution=args.resolution,
-        iterations=args.iterations,
-        gaussians=args.gaussians,
-        extra=split(args.extra),
-        cpu=args.cpu,
-    )
-    arms = needed(parse_arms([BASELINE, *study.arms]))
-    seeds = range(args.seeds)
-    say(f"{profile.name}: {len(arms)} arms, {len(seeds)} seed(s), one training at a time")
-    comparison.train(arms, seeds, say)
-    _say_scores(args.out, study, seeds)
-    return 0
 
 
 def _embedded(root: Path) -> Path:

@@ -12,10 +12,11 @@ import os
 import shlex
 import time
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, List
 
-from legs_loss.cli.shared.affordable import add_scene_arguments, default_resolution
+from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution
 from legs_loss.system import say, write_whole
 
 HELP = "weight maps, four trainings, a table and pictures, on the embedded scene or your own"
@@ -69,17 +70,8 @@ def run(args: argparse.Namespace) -> int:
         for view, reason in report.skipped.items():
             raise LegsError(f"{view}: {reason}")
 
-    arms = [
-        Arm(
-            name,
-            root,
-            TrainConfig(spec=name, iterations=args.iterations, resolution=resolution, seed=args.seed),
-            out / name,
-            args.images,
-            store,
-        )
-        for name in METHODS
-    ]
+    base = TrainConfig(iterations=args.iterations, resolution=resolution, seed=args.seed)
+    arms = [Arm(name, root, replace(base, spec=name), out / name, args.images, store) for name in METHODS]
     for arm in arms:  # of an earlier demo, which this one replaces
         with suppress(FileNotFoundError):
             (out / arm.name / CHECKPOINT).unlink()

@@ -107,7 +107,7 @@ def _is_sharp(unit: np.ndarray) -> np.ndarray:
     import numpy as np
     import torch
 
-    from legs_loss.response import gaussian_blur, response
+    from legs_loss.responses import gaussian_blur, response
 
     image = torch.from_numpy(np.ascontiguousarray(unit.transpose(2, 0, 1)))
     contrast = gaussian_blur(response(image, channels_last=False), max(1.0, unit.shape[0] / 50))[0].numpy()

@@ -18,6 +18,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Dict, Iterable, Optional
 
+from legs_loss.cli.shared.scene_arguments import add_images, add_resolution
 from legs_loss.system import cores, say
 
 if TYPE_CHECKING:
@@ -36,15 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         help="a COLMAP scene, a scene with transforms.json or a folder of images; a glob; a .txt file of these",
     )
-    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
-    parser.add_argument(
-        "-r",
-        "--resolution",
-        type=int,
-        default=-1,
-        metavar="1|2|4|8|WIDTH",
-        help="as in 3DGS; default: at most 1600 wide",
-    )
+    add_images(parser)
+    add_resolution(parser, default=-1)
     parser.add_argument("-w", "--white_background", action="store_true", help="as in 3DGS: lay alpha over white")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="whose operator to use; default: legs")
     parser.add_argument("--masks", metavar="DIR|alpha", help="a folder of masks, or the photographs' own alpha")
@@ -73,12 +67,12 @@ def run(args: argparse.Namespace) -> int:
     """Write the stores; 1 when a photograph was skipped, or one of several scenes failed."""
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import precompute_scene
-    from legs_loss.system.executors import executor, in_the_order_they_end
+    from legs_loss.system.executors import outcomes
 
     tasks = _tasks(args)
     failed = 0
-    with _Bar(len(tasks)) as bar, executor(args.scheduler, bar.listen) as (runs, tell):
-        for task, done in in_the_order_they_end(runs, precompute_scene, tasks, tell):
+    with _Bar(len(tasks)) as bar:
+        for task, done in outcomes(precompute_scene, tasks, args.scheduler, bar.listen):
             with bar.above():
                 if isinstance(done, LegsError) and len(tasks) == 1:
                     raise done
@@ -116,7 +110,8 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
         views = ()
     check_resolution(args.resolution, views)
     if args.out is not None:
-        _make(stores[0].parent)
+        check_writable(stores[0].parent)
+        stores[0].parent.mkdir(parents=True, exist_ok=True)
     if args.scheduler is None:
         for store in stores:
             check_writable(store)
@@ -161,15 +156,6 @@ def _refuse_photographs_of_a_scene(folder: Path) -> None:
             f"{folder} has the photographs of the scene {scene}: no training of it looks for maps in there; give "
             f"the scene: legs precompute {shlex.quote(str(scene))}{other}"
         )
-
-
-def _make(folder: Path) -> None:
-    from legs_loss.errors import LegsError
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LegsError(f"cannot write to {folder}: {error.strerror or error}") from None
 
 
 def _say(store: Path, done: SceneDone) -> int:

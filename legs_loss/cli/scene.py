@@ -34,8 +34,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the scene; 1 when the camera of a photograph was not found."""
-    from tqdm import tqdm
-
     from legs_loss.errors import LegsError
     from legs_loss.scenes.reconstruct import reconstruct
 
@@ -46,21 +44,11 @@ def run(args: argparse.Namespace) -> int:
     ):
         if not fits:
             raise LegsError(f"--{name} must be {wanted}, got {getattr(args, name)}")
-    bars = {}
 
-    def tell(step: str, done: int, of: int) -> None:
-        if step not in bars:
-            bars[step] = tqdm(total=of, desc=step)
-        bar = bars[step]
-        bar.update(done - bar.n)
-        if done == of:
-            bar.close()
+    def tell(step: str) -> None:
+        say(f"{step} ...", sys.stderr)
 
-    try:
-        made = reconstruct(args.photographs, args.out, args.max_size, args.overlap, args.threads, tell)
-    finally:
-        for bar in bars.values():
-            bar.close()
+    made = reconstruct(args.photographs, args.out, args.max_size, args.overlap, args.threads, tell)
     say(
         f"{made.folder}: {len(made.placed)} of {len(made.placed) + len(made.lost)} photographs, {made.points} points, "
         f"mean reprojection error {made.error:.2f} pixels"

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
 
+from legs_loss.cli.shared.scene_arguments import add_images, add_resolution
 from legs_loss.system import printable, say
 
 if TYPE_CHECKING:
@@ -28,43 +29,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from legs_loss.spec import PRESETS
 
     parser.add_argument("scene", metavar="SCENE", help="a COLMAP scene")
-    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
-    parser.add_argument(
-        "-m",
-        "--out",
-        "--model_path",
-        dest="out",
-        type=Path,
-        metavar="DIR",
-        help="the run's folder; default: output/SCENE-PRESET",
-    )
+    add_images(parser)
+    folder = "the run's folder; default: output/SCENE-PRESET"
+    parser.add_argument("-m", "--out", "--model_path", dest="out", type=Path, metavar="DIR", help=folder)
     parser.add_argument("--resume", action="store_true", help="resume the run in the output folder")
     # Settings of the run. One that is not given is absent, so that --resume can tell.
     settings = parser.add_argument_group("the loss and the run", argument_default=argparse.SUPPRESS)
     settings.add_argument("--preset", dest="spec", choices=PRESETS, help="the loss; default: legs")
     settings.add_argument("--iterations", type=int, metavar="N", help="default: 2000")
-    settings.add_argument(
-        "-r", "--resolution", type=int, metavar="1|2|4|8|WIDTH", help="as in 3DGS; default: at most 1600 wide"
-    )
+    add_resolution(settings)
     settings.add_argument("-w", "--white_background", action="store_true", help="white in place of black")
     settings.add_argument("--max_gaussians", type=int, metavar="N", help="a cap on their number; default: none")
     settings.add_argument("--seed", type=int, metavar="N", help="default: 0")
     advanced = parser.add_argument_group("advanced: the training", argument_default=argparse.SUPPRESS)
     advanced.add_argument("--sh_degree", type=int, choices=range(4), help="of the colours; default: 1")
-    advanced.add_argument("--lambda_dssim", type=float, metavar="X", help="share of D-SSIM in the loss; default: 0.2")
-    advanced.add_argument("--l1_scale", type=float, metavar="X", help="multiplies the L1 term; default: 1")
-    advanced.add_argument(
-        "--position_lr_max_steps",
-        type=int,
-        metavar="N",
-        help="iterations over which the rate of positions falls; default: all; 3DGS: 30000",
-    )
-    advanced.add_argument(
-        "--densify_grad_threshold",
-        type=float,
-        metavar="X",
-        help="default: 0.12 / sqrt(width * height), at least 3DGS's 2e-4, which is too low for small images",
-    )
+    for name, kind, what in (
+        ("lambda_dssim", float, "share of D-SSIM in the loss; default: 0.2"),
+        ("l1_scale", float, "multiplies the L1 term; default: 1"),
+        ("position_lr_max_steps", int, "iterations over which the rate of positions falls; default: all; 3DGS: 30000"),
+        (
+            "densify_grad_threshold",
+            float,
+            "default: 0.12 / sqrt(width * height), at least 3DGS's 2e-4, which is too low for small images",
+        ),
+    ):
+        advanced.add_argument(f"--{name}", type=kind, metavar="N" if kind is int else "X", help=what)
     places = parser.add_argument_group("advanced: files and threads")
     places.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")
     places.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
@@ -76,10 +65,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, or resume a training, and print the scores."""
-    from legs_loss.cli.shared.checks import check_trainable, check_writable
+    from legs_loss.cli.shared.checks import check_resolution, check_writable
     from legs_loss.errors import LegsError
     from legs_loss.reference.training.checkpoint import CHECKPOINT, check_new
-    from legs_loss.reference.training.trainer import TrainConfig, point_cloud, train
+    from legs_loss.reference.training.trainer import TrainConfig, check_trainable, point_cloud, train
     from legs_loss.report.tensorboard import tensorboard_log
     from legs_loss.scenes import read_scene
 
@@ -92,7 +81,8 @@ def run(args: argparse.Namespace) -> int:
         raise LegsError(f"--checkpoint_every must be at least 1, got {args.checkpoint_every}")
     config = _resumed(checkpoint, given) if args.resume else TrainConfig(**given)
     scene = read_scene(args.scene, args.images)
-    check_trainable(scene, config.resolution)
+    check_trainable(scene)
+    check_resolution(config.resolution, scene.views)
     if not args.resume:
         check_new(out)  # and again when it begins: another may have begun meanwhile
     check_writable(out)

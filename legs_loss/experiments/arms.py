@@ -20,7 +20,9 @@ from legs_loss.spec import PRESETS, WeightSpec
 if TYPE_CHECKING:
     from legs_loss.reference.training.trainer import TrainConfig
 
-__all__ = ["CHANGES", "ArmSpec", "needed", "parse_arm", "parse_arms"]
+__all__ = ["BASELINE", "CHANGES", "STUDIES", "ArmSpec", "needed", "parse_arm", "parse_arms", "these_arms"]
+
+BASELINE = "3dgs"
 
 # The changes, with their descriptions for the help and the tables.
 CHANGES: Mapping[str, str] = {
@@ -29,6 +31,15 @@ CHANGES: Mapping[str, str] = {
     "mean1": "each map divided by its mean",
     "lambda=X": "the share X of D-SSIM in the loss",
     "threshold": "the densification threshold times the loss's mean weight",
+}
+
+# The built-in lists of arms.
+STUDIES: Mapping[str, Tuple[str, ...]] = {
+    "main": ("eggs", "legs-l", "legs"),
+    "controls": (
+        *("legs", "legs:scale", "legs:shuffled", "legs:mean1", "legs:threshold"),
+        *("3dgs@legs", "legs@3dgs", "legs:mean1@3dgs"),
+    ),
 }
 
 LOOSE = 0.25  # of the threshold: low enough that another arm's numbers are reached
@@ -48,6 +59,13 @@ class ArmSpec:
     def folder(self) -> str:
         """Return the name as a folder's, on any system."""
         return self.name.replace(":", "-").replace("@", "-at-").replace("=", "-").replace(",", "-")
+
+    @property
+    def reference(self) -> Optional[str]:
+        """Return the arm that this is measured against: the one whose numbers the unweighted loss gets, else 3dgs."""
+        if self.name == BASELINE:
+            return None
+        return self.at if self.at is not None and self.spec.unweighted else BASELINE
 
     @property
     def needs_mean_weight(self) -> bool:
@@ -121,6 +139,17 @@ def parse_arms(names: Sequence[str]) -> List[ArmSpec]:
 def needed(arms: Sequence[ArmSpec]) -> List[ArmSpec]:
     """Return the arms, and before them those whose numbers of Gaussians they use."""
     return list(dict.fromkeys([parse_arm(arm.at) for arm in arms if arm.at is not None] + list(arms)))
+
+
+def these_arms(names: Sequence[str]) -> List[str]:
+    """Return the arms of a table: the baseline, those whose numbers others get, and the named ones under these names.
+
+    >>> these_arms(["C4", "3dgs@legs"])
+    ['3dgs', 'legs', 'C4', '3dgs@legs']
+    """
+    own = {parse_arm(name).name: name for name in names}
+    arms = sorted(needed(parse_arms([BASELINE, *names])), key=lambda arm: arm.name != BASELINE)  # else as they were
+    return [own.get(arm.name, arm.name) for arm in arms]
 
 
 def _lambda(name: str, changes: Sequence[str]) -> Optional[float]:

@@ -40,18 +40,15 @@ def prove_unweighted(views: Sequence[TrainingView], config: TrainConfig) -> Dict
                 "differences from it would be meaningless"
             )
         # Any rendering will do: the photograph with noise has errors of all sizes.
-        rendering = (view.image + 0.2 * torch.randn(view.image.shape, generator=generator)).clamp(0, 1)
-        ours, our_gradient = _with_gradient(
-            lambda image, view=view, weight=weight: step_loss(image, view.image, weight, config.lambda_dssim), rendering
+        rendering = (view.image + 0.2 * torch.randn(view.image.shape, generator=generator)).clamp(0, 1).requires_grad_()
+        absolute, share = (rendering - view.image).abs().mean(), config.lambda_dssim
+        losses = (
+            step_loss(rendering, view.image, weight, share),
+            (1 - share) * absolute + share * d_ssim(rendering, view.image),
         )
-        theirs, their_gradient = _with_gradient(
-            lambda image, view=view: (
-                (1 - config.lambda_dssim) * (image - view.image).abs().mean()
-                + config.lambda_dssim * d_ssim(image, view.image)
-            ),
-            rendering,
-        )
+        our_gradient, their_gradient = (torch.autograd.grad(loss, rendering)[0] for loss in losses)
         difference = float((our_gradient - their_gradient).abs().max() / their_gradient.abs().max())
+        ours, theirs = (float(loss.detach()) for loss in losses)
         if abs(ours - theirs) > CLOSE * theirs or difference > CLOSE:
             raise LegsError(
                 f"the baseline's loss is not 3DGS's: {ours:.6f} in place of {theirs:.6f} for {view.name} "
@@ -60,10 +57,3 @@ def prove_unweighted(views: Sequence[TrainingView], config: TrainConfig) -> Dict
         ours_sum, theirs_sum, worst = ours_sum + ours, theirs_sum + theirs, max(worst, difference)
     count = len(views)
     return {"views": count, "loss": ours_sum / count, "loss_3dgs": theirs_sum / count, "gradient_error": worst}
-
-
-def _with_gradient(loss: Any, rendering: torch.Tensor) -> Any:
-    image = rendering.clone().requires_grad_(True)
-    value = loss(image)
-    value.backward()
-    return float(value.detach()), image.grad

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import time
-from pathlib import Path
 from typing import Any, Callable, Dict, Sequence
 
 from legs_loss.errors import LegsError
 from legs_loss.reference.training.side_by_side import Arm, train_arm
 from legs_loss.reference.training.trainer import Progress
-from legs_loss.system.executors import Listener, executor, in_the_order_they_end
+from legs_loss.system.executors import Listener, outcomes
 
 __all__ = ["train_on_cluster"]
 
@@ -23,34 +21,27 @@ def train_on_cluster(
     on_progress: Callable[[str, Progress], None],
     on_done: Callable[[str, Dict[str, Any]], None],
 ) -> None:
-    """Train all arms on a cluster that shares the file system; the other arguments are those of ``train_side_by_side``.
+    """Train arms on a cluster that shares the file system; the other arguments are those of ``train_side_by_side``.
 
+    Their paths are absolute.
     If a worker dies, another one resumes its training from the last checkpoint.
 
     Raises:
         LegsError: an arm failed; the message names it and its worker. Finished trainings are kept.
     """
-    if not arms:
-        return
-    absolute = [
-        arm._replace(
-            scene=Path(os.path.abspath(str(arm.scene))),
-            out=None if arm.out is None else Path(os.path.abspath(str(arm.out))),
-            images=os.path.abspath(arm.images) if arm.images and os.path.isdir(arm.images) else arm.images,
-        )
-        for arm in arms
-    ]
+    for arm in arms:
+        if arm.out is not None:
+            arm.out.mkdir(parents=True, exist_ok=True)  # made by a worker it would be on its own disk
 
     def listen(message: Dict[str, Any]) -> None:
         on_progress(message["name"], Progress(*message["progress"]))
 
     failed: Dict[str, LegsError] = {}
-    with executor(scheduler, listen) as (runs, tell):
-        for arm, outcome in in_the_order_they_end(runs, _train, absolute, tell):
-            if isinstance(outcome, LegsError):
-                failed[arm.name] = outcome
-            else:
-                on_done(arm.name, outcome)
+    for arm, outcome in outcomes(_train, arms, scheduler, listen):
+        if isinstance(outcome, LegsError):
+            failed[arm.name] = outcome
+        else:
+            on_done(arm.name, outcome)
     for name, error in failed.items():
         raise LegsError(f"{name}: {error}")
 

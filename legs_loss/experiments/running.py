@@ -1,8 +1,7 @@
 """A comparison in a folder: its settings, and one row for each arm and seed.
 
 OUT/comparison.json              the scene and the settings that all arms share, the proof of the baseline
-OUT/ARM/seed-N/plan.json         the row's complete settings
-OUT/ARM/seed-N/row.json          the same with the scores, once it is trained
+OUT/ARM/seed-N/row.json          the row's complete settings and its scores, once it is trained
 OUT/ARM/seed-N/point_cloud/...   its Gaussians
 """
 
@@ -21,10 +20,10 @@ import numpy as np
 
 from legs_loss._version import __version__
 from legs_loss.errors import LegsError
-from legs_loss.experiments.arms import ArmSpec, needed, parse_arm
+from legs_loss.experiments.arms import BASELINE, ArmSpec, needed, parse_arm
 from legs_loss.experiments.baseline import prove_unweighted
 from legs_loss.experiments.on_cluster import train_on_cluster
-from legs_loss.experiments.schema import PLAN, ROW, SETTINGS, what_is_wrong
+from legs_loss.experiments.schema import ROW, SETTINGS, what_is_wrong
 from legs_loss.reference.training.checkpoint import CHECKPOINT, alone_in
 from legs_loss.reference.training.dataset import Dataset, load_dataset
 from legs_loss.reference.training.side_by_side import Arm, train_arm, train_side_by_side
@@ -35,7 +34,6 @@ from legs_loss.system import read_regular, write_whole
 from legs_loss.weights import weight_maps
 
 __all__ = [
-    "BASELINE",
     "Comparison",
     "Row",
     "identity",
@@ -47,7 +45,6 @@ __all__ = [
     "write_json",
 ]
 
-BASELINE = "3dgs"
 _LARGEST = 256 << 20  # bytes of a file of a comparison
 EVALUATIONS = 10  # of the held-out views during a run, for the plots
 
@@ -68,9 +65,9 @@ class Comparison:
     """
 
     def __init__(self, scene: Path, base: TrainConfig, out: Path, images: Optional[str] = None) -> None:
-        self.root: Path = Path(scene)
+        self.root: Path = Path(os.path.abspath(str(scene)))
         self.images: Optional[str] = images
-        self.out: Path = Path(out)
+        self.out: Path = Path(os.path.abspath(str(out)))
         self.scene: Scene = read_scene(self.root, images)
         self.base: TrainConfig = replace(base, spec=BASELINE, seed=0)
         self._data: Optional[Dataset] = None
@@ -136,7 +133,7 @@ class Comparison:
 
             if scheduler is None:
                 train_side_by_side(trainings, processes, on_progress, done)
-            else:
+            elif trainings:
                 train_on_cluster(trainings, scheduler, on_progress, done)
         rows = [self.row(arm, seed) for seed in seeds for arm in needed(arms)]
         return [row for row in rows if row is not None]
@@ -151,16 +148,12 @@ class Comparison:
         return row
 
     def _training(self, name: str, arm: ArmSpec, seed: int) -> Arm:
+        """Return the training of a row; it resumes from a checkpoint in its folder."""
         config, caps = self._config(arm, seed)
+        every = max(1, config.iterations // EVALUATIONS)
+        images = os.path.abspath(self.images) if self.images and os.path.isdir(self.images) else self.images
         folder = self.folder(arm, seed)
-        plan = {
-            "arm": arm.name,
-            "seed": seed,
-            "config": config.as_dict(),
-            "caps": None if caps is None else sorted(caps.items()),
-        }
-        keep(folder / "plan.json", json.loads(json.dumps(plan)), "row", PLAN)
-        return _planned(name, plan, self.root, self.images, folder)
+        return Arm(name, self.root, config, folder, images, caps=caps, evaluate_every=every, resume=None)
 
     def _config(self, arm: ArmSpec, seed: int) -> Tuple[TrainConfig, Optional[Dict[int, int]]]:
         mean_weight = self.mean_weight(arm.spec) if arm.needs_mean_weight else 1.0
@@ -177,7 +170,15 @@ class Comparison:
         if arm.name == BASELINE and metrics["mean_weight"] != 1.0:
             raise LegsError(f"the baseline was trained with weights of mean {metrics['mean_weight']}")
         if self.row(arm, seed) is None:  # another comparison in this folder may have trained it, too
-            row = dict(read_json(folder / "plan.json", PLAN), versions=versions(), metrics=metrics)
+            config, caps = self._config(arm, seed)
+            row = {
+                "arm": arm.name,
+                "seed": seed,
+                "config": config.as_dict(),
+                "caps": None if caps is None else sorted(caps.items()),
+                "versions": versions(),
+                "metrics": metrics,
+            }
             write_json(folder / "row.json", row)
         with suppress(FileNotFoundError):
             (folder / CHECKPOINT).unlink()
@@ -185,13 +186,13 @@ class Comparison:
     def _begin(self) -> None:
         settings = {
             "scene": identity(self.scene),
-            "path": os.path.abspath(str(self.root)),
+            "path": str(self.root),
             "images": self.images,
             "base": replace(self.base, densify_grad_threshold=self.threshold).as_dict(),
         }
         path = self.out / "comparison.json"
         with alone_in(self.out, make=True):
-            keep(path, dict(settings, baseline=None), "comparison", SETTINGS, ("path", "baseline"))
+            keep(path, dict(settings, baseline=None), SETTINGS, ("path", "baseline"))
         # Each time: a resumed comparison may run with newer code.
         self.proof: Dict[str, Any] = prove_unweighted(self.data.train, self.base)
         write_json(path, dict(read_json(path, SETTINGS), baseline=self.proof))
@@ -251,21 +252,6 @@ def _code() -> str:
     return digest.hexdigest()[:12]
 
 
-def _planned(name: str, plan: Mapping[str, Any], root: Path, images: Optional[str], folder: Optional[Path]) -> Arm:
-    """Return the training that a plan describes; it resumes from a checkpoint in its folder."""
-    config = TrainConfig.from_dict(plan["config"])
-    return Arm(
-        name,
-        root,
-        config,
-        folder,
-        images,
-        caps=None if plan["caps"] is None else {int(iteration): int(count) for iteration, count in plan["caps"]},
-        evaluate_every=max(1, config.iterations // EVALUATIONS),
-        resume=None,
-    )
-
-
 def identity(scene: Scene) -> Dict[str, Any]:
     """Return an identification of a scene that does not depend on its folder."""
     digest = hashlib.sha256("\n".join(view.name for view in scene.views).encode())
@@ -274,7 +260,7 @@ def identity(scene: Scene) -> Dict[str, Any]:
     return {"name": scene.root.resolve().name, "views": len(scene.views), "sha256": digest.hexdigest()[:16]}
 
 
-def keep(path: Path, values: Dict[str, Any], what: str, names: Sequence[str], free: Sequence[str] = ()) -> None:
+def keep(path: Path, values: Dict[str, Any], names: Sequence[str], free: Sequence[str] = ()) -> None:
     """Write values, or check them against an existing file; those of the names in ``free`` may differ."""
     if not path.is_file():
         write_json(path, values)
@@ -285,7 +271,7 @@ def keep(path: Path, values: Dict[str, Any], what: str, names: Sequence[str], fr
     ]
     if different:
         raise LegsError(
-            f"{path}: this {what} was started with another {', '.join(different)}: choose another folder (--out), "
+            f"{path}: this comparison was started with another {', '.join(different)}: choose another folder (--out), "
             "or give the settings that it has"
         )
 

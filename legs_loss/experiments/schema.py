@@ -22,12 +22,11 @@ from legs_loss.system.values import (
     with_names,
 )
 
-__all__ = ["PLAN", "ROW", "SETTINGS", "what_is_wrong"]
+__all__ = ["ROW", "SETTINGS", "what_is_wrong"]
 
 # The required contents of the files.
 SETTINGS = ("scene", "path", "images", "base", "baseline")
-PLAN = ("arm", "seed", "config", "caps")
-ROW = (*PLAN, "versions", "metrics")
+ROW = ("arm", "seed", "config", "caps", "versions", "metrics")
 
 
 def what_is_wrong(values: Any, names: Iterable[str]) -> Optional[str]:

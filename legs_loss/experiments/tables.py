@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations
 from typing import Any, List, Mapping, Optional, Sequence, Tuple, TypeVar
 
 from legs_loss.experiments.arms import parse_arm
-from legs_loss.experiments.running import BASELINE
 from legs_loss.experiments.statistics import COLUMNS, Difference, difference, summarise_all, times_gaussians
-from legs_loss.experiments.studies import Study
 from legs_loss.reference.training.metrics import METRICS
 
 __all__ = [
@@ -18,10 +15,9 @@ __all__ = [
     "difference_cell",
     "differences_table",
     "markdown",
-    "paper_text",
     "score_cells",
     "scores_table",
-    "study_text",
+    "tables",
     "times_cell",
     "with_values",
 ]
@@ -99,52 +95,24 @@ DIFFERENCES: Mapping[str, Tuple[str, str]] = {
 }
 
 
-def differences_table(rows: Rows, study: Study) -> str:
+def differences_table(rows: Rows, arms: Sequence[str]) -> str:
     """Return each arm's differences from its reference arm, with their intervals."""
     lines = []
-    for arm in study.arms:
-        name, reference = parse_arm(arm).name, study.reference(parse_arm(arm).name)
-        if reference is None or name == reference:
-            continue
-        cells = [
-            difference_cell(difference(rows, name, reference, split, score), score)
-            for split, score in DIFFERENCES.values()
-        ]
-        ratio = times_gaussians(rows, name, reference)
-        if ratio is not None:
+    for arm in arms:
+        name, reference = parse_arm(arm).name, parse_arm(arm).reference
+        ratio = None if reference is None else times_gaussians(rows, name, reference)
+        if reference is not None and ratio is not None:
+            cells = [
+                difference_cell(difference(rows, name, reference, split, score), score)
+                for split, score in DIFFERENCES.values()
+            ]
             lines.append([f"{label(arm)} − {reference}", *cells, times_cell(ratio)])
     return markdown(*with_values(["difference", *DIFFERENCES, "Gaussians"], lines))
 
 
-def paper_text(rows: Rows, study: Study) -> str:
-    """Return the paper's values beside the measured ones."""
-    lines = [study.paper_says]
-    gains = {arm: difference(rows, parse_arm(arm).name, BASELINE, "train") for arm in study.paper or ()}
-    known = {arm: gain for arm, gain in gains.items() if gain is not None}
-    if len(known) > 1:
-        heads = ["curve", "paper, train PSNR", "here, train PSNR over 3dgs"]
-        table = [[label(arm), f"{study.paper[arm]:.2f}", difference_cell(known[arm], "psnr")] for arm in known]
-        lines += ["", markdown(heads, table), "", *_orders(rows, study, known)]
-    return "\n".join(lines)
-
-
-def study_text(rows: Rows, study: Study) -> str:
-    """Return a study's tables and the paper's statements."""
-    parts = [f"## {study.title}", scores_table(rows, study.arms), differences_table(rows, study)]
-    return "\n\n".join([*parts, paper_text(rows, study)] if study.paper_says else parts)
-
-
-def _orders(rows: Rows, study: Study, gains: Mapping[str, Difference]) -> List[str]:
-    theirs = sorted(gains, key=lambda arm: -study.paper[arm])
-    ours = sorted(gains, key=lambda arm: -gains[arm].mean)
-    lines = [f"Order in the paper: {' > '.join(theirs)}. Here: {' > '.join(ours)}."]
-    swapped = [(first, second) for first, second in combinations(theirs, 2) if ours.index(first) > ours.index(second)]
-    for first, second in swapped:
-        gap = difference(rows, parse_arm(first).name, parse_arm(second).name, "train")
-        assert gap is not None
-        weight = "more than the seeds and views explain" if gap.clear else "no more than seeds and views explain"
-        lines.append(f"{first} − {second} is {difference_cell(gap, 'psnr')} here: {weight}.")
-    return lines + ([] if swapped else ["The orders agree."])
+def tables(rows: Rows, arms: Sequence[str]) -> str:
+    """Return the scores of the arms, and their differences."""
+    return f"{scores_table(rows, arms)}\n\n{differences_table(rows, arms)}"
 
 
 def difference_cell(value: Optional[Difference], score: str) -> str:

@@ -31,37 +31,19 @@ def fused_loss(
     unweighted = weights.map is weights.mask is None and (weights.spec is None or weights.spec.unweighted)
     if padding != "zeros" or lambda_dssim == 0.0 or (unweighted and not forced_backend()):
         return None  # unweighted it is 3DGS's own loss, to the last bit
-    return _fused(
-        "loss",
-        prediction,
-        target,
-        weights,
-        lambda backend, first, second, resolved: backend.loss(first, second, resolved, lambda_dssim),
-    )
+    return _fused("loss", prediction, target, weights, lambda backend, *given: backend.loss(*given, lambda_dssim))
 
 
 def fused_l1(prediction: Tensor, target: Tensor, weights: Weights) -> Optional[Tensor]:
     """Return what :func:`legs_loss.weighted_l1` returns, by the backend for these images; None where that is torch."""
-    return _fused(
-        "l1",
-        prediction,
-        target,
-        weights,
-        lambda backend, first, second, resolved: backend.weighted_l1(first, second, resolved),
-    )
+    return _fused("l1", prediction, target, weights, lambda backend, *given: backend.weighted_l1(*given))
 
 
 def fused_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros") -> Optional[Tensor]:
     """Return what :func:`legs_loss.ssim` returns, by the backend for these images; None where that is torch."""
     if padding != "zeros":
         return None
-    return _fused(
-        "ssim",
-        prediction,
-        target,
-        Weights(),
-        lambda backend, first, second, _: backend.ssim(first, second),
-    )
+    return _fused("ssim", prediction, target, Weights(), lambda backend, first, second, _: backend.ssim(first, second))
 
 
 def fused_range(target: Tensor, spec: WeightSpec) -> Optional[Tensor]:
@@ -69,16 +51,12 @@ def fused_range(target: Tensor, spec: WeightSpec) -> Optional[Tensor]:
 
     None where no backend makes the weights of this spec for this image by itself.
     """
-    return _fused(
-        "l1",
-        target.detach(),
-        target.detach(),
-        Weights(spec),
-        lambda backend, _, second, resolved: (
-            backend.response_range(second, spec) if resolved.spec is not None else None
-        ),
-        with_maps=False,
-    )
+
+    def run(backend: Backend, _: Tensor, second: Tensor, resolved: Weights) -> Optional[Tensor]:
+        return None if resolved.spec is None else backend.response_range(second, spec)
+
+    target = target.detach()
+    return _fused("l1", target, target, Weights(spec), run, with_maps=False)
 
 
 Operation = Callable[[Backend, Tensor, Tensor, Weights], Optional[Tensor]]

@@ -122,15 +122,7 @@ def precompute_scene(task: SceneTask, tell: Listener) -> SceneDone:
             due = time.monotonic() + _TELL_SECONDS
             tell({"scene": str(task.scene), "done": done, "of": of})
 
-    report = precompute(
-        scene,
-        task.store,
-        task.spec,
-        task.resolution,
-        task.white_background,
-        task.workers,
-        on_progress=on_progress,
-        maps=task.maps,
-    )
+    settings = task.spec, task.resolution, task.white_background, task.workers
+    report = precompute(scene, task.store, *settings, on_progress=on_progress, maps=task.maps)
     short = Counter(PurePosixPath(view.name).name.split(".")[0] for view in scene.views)
     return SceneDone(report, sum(count for count in short.values() if count > 1))

@@ -11,12 +11,12 @@ import torch
 from legs_loss.kernels.available import BACKENDS
 from legs_loss.levels import response_levels
 from legs_loss.operators import OPERATORS
-from legs_loss.response import response
+from legs_loss.responses import response
 from legs_loss.scenes import image_tensor
 from legs_loss.scenes.images import row_strips
 from legs_loss.spec import WeightSpec
 
-__all__ = ["compiled_anew", "compiles", "normalised_map", "normalised_map_and_levels", "response_map"]
+__all__ = ["normalised_map", "normalised_map_and_levels", "response_map"]
 
 _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 
@@ -38,7 +38,7 @@ def normalised_map_and_levels(image: np.ndarray, spec: WeightSpec) -> Tuple[np.n
 
 def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
-    if compiles(image.size):
+    if image.size >= _WORTH_COMPILING and BACKENDS.chosen(torch.device("cpu")) == "numba":
         from legs_loss.kernels.numba_response import photograph_response, supports_response
 
         if supports_response(spec):
@@ -63,20 +63,3 @@ def _normalised(strength: torch.Tensor, spec: WeightSpec) -> Tuple[np.ndarray, f
     for rows in row_strips(height, width):  # in place: new memory would have to be mapped
         torch.from_numpy(normalised[rows]).copy_(strength[rows].sub_(low).div_(span))
     return normalised, float(low), float(span)
-
-
-def compiles(values: int) -> bool:
-    """Return whether numba is there, and worth loading for so many values of a photograph."""
-    return values >= _WORTH_COMPILING and BACKENDS.chosen(torch.device("cpu")) == "numba"
-
-
-def compiled_anew(spec: WeightSpec) -> bool:
-    """Load the compiled code by a small picture, and say whether any of it was not on disk yet."""
-    from numba.core import event
-
-    from legs_loss.kernels.numba_response import photograph_response, supports_response
-
-    with event.install_recorder("numba:compile") as compiled:
-        if supports_response(spec):
-            photograph_response(np.zeros((32, 32, 3), np.uint8), spec)
-    return bool(compiled.buffer)

@@ -13,7 +13,7 @@ from legs_loss.errors import LegsError
 from legs_loss.reference.training.metrics import strongest
 from legs_loss.report.labels import label
 from legs_loss.report.saving import save_figure, save_png
-from legs_loss.response import normalise_response, response
+from legs_loss.responses import normalise_response, response
 
 __all__ = ["Compared", "check_matplotlib", "save_pictures"]
 

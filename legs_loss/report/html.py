@@ -14,8 +14,8 @@ from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.experiments.arms import parse_arm
-from legs_loss.experiments.running import BASELINE, read_rows, scene_of
+from legs_loss.experiments.arms import BASELINE, parse_arm
+from legs_loss.experiments.running import read_rows, scene_of
 from legs_loss.experiments.statistics import COLUMNS, Difference, difference, summarise_all, times_gaussians
 from legs_loss.experiments.tables import LABELS, MISSING, difference_cell, score_cells, times_cell, with_values
 from legs_loss.levels import levels_of
@@ -67,20 +67,10 @@ def write_report(
         first.setdefault(row["arm"], row)
     base = TrainConfig.from_dict(settings["base"])
     levels = _scene_levels(read, base, first)
+    folders = {arm: run / parse_arm(arm).folder / f"seed-{first[arm]['seed']}" for arm in names}
     drawn = []
-    for view in shown:
-        loaded = load_view(read, view, base.resolution)
-        drawn.append(
-            (
-                loaded,
-                {
-                    arm: draw_row(
-                        first[arm], run / parse_arm(arm).folder / f"seed-{first[arm]['seed']}", loaded, levels.get(arm)
-                    )
-                    for arm in names
-                },
-            )
-        )
+    for view in (load_view(read, view, base.resolution) for view in shown):
+        drawn.append((view, {arm: draw_row(first[arm], folders[arm], view, levels.get(arm)) for arm in names}))
     for form in IMAGE_FORMATS:
         page = _page(settings, rows, names, [encode(view, each, form) for view, each in drawn], first, run)
         data = page.encode("utf-8")
@@ -126,7 +116,8 @@ def _page(
         ),
         verdict=_verdict(rows, arms, preferred),
         scores=_scores(rows, arms),
-        differences=_differences(rows, others) if BASELINE in arms and others else "There is no second arm.",
+        differences=_differences(rows, others) if BASELINE in arms and others else None,
+        baseline=BASELINE,
         by_iterations=Markup(by_iterations(rows, arms)),
         by_gaussians=[Markup(plot) for plot in by_gaussians(rows, arms)],
         seed=first[arms[0]]["seed"],
@@ -159,22 +150,21 @@ def _in_words(found: Difference) -> str:
     return amount if found.clear else f"no clear difference in PSNR ({found.mean:+.2f} dB, may be chance) to"
 
 
-def _scores(rows: Sequence[Row], arms: Sequence[str]) -> str:
+# The heads of a table and its lines; each cell is its text and the value that it sorts by.
+Table = Tuple[List[str], List[List[Tuple[str, str]]]]
+
+
+def _scores(rows: Sequence[Row], arms: Sequence[str]) -> Table:
     body = []
     for summary in summarise_all(rows, arms):
         cells = score_cells(summary.mean, summary.spread)
-        values = [summary.mean[label] for label in LABELS]
-        body.append(
-            [(summary.arm, summary.arm), *zip(cells, map(_sortable, values)), (str(summary.seeds), str(summary.seeds))]
-        )
-    return _table(
-        "Mean ± standard deviation over seeds. PSNR in dB. “strongest 10%” and “the rest” split each held-out "
-        "photograph's pixels by their Laplacian response, which favours the weighted losses.",
-        *with_values(["arm", *LABELS, "seeds"], body),
-    )
+        values = [_sortable(summary.mean[label]) for label in LABELS]
+        seeds = str(summary.seeds)
+        body.append([(summary.arm, summary.arm), *zip(cells, values), (seeds, seeds)])
+    return with_values(["arm", *LABELS, "seeds"], body)
 
 
-def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
+def _differences(rows: Sequence[Row], arms: Sequence[str]) -> Table:
     columns = {column.label: column.metric for column in COLUMNS if column.metric is not None}
     body = []
     for arm in arms:
@@ -186,64 +176,32 @@ def _differences(rows: Sequence[Row], arms: Sequence[str]) -> str:
         ratio = times_gaussians(rows, arm, BASELINE)
         times = (MISSING, _sortable(math.nan)) if ratio is None else (times_cell(ratio), _sortable(ratio))
         body.append([(arm, arm), *cells, times])
-    return _table(
-        f"Each arm minus {BASELINE}, paired by view. Brackets: 95% interval over seeds and views. ? where it holds 0, "
-        "or where seeds differ in sign.",
-        *with_values(["arm", *columns, "Gaussians"], body),
-    )
+    return with_values(["arm", *columns, "Gaussians"], body)
 
 
-def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> str:
-    heads = [
-        "arm",
-        "operator",
-        "p",
-        "curve",
-        "beta",
-        "percentile",
-        "normalise",
-        "L1 scale",
-        "threshold",
-        "weights",
-        "numbers of",
-    ]
-    body = []
-    for arm in arms:
-        row = first[arm]
-        config, spec = row["config"], row["config"]["spec"]
-        values = [spec[name] for name in ("operator", "p", "curve", "beta", "percentile", "normalise")]
-        threshold = config["densify_grad_threshold"]
-        values += [f"{config['l1_scale']:.4g}", "–" if threshold is None else f"{threshold:.4g}"]
-        values += ["shuffled" if config.get("shuffled") else "the spec's", parse_arm(arm).at or "its own"]
-        body.append([(arm, arm)] + [(str(value), "") for value in values])
-    return _table("", heads, body, sortable=False)
-
-
-def _table(caption: str, heads: Sequence[str], body: Sequence[Sequence[Tuple[str, str]]], sortable: bool = True) -> str:
-    """Return a table; each cell is its text and the value that it sorts by."""
-    from markupsafe import Markup
-
-    nothing = Markup("")
-    button = Markup('<th scope="col"><button type="button">{}</button></th>')
-    head = nothing.join(
-        (button if sortable else Markup('<th scope="col" class="plain">{}</th>')).format(h) for h in heads
-    )
+def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> List[Dict[str, str]]:
     lines = []
-    for (text, value), *cells in body:
-        first = Markup('<th scope="row" data-value="{}">{}</th>').format(value, text)
-        others = nothing.join(Markup('<td data-value="{}">{}</td>').format(value, text) for text, value in cells)
-        lines.append(Markup("<tr>{}{}</tr>").format(first, others))
-    kind = Markup(' class="sortable"') if sortable else ""
-    described = Markup("<caption><span>{}</span></caption>").format(caption) if caption else ""
-    table = Markup("<table{}>{}<thead><tr>{}</tr></thead><tbody>{}</tbody></table>")
-    return table.format(kind, described, head, nothing.join(lines))
+    for arm in arms:
+        config = first[arm]["config"]
+        spec, threshold = config["spec"], config["densify_grad_threshold"]
+        lines.append(
+            {
+                "arm": arm,
+                **{name: spec[name] for name in ("operator", "p", "curve", "beta", "percentile", "normalise")},
+                "L1 scale": f"{config['l1_scale']:.4g}",
+                "threshold": MISSING if threshold is None else f"{threshold:.4g}",
+                "weights": "shuffled" if config.get("shuffled") else "the spec's",
+                "numbers of": parse_arm(arm).at or "its own",
+            }
+        )
+    return lines
 
 
-def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> str:
-    base, proof, scene = settings["base"], settings["baseline"], settings["scene"]
+def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> Dict[str, str]:
+    base, scene = settings["base"], settings["scene"]
     shared = {
         "scene": f"{scene['name']}: {scene['views']} views, sha256 {scene['sha256']}",
-        "proof of the baseline": _proof(proof),
+        "proof of the baseline": _proof(settings["baseline"]),
     }
     if "upstream" in settings:  # the other settings are the package's own trainer's
         own = {**settings["upstream"], "iterations": base["iterations"]}
@@ -251,13 +209,10 @@ def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> str:
             shared[f"upstream {name}"] = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     else:
         shared.update({name: str(base[name]) for name in base if name not in ("spec", "seed", "max_gaussians")})
-    versions = {name: sorted({str(row["versions"].get(name)) for row in rows}) for name in rows[0]["versions"]}
-    shared.update(
-        {f"version of {name}" if name != "machine" else name: ", ".join(each) for name, each in versions.items()}
-    )
-    from markupsafe import Markup
-
-    return Markup("").join(Markup("<dt>{}</dt><dd>{}</dd>").format(name, value) for name, value in shared.items())
+    for name in rows[0]["versions"]:
+        versions = sorted({str(row["versions"].get(name)) for row in rows})
+        shared[name if name == "machine" else f"version of {name}"] = ", ".join(versions)
+    return shared
 
 
 def _proof(proof: Mapping[str, Any]) -> str:
@@ -271,14 +226,15 @@ def _proof(proof: Mapping[str, Any]) -> str:
 
 def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[int], run: Path) -> str:
     base = settings["base"]
-    words = ["legs", "compare", settings["scene"]["name"], "--arms", *(arm for arm in arms if arm != BASELINE)]
-    words += ["--seeds", str(seeds[-1] + 1)]
+    program = ["legs", "compare"] if "upstream" not in settings else ["python", "examples/reproduce_paper/compare.py"]
+    words = [*program, settings["scene"]["name"], *(["CHECKOUT"] if "upstream" in settings else [])]
+    words += ["--arms", *(arm for arm in arms if arm != BASELINE), "--seeds", str(seeds[-1] + 1)]
     words += ["--images", settings["images"]] if settings["images"] is not None else []
     own = settings.get("upstream", base)
     for flag, name in (("-r", "resolution"), ("--iterations", "iterations")):
         words += [flag, str(own[name])] if own[name] is not None else []
     if "upstream" in settings:
-        words += ["--upstream", "CHECKOUT", "--profile", own["profile"], *(["--cpu"] if own["cpu"] else [])]
+        words += ["--profile", own["profile"], *(["--cpu"] if own["cpu"] else [])]
         words += ["--gaussians", str(own["gaussians"])] if own["gaussians"] is not None else []
         words += ["--extra=" + " ".join(map(shlex.quote, own["extra"]))] if own["extra"] else []
         return " ".join(shlex.quote(word) for word in [*words, "--out", run.name])

@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from legs_loss.errors import LegsError
-from legs_loss.experiments.upstream.training import read_picture
 from legs_loss.reference.ply import read_ply
 from legs_loss.reference.training.dataset import TrainingView, shuffled
 from legs_loss.reference.training.trainer import TrainConfig, draw, point_cloud, step_weight
+from legs_loss.scenes import image_tensor, open_image
 from legs_loss.weights import weight_map
 
-__all__ = ["KINDS", "Drawn", "Pictures", "differing", "draw_row", "encode"]
+__all__ = ["KINDS", "Drawn", "Pictures", "differing", "draw_row", "encode", "read_picture"]
 
 KINDS = ("rendering", "error", "weight")
 CROPS = 3  # of each pair of arms and each view
@@ -81,6 +81,12 @@ def _upstreams_own(row: Mapping[str, Any], folder: Path, view: TrainingView) -> 
     if full is None or folder.resolve().parents[1] not in full.parents or not full.is_file():
         raise LegsError(f"{row['arm']} left no rendering of {view.name}: choose held-out views (--views)")
     return read_picture(full)
+
+
+def read_picture(path: Path) -> Tensor:
+    """Return a picture that a codebase wrote, [3, H, W] in [0, 1]."""
+    with open_image(path) as image:
+        return image_tensor(np.asarray(image.convert("RGB")))
 
 
 def encode(view: TrainingView, drawn: Mapping[str, Drawn], form: Mapping[str, Any]) -> Pictures:

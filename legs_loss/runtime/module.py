@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from legs_loss.config import find_config
 from legs_loss.levels import RunningLevels, response_levels
 from legs_loss.loss import legs_loss
-from legs_loss.response import response
+from legs_loss.responses import response
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.state import Run
 from legs_loss.spec import Spec, WeightSpec, as_spec

@@ -21,7 +21,7 @@ from legs_loss.kernels.available import is_capturing
 from legs_loss.kernels.backends import fused_range
 from legs_loss.kernels.contract import Weights
 from legs_loss.levels import RunningLevels, response_levels
-from legs_loss.response import response
+from legs_loss.responses import response
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.memo import WeightMemo
 from legs_loss.runtime.stored import Stored

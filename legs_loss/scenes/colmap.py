@@ -85,22 +85,11 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
         path = images / name
         if not os.path.isfile(str(path)) and os.path.isfile(str(images / path.name)):  # pathlib's raise for some names
             path, name = images / path.name, path.name
-        intrinsics = cameras[image.camera_id]
-        views.append(
-            View(
-                name=f"{prefix}{name}",
-                path=path,
-                camera=_pinhole(intrinsics, image),
-                camera_model=intrinsics.model,
-            )
-        )
+        lens = cameras[image.camera_id]
+        views.append(View(f"{prefix}{name}", path, _pinhole(lens, image), camera_model=lens.model))
     points = model / f"points3D.{kind}"
-    return Scene(
-        root=root,
-        kind="colmap",
-        views=tuple(sorted(views, key=lambda view: view.name)),
-        read_points=partial(read_points, points) if points.is_file() else None,
-    )
+    read = partial(read_points, points) if points.is_file() else None
+    return Scene(root, "colmap", tuple(sorted(views, key=lambda view: view.name)), read)
 
 
 def read_points(path: Path) -> PointCloud:

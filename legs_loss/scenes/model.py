@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Callable, Iterator, Optional, Tuple
 
@@ -37,15 +37,7 @@ class Camera:
         (250.0, 75.0)
         """
         x, y = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * x,
-            fy=self.fy * y,
-            cx=self.cx * x,
-            cy=self.cy * y,
-        )
+        return Camera(width, height, self.fx * x, self.fy * y, self.cx * x, self.cy * y, self.world_to_camera)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from itertools import combinations
 from pathlib import Path
 from typing import Any, Callable, List, NamedTuple, Optional, Sequence, Tuple
 
@@ -19,12 +18,7 @@ from legs_loss.scenes.images import open_image
 __all__ = ["PHOTOGRAPHS", "Reconstructed", "reconstruct"]
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
-EXTRACTED_AT_ONCE = 4
-MATCHED_AT_ONCE = 100  # pairs
 FEWEST = 3  # photographs that a scene needs
-
-# Of a step's name, how many are done and how many there are.
-Tell = Callable[[str, int, int], None]
 
 
 class Reconstructed(NamedTuple):
@@ -50,7 +44,7 @@ def reconstruct(
     max_size: int = 3200,
     overlap: Optional[int] = None,
     threads: int = -1,
-    tell: Tell = lambda step, done, of: None,
+    tell: Callable[[str], None] = lambda step: None,
 ) -> Reconstructed:
     """Find the cameras of photographs and points of the scene, and write them as a COLMAP scene.
 
@@ -61,7 +55,7 @@ def reconstruct(
         overlap: compare each photograph with so many that follow it by name, for frames of a video; None compares all
             with all.
         threads: -1 for one a core.
-        tell: called as the work goes on.
+        tell: called with the name of each step as it begins.
 
     Raises:
         LegsError: pycolmap is missing, there are too few photographs, or no scene can be made of them.
@@ -77,10 +71,14 @@ def reconstruct(
         raise LegsError(f"cannot write {out}: {error.strerror or error}") from None
     try:
         database = work / "database.db"
-        _extract(pycolmap, database, photographs, names, max_size, threads, tell)
-        _match(pycolmap, database, work / "pairs.txt", names, overlap, threads, tell)
-        model = _map(pycolmap, database, photographs, work / "models", len(names), threads, tell)
-        scene = _undistort(pycolmap, model, photographs, work, max_size, threads, tell)
+        tell(f"features of {len(names)} photographs")
+        _extract(pycolmap, database, photographs, names, max_size, threads)
+        tell("features that photographs share")
+        _match(pycolmap, database, overlap, threads)
+        tell("cameras and points")
+        model = _map(pycolmap, database, photographs, work / "models", threads)
+        tell("undistorted photographs")
+        scene = _undistort(pycolmap, model, photographs, work, max_size, threads)
         placed = sorted(image.name for image in model.images.values() if image.has_pose)
         os.replace(str(scene), str(out))
     finally:
@@ -94,7 +92,7 @@ def _pycolmap() -> Any:
         import pycolmap
     except ImportError:
         raise LegsError('reconstruction needs pycolmap: pip install "legs-loss[colmap]"') from None
-    if not hasattr(pycolmap, "match_image_pairs"):
+    if not hasattr(pycolmap, "FeatureMatchingOptions"):
         raise LegsError('this pycolmap is too old: pip install --upgrade "legs-loss[colmap]"')
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # failures are reported by this module
     pycolmap.set_random_seed(0)
@@ -124,65 +122,38 @@ def _one_camera(folder: Path, names: Sequence[str]) -> bool:
     return len(kinds) == 1
 
 
-def _extract(
-    pycolmap: Any, database: Path, folder: Path, names: Sequence[str], max_size: int, threads: int, tell: Tell
-) -> None:
+def _extract(pycolmap: Any, database: Path, folder: Path, names: Sequence[str], max_size: int, threads: int) -> None:
     mode = pycolmap.CameraMode.SINGLE if _one_camera(folder, names) else pycolmap.CameraMode.AUTO
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size, options.num_threads = max_size, threads
-    reader = pycolmap.ImageReaderOptions()
-    for start in range(0, len(names), EXTRACTED_AT_ONCE):
-        tell("features", start, len(names))
-        pycolmap.extract_features(
-            database, folder, list(names[start : start + EXTRACTED_AT_ONCE]), mode, reader, options
-        )
-        if mode == pycolmap.CameraMode.SINGLE:  # one camera for all calls, not one for each
-            with pycolmap.Database.open(database) as opened:
-                reader.existing_camera_id = opened.read_all_cameras()[0].camera_id
-    tell("features", len(names), len(names))
+    pycolmap.extract_features(database, folder, list(names), mode, extraction_options=options)
 
 
-def _match(
-    pycolmap: Any, database: Path, listed: Path, names: Sequence[str], overlap: Optional[int], threads: int, tell: Tell
-) -> None:
-    pairs = [
-        (first, second)
-        for first, second in combinations(range(len(names)), 2)
-        if overlap is None or second - first <= overlap
-    ]
-    matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
-    matching.num_threads, pairing.match_list_path = threads, listed
-    for start in range(0, len(pairs), MATCHED_AT_ONCE):
-        tell("pairs", start, len(pairs))
-        block = pairs[start : start + MATCHED_AT_ONCE]
-        listed.write_text("".join(f"{names[first]} {names[second]}\n" for first, second in block), encoding="utf-8")
-        pycolmap.match_image_pairs(database, matching, pairing)
-    tell("pairs", len(pairs), len(pairs))
+def _match(pycolmap: Any, database: Path, overlap: Optional[int], threads: int) -> None:
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = threads
+    if overlap is None:
+        pycolmap.match_exhaustive(database, options)
+        return
+    pairs = pycolmap.SequentialPairingOptions()
+    pairs.overlap, pairs.quadratic_overlap = overlap, False
+    pycolmap.match_sequential(database, options, pairs)
 
 
-def _map(pycolmap: Any, database: Path, folder: Path, out: Path, count: int, threads: int, tell: Tell) -> Any:
+def _map(pycolmap: Any, database: Path, folder: Path, out: Path, threads: int) -> Any:
     out.mkdir()
-    placed = [0]
-
-    def one_more(by: int) -> None:
-        placed[0] = min(count, placed[0] + by)
-        tell("cameras", placed[0], count)
-
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.min_model_size = threads, 0, FEWEST
-    tell("cameras", 0, count)
-    models = pycolmap.incremental_mapping(database, folder, out, options, "", lambda: one_more(2), lambda: one_more(1))
+    models = pycolmap.incremental_mapping(database, folder, out, options)
     if not models:
         raise LegsError(
             f"{folder}: no scene can be made of these photographs. They must show one still scene from different "
             "places, each overlapping its neighbours by half or more, with texture, in focus"
         )
-    tell("cameras", count, count)
     return max(models.values(), key=lambda model: model.num_reg_images())
 
 
-def _undistort(pycolmap: Any, model: Any, folder: Path, work: Path, max_size: int, threads: int, tell: Tell) -> Path:
-    tell("photographs", 0, 1)
+def _undistort(pycolmap: Any, model: Any, folder: Path, work: Path, max_size: int, threads: int) -> Path:
     best, made = work / "best", work / "undistorted"
     best.mkdir()
     model.write(best)
@@ -193,5 +164,4 @@ def _undistort(pycolmap: Any, model: Any, folder: Path, work: Path, max_size: in
     (scene / "sparse").mkdir(parents=True)
     os.replace(str(made / "images"), str(scene / "images"))
     os.replace(str(made / "sparse"), str(scene / "sparse" / "0"))
-    tell("photographs", 1, 1)
     return scene

@@ -71,17 +71,8 @@ def _read_file(root: Path, file: Path) -> List[View]:
         name = _image_name(root, frame["file_path"])
         intrinsics = {**common, **frame}
         model = _model(intrinsics)
-        pinhole = model in ("PINHOLE", "SIMPLE_PINHOLE")
-        views.append(
-            View(
-                name=name,
-                path=root / name,
-                camera=_camera(intrinsics, root / name) if pinhole else None,
-                split=one_split or splits.get(name),
-                camera_model=model,
-                composited=True,
-            )
-        )
+        camera = _camera(intrinsics, root / name) if model in ("PINHOLE", "SIMPLE_PINHOLE") else None
+        views.append(View(name, root / name, camera, one_split or splits.get(name), model, composited=True))
     return views
 
 

@@ -5,7 +5,8 @@ The modules are independent of images and losses, and do not import torch. ``exe
 
 from __future__ import annotations
 
-from legs_loss.system.ctrl_c import held_back, kept_from_children, noted
+from legs_loss.system.children import Child
+from legs_loss.system.ctrl_c import held_back, noted
 from legs_loss.system.distributed import is_first_process
 from legs_loss.system.files import open_regular, read_regular, write_whole
 from legs_loss.system.locks import FileLock, HeldError, is_held
@@ -15,6 +16,7 @@ from legs_loss.system.processors import cores
 from legs_loss.system.terminal import never_fail_to_print, printable, say, say_error
 
 __all__ = [
+    "Child",
     "FileLock",
     "HeldError",
     "cores",
@@ -22,7 +24,6 @@ __all__ = [
     "is_first_process",
     "is_held",
     "keep_freed_memory",
-    "kept_from_children",
     "never_fail_to_print",
     "noted",
     "open_regular",

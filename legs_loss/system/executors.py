@@ -1,7 +1,7 @@
-"""Run tasks in this process, or on the workers of a dask scheduler. Both are concurrent.futures' Executor.
+"""Run a task for each argument, in this process or on the workers of a dask scheduler.
 
-A task is a function of a module with its arguments. A task that reports progress takes ``tell``, which sends a message
-(numbers, strings, lists, dicts) to the caller. Workers need access to the task's files: the file system is shared.
+A task is a function of a module: of an argument and of ``tell``, which sends a message (numbers, strings, lists, dicts)
+to the caller. Workers need access to the task's files: the file system is shared.
 """
 
 from __future__ import annotations
@@ -9,35 +9,46 @@ from __future__ import annotations
 import asyncio
 import platform
 import uuid
-from concurrent.futures import Executor, Future, as_completed
-from contextlib import contextmanager
-from typing import Any, Callable, Dict, Iterable, Iterator, NamedTuple, Optional, Tuple
+from typing import Any, Callable, Iterable, Iterator, Optional, Tuple
 
 from legs_loss._version import __version__
 from legs_loss.errors import LegsError
 
-__all__ = ["Listener", "executor", "in_the_order_they_end"]
+__all__ = ["Listener", "Task", "outcomes"]
 
 Listener = Callable[[Any], None]
+Task = Callable[[Any, Listener], Any]
 _PATIENCE = 30  # seconds for a scheduler to answer, and for its first worker
 
 
-@contextmanager
-def executor(scheduler: Optional[str], listen: Listener) -> Iterator[Tuple[Executor, Listener]]:
-    """Yield an executor and the ``tell`` of its tasks: this process one after the other, or a dask scheduler's workers.
+def outcomes(
+    task: Task, arguments: Iterable[Any], scheduler: Optional[str], listen: Listener
+) -> Iterator[Tuple[Any, Any]]:
+    """Yield each argument with the result of its task, or the LegsError that this ended in, in the order they end.
 
     Args:
-        scheduler: a dask scheduler's address ("tcp://host:8786"); None for this process.
+        task: what is run.
+        arguments: of the tasks.
+        scheduler: a dask scheduler's address ("tcp://host:8786"), whose workers run them; None runs them here, one
+            after the other.
         listen: gets what all tasks tell, maybe in another thread.
 
     Raises:
         LegsError: dask is missing, or no scheduler or no worker answers.
     """
-    if scheduler is None:
-        yield _Here(), listen
+    if scheduler is not None:
+        yield from _on_cluster(task, arguments, scheduler, listen)
         return
+    for argument in arguments:
+        try:
+            yield argument, task(argument, listen)
+        except LegsError as error:
+            yield argument, error
+
+
+def _on_cluster(task: Task, arguments: Iterable[Any], scheduler: str, listen: Listener) -> Iterator[Tuple[Any, Any]]:
     try:
-        from distributed import Client
+        from distributed import Client, as_completed
     except ImportError:
         raise LegsError("--scheduler needs dask: pip install 'legs-loss[cluster]'") from None
     try:
@@ -51,25 +62,15 @@ def executor(scheduler: Optional[str], listen: Listener) -> Iterator[Tuple[Execu
             raise LegsError(f"the scheduler {scheduler} has no workers: start some with `dask worker`") from None
         topic = f"legs-{uuid.uuid4().hex}"
         client.subscribe_topic(topic, lambda event: listen(event[1]))
-        yield _Cluster(client), _Topic(topic).tell
+        futures = {
+            client.submit(_on_worker, __version__, task, argument, topic, pure=False): argument
+            for argument in arguments
+        }
+        for future in as_completed(futures, loop=client.loop):
+            yield futures[future], _outcome(future)
 
 
-def in_the_order_they_end(
-    runs: Executor, function: Callable[..., Any], arguments: Iterable[Any], *more: Any
-) -> Iterator[Tuple[Any, Any]]:
-    """Run ``function(argument, *more)`` for each argument; yield each with its result, or the LegsError it ended in."""
-    waiting: Dict[Any, Any] = {}
-    for argument in arguments:
-        future = runs.submit(function, argument, *more)
-        if future.done():  # in this process, one after the other
-            yield argument, _outcome(future)
-        else:
-            waiting[future] = argument
-    for future in as_completed(waiting):
-        yield waiting[future], _outcome(future)
-
-
-def _outcome(future: Future[Any]) -> Any:
+def _outcome(future: Any) -> Any:
     try:
         return future.result()
     except LegsError as error:
@@ -86,40 +87,7 @@ def _outcome(future: Future[Any]) -> Any:
         return LegsError(f"a worker could not run it: {error}")
 
 
-class _Here(Executor):
-    """Run a task when it is submitted, in this process and thread, so that Ctrl-C reaches it."""
-
-    def submit(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Future[Any]:  # type: ignore[override]
-        future: Future[Any] = Future()
-        try:
-            future.set_result(function(*arguments, **named))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-class _Cluster(Executor):
-    """Hand tasks to dask's own executor. A task whose worker dies is given to another one."""
-
-    def __init__(self, client: Any) -> None:
-        self._executor = client.get_executor(pure=False)
-
-    def submit(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Future[Any]:  # type: ignore[override]
-        return self._executor.submit(_on_worker, __version__, function, arguments, named)
-
-
-class _Topic(NamedTuple):
-    """The topic of a worker's messages; the scheduler passes them on."""
-
-    name: str
-
-    def tell(self, message: Any) -> None:
-        from distributed import get_worker
-
-        get_worker().log_event(self.name, message)
-
-
-def _on_worker(version: str, function: Callable[..., Any], arguments: Tuple[Any, ...], named: Dict[str, Any]) -> Any:
+def _on_worker(version: str, task: Task, argument: Any, topic: str) -> Any:
     """Run a task; errors name the worker."""
     from distributed import get_worker
 
@@ -128,6 +96,6 @@ def _on_worker(version: str, function: Callable[..., Any], arguments: Tuple[Any,
     if version != __version__:
         raise LegsError(f"{where} has legs-loss {__version__}, not {version}: install the same version on every worker")
     try:
-        return function(*arguments, **named)
+        return task(argument, lambda message: worker.log_event(topic, message))
     except (LegsError, OSError, MemoryError) as error:
         raise LegsError(f"{where}: {error or 'not enough memory'}") from None

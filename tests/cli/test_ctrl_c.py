@@ -14,7 +14,8 @@ from tests.support import ROOT, legs_environment
 
 SCRIPT = """
 import multiprocessing, os, signal
-from legs_loss.system import held_back, kept_from_children, noted
+from legs_loss.system import held_back, noted
+from legs_loss.system.ctrl_c import kept_from_children
 
 
 def ask(answers):

@@ -213,12 +213,6 @@ class TestFirstQuarterOfAnHour:
             assert (code, text.count("\n")) == (2, 1)
             assert message in text
 
-    def test_an_upstream_that_is_not_there(self, capsys, scene, tmp_path):
-        pytest.importorskip("numba")
-        code, text = says(capsys, "compare", scene, "--upstream", tmp_path / "nothere", "--out", tmp_path / "out")
-        assert code == 2
-        assert f"there is no folder {tmp_path / 'nothere'}: --upstream takes a checkout" in text
-
     def test_cpu_behind_the_script(self, tmp_path):
         pytest.importorskip("libcst")
         script = tmp_path / "train.py"

@@ -280,10 +280,9 @@ def contrast(first: str, second: str) -> float:
 def test_what_a_stranger_named_is_shown_and_not_run(page_path: Path, comparison: Path) -> None:
     """A row.json may come from anyone: all of it is escaped, and the policy runs the page's own script alone."""
     attack = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
-    table = report._table(attack, [attack], [[(attack, f'"{attack}')]])
-    assert "<img" not in table
-    assert "<script" not in table
     settings, rows = read_rows(comparison)
+    for row in rows:
+        row["config"]["spec"]["curve"] = row["versions"]["torch"] = f'"{attack}'
     first = {row["arm"]: dict(row, seed=attack) for row in rows}
     named = dict(settings, scene=dict(settings["scene"], name=attack))
     view = report.Pictures(attack, 8, 6, {}, 1.0, 1.0, {})

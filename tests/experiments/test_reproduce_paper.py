@@ -23,9 +23,9 @@ def test_each_codebase_and_scene_is_one_comparison(tmp_path: Path) -> None:
     checkouts = ["--inria", "INRIA", "--fastgs", root, "--nerficg", "NERF"]
     done = reproduce(*checkouts, "--data", "DATA", "--scenes", "truck", "garden", "room", "--dry-run")
     assert done.returncode == 0, done.stderr
-    lines = [line.partition(" legs_loss ")[2] for line in done.stdout.splitlines()]
-    assert len(lines) == 9 and all(line.startswith("compare DATA/") and "--study codebase" in line for line in lines)
-    find = {(line.split("--profile ")[1].split()[0], line.split()[1].rpartition("/")[2]): line for line in lines}
+    lines = [line.partition("compare.py ")[2] for line in done.stdout.splitlines()]
+    assert len(lines) == 9 and all(line.startswith("DATA/") for line in lines)
+    find = {(line.split("--profile ")[1].split()[0], line.split()[0].rpartition("/")[2]): line for line in lines}
     assert "--images images_4" in find["3dgs", "garden"] and "--images images_2" in find["3dgs", "room"]
     assert "--images" not in find["3dgs", "truck"]
     assert find["fastgs", "truck"].endswith("'--extra=--grad_abs_thresh 0.0008'")
@@ -37,5 +37,5 @@ def test_each_codebase_and_scene_is_one_comparison(tmp_path: Path) -> None:
 def test_it_ends_with_the_first_comparison_that_fails(tmp_path: Path) -> None:
     done = reproduce("--inria", str(tmp_path), "--data", str(tmp_path), "--out", str(tmp_path / "out"))
     assert done.returncode == 2
-    assert done.stdout.count("compare") == 1 and "legs: error: " in done.stderr
+    assert done.stdout.count("compare.py") == 1 and "compare: error: " in done.stderr
     assert "name at least one checkout" in reproduce("--data", "DATA").stderr

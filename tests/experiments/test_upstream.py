@@ -1,4 +1,4 @@
-"""`legs compare --upstream`: a codebase's own script, real subprocesses, end to end on a miniature; and profiles."""
+"""examples/reproduce_paper/compare.py: a codebase's own script, real subprocesses, on a miniature; profiles."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from pathlib import Path
 
 import pytest
 
-from legs_loss import LegsError
-from legs_loss.cli import main
-from legs_loss.experiments.arms import parse_arms
-from legs_loss.experiments.upstream import training
-from legs_loss.experiments.upstream.comparison import UpstreamComparison
-from legs_loss.experiments.upstream.profile import PROFILES, Edit, Threshold, fill, find_profile, read_profile
-from legs_loss.experiments.upstream.training import (
+from examples.reproduce_paper.codebases import training
+from examples.reproduce_paper.codebases.comparison import UpstreamComparison
+from examples.reproduce_paper.codebases.profile import PROFILES, Edit, Threshold, fill, find_profile, read_profile
+from examples.reproduce_paper.codebases.training import (
     Checkout,
     check_copy,
     copy_checkout,
     gaussians_in,
     train_and_score,
 )
+from examples.reproduce_paper.compare import main
+from legs_loss import LegsError
+from legs_loss.cli import main as legs
+from legs_loss.experiments.arms import parse_arms
 from legs_loss.reference.training import checkpoint
 from legs_loss.spec import WeightSpec
 from tests.experiments.miniature import write_miniature
@@ -251,10 +252,11 @@ def test_a_comparison_goes_on_with_the_checkout_that_it_began_with(tmp_path: Pat
 # One run
 
 
+LAUNCH = training.LAUNCH
 SEEDS = """
 import random
 import numpy, torch
-from legs_loss.experiments.upstream.launch import move_seeds
+from examples.reproduce_paper.launch import move_seeds
 move_seeds(2)
 numpy.random.seed(seed=3)
 torch.random.manual_seed(5)
@@ -274,9 +276,9 @@ def test_seeds_are_moved_however_they_are_set() -> None:
     assert said[2] == said[3] == said[4] != said[5]
 
 
-PARENT = """
+PARENT = f"""
 import subprocess, sys
-words = [sys.executable, "-m", "legs_loss.experiments.upstream.launch", "report.json", "0", "--cpu", "train.py"]
+words = [sys.executable, {str(LAUNCH)!r}, "report.json", "0", "--cpu", "train.py"]
 subprocess.run(words)
 """
 
@@ -315,15 +317,13 @@ def test_settings_that_cannot_be_used_leave_the_folder_as_it_was(
     tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     profile = write_miniature(tmp_path / "miniature", tiny_scene)
-    words = ["compare", str(tiny_scene), "--upstream", str(tmp_path / "miniature"), "--profile", str(profile)]
+    words = [str(tiny_scene), str(tmp_path / "miniature"), "--profile", str(profile)]
     words += ["--arms", "legs", "-m", str(tmp_path / "out")]
     for change, says in (
         (["--iterations", "0"], "iterations must be at least 1"),
         (["-r", "0"], "resolution must be 1, 2, 4, 8"),
         (["--gaussians", "100"], "has no option for gaussians"),
         (["--extra=-r 12"], "--extra has -r: give --resolution"),
-        (["--upstream", str(tmp_path / "nowhere")], "there is no folder"),
-        (["--tensorboard", str(tmp_path / "log")], "do not give --tensorboard"),
     ):
         assert main([*words, *change]) == 2
         assert says in capsys.readouterr().err
@@ -356,7 +356,7 @@ def compared(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory):
     """Two seeds of a comparison: its folder, and the command that made it."""
     folder = tmp_path_factory.mktemp("upstream")
     profile = write_miniature(folder / "miniature", tiny_scene)
-    words = ["compare", str(tiny_scene), "--upstream", str(folder / "miniature"), "--profile", str(profile)]
+    words = [str(tiny_scene), str(folder / "miniature"), "--profile", str(profile)]
     words += ["--arms", "legs", "legs:mean1", "3dgs@legs", "--seeds", "2", "-r", "24", "--iterations", "30"]
     words += ["-m", str(folder / "out")]
     assert main(words) == 0
@@ -399,7 +399,7 @@ def test_without_a_gpu_the_ssim_of_every_arm_is_the_packages(tiny_scene: Path, t
     first = lines.index("def ssim(img1, img2):")
     script.write_text("\n".join([*lines[:first], "from loss_utils import ssim", *lines[first + 3 :], ""]))
     (script.parent / "loss_utils.py").write_text(files("ssim_beside_l1_fused")["utils/loss_utils.py"])
-    words = ["compare", str(tiny_scene), "--upstream", str(script.parent), "--profile", str(profile), "--cpu"]
+    words = [str(tiny_scene), str(script.parent), "--profile", str(profile), "--cpu"]
     words += ["--arms", "legs", "--seeds", "1", "-r", "24", "--iterations", "30", "-m", str(tmp_path / "out")]
     assert main(words) == 0
     for arm in ("3dgs", "legs"):
@@ -439,11 +439,12 @@ def test_done_rows_stay_and_others_are_added(compared, capsys: pytest.CaptureFix
     assert changed == {"legs"}
     assert main([*words, "--iterations", "31"]) == 2
     assert "started with another" in capsys.readouterr().err
-    assert main(["report", str(folder / "out")]) == 0
+    assert legs(["report", str(folder / "out")]) == 0
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
     assert "PSNR by Gaussians" in page and "PSNR by iterations" not in page  # nothing was scored during the runs
     assert "sh_degree" not in page  # of the package's own trainer
-    assert "--seeds 2 -r 24 --iterations 30 --upstream CHECKOUT" in page
+    assert f"examples/reproduce_paper/compare.py {words[0].rpartition('/')[2]} CHECKOUT --arms" in page
+    assert "--seeds 2 -r 24 --iterations 30 --profile" in page
 
 
 @pytest.mark.slow
@@ -455,8 +456,6 @@ def test_what_cannot_be_compared_is_refused(compared, tmp_path: Path, capsys: py
         (["--gaussians", "100"], "has no option for gaussians"),
         (["--profile", "3dgs-mcmc"], "give it with --gaussians"),
         (["--profile", "3dgs-mcmc", "--gaussians", "1"], "give more with --gaussians, not 1"),
-        (["--densify_grad_threshold", "1"], "by --extra"),
-        (["--upstream", str(tmp_path / "nowhere")], "there is no folder"),
     ):
         assert main([*new, *change]) == 2
         assert says in capsys.readouterr().err
@@ -464,12 +463,12 @@ def test_what_cannot_be_compared_is_refused(compared, tmp_path: Path, capsys: py
     patched = tmp_path / "patched"
     shutil.copytree(folder / "miniature", patched)
     (patched / "train.py").write_text("import legs_loss\n")
-    assert main([*new, "--upstream", str(patched)]) == 2
+    assert main([new[0], str(patched), *new[2:]]) == 2
     assert "is patched already" in capsys.readouterr().err
     broken = tmp_path / "broken"
     shutil.copytree(folder / "miniature", broken)
     (broken / "train.py").write_text((broken / "train.py").read_text().replace("points = 100", "points = 1 / 0"))
-    assert main([*words, "-m", str(tmp_path / "other"), "--upstream", str(broken)]) == 2
+    assert main([words[0], str(broken), *words[2:], "-m", str(tmp_path / "other")]) == 2
     assert "ZeroDivisionError" in capsys.readouterr().err
-    assert main(["compare", "--cpu"]) == 2
-    assert "--cpu is for --upstream" in capsys.readouterr().err
+    assert main([words[0], str(tmp_path / "nowhere"), *words[2:]]) == 2
+    assert f"there is no folder {tmp_path / 'nowhere'}: give a checkout" in capsys.readouterr().err

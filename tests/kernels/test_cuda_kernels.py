@@ -32,7 +32,7 @@ from legs_loss.kernels.available import BACKENDS, Availability, Known
 from legs_loss.kernels.contract import Weights
 from legs_loss.kernels.cuda.backend import STENCILS
 from legs_loss.kernels.trial import difference_from_torch
-from legs_loss.response import response
+from legs_loss.responses import response
 from legs_loss.runtime import state
 from legs_loss.spec import PRESETS
 from tests.cuda_emulation import COMPILER

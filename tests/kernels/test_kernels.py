@@ -18,7 +18,7 @@ from legs_loss import LegsError, LEGSLoss, WeightSpec, legs_loss, weight_map
 from legs_loss.kernels.available import BACKENDS
 from legs_loss.operators import OPERATORS, Operator
 from legs_loss.precompute import normalised_map
-from legs_loss.response import response
+from legs_loss.responses import response
 from legs_loss.scenes.images import image_tensor
 from legs_loss.spec import PRESETS
 from tests.kernels.support import compare, images, used

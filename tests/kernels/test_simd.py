@@ -17,7 +17,7 @@ def by_lanes(operation, *rows):
     """Apply an operation to rows of eight float32."""
     import numba
 
-    from legs_loss.kernels.simd import load, store
+    from legs_loss.kernels.simd.memory import load, store
 
     @numba.njit
     def two(a, b, result):
@@ -35,9 +35,9 @@ def by_lanes(operation, *rows):
 def test_comparisons_are_false_of_a_nan(name, expected):
     import numba
 
-    from legs_loss.kernels import simd
+    from legs_loss.kernels.simd import arithmetic
 
-    compare, where, splat = getattr(simd, name), simd.where, simd.splat
+    compare, where, splat = getattr(arithmetic, name), arithmetic.where, arithmetic.splat
 
     @numba.njit
     def as_numbers(a, b):
@@ -50,9 +50,9 @@ def test_comparisons_are_false_of_a_nan(name, expected):
 def test_of_a_nan_the_second_is_taken(name):
     import numba
 
-    from legs_loss.kernels import simd
+    from legs_loss.kernels.simd import arithmetic
 
-    choose = getattr(simd, name)
+    choose = getattr(arithmetic, name)
 
     @numba.njit
     def of_two(a, b):

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from legs_loss import LegsError, response
 from legs_loss.operators import OPERATORS
-from legs_loss.response import normalise_response
+from legs_loss.responses import normalise_response
 from tests.strategies import images
 
 ndimage_mode = "mirror"  # what torch calls reflect: the edge pixel is not repeated

@@ -18,7 +18,7 @@ from legs_loss.cli import main
 from legs_loss.kernels.available import BACKENDS
 from legs_loss.levels import levels_of, response_levels
 from legs_loss.precompute import precompute
-from legs_loss.response import gaussian_blur, response
+from legs_loss.responses import gaussian_blur, response
 from legs_loss.runtime import state
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
 from legs_loss.spec import PRESETS

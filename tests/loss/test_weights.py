@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from legs_loss import LegsError, WeightSpec, weight_map
-from legs_loss.response import gaussian_blur
+from legs_loss.responses import gaussian_blur
 from legs_loss.weights import weight_from_response
 from tests.strategies import images
 
@@ -124,7 +124,7 @@ def test_an_8_bit_range_is_named():
 
 
 def test_a_nan_that_is_not_looked_for_is_not_hidden():
-    from legs_loss.response import normalise_response, response
+    from legs_loss.responses import normalise_response, response
 
     image = torch.rand(3, 6, 6)
     image[0, 0, 0] = float("nan")

@@ -210,7 +210,8 @@ for threads in (2, 1, 2):
 def test_exp2():
     import numba
 
-    from legs_loss.kernels.simd import LANES, load, store
+    from legs_loss.kernels.simd.memory import load, store
+    from legs_loss.kernels.simd.vectors import LANES
     from legs_loss.reference.rasterizer.strips import exp2
 
     @numba.njit

@@ -256,8 +256,8 @@ class TestCluster:
             ("tcp://127.0.0.1:9", "no dask scheduler answers at tcp://127.0.0.1:9"),
             (cluster.address, "has no workers"),
         ):
-            with pytest.raises(LegsError, match=message), executors.executor(address, print):
-                pass
+            with pytest.raises(LegsError, match=message):
+                list(executors.outcomes(print, ["task"], address, print))
 
     def test_a_comparison_is_that_of_this_machine(self, cluster, tiny_scene, tmp_path):
         pytest.importorskip("numba")

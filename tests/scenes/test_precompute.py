@@ -16,8 +16,7 @@ from PIL import Image
 from legs_loss.errors import LegsError
 from legs_loss.operators import OPERATORS
 from legs_loss.precompute import normalised_map, precompute
-from legs_loss.precompute.photograph import compiled_anew
-from legs_loss.response import normalise_response, response
+from legs_loss.responses import normalise_response, response
 from legs_loss.scenes import image_tensor, images, load_training_image, read_scene
 from legs_loss.spec import PRESETS, WeightSpec
 from legs_loss.store import WeightStore, fingerprint
@@ -330,27 +329,6 @@ class TestInterrupted:
         assert errors.count(b"legs: skipped") == 1
         assert b"5a.png: the process that read it was killed" in errors
         self.finish(scene, out, 6)
-
-
-class TestCompiling:
-    def test_what_is_compiled_anew_is_noticed(self, monkeypatch):
-        numba = pytest.importorskip("numba")
-        from legs_loss.kernels import numba_response
-
-        never_compiled = numba.njit(lambda image: image)
-        monkeypatch.setattr(numba_response, "photograph_response", lambda image, spec: never_compiled(image))
-        assert compiled_anew(PRESETS["legs"])
-        assert not compiled_anew(PRESETS["legs"])
-
-    @pytest.mark.slow
-    def test_a_worker_that_compiled_leaves_the_photograph_to_another(self, tmp_path):
-        pytest.importorskip("numba")
-        environment = {**legs_environment(), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-        save(tmp_path / "images" / "a.png", photograph(700, 600))
-        command = legs_command("precompute", tmp_path / "images", "-r", "2", "--workers", 2, "--out", tmp_path / "maps")
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        assert len(WeightStore(tmp_path / "maps").entries) == 1
 
 
 def wait_until(condition):

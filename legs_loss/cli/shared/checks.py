@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
-from legs_loss.scenes import Scene, View, image_size, training_size
+from legs_loss.scenes import View, image_size, training_size
 from legs_loss.system import say
 
-__all__ = ["check_empty", "check_resolution", "check_trainable", "check_writable"]
+__all__ = ["check_empty", "check_resolution", "check_writable"]
 
 _TINY = 64  # pixels: a smaller width was probably meant as a divisor
 
@@ -31,25 +31,6 @@ def check_resolution(resolution: int, views: Sequence[View]) -> None:
             "the size, and any other number is the width",
             sys.stderr,
         )
-
-
-def check_trainable(scene: Scene, resolution: int) -> None:
-    """Check that a scene has what a training needs, from its files' headers.
-
-    Raises:
-        LegsError: views without pinhole cameras, no points to start from, or a bad resolution.
-    """
-    from legs_loss.reference.training.dataset import pinhole_camera, split_views
-
-    for views in split_views(scene):
-        for view in views:
-            pinhole_camera(scene, view)
-    if scene.read_points is None:
-        raise LegsError(
-            f"{scene.root}: there are no points to start from: training needs a COLMAP scene, which has them in "
-            "sparse/0/points3D.bin"
-        )
-    check_resolution(resolution, scene.views)
 
 
 def check_empty(folder: Path) -> None:

@@ -10,22 +10,6 @@ from numba.core import cgutils
 
 from legs_loss.kernels.simd.vectors import FLOATS, INTEGERS, KINDS, LANES, float8, integer8, intrinsic, mask8
 
-__all__ = [
-    "above",
-    "absolute",
-    "as_floats",
-    "as_integers",
-    "at_least",
-    "equal",
-    "maximum",
-    "minimum",
-    "multiply_add",
-    "sign",
-    "splat",
-    "square_root",
-    "where",
-]
-
 
 @intrinsic
 def splat(typingctx, value):  # type: ignore[no-untyped-def]
@@ -140,16 +124,3 @@ def absolute(typingctx, a):  # type: ignore[no-untyped-def]
 def square_root(typingctx, a):  # type: ignore[no-untyped-def]
     """Return the square root, correctly rounded."""
     return float8(float8), _calling("sqrt")
-
-
-@intrinsic
-def sign(typingctx, a):  # type: ignore[no-untyped-def]
-    """Return -1, 0 or 1 in each lane, as torch.sign does."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        zero = ir.Constant(FLOATS, [0.0] * LANES)
-        above = builder.uitofp(builder.fcmp_ordered(">", args[0], zero), FLOATS)
-        below = builder.uitofp(builder.fcmp_ordered("<", args[0], zero), FLOATS)
-        return builder.fsub(above, below)
-
-    return float8(float8), generate

@@ -9,24 +9,7 @@ from numba.core.errors import RequireLiteralValue
 from legs_loss.kernels.compiling import inlined
 from legs_loss.kernels.simd.vectors import INTEGERS, LANES, float8, intrinsic
 
-__all__ = ["lane", "shifted", "total", "totals"]
-
-
-@intrinsic
-def shifted(typingctx, a, b, count):  # type: ignore[no-untyped-def]
-    """Return array[i + count : i + count + 8] where a and b are its values from i and from i + 4; count is 1, 2 or 3.
-
-    It takes one instruction of the shuffling units, where a load across two cache lines takes two of the loading ones.
-    """
-    if not isinstance(count, types.IntegerLiteral):
-        raise RequireLiteralValue("count")
-    count = count.literal_value
-    lanes = [half + (k + count if k + count < 4 else LANES + k + count - 4) for half in (0, 4) for k in range(4)]
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.shuffle_vector(args[0], args[1], ir.Constant(INTEGERS, lanes))
-
-    return float8(float8, float8, types.IntegerLiteral(count)), generate
+__all__ = ["lane", "total", "totals"]
 
 
 @intrinsic

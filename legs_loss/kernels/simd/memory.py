@@ -8,11 +8,9 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from legs_loss.kernels.simd.vectors import KINDS, LANES, intrinsic
+from legs_loss.kernels.simd.vectors import KINDS, intrinsic
 
 __all__ = ["load", "prefetch", "store"]
-
-_BYTES = ir.VectorType(ir.IntType(8), LANES)
 
 
 def _is_row(array: Any, dtype: Any) -> bool:

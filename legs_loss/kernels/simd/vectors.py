@@ -59,9 +59,7 @@ for _symbol, _kind, _instruction in (
     (operator.mul, float8, "fmul"),
     (operator.truediv, float8, "fdiv"),
     (operator.add, integer8, "add"),
-    (operator.mul, integer8, "mul"),
     (operator.lshift, integer8, "shl"),
-    (operator.rshift, integer8, "ashr"),
     (operator.and_, mask8, "and_"),
 ):
     _operator(_symbol, _kind, _instruction)

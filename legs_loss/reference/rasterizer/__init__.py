@@ -9,31 +9,22 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from legs_loss.reference.conventions import MIN_ALPHA, NEAR, View
-from legs_loss.reference.rasterizer.rasterize import Rendering, rasterize
+from legs_loss.reference.conventions import MIN_ALPHA as MIN_ALPHA
+from legs_loss.reference.conventions import NEAR as NEAR
+from legs_loss.reference.conventions import View as View
+from legs_loss.reference.rasterizer.oracle import rotations as rotations
+from legs_loss.reference.rasterizer.rasterize import Rendering as Rendering
+from legs_loss.reference.rasterizer.rasterize import rasterize as rasterize
 
 if TYPE_CHECKING:
-    from legs_loss.reference.rasterizer.compact_box import CompactBox
-    from legs_loss.reference.rasterizer.compiled import Tensors
-    from legs_loss.reference.rasterizer.drawing import Contributions, Drawn, Lens, compensation, covariance, draw
-    from legs_loss.reference.rasterizer.oracle import rotations
-
-__all__ = [
-    "MIN_ALPHA",
-    "NEAR",
-    "CompactBox",
-    "Contributions",
-    "Drawn",
-    "Lens",
-    "Rendering",
-    "Tensors",
-    "View",
-    "compensation",
-    "covariance",
-    "draw",
-    "rasterize",
-    "rotations",
-]
+    from legs_loss.reference.rasterizer.compact_box import CompactBox as CompactBox
+    from legs_loss.reference.rasterizer.compiled import Tensors as Tensors
+    from legs_loss.reference.rasterizer.drawing import Contributions as Contributions
+    from legs_loss.reference.rasterizer.drawing import Drawn as Drawn
+    from legs_loss.reference.rasterizer.drawing import Lens as Lens
+    from legs_loss.reference.rasterizer.drawing import compensation as compensation
+    from legs_loss.reference.rasterizer.drawing import covariance as covariance
+    from legs_loss.reference.rasterizer.drawing import draw as draw
 
 _HOMES = {
     "CompactBox": "compact_box",
@@ -44,8 +35,8 @@ _HOMES = {
     "compensation": "drawing",
     "covariance": "drawing",
     "draw": "drawing",
-    "rotations": "oracle",
 }
+__all__ = ["MIN_ALPHA", "NEAR", "Rendering", "View", "rasterize", "rotations", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from legs_loss.reference.conventions import SH_C0, View
 from legs_loss.reference.rasterizer import projection, projection_backward, sorting, strips
-from legs_loss.reference.rasterizer.groups import Camera, Footprint, Parameters, Splats
+from legs_loss.reference.rasterizer.groups import Camera, Footprint, Parameters, Splats, room
 
 Clip = Callable[..., None]
 
@@ -110,7 +110,7 @@ def draw(
         position=view.position,
         size=np.array([view.width, view.height], np.int64),
     )
-    found = Splats.empty(count)
+    found = room(Splats, count, 9)
     projection.project(parameters, camera, footprint, found)
     splats, depths, radii, clamped, boxes, slots = found
     if tensors.colours is not None:
@@ -191,19 +191,3 @@ class _Attach(torch.autograd.Function):
         )
         found = [gradient if wanted else None for gradient, wanted in zip(gradients, ctx.needs_input_grad)]
         return (*found, None)
-
-
-def render(
-    means: Tensor,
-    scales: Tensor,
-    quaternions: Tensor,
-    opacities: Tensor,
-    sh: Tensor,
-    view: View,
-    background: Tensor,
-    sh_degree: int,
-    viewspace: Optional[Tensor],
-) -> Tuple[Tensor, Tensor]:
-    """Return image [3, H, W] and radii int32 [N]; arguments as `rasterize` has checked them."""
-    tensors = Tensors(means, scales, quaternions, opacities, sh, None, viewspace)
-    return attach(draw(tensors, view, background, sh_degree), tensors)

@@ -92,15 +92,10 @@ class Drawn:
 
     def contributions(self, values: Optional[Tensor] = None) -> Contributions:
         """Return the sums; ``values`` [H, W] are summed too."""
-        view, drawing = self._view, self._drawing
-        plane = torch.zeros(view.height, view.width) if values is None else values.detach().to(torch.float32)
-        sums = np.empty((len(self.radii), contributions.FIELDS))
-        contributions.contribute(
-            drawing.across, drawing.ranges, drawing.ends, drawing.splats, drawing.draws, drawing.entries,
-            plane.reshape(view.height, view.width).contiguous().numpy(), sums,
-        )  # fmt: skip
-        found = torch.from_numpy(sums).to(torch.float32)
-        return Contributions(found[:, 0].to(torch.int32), *found[:, 1:].unbind(1))
+        size = self._view.height, self._view.width
+        plane = torch.zeros(size) if values is None else values.detach().to(torch.float32).reshape(size)
+        found = self._summed(plane, torch.zeros_like(self.image)).to(torch.float32)
+        return Contributions(found[:, 0].to(torch.int32), *found[:, 1 : contributions.SLOPES].unbind(1))
 
     def scored(self, scores: Tensor) -> Tensor:
         """Return the image; its backward pass leaves `squared_slopes` in the gradient of ``scores`` [N, 1]."""
@@ -111,11 +106,17 @@ class Drawn:
 
         ``gradient`` [3, H, W] is the image's. Source: Speedy-Splat (Hanson et al. 2025).
         """
-        sums, it = np.empty(len(self.radii)), self._drawing
-        g_image = gradient.detach().to(torch.float32).contiguous().numpy()
-        contributions.sensitivity(
-            it.across, it.ranges, it.ends, it.splats, it.draws, it.entries, it.image, g_image, sums
-        )  # fmt: skip
+        slopes = self._summed(torch.zeros(gradient.shape[1:]), gradient)[:, contributions.SLOPES]
+        # By the falloff, not by alpha: the opacity is a factor. A row that was not drawn has none.
+        opacity = torch.from_numpy(self._drawing.splats[:, 5]).exp()
+        return torch.where(slopes > 0, opacity.square() * slopes, slopes)
+
+    def _summed(self, plane: Tensor, gradient: Tensor) -> Tensor:
+        it, sums = self._drawing, np.empty((len(self.radii), contributions.FIELDS))
+        values, g_image = (tensor.detach().to(torch.float32).contiguous().numpy() for tensor in (plane, gradient))
+        contributions.contribute(
+            it.across, it.ranges, it.ends, it.splats, it.draws, it.entries, values, it.image, g_image, sums
+        )
         return torch.from_numpy(sums)
 
     def reaching(self) -> Tensor:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Optional
+from typing import Any, NamedTuple, Optional
 
 import numpy as np
 
 from legs_loss.reference.conventions import DILATION, SQUARE
 
-__all__ = ["Camera", "Footprint", "Parameters", "Splats"]
+__all__ = ["Camera", "Footprint", "Parameters", "Splats", "room"]
 
 
 class Parameters(NamedTuple):
@@ -49,14 +49,14 @@ class Splats(NamedTuple):
     boxes: np.ndarray  # [N, 4], int32: of strips across, of rows down
     slots: np.ndarray  # [N], int64: how many strips the box has
 
-    @classmethod
-    def empty(cls, count: int) -> Splats:
-        """Return room for as many."""
-        return cls(
-            np.empty((count, 9)),
-            np.empty(count, np.float32),
-            np.empty(count, np.int32),
-            np.empty((count, 3), np.bool_),
-            np.empty((count, 4), np.int32),
-            np.empty(count, np.int64),
-        )
+
+def room(kind: Any, count: int, *widths: int) -> Any:
+    """Return a group of splats to be filled: rows of so many float64 each, then what all splats have."""
+    return kind(
+        *(np.empty((count, width)) for width in widths),
+        depths=np.empty(count, np.float32),
+        radii=np.empty(count, np.int32),
+        clamped=np.empty((count, 3), np.bool_),
+        boxes=np.empty((count, 4), np.int32),
+        slots=np.empty(count, np.int64),
+    )

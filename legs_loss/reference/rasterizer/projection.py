@@ -122,15 +122,9 @@ def _covariances(count, intrinsics, pose, dilation, state):
     for j in range(np.uint64(count)):
         x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
         t = linearised(x, y, z, intrinsics, pose)
-        v = (
-            state[SHAPE, j],
-            state[SHAPE + 1, j],
-            state[SHAPE + 2, j],
-            state[SHAPE + 3, j],
-            state[SHAPE + 4, j],
-            state[SHAPE + 5, j],
-        )
-        u = times_covariance(t, v)
+        xx, xy, xz = state[SHAPE, j], state[SHAPE + 1, j], state[SHAPE + 2, j]
+        yy, yz, zz = state[SHAPE + 3, j], state[SHAPE + 4, j], state[SHAPE + 5, j]
+        u = times_covariance(t, (xx, xy, xz, yy, yz, zz))
         a = u[0] * t[0] + u[1] * t[1] + u[2] * t[2]
         b = u[0] * t[3] + u[1] * t[4] + u[2] * t[5]
         c = u[3] * t[3] + u[4] * t[4] + u[5] * t[5]

@@ -9,7 +9,8 @@ import numpy as np
 from numba import prange
 
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.simd import lane, load
+from legs_loss.kernels.simd.lanes import lane
+from legs_loss.kernels.simd.memory import load
 from legs_loss.reference.rasterizer.geometry import (
     centre_gradient,
     covariance_gradient,
@@ -47,11 +48,8 @@ def _collect(first, end, sums, state, j):
         for k in range(np.uint64(first), np.uint64(end)):
             along_u += sums[k, 9]
             along_v += sums[k, 10]
-    state[POWER, j], state[FIRST, j], state[FIRST + 1, j] = (
-        lane(total, 0),
-        LENGTH * lane(total, 1),
-        LENGTH * lane(total, 2),
-    )
+    state[POWER, j] = lane(total, 0)
+    state[FIRST, j], state[FIRST + 1, j] = LENGTH * lane(total, 1), LENGTH * lane(total, 2)
     for k in range(3):
         state[SECOND + k, j] = LENGTH**2 * lane(total, 3 + k)
     state[COLOUR, j], state[COLOUR + 1, j], state[COLOUR + 2, j] = lane(total, 6), lane(total, 7), blue
@@ -106,16 +104,10 @@ def _covariances_backward(count, intrinsics, pose, state):
         axes = state[AXES, j], state[AXES + 1, j], state[AXES + 2, j]
         gu, gv = centre_gradient(axes, state[FIRST, j], state[FIRST + 1, j])
         s00, s01, s11 = covariance_gradient(axes, state[SECOND, j], state[SECOND + 1, j], state[SECOND + 2, j])
-        v = (
-            state[SHAPE, j],
-            state[SHAPE + 1, j],
-            state[SHAPE + 2, j],
-            state[SHAPE + 3, j],
-            state[SHAPE + 4, j],
-            state[SHAPE + 5, j],
-        )
+        xx, xy, xz = state[SHAPE, j], state[SHAPE + 1, j], state[SHAPE + 2, j]
+        yy, yz, zz = state[SHAPE + 3, j], state[SHAPE + 4, j], state[SHAPE + 5, j]
         # The image's is T V T^t: 2 G T V; and to V, of which the triangle has three numbers that stand twice.
-        u = times_covariance(t, v)
+        u = times_covariance(t, (xx, xy, xz, yy, yz, zz))
         h0, h1, h2 = s00 * t[0] + s01 * t[3], s00 * t[1] + s01 * t[4], s00 * t[2] + s01 * t[5]
         h3, h4, h5 = s01 * t[0] + s11 * t[3], s01 * t[1] + s11 * t[4], s01 * t[2] + s11 * t[5]
         state[SHAPE, j], state[SHAPE + 3, j] = t[0] * h0 + t[3] * h3, t[1] * h1 + t[4] * h4

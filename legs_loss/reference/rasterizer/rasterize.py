@@ -14,8 +14,6 @@ from legs_loss.reference.conventions import View
 
 __all__ = ["Rendering", "rasterize"]
 
-BACKENDS = ("numba", "torch")
-
 
 class Rendering(NamedTuple):
     """The result of `rasterize`."""
@@ -78,15 +76,10 @@ def rasterize(
     _check_values(tensors, background)
     if backend == "torch":
         from legs_loss.reference.rasterizer.oracle import render
-    elif backend == "numba":
-        render = _numba_renderer(means)
-    else:
-        raise LegsError(f"no rasterizer backend {backend!r}; choose one of {', '.join(BACKENDS)}")
-    image, radii = render(means, scales, quaternions, opacities, sh, view, background, sh_degree, viewspace)
-    return Rendering(image, radii)
 
-
-def _numba_renderer(means: Tensor) -> Any:
+        return Rendering(*render(means, scales, quaternions, opacities, sh, view, background, sh_degree, viewspace))
+    if backend != "numba":
+        raise LegsError(f"no rasterizer backend {backend!r}; choose one of numba, torch")
     if means.dtype != torch.float32:
         raise LegsError(f"the numba rasterizer computes in float32, not {means.dtype}; convert, or use backend='torch'")
     try:
@@ -95,9 +88,10 @@ def _numba_renderer(means: Tensor) -> Any:
         raise LegsError(
             "the numba rasterizer needs numba: pip install 'legs-loss[cpu]', or use backend='torch'"
         ) from error
-    from legs_loss.reference.rasterizer.compiled import render
+    from legs_loss.reference.rasterizer import compiled
 
-    return render
+    given = compiled.Tensors(means, scales, quaternions, opacities, sh, None, viewspace)
+    return Rendering(*compiled.attach(compiled.draw(given, view, background, sh_degree), given))
 
 
 def _check_shapes(tensors: Any, sh_degree: int, viewspace: Optional[Tensor]) -> None:

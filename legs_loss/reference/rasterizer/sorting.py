@@ -16,7 +16,7 @@ import numpy as np
 
 from legs_loss.errors import LegsError
 from legs_loss.kernels.compiling import compiled, inlined
-from legs_loss.kernels.simd import prefetch
+from legs_loss.kernels.simd.memory import prefetch
 
 BAND = 16  # strips
 MOST_BANDS = 1 << 15  # in an image: of 8 x 32 pixel strips, 134 million pixels

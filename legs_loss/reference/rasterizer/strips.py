@@ -26,22 +26,20 @@ import numpy as np
 from numba import prange
 
 from legs_loss.kernels.compiling import compiled, inlined
-from legs_loss.kernels.simd import (
+from legs_loss.kernels.compiling import multiply_add as multiply_add_one
+from legs_loss.kernels.simd.arithmetic import (
     absolute,
     as_floats,
     as_integers,
     at_least,
-    load,
     maximum,
     minimum,
     multiply_add,
-    prefetch,
     splat,
-    store,
-    total,
-    totals,
     where,
 )
+from legs_loss.kernels.simd.lanes import total, totals
+from legs_loss.kernels.simd.memory import load, prefetch, store
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from legs_loss.reference.rasterizer.projection import TALL, WIDE, origin
 from legs_loss.reference.rasterizer.sorting import OWNER, ROWS, SUM
@@ -124,30 +122,6 @@ def place(xs, transmittance, across, down):
         transmittance[pixel] = _ONE if pixel % WIDE < across and pixel // WIDE < down else -_ONE
 
 
-@inlined
-def _write(pixels, at, wide, values, state):
-    """Set a strip's row in an image, by way of WORK where the strip is cut off by the image's edge."""
-    if wide == WIDE:
-        store(pixels, at, values)
-    else:
-        store(state, WORK, values)
-        for x in range(wide):
-            pixels[at + x] = state[WORK + x]
-
-
-@inlined
-def _read(pixels, at, wide, state):
-    """Return a strip's row in an image; what is beyond the image's edge is 0."""
-    if wide < WIDE:
-        store(state, WORK, splat(_ZERO))
-        for x in range(wide):
-            state[WORK + x] = pixels[at + x]
-        row = load(state, WORK)
-    else:
-        row = load(pixels, at)
-    return row
-
-
 @compiled()
 def unfinished(transmittance):
     """Return whether a pixel of the strip still takes colour: as a rule, already the first one does."""
@@ -218,7 +192,7 @@ def _blend(state, begin, end, draws, entries):
 
 @compiled()
 def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image):
-    height, width, pixels = image.shape[1], image.shape[2], image.reshape(-1)
+    height, width = image.shape[1], image.shape[2]
     left, top = strip % across * WIDE, strip // across * TALL
     wide, tall = min(WIDE, width - left), min(TALL, height - top)
     place(state[X:], state[T : T + PIXELS], wide, tall)
@@ -229,12 +203,12 @@ def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, ba
         _expand(begin, end, strip % across, strip // across, splats, draws, entries)
         _blend(state, begin, end, draws, entries)
     ends[strip] = end
-    for y in range(tall):
-        left_over = absolute(load(state, T + y * WIDE))
-        for channel in range(3):
-            colour = load(state, RED + channel * PIXELS + y * WIDE)
-            colour = multiply_add(left_over, splat(background[channel]), colour)
-            _write(pixels, (channel * height + top + y) * width + left, wide, colour, state)
+    for channel in range(3):
+        for y in range(tall):
+            for x in range(wide):
+                i = y * WIDE + x
+                colour = state[RED + channel * PIXELS + i]
+                image[channel, top + y, left + x] = multiply_add_one(abs(state[T + i]), background[channel], colour)
 
 
 @compiled(parallel=True)
@@ -293,19 +267,17 @@ def _blend_backward(state, begin, end, draws, entries, moments, sums):
 
 @compiled()
 def _render_backward_strip(strip, across, state, ranges, draws, entries, ends, image, g_image, moments, sums):
-    height, width, pixels, g_pixels = image.shape[1], image.shape[2], image.reshape(-1), g_image.reshape(-1)
+    height, width = image.shape[1], image.shape[2]
     left, top = strip % across * WIDE, strip // across * TALL
     wide, tall = min(WIDE, width - left), min(TALL, height - top)
     place(state[X:], state[T : T + PIXELS], wide, tall)
     state[RED:X] = 0
-    for y in range(tall):
-        rest = splat(_ZERO)
-        for channel in range(3):
-            at = (channel * height + top + y) * width + left
-            gradient = _read(g_pixels, at, wide, state)
-            store(state, RED + channel * PIXELS + y * WIDE, gradient)
-            rest = multiply_add(gradient, _read(pixels, at, wide, state), rest)
-        store(state, REST + y * WIDE, rest)
+    for channel in range(3):
+        for y in range(tall):
+            for x in range(wide):
+                i, gradient = y * WIDE + x, g_image[channel, top + y, left + x]
+                state[RED + channel * PIXELS + i] = gradient
+                state[REST + i] = multiply_add_one(gradient, image[channel, top + y, left + x], state[REST + i])
     _blend_backward(state, ranges[strip], ends[strip], draws, entries, moments, sums)
 
 

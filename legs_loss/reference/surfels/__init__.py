@@ -1,4 +1,4 @@
-"""Surfels (2D Gaussian Splatting) to an image: the readable oracle and the compiled rasterizer behind one function."""
+"""Surfels (2D Gaussian Splatting) to an image: a compiled rasterizer."""
 
 from legs_loss.reference.surfels.model import Surfels, SurfelView
 from legs_loss.reference.surfels.rasterize import rasterize_surfels

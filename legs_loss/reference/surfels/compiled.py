@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from legs_loss.reference.rasterizer import sorting
+from legs_loss.reference.rasterizer.groups import room
 from legs_loss.reference.surfels import projection, projection_backward, strips
 from legs_loss.reference.surfels.groups import Camera, Discs, Pictures, Splats, Work
-from legs_loss.reference.surfels.model import Surfels, SurfelView
-from legs_loss.reference.surfels.oracle import CHANNELS, to_pixels
+from legs_loss.reference.surfels.model import CHANNELS, Surfels, SurfelView
 
 # Means, scales, quaternions, homographies, opacities, harmonics and colours; of those not given, an empty one.
 EMPTY = ((0, 3), (0, 2), (0, 4), (0, 9), (0, 1), (0, 1, 3), (0, 3))
@@ -36,20 +36,12 @@ class _Render(torch.autograd.Function):
         camera = Camera(
             degree=view.sh_degree,
             pose=_array(view.world_to_camera.double()),
-            pixels=_array(to_pixels(view.projection.detach().double(), width, height)),
+            pixels=_array(view.pixels),
             position=_array(view.position.double()),
             width=width,
             height=height,
         )
-        found = Splats(
-            rows=np.empty((count, projection.SPLAT)),
-            extents=np.empty((count, projection.EXTENT)),
-            depths=np.empty(count, np.float32),
-            radii=np.empty(count, np.int32),
-            clamped=np.empty((count, 3), np.bool_),
-            boxes=np.empty((count, 4), np.int32),
-            slots=np.empty(count, np.int64),
-        )
+        found = room(Splats, count, projection.SPLAT, projection.EXTENT)
         projection.project(discs, camera, found)
 
         across, down = -(-width // projection.WIDE), -(-height // projection.TALL)
@@ -97,7 +89,7 @@ class _Render(torch.autograd.Function):
 
 
 def render(surfels: Surfels, view: SurfelView) -> Tuple[Tensor, Tensor, Tensor]:
-    """Return image [3, H, W], the other channels [7, H, W] and radii [N], as the oracle's `render`."""
+    """Return image [3, H, W], the other channels [7, H, W] and radii [N],."""
     s = surfels
     given = (s.means, s.scales, s.quaternions, s.homographies, s.opacities, s.sh, s.colours)
     return _Render.apply(s.viewspace, view, *given)

@@ -5,7 +5,7 @@ With the rows of a homography T = (x, y, w), the ray of the pixel (i, j) meets t
     p = (i w - x) x (j w - y) = x x y + i (y x w) + j (w x x),      (u, v) = p_xy / p_z,      depth = det T / p_z
 
 so p is linear in the pixel. It is computed about the disc's centre and divided by det T, so that depth = 1 / p_z. All
-of it is in float64: the homography of a thin disc cancels badly in float32. The steps are those of oracle.py.
+of it is in float64: the homography of a thin disc cancels badly in float32. The steps are those of the tests' oracle.
 """
 
 # mypy: ignore-errors

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from typing import NamedTuple, Optional
 
+import torch
 from torch import Tensor
 
 __all__ = ["SurfelView", "Surfels"]
+
+# The numbers that make a rasterizer 2DGS's, beside those of conventions.py.
+FAR = 100.0  # with NEAR, the scale of the distortion's depths; nothing is cut off there
+CUTOFF = 3.0  # standard deviations: where a surfel's square of tiles ends
+FILTER_RADIUS = 0.707106  # pixels: the standard deviation of the screen-space Gaussian, as upstream rounds it
+MIN_EXTENT = 1e-4  # pixels^2: the least half extent of the disc's box, squared
+CHANNELS = 7  # of the second image: depth, alpha, normal x y z, median depth, distortion
 
 
 class Surfels(NamedTuple):
@@ -44,3 +52,10 @@ class SurfelView(NamedTuple):
     position: Tensor  # [3]: the camera's centre in the world
     background: Tensor  # [3]
     sh_degree: int
+
+    @property
+    def pixels(self) -> Tensor:
+        """Return the map from the world to homogeneous pixels, float64 [4, 3]; pixels' centres are integers."""
+        width, height = self.width, self.height
+        to_image = [[width / 2, 0, 0], [0, height / 2, 0], [0, 0, 0], [(width - 1) / 2, (height - 1) / 2, 1]]
+        return self.projection.detach().double() @ torch.tensor(to_image, dtype=torch.float64)

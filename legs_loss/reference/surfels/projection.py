@@ -16,7 +16,7 @@ from legs_loss.reference.rasterizer.harmonics import shade
 from legs_loss.reference.rasterizer.projection import BLOCK, FAINTEST, WIDE, ceil, floor, tile_range
 from legs_loss.reference.rasterizer.sorting import FIRST_SLOT, ROWS, STRIP, band_at, bands_across, packed
 from legs_loss.reference.surfels.geometry import CAREFUL, ellipse, point, ray_map, shape, signed, through
-from legs_loss.reference.surfels.oracle import CUTOFF, FILTER_RADIUS, MIN_EXTENT
+from legs_loss.reference.surfels.model import CUTOFF, FILTER_RADIUS, MIN_EXTENT
 
 TALL = 16  # pixels: of a strip of the image, WIDE across; its rows are one contiguous loop
 SLACK = 1e-6  # pixels^2: what an ellipse is widened by, against rounding

@@ -14,7 +14,7 @@ from legs_loss.reference.rasterizer.harmonics import shade_gradient
 from legs_loss.reference.rasterizer.projection import BLOCK
 from legs_loss.reference.rasterizer.sorting import FIRST_SUM
 from legs_loss.reference.surfels.geometry import cross, less, plus, ray_map, shape, signed, turned
-from legs_loss.reference.surfels.oracle import CUTOFF
+from legs_loss.reference.surfels.model import CUTOFF
 from legs_loss.reference.surfels.projection import CENTRE
 
 # An entry's gradient, float32: of p's nine numbers, of det T as a factor of the depth, of the centre, of w's three by
@@ -57,9 +57,13 @@ def _rows_gradient(x, y, w, u, v, sums):
 
 
 @compiled()
-def _across(gx, gy, gw, pixels, a, k):
-    """Return the gradient to the `a`-th number of what row-wise became column `k` of T."""
-    return gx[k] * pixels[a, 0] + gy[k] * pixels[a, 1] + gw[k] * pixels[a, 2]
+def _to_world(gx, gy, gw, pixels, k):
+    """Return the gradient to what row-wise became column `k` of T: an axis of the disc, or its centre."""
+    return (
+        gx[k] * pixels[0, 0] + gy[k] * pixels[0, 1] + gw[k] * pixels[0, 2],
+        gx[k] * pixels[1, 0] + gy[k] * pixels[1, 1] + gw[k] * pixels[1, 2],
+        gx[k] * pixels[2, 0] + gy[k] * pixels[2, 1] + gw[k] * pixels[2, 2],
+    )
 
 
 @compiled()
@@ -113,21 +117,12 @@ def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, 
             for k in range(3):
                 g_homographies[i, k], g_homographies[i, 3 + k], g_homographies[i, 6 + k] = gx[k], gy[k], gw[k]
         else:
-            mx += _across(gx, gy, gw, pixels, 0, 2)
-            my += _across(gx, gy, gw, pixels, 1, 2)
-            mz += _across(gx, gy, gw, pixels, 2, 2)
+            centre = _to_world(gx, gy, gw, pixels, 2)
+            mx, my, mz = mx + centre[0], my + centre[1], mz + centre[2]
             axes, q, _ = turned(quaternions, i)
             long, short = np.float64(scales[i, 0]), np.float64(scales[i, 1])
-            a0, a1, a2 = (
-                _across(gx, gy, gw, pixels, 0, 0),
-                _across(gx, gy, gw, pixels, 1, 0),
-                _across(gx, gy, gw, pixels, 2, 0),
-            )
-            b0, b1, b2 = (
-                _across(gx, gy, gw, pixels, 0, 1),
-                _across(gx, gy, gw, pixels, 1, 1),
-                _across(gx, gy, gw, pixels, 2, 1),
-            )
+            a0, a1, a2 = _to_world(gx, gy, gw, pixels, 0)
+            b0, b1, b2 = _to_world(gx, gy, gw, pixels, 1)
             g_scales[i, 0] = a0 * axes[0] + a1 * axes[3] + a2 * axes[6]
             g_scales[i, 1] = b0 * axes[1] + b1 * axes[4] + b2 * axes[7]
             n0, n1, n2 = turn * sums[G_NORMAL], turn * sums[G_NORMAL + 1], turn * sums[G_NORMAL + 2]

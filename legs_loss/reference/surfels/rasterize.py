@@ -1,4 +1,4 @@
-"""Draw surfels with one of two rasterizers: the fast one with numba, or the reference with torch."""
+"""Draw surfels: the arguments are checked here."""
 
 from __future__ import annotations
 
@@ -8,20 +8,17 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.reference.surfels.model import Surfels, SurfelView
+from legs_loss.reference.surfels.model import CHANNELS, Surfels, SurfelView
 
 __all__ = ["rasterize_surfels"]
 
-OTHERS = 7  # channels in addition to the image's
 
-
-def rasterize_surfels(surfels: Surfels, view: SurfelView, backend: str = "numba") -> Tuple[Tensor, Tensor, Tensor]:
+def rasterize_surfels(surfels: Surfels, view: SurfelView) -> Tuple[Tensor, Tensor, Tensor]:
     """Draw surfels as 2D Gaussian Splatting does, differentiable in all their tensors.
 
     Args:
-        surfels: the discs, float32 for "numba".
+        surfels: the discs, float32.
         view: the camera. No gradient.
-        backend: "numba", or "torch": the oracle, slow, in any floating type.
 
     Returns:
         Image [3, H, W]; radii int32 [N], pixels, 0 for what is not drawn; and depth, alpha, normal x y z, median depth,
@@ -34,13 +31,11 @@ def rasterize_surfels(surfels: Surfels, view: SurfelView, backend: str = "numba"
     """
     if not len(surfels.means):  # as upstream: nothing at all, not even the background
         empty = surfels.means.sum() * 0
-        image, others = (empty.expand(channels, view.height, view.width) for channels in (3, OTHERS))
+        image, others = (empty.expand(channels, view.height, view.width) for channels in (3, CHANNELS))
         return image, torch.zeros(0, dtype=torch.int32), others
     _check(surfels, view.sh_degree)
-    if backend == "torch":
-        from legs_loss.reference.surfels.oracle import render
-    else:
-        from legs_loss.reference.surfels.compiled import render
+    from legs_loss.reference.surfels.compiled import render
+
     image, others, radii = render(surfels, view)
     return image, radii, others
 
@@ -54,20 +49,11 @@ def _check(surfels: Surfels, degree: int) -> None:
     count, coefficients = len(surfels.means), 0 if surfels.sh is None else surfels.sh.shape[1]
     if surfels.sh is not None and coefficients < (degree + 1) ** 2:
         raise LegsError(f"sh_degree {degree} needs {(degree + 1) ** 2} coefficients; sh has {coefficients}")
-    expected = (
-        (count, 3),
-        (count, 1),
-        (count, 2),
-        (count, 4),
-        (count, 9),
-        (count, coefficients, 3),
-        (count, 3),
-        (count, 3),
-    )
+    sides = ((3,), (1,), (2,), (4,), (9,), (coefficients, 3), (3,), (3,))  # behind the first, of each field
     wrong = [
-        f"{name} {list(tensor.shape)}, expected {list(shape)}"
-        for name, tensor, shape in zip(Surfels._fields, surfels, expected)
-        if tensor is not None and tuple(tensor.shape) != shape
+        f"{name} {list(tensor.shape)}, expected {[count, *shape]}"
+        for name, tensor, shape in zip(Surfels._fields, surfels, sides)
+        if tensor is not None and tuple(tensor.shape) != (count, *shape)
     ]
     if wrong:
         raise LegsError(f"surfels of the wrong shape: {'; '.join(wrong)}")

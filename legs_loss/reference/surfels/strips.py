@@ -15,25 +15,14 @@ import numpy as np
 from numba import prange
 
 from legs_loss.kernels.compiling import compiled, inlined
-from legs_loss.kernels.simd import (
-    above,
-    at_least,
-    equal,
-    load,
-    maximum,
-    minimum,
-    multiply_add,
-    prefetch,
-    splat,
-    store,
-    totals,
-    where,
-)
+from legs_loss.kernels.simd.arithmetic import above, at_least, equal, maximum, minimum, multiply_add, splat, where
+from legs_loss.kernels.simd.lanes import totals
+from legs_loss.kernels.simd.memory import load, prefetch, store
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, NEAR
 from legs_loss.reference.rasterizer.projection import WIDE, origin
 from legs_loss.reference.rasterizer.sorting import OWNER, ROWS, SUM
 from legs_loss.reference.rasterizer.strips import AHEAD, CHECK, cover, exp2, place, reach, unfinished
-from legs_loss.reference.surfels.oracle import FAR
+from legs_loss.reference.surfels.model import FAR
 from legs_loss.reference.surfels.projection import CAREFUL, CENTRE, COLOUR, NORMAL, OPACITY, SPLAT, TALL
 from legs_loss.reference.surfels.projection_backward import GRADIENTS
 

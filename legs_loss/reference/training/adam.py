@@ -14,6 +14,7 @@ from legs_loss.reference.gaussians import Gaussians
 
 __all__ = ["FIELDS", "Adam", "position_rate", "select", "stack"]
 
+SETS = ("gaussians", "moment1", "moment2")
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 
 # 3DGS's rates. Positions: times the scene's extent, decaying exponentially from the first to the second.
@@ -97,19 +98,16 @@ class Adam:
 
     def state(self) -> Dict[str, Any]:
         """Return arrays from which :meth:`restore` makes an equal optimiser."""
-        sets = (("gaussians", self.gaussians), ("moment1", self.moment1), ("moment2", self.moment2))
         arrays = {
-            f"{label}.{name}": getattr(values, name).detach().numpy() for label, values in sets for name in FIELDS
+            f"{label}.{name}": getattr(getattr(self, label), name).detach().numpy() for label in SETS for name in FIELDS
         }
-        arrays["steps"] = np.array(self.steps)
-        return arrays
+        return dict(arrays, steps=np.array(self.steps))
 
     @classmethod
     def restore(cls, arrays: Any) -> Adam:
         """Return the optimiser whose :meth:`state` this is."""
         sets = [
-            Gaussians(*(torch.from_numpy(np.array(arrays[f"{label}.{name}"])) for name in FIELDS))
-            for label in ("gaussians", "moment1", "moment2")
+            Gaussians(*(torch.from_numpy(np.array(arrays[f"{label}.{name}"])) for name in FIELDS)) for label in SETS
         ]
         adam = cls(sets[0])
         adam.moment1, adam.moment2, adam.steps = sets[1], sets[2], int(arrays["steps"])

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from legs_loss.kernels.compiling import compiled, inlined
-from legs_loss.kernels.simd import LANES, load, splat, square_root, store
+from legs_loss.kernels.simd.arithmetic import splat, square_root
+from legs_loss.kernels.simd.memory import load, store
+from legs_loss.kernels.simd.vectors import LANES
 
 __all__ = ["BETA1", "BETA2", "LANES", "update"]
 

@@ -139,20 +139,21 @@ def alone_in(folder: Optional[Path], make: bool) -> Iterator[None]:
     Raises:
         LegsError: another training holds it, or it cannot be made.
     """
+    if folder is None:
+        yield
+        return
     lock: Optional[FileLock] = None
-    if folder is not None and make:
-        try:
+    try:
+        if make:
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise LegsError(f"cannot write {folder}: {error.strerror or error}") from None
-    if folder is not None and folder.is_dir():
-        try:
-            note = f"process {os.getpid()} on {platform.node()}"
-            lock = FileLock(folder / LOCK, wait=WAIT, note=note, remove=True)
-        except HeldError as error:
-            raise LegsError(f"{folder}: another training writes there ({error}): choose another folder") from None
-        except OSError:  # a file system without locks, or without room: what is written next says so
-            pass
+    except OSError as error:
+        raise LegsError(f"cannot write {folder}: {error.strerror or error}") from None
+    try:
+        lock = FileLock(folder / LOCK, wait=WAIT, note=f"process {os.getpid()} on {platform.node()}", remove=True)
+    except HeldError as error:
+        raise LegsError(f"{folder}: another training writes there ({error}): choose another folder") from None
+    except OSError:  # no folder; a file system without locks, or without room: what is written next says so
+        pass
     try:
         yield
     finally:

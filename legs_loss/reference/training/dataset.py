@@ -165,27 +165,23 @@ def _open_store(scene: Scene, store: Optional[Path]) -> Optional[WeightStore]:
 
 def _weights(store: Optional[WeightStore], views: List[TrainingView], spec: WeightSpec) -> List[Tensor]:
     """Return the views' weight maps, of stored responses where a store has those of these very images."""
-    if store is None:
+    found = [] if store is None else [_entry(store, view, spec) for view in views]
+    # Where a map is missing, the levels of the scene are not known.
+    if store is None or (spec.over == "scene" and None in found):
         return weight_maps([view.image for view in views], spec)
-    found = [_entry(store, view, spec) for view in views]
     if spec.over == "scene":
-        entries = [entry for entry in found if entry is not None]
-        if len(entries) < len(views):  # of a part of the scene the levels are not known
-            return weight_maps([view.image for view in views], spec)
-        return [
-            weight_over_scene(
-                torch.from_numpy(store.response(entry))[None],
-                spec,
-                store.scene_levels(spec, entry.width * entry.height),
-            )
-            for entry in entries
-        ]
+        return [_over_scene(store, entry, spec) for entry in found if entry is not None]
     return [
         weight_map(view.image, spec)
         if entry is None
         else weight_from_response(torch.from_numpy(store.normalised_response(entry))[None], spec)
         for view, entry in zip(views, found)
     ]
+
+
+def _over_scene(store: WeightStore, entry: Entry, spec: WeightSpec) -> Tensor:
+    strength = torch.from_numpy(store.response(entry))[None]
+    return weight_over_scene(strength, spec, store.scene_levels(spec, entry.width * entry.height))
 
 
 def _entry(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional[Entry]:

@@ -6,14 +6,14 @@ To add a metric, add a record. Rows that were trained before show it as missing.
 from __future__ import annotations
 
 import math
-from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import Callable, Dict, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.reference.training import perceptual
-from legs_loss.response import response
+from legs_loss.responses import response
 
 __all__ = ["METRICS", "Metric", "left_out", "mean_scores", "psnr", "score", "strongest"]
 
@@ -32,7 +32,6 @@ class Metric(NamedTuple):
         available: whether its requirements are installed; None without requirements. Rows lack unavailable metrics, and
             tables omit columns that no row has.
         needs: how to make it available, in words.
-        least_side: the pixels that the shorter side of an image must have; rows of smaller images lack it.
     """
 
     key: str
@@ -43,12 +42,10 @@ class Metric(NamedTuple):
     differences: Tuple[str, ...] = ()
     available: Optional[Callable[[], bool]] = None
     needs: str = ""
-    least_side: int = 1
 
-    def computes(self, image: Tensor, split: str) -> bool:
-        """Return whether the metric can be had of an image [3, H, W] of a split."""
-        large = min(image.shape[-2:]) >= self.least_side
-        return split in self.splits and large and (self.available is None or self.available())
+    def computes(self, split: str) -> bool:
+        """Return whether the metric can be had of an image of a split."""
+        return split in self.splits and (self.available is None or self.available())
 
     def column(self, split: str) -> str:
         """Return the head of its column: with the split in front, where it has two."""
@@ -93,8 +90,6 @@ def _ssim(prediction: Tensor, target: Tensor) -> float:
     return 1.0 - float(fused_loss(prediction, target, None, 1.0))  # many times as fast as torch's
 
 
-_EXTRA = "pip install 'legs-loss[metrics]'"
-
 METRICS: Mapping[str, Metric] = {
     metric.key: metric
     for metric in (
@@ -115,9 +110,6 @@ METRICS: Mapping[str, Metric] = {
             ("test",),
             lambda prediction, target: psnr(prediction, target, ~strongest(target)),
         ),
-        Metric("flip", "FLIP", ".4f", ("test",), perceptual.flip, ("test",), perceptual.has_flip, _EXTRA),
-        Metric("gmsd", "GMSD", ".4f", ("test",), perceptual.gmsd, ("test",), perceptual.has_piq, _EXTRA),
-        Metric("haarpsi", "HaarPSI", ".4f", ("test",), perceptual.haarpsi, ("test",), perceptual.has_piq, _EXTRA, 16),
         Metric(
             "lpips",
             "LPIPS",
@@ -134,20 +126,14 @@ METRICS: Mapping[str, Metric] = {
 
 def left_out() -> str:
     """Return one line on the metrics that are not computed here and what they need, "" where all are."""
-    missing: Dict[str, List[str]] = {}
-    for metric in METRICS.values():
-        if metric.available is not None and not metric.available():
-            missing.setdefault(metric.needs, []).append(metric.label)
-    parts = [f"{', '.join(labels)} ({needs})" for needs, labels in missing.items()]
-    return f"Left out: {'; '.join(parts)}." if parts else ""
+    missing = [f"{metric.label} ({metric.needs})" for metric in METRICS.values() if not metric.computes("test")]
+    return f"Left out: {'; '.join(missing)}." if missing else ""
 
 
 def score(prediction: Tensor, target: Tensor, split: str = "test") -> Dict[str, float]:
     """Return by key the metrics of one rendering [3, H, W] (clipped to [0, 1]) of a photograph of a split."""
     prediction = prediction.clamp(0.0, 1.0)
-    return {
-        key: metric.compute(prediction, target) for key, metric in METRICS.items() if metric.computes(target, split)
-    }
+    return {key: metric.compute(prediction, target) for key, metric in METRICS.items() if metric.computes(split)}
 
 
 def mean_scores(scores: Sequence[Mapping[str, float]]) -> Dict[str, float]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence
+from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
 from legs_loss.reference.training.trainer import Progress, TrainConfig, train
 from legs_loss.scenes import read_scene
-from legs_loss.system import kept_from_children
+from legs_loss.system import Child
 
 __all__ = ["Arm", "train_arm", "train_side_by_side"]
 
@@ -45,16 +44,17 @@ def train_side_by_side(
         LegsError: an arm failed; the message names it. The others are ended.
     """
     waiting: List[Arm] = list(reversed(arms))
-    running: Dict[Any, _Process] = {}  # by this side's end of their pipes
+    running: Dict[Any, Tuple[str, Child]] = {}  # by this side's end of their pipes
     metrics: Dict[str, Dict[str, Any]] = {}
     try:
         while waiting or running:
             while waiting and len(running) < processes:
-                process = _Process(waiting.pop())
-                running[process.connection] = process
+                arm = waiting.pop()
+                child = Child(_work, arm)
+                running[child.connection] = arm.name, child
             ready: List[Any] = wait(list(running))
             for connection in ready:
-                name = running[connection].name
+                name, child = running[connection]
                 try:
                     message = connection.recv()
                 except (EOFError, OSError):
@@ -65,29 +65,14 @@ def train_side_by_side(
                 if isinstance(message, str):
                     raise LegsError(f"{name}: {message}")
                 metrics[name] = message
-                running.pop(connection).end()
+                del running[connection]
+                child.end()
                 if on_done is not None:
                     on_done(name, message)
     finally:
-        for process in running.values():
-            process.end()
+        for _, child in running.values():
+            child.end()
     return {arm.name: metrics[arm.name] for arm in arms}
-
-
-class _Process:
-    def __init__(self, arm: Arm) -> None:
-        self.name = arm.name
-        context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
-        self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, arm), daemon=True)
-        with kept_from_children():
-            self.process.start()
-        theirs.close()
-
-    def end(self) -> None:
-        self.connection.close()
-        self.process.terminate()
-        self.process.join()
 
 
 def train_arm(arm: Arm, on_progress: Callable[[Progress], None]) -> Dict[str, Any]:

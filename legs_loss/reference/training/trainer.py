@@ -12,7 +12,7 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Union
+from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Tuple, Union
 
 import numpy as np
 import torch
@@ -25,7 +25,15 @@ from legs_loss.reference.rasterizer import Rendering, rasterize
 from legs_loss.reference.training.adam import Adam, position_rate
 from legs_loss.reference.training.checkpoint import CHECKPOINT, alone_in, check_new, read_state, write_checkpoint
 from legs_loss.reference.training.config import TrainConfig, default_threshold
-from legs_loss.reference.training.dataset import Dataset, TrainingView, extent, load_dataset, shuffled
+from legs_loss.reference.training.dataset import (
+    Dataset,
+    TrainingView,
+    extent,
+    load_dataset,
+    pinhole_camera,
+    shuffled,
+    split_views,
+)
 from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.reference.training.metrics import mean_scores, psnr, score
 from legs_loss.scenes import Scene
@@ -35,6 +43,7 @@ __all__ = [
     "Progress",
     "Result",
     "TrainConfig",
+    "check_trainable",
     "default_threshold",
     "draw",
     "point_cloud",
@@ -42,6 +51,9 @@ __all__ = [
     "step_weight",
     "train",
 ]
+
+
+_FACTS = ("iteration", "order", "loss", "psnr", "growth", "history")  # of a run, that a checkpoint keeps as they are
 
 
 class Progress(NamedTuple):
@@ -117,6 +129,8 @@ def train(
             writes to ``out``, or a run is there and ``resume`` is False.
         KeyboardInterrupt: Ctrl-C, after the checkpoint.
     """
+    if not resume:
+        check_trainable(scene)
     data = load_dataset(scene, config.weights, config.resolution, config.white_background, store, weights)
     if config.shuffled:
         data = data._replace(train=shuffled(data.train, config.seed))
@@ -145,6 +159,29 @@ def train(
         return Result(run.adam.gaussians, metrics)
 
 
+def check_trainable(scene: Scene) -> None:
+    """Check that a scene has what a training needs; no photograph is read.
+
+    Raises:
+        LegsError: a view without a pinhole camera, or no points to start from.
+    """
+    for views in split_views(scene):
+        for view in views:
+            pinhole_camera(scene, view)
+    _points(scene)
+
+
+def _points(scene: Scene) -> Tuple[np.ndarray, np.ndarray]:
+    """Return a scene's points and their colours."""
+    points = scene.points
+    if points is None or len(points.xyz) < 2:
+        raise LegsError(
+            f"{scene.root}: there are no points to start from: training needs a COLMAP scene, which has them in "
+            "sparse/0/points3D.bin"
+        )
+    return points.xyz, points.rgb
+
+
 class _Run:
     """The state of a training between two iterations."""
 
@@ -169,12 +206,7 @@ class _Run:
 
     @classmethod
     def begin(cls, data: Dataset, config: TrainConfig, scene: Scene) -> _Run:
-        points = scene.points
-        if points is None or len(points.xyz) < 2:
-            raise LegsError(
-                f"{scene.root}: there are no points to start from: a COLMAP scene has them in sparse/0/points3D.bin"
-            )
-        return cls(data, config, Adam(Gaussians.from_points(points.xyz, points.rgb, config.sh_degree)))
+        return cls(data, config, Adam(Gaussians.from_points(*_points(scene), config.sh_degree)))
 
     @classmethod
     def restore(cls, data: Dataset, config: TrainConfig, path: Path) -> _Run:
@@ -184,9 +216,9 @@ class _Run:
         if TrainConfig.from_dict(facts["config"]) != config:
             raise LegsError(f"{path}: this run was made with other settings")
         run = cls(data, config, Adam.restore(arrays))
-        run.iteration, run.clocks, run.order = facts["iteration"], np.array(facts["clocks"]), facts["order"]
-        run.loss, run.psnr = facts["loss"], facts["psnr"]
-        run.growth, run.history = facts["growth"], facts["history"]
+        run.clocks = np.array(facts["clocks"])
+        for name in _FACTS:
+            setattr(run, name, facts[name])
         run.gradient_sum = torch.from_numpy(arrays["gradient_sum"])
         run.times_seen = torch.from_numpy(arrays["times_seen"])
         run.generator.set_state(torch.from_numpy(arrays["generator"]))
@@ -202,13 +234,8 @@ class _Run:
         facts = {
             "config": self.config.as_dict(),
             "views": [view.name for view in self.data.train],
-            "iteration": self.iteration,
             "clocks": self.clocks.tolist(),
-            "order": self.order,
-            "loss": self.loss,
-            "psnr": self.psnr,
-            "growth": self.growth,
-            "history": self.history,
+            **{name: getattr(self, name) for name in _FACTS},
         }
         write_checkpoint(path, arrays, facts)
 

@@ -10,7 +10,7 @@ import torch
 
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA
 from legs_loss.reference.rasterizer import oracle
-from legs_loss.reference.surfels import oracle as surfels_oracle
+from tests.reference.surfels import oracle as surfels_oracle
 from tests.reference.surfels.support import (
     ALPHA,
     BACKGROUND,

@@ -12,7 +12,7 @@ from legs_adapters.shims.missing import MissingShim
 
 from legs_loss import LegsError
 from legs_loss.reference.surfels import Surfels, rasterize_surfels
-from legs_loss.reference.surfels import oracle as surfels_oracle
+from tests.reference.surfels import oracle as surfels_oracle
 from tests.reference.surfels.support import (
     ALPHA,
     BACKGROUND,
@@ -20,6 +20,7 @@ from tests.reference.surfels.support import (
     camera,
     draw,
     in_type,
+    rasterize_by,
     run,
     scene,
 )
@@ -144,7 +145,7 @@ class TestAgreement:
         for backend, dtype in (("numba", torch.float32), ("torch", torch.float64)):
             colours = rgb.clone().to(dtype).requires_grad_()
             geometry = [tensor.to(dtype) for tensor in (means, opacities, scales, quaternions)]
-            image, _, _ = rasterize_surfels(Surfels(*geometry, colours=colours), in_type(camera(), dtype), backend)
+            image, _, _ = rasterize_by(backend, Surfels(*geometry, colours=colours), in_type(camera(), dtype))
             image.square().sum().backward()
             results.append((image.double(), colours.grad.double()))
         torch.testing.assert_close(*[image for image, _ in results], atol=1e-5, rtol=0)
@@ -165,7 +166,7 @@ class TestAgreement:
             handed = Surfels(
                 means.to(dtype), opacities.to(dtype), homographies=given, sh=sh.to(dtype), viewspace=viewspace
             )
-            image, _, others = rasterize_surfels(handed, in_type(settings, dtype), backend)
+            image, _, others = rasterize_by(backend, handed, in_type(settings, dtype))
             (torch.cat([image, others]) * weights.to(dtype)).sum().backward()
             results.append((image, {"rows": given.grad, "viewspace": viewspace.grad}))
         torch.testing.assert_close(results[0][0].double(), results[1][0], atol=1e-5, rtol=0)
@@ -182,7 +183,7 @@ class TestAgreement:
             given = rows.detach().to(dtype, copy=True).requires_grad_()
             opacity = torch.full((1, 1), 0.9, dtype=dtype)
             handed = Surfels(0 * means.to(dtype), opacity, homographies=given, sh=sh.to(dtype))
-            image, _, others = rasterize_surfels(handed, in_type(camera(), dtype), backend)
+            image, _, others = rasterize_by(backend, handed, in_type(camera(), dtype))
             (image.sum() + others[:2].sum() + others[5:].sum()).backward()
             results.append((torch.cat([image, others[:2], others[5:]]).double(), given.grad.double()))
         (got, gradient), (expected, expected_gradient) = results

@@ -14,19 +14,17 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence, Set
 
-import numpy as np
-import torch
-
+from examples.reproduce_paper.codebases.profile import Edit, Profile, fill
 from legs_loss.errors import LegsError
-from legs_loss.experiments.upstream.profile import Edit, Profile, fill
 from legs_loss.reference.training.densify import Schedule
 from legs_loss.reference.training.metrics import mean_scores, score
-from legs_loss.scenes import open_image
+from legs_loss.report.html_pictures import read_picture
 from legs_loss.spec import WeightSpec
 from legs_loss.system import read_regular, write_whole
 
-__all__ = ["Checkout", "check_copy", "copy_checkout", "gaussians_in", "read_picture", "train_and_score"]
+__all__ = ["Checkout", "check_copy", "copy_checkout", "gaussians_in", "train_and_score"]
 
+LAUNCH = Path(__file__).resolve().parents[1] / "launch.py"
 # Files that are not copied; and what a folder of installed packages has in it, which is not either.
 UNNEEDED = (".git", "__pycache__", "node_modules", "output", "outputs")
 INSTALLED = ("pyvenv.cfg", "conda-meta")
@@ -272,7 +270,7 @@ def _once(
     log = folder / f"{step}.log"
     for words in commands:
         part.unlink() if part.exists() else None
-        prefix = [sys.executable, "-m", "legs_loss.experiments.upstream.launch", str(part.resolve()), str(seed)]
+        prefix = [sys.executable, str(LAUNCH), str(part.resolve()), str(seed)]
         words = [*prefix, *(["--cpu", "--ssim"] if checkout.cpu else []), *words]
         with open(str(log), "ab") as said:
             code = subprocess.run(
@@ -323,10 +321,3 @@ def _scores(renders: Path, truths: Path, split: str) -> Dict[str, Mapping[str, f
     if names != sorted(path.name for path in truths.glob("*.png")):
         raise LegsError(f"{renders} and {truths} do not hold the same views")
     return {name: score(read_picture(renders / name), read_picture(truths / name), split) for name in names}
-
-
-def read_picture(path: Path) -> torch.Tensor:
-    """Return a picture that a codebase wrote, [3, H, W] in [0, 1]."""
-    with open_image(path) as image:
-        pixels = np.asarray(image.convert("RGB"), np.float32) / 255.0
-    return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()

@@ -17,13 +17,15 @@ from torch import Tensor
 
 from legs_loss.reference.conventions import FARTHEST, NEAR, TILE
 from legs_loss.reference.rasterizer.oracle import colours, cover, tile_bounds, unit_rotations
-from legs_loss.reference.surfels.model import Surfels, SurfelView
-
-FAR = 100.0  # with NEAR, the scale of the distortion's depths; nothing is cut off there
-CUTOFF = 3.0  # standard deviations: where a surfel's square of tiles ends
-FILTER_RADIUS = 0.707106  # pixels: the standard deviation of the screen-space Gaussian, as upstream rounds it
-MIN_EXTENT = 1e-4  # pixels^2: the least half extent of the disc's box, squared
-CHANNELS = 7  # of the second image: depth, alpha, normal x y z, median depth, distortion
+from legs_loss.reference.surfels.model import (
+    CHANNELS,
+    CUTOFF,
+    FAR,
+    FILTER_RADIUS,
+    MIN_EXTENT,
+    Surfels,
+    SurfelView,
+)
 
 
 class Bounds(NamedTuple):

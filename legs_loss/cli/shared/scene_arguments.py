@@ -1,32 +1,37 @@
-"""The arguments of demo and compare for a scene that a CPU trains in minutes."""
+"""The arguments for a scene and its photographs; those of demo and compare, for what a CPU trains in minutes."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from legs_loss.system import cores
 
 if TYPE_CHECKING:
     from legs_loss.scenes import Scene
 
-__all__ = ["add_scene_arguments", "default_resolution"]
+__all__ = ["add_images", "add_resolution", "add_scene_arguments", "default_resolution"]
 
 AFFORDABLE = 70_000  # pixels a photograph
+
+
+def add_images(parser: Any) -> None:
+    """Declare the folder of a scene's photographs."""
+    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
+
+
+def add_resolution(parser: Any, without: str = "at most 1600 wide", **more: Any) -> None:
+    """Declare 3DGS's -r, and say what is done without it."""
+    what = f"as in 3DGS; default: {without}"
+    parser.add_argument("-r", "--resolution", type=int, metavar="1|2|4|8|WIDTH", help=what, **more)
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the scene, its photographs and their size, and the number of parallel trainings."""
     parser.add_argument("scene", metavar="SCENE", nargs="?", help="a COLMAP scene; default: the embedded scene")
-    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
-    parser.add_argument(
-        "-r",
-        "--resolution",
-        type=int,
-        metavar="1|2|4|8|WIDTH",
-        help=f"as in 3DGS; default: about {AFFORDABLE:,} pixels, which a CPU trains in minutes",
-    )
+    add_images(parser)
+    add_resolution(parser, f"about {AFFORDABLE:,} pixels, which a CPU trains in minutes")
     parser.add_argument(
         "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one a core"
     )

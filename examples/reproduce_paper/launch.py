@@ -1,6 +1,6 @@
 """Run one script of a codebase with a given seed, and report what was weighted.
 
-    python -m legs_loss.experiments.upstream.launch REPORT SEED [--cpu] SCRIPT ...
+    python launch.py REPORT SEED [--cpu] SCRIPT ...
 
 3DGS and its forks set their seeds to 0 in their code. Here a multiple of SEED is added to every seed that is set,
 so that runs with the same SEED agree and others differ; 0 keeps the script's own. The report is written at the end.
@@ -17,7 +17,7 @@ import threading
 import time
 import zlib
 from pathlib import Path
-from typing import Any, Callable, List
+from typing import Any, Callable
 
 STRIDE = 1_000_003  # between the seeds of two runs: a script that counts its seeds up meets none twice
 
@@ -91,5 +91,5 @@ def main(report: str, seed: str, *words: str) -> int:
 
 
 if __name__ == "__main__":
-    arguments: List[str] = sys.argv[1:]
-    sys.exit(main(*arguments))
+    del sys.path[0]  # this folder: its modules are none of the codebase's
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,29 @@
+"""Start processes that work for this one, with a pipe to each."""
+
+from __future__ import annotations
+
+import multiprocessing
+from typing import Any, Callable
+
+from legs_loss.system.ctrl_c import kept_from_children
+
+__all__ = ["Child"]
+
+
+class Child:
+    """A process that runs ``target(connection, *arguments)``, and this side's end of the connection."""
+
+    def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
+        context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=target, args=(theirs, *arguments), daemon=True)
+        with kept_from_children():
+            self.process.start()
+        theirs.close()
+
+    def end(self, patience: float = 0.0) -> None:
+        """Close the pipe, which ends the process when it is idle; after some seconds kill it."""
+        self.connection.close()
+        self.process.join(patience)
+        self.process.terminate()
+        self.process.join()

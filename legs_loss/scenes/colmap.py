@@ -33,9 +33,11 @@ MODELS = (
 )
 
 
+_TWO_FOCAL_LENGTHS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")
 _LARGEST = 2 << 30  # bytes of a text, which is read whole; of a binary file as much is read as its counts say
 _LONGEST = 4096  # bytes of an image's name
 _SIDE = 1 << 20  # pixels
+_LONGEST_FOCAL, _FARTHEST_CAMERA = 1e9, 1e12  # pixels, and the scene's unit: what float32 can still compute with
 _FARTHEST = float(np.finfo(np.float32).max)
 
 
@@ -272,7 +274,10 @@ def _points_txt(data: bytes) -> PointCloud:
 def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) -> _Intrinsics:
     if len(params) != dict(MODELS).get(model, len(params)):
         raise ValueError(f"a camera of model {model} has {len(params)} parameters")
-    if not (0 < width <= _SIDE and 0 < height <= _SIDE and np.isfinite(params).all()):
+    focal = params[: 2 if model in _TWO_FOCAL_LENGTHS else 1]
+    if not (
+        0 < width <= _SIDE and 0 < height <= _SIDE and _is_within(params, _LONGEST_FOCAL) and min(focal, default=1) > 0
+    ):
         raise ValueError(f"a camera of {width}x{height} pixels with parameters {params}")
     return _Intrinsics(model, width, height, params)
 
@@ -286,9 +291,13 @@ def _image(name: str, camera_id: int, quaternion: Tuple[float, ...], translation
     if len(quaternion) != 4 or len(translation) != 3:
         raise ValueError(f"the pose of {name!r} has {len(quaternion) + len(translation)} numbers, not 7")
     largest = max(map(abs, quaternion))
-    if not np.isfinite(quaternion + translation).all() or not 1e-150 < largest < 1e150:
+    if not (1e-150 < largest < 1e150 and _is_within(quaternion, 1e150) and _is_within(translation, _FARTHEST_CAMERA)):
         raise ValueError(f"the pose of {name!r} is not a number")
     return _Image(name, camera_id, quaternion, translation)
+
+
+def _is_within(values: Tuple[float, ...], limit: float) -> bool:
+    return all(abs(value) < limit for value in values)  # of NaN, too, this is false
 
 
 def _cloud(xyz: List[Any], rgb: List[Any]) -> PointCloud:

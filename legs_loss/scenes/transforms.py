@@ -113,7 +113,7 @@ def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
         angle = intrinsics.get("camera_angle_y")
         fy = fx if angle is None else height / 2 / math.tan(angle / 2)
     cx, cy = float(intrinsics.get("cx", width / 2)), float(intrinsics.get("cy", height / 2))
-    if not (0 < width <= _SIDE and 0 < height <= _SIDE and np.isfinite([fx, fy, cx, cy]).all() and fx and fy):
+    if not (0 < width <= _SIDE and 0 < height <= _SIDE and (np.abs([fx, fy, cx, cy]) < 1e9).all() and fx > 0 < fy):
         raise ValueError(f"{str(image)!r} has a camera of {width}x{height} pixels, focal lengths {fx:g}, {fy:g}")
     camera_to_world = np.asarray(intrinsics["transform_matrix"], dtype=np.float64)
     if camera_to_world.shape == (3, 4):

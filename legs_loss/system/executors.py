@@ -7,8 +7,10 @@ to the caller. Workers need access to the task's files: the file system is share
 from __future__ import annotations
 
 import asyncio
+import logging
 import platform
 import uuid
+from concurrent.futures import CancelledError
 from typing import Any, Callable, Iterable, Iterator, Optional, Tuple
 
 from legs_loss._version import __version__
@@ -55,6 +57,7 @@ def _on_cluster(task: Task, arguments: Iterable[Any], scheduler: str, listen: Li
         client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise LegsError(f"no dask scheduler answers at {scheduler}: {error}") from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a traceback where the scheduler goes away
     with client:
         try:
             client.wait_for_workers(1, timeout=_PATIENCE)
@@ -75,15 +78,11 @@ def _outcome(future: Any) -> Any:
         return future.result()
     except LegsError as error:
         return error
+    except (CancelledError, asyncio.CancelledError):
+        return LegsError("the scheduler went away: what was done is kept, run it again")
     except Exception as error:
         if type(error).__module__.split(".")[0] != "distributed" and not isinstance(error, ModuleNotFoundError):
             raise
-        if type(error).__name__ == "KilledWorker":
-            last = getattr(error, "last_worker", None)
-            return LegsError(
-                f"the workers that took it died, the last one being {getattr(last, 'address', 'unknown')} (out of "
-                "memory?)"
-            )
         return LegsError(f"a worker could not run it: {error}")
 
 

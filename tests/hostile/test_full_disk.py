@@ -19,6 +19,7 @@ from legs_loss.reference.gaussians import Gaussians
 from legs_loss.reference.ply import read_ply, write_ply
 from legs_loss.reference.training.checkpoint import read_state
 from legs_loss.store import WeightStore
+from tests.scenes.test_cluster import Cluster
 from tests.support import colmap_scene, legs
 
 pytestmark = pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="mounting a small disk needs root")
@@ -128,6 +129,30 @@ def test_precompute(disk, tmp_path, capsys):
     assert main(["precompute", str(scene), "--out", str(store), "--workers", "1"]) == 0
     assert len(WeightStore(store).entries) == 8
     assert not [name for name in disk.state() if ".writing" in name or name.endswith(".part")]
+
+
+@pytest.mark.slow
+def test_precompute_by_a_cluster(disk, tmp_path):
+    """The error names the worker whose disk it is; what fitted is whole, and is kept by the next run."""
+    pytest.importorskip("distributed")
+    scene = colmap_scene(tmp_path / "scene", names=[f"{i}.png" for i in range(8)], width=200, height=150)
+    store = disk.path / "store"
+    cluster = Cluster(tmp_path)
+    try:
+        _, address = cluster.worker()
+        command = ["precompute", scene, "--out", store, "--scheduler", cluster.address]
+        with disk.full(200_000):
+            done = legs(*command)
+            (line,) = [line for line in done.stderr.splitlines() if "error" in line]
+            assert done.returncode == 2 and f"worker {address}" in line and FULL in line
+            kept = len(WeightStore(store).entries)
+            assert 0 < kept < 8 and WeightStore(store).check().damaged == []
+        done = legs(*command)
+        assert done.stdout.endswith(f": {8 - kept} made, {kept} up to date, 0 skipped\n"), done.stderr
+        assert WeightStore(store).check() == ([], [])
+        assert not [name for name in disk.state() if ".writing" in name or name.endswith(".part")]
+    finally:
+        cluster.close()
 
 
 def test_train(disk, tiny_scene, capsys):

@@ -37,7 +37,29 @@ COLMAP = [
     ("cameras.bin", at(0, HUGE), "cameras.bin is damaged"),
     ("cameras.bin", at(16, HUGE), "a camera of 1152921504606846976x"),
     ("cameras.bin", at(32, struct.pack("<d", float("inf"))), "with parameters"),
+    ("cameras.bin", at(32, struct.pack("<d", 0)), "with parameters"),
+    ("cameras.bin", at(32, struct.pack("<d", -50)), "with parameters"),
+    ("cameras.bin", at(40, struct.pack("<d", 0)), "with parameters"),
+    ("cameras.bin", at(40, struct.pack("<d", float("nan"))), "with parameters"),
+    ("cameras.bin", at(48, struct.pack("<d", 1e300)), "with parameters"),
+    ("cameras.bin", at(16, struct.pack("<Q", 0)), "a camera of 0x30"),
+    ("cameras.bin", at(24, struct.pack("<Q", 1 << 63)), "a camera of 40x9223372036854775808"),
+    ("cameras.bin", at(12, struct.pack("<i", 99)), "the unknown model 99"),
+    ("cameras.bin", at(12, struct.pack("<i", -1)), "the unknown model -1"),
+    ("cameras.bin", at(8, struct.pack("<i", 7)), "has camera 1, which cameras.bin does not list"),
+    ("cameras.bin", lambda old: old[:-3], "cameras.bin is damaged"),
+    ("images.bin", at(44, struct.pack("<d", 1e300)), "the pose of"),
+    ("images.bin", at(68, struct.pack("<i", 5)), "has camera 5, which cameras.bin does not list"),
+    ("images.bin", at(72, b"a/../../b"), "leads out of the scene"),
+    ("images.bin", at(72, b"..\\b"), "leads out of the scene"),
+    ("images.bin", at(72, b"\0"), "no file can have"),
+    ("images.bin", at(72, b"\xff\xfe"), "images.bin is damaged"),
     ("points3D.bin", at(0, HUGE), "points3D.bin is damaged"),
+    ("points3D.bin", at(0, struct.pack("<Q", 0)), "where its own counts say 8"),
+    ("points3D.bin", at(16, struct.pack("<d", float("nan"))), "a point is nowhere"),
+    ("points3D.bin", at(24, struct.pack("<d", float("-inf"))), "a point is nowhere"),
+    ("points3D.bin", lambda old: old[:-1], "points3D.bin is damaged"),
+    ("points3D.bin", lambda old: b"", "points3D.bin is damaged"),
     ("points3D.bin", at(16, struct.pack("<d", 1e300)), "a point is nowhere"),
     ("points3D.bin", at(51, HUGE), "too early"),
 ]
@@ -50,6 +72,41 @@ def test_colmap(name, change, line, tmp_path):
     file.write_bytes(change(file.read_bytes()))
     with pytest.raises(LegsError, match=line):
         _ = read_scene(root).points
+
+
+TEXT = [
+    ("cameras", "1 PINHOLE 40 30 0 51 20 15", "with parameters"),
+    ("cameras", "1 PINHOLE 40 30 -50 51 20 15", "with parameters"),
+    ("cameras", "1 PINHOLE 40 30 nan 51 20 15", "with parameters"),
+    ("cameras", "1 PINHOLE 40 30 50 51 20", "has 3 parameters"),
+    ("cameras", "1 SIMPLE_RADIAL 40 30 -50 20 15 0", "with parameters"),
+    ("cameras", f"1 PINHOLE {'9' * 400} 30 50 51 20 15", "a camera of 999"),
+    ("cameras", f"1 PINHOLE {'9' * 5000} 30 50 51 20 15", "cameras.txt is damaged|a camera of 999"),
+    ("cameras", "one", "cameras.txt is damaged"),
+    ("images", "1 1 0 0 0 0 0 0 1 ../../a.png", "leads out of the scene"),
+    ("images", "1 1 0 0 0 0 0 0 1 /etc/passwd", "leads out of the scene"),
+    ("images", "1 0 0 0 0 0 0 0 1 a.png", "the pose of"),
+    ("images", "1 1 0 0 nan 0 0 0 1 a.png", "the pose of"),
+    ("images", "1 1 0 0 0 0 0 0 1", "images.txt is damaged"),
+    ("points3D", "1 0 0 1e39 7 7 7 0", "a point is nowhere"),
+    ("points3D", "1 0 0 0 256 7 7 0", "a point's colour"),
+    ("points3D", "1 0 0", "points3D.txt is damaged"),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "line"), TEXT, ids=lambda value: str(value)[:40])
+def test_colmap_s_texts(name, text, line, tmp_path):
+    """One short error says what is wrong; mended, the scene is read."""
+    save(tmp_path / "images" / "a.png", photograph(40, 30))
+    good = {"cameras": "1 PINHOLE 40 30 50 51 20 15", "images": "1 1 0 0 0 0 0 0 1 a.png\n", "points3D": ""}
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    for file, content in {**good, name: text}.items():
+        (tmp_path / "sparse" / "0" / f"{file}.txt").write_text(content + "\n")
+    with pytest.raises(LegsError, match=line) as raised:
+        _ = read_scene(tmp_path).points
+    assert len(str(raised.value)) < 1000
+    (tmp_path / "sparse" / "0" / f"{name}.txt").write_text(good[name] + "\n")
+    assert len(read_scene(tmp_path).views) == 1
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "cameras.txt"])
@@ -84,6 +141,8 @@ TRANSFORMS = [
     (frames(w=1 << 40), "a camera of 1099511627776x6"),
     (frames(fl_x=float("nan")), "focal lengths nan"),
     (frames(fl_x=0), "focal lengths 0"),
+    (frames(fl_x=-9.0), "focal lengths -9"),
+    (frames(cx=1e300), "a camera of 8x6"),
     (frames(transform_matrix=[[1e308] * 4] * 4), "damaged"),
     (frames(transform_matrix=[[0.0] * 4] * 4), "damaged"),
     (frames(transform_matrix=[[1.0, 2.0]]), "no 4x4 matrix"),

@@ -37,15 +37,11 @@ def find_content(path: Path, scene: Optional[Path] = None) -> Content:
         raise LegsError(f"there is no file or folder {path}: give a .ply, a run's folder or a comparison")
     if (path / "comparison.json").is_file():
         return _comparison(path, scene)
-    if path.is_file():
-        methods = {path.stem: path}
-    else:
-        methods = dict(_runs(path))
+    methods = {path.stem: path} if path.is_file() else dict(_runs(path))
     if not methods:
         raise LegsError(f"{path} holds no Gaussians: a run has point_cloud/iteration_N/point_cloud.ply")
-    if scene is None and (path / "scene" / "sparse").is_dir():
-        scene = path / "scene"
-    return Content(path.resolve().name, methods, None if scene is None else read_scene(scene), -1)
+    beside = path / "scene" if scene is None and (path / "scene" / "sparse").is_dir() else scene
+    return Content(path.resolve().name, methods, None if beside is None else read_scene(beside), -1)
 
 
 def _runs(path: Path) -> Iterator[Tuple[str, Path]]:

@@ -158,13 +158,12 @@ class TestCommandLine:
         before = snapshot(root)
         content = json.loads(run("--json", root).stdout)
         assert [(plain["file"], plain["line"], plain["reason"]) for plain in content["plain"]] == [
-            ("avatar.py", 15, "distillation"),
             ("train.py", 15, "distillation"),
             ("train.py", 17, "distillation"),
             ("train.py", 23, "depth"),
             ("slam.py", 7, "tracking"),
         ]
-        assert content["plain"][0]["weighted_at"] == "utils/criteria.py:11"
+        assert content["plain"][0]["weighted_at"] == "utils/photometric.py:6"
         assert "slam.py" in content["wrote"]
         again = run(root)
         assert "nothing to do: it is patched" in again.stdout

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import PurePosixPath
-from typing import Callable, Dict, Iterable, Iterator, List, Mapping, Optional, Set, Tuple
+from typing import Dict, Iterable, Iterator, List, Mapping, Optional, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.limits import Budget
-from legs_adapters.code.module import Function, Module, parse, said
+from legs_adapters.code.module import Function, Module, index_by_word, parse
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import dotted
 
 __all__ = ["Checkout", "imported_name"]
-
-_DEFINED = re.compile(r"^[ \t]*(?:async[ \t]+)?(?:def|class)[ \t]+(\w+)", re.M)
 
 
 class Checkout:
@@ -34,17 +32,12 @@ class Checkout:
         self._modules: Dict[str, Optional[Module]] = {}
         self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
         self._methods: Dict[str, List[Function]] = {}
-        self._by_word: Optional[Dict[str, List[str]]] = None  # as ``said`` has them
-        self._defined: Dict[str, List[str]] = {}
-        self._by_import: Dict[Tuple[str, str, int], Optional[Module]] = {}
-        self._together: Dict[str, Set[str]] = {}
-        self._ending: Dict[str, List[str]] = {}  # by the last name of what is imported of them
-        for source in self.sources.values():
-            path = PurePosixPath(source.path)
-            last = path.parent.name if path.name == "__init__.py" else path.stem
-            self._ending.setdefault(last, []).append(source.path)
-            for name in set(_DEFINED.findall(source.text)):
-                self._defined.setdefault(name, []).append(source.path)
+        self._by_import: Dict[Tuple[str, str, int, str], Optional[Module]] = {}
+        self._by_stem: Dict[str, List[str]] = {}
+        for path in map(PurePosixPath, self.sources):
+            stem = path.parent.name if path.name == "__init__.py" else path.stem
+            self._by_stem.setdefault(stem, []).append(path.as_posix())
+        self._by_word = index_by_word((path, source.text) for path, source in self.sources.items())
 
     def module(self, path: str) -> Optional[Module]:
         """Return a parsed file; None where it does not parse (it is then among ``unreadable``)."""
@@ -65,141 +58,69 @@ class Checkout:
         """Record a file as unreadable."""
         self._unreadable[path] = Unreadable(path, reason)
 
-    def matching(self, pattern: re.Pattern[str]) -> Iterator[Module]:
-        """Yield the modules whose text matches, each parsed when it is reached."""
-        for path, source in self.sources.items():
-            module = self.module(path) if pattern.search(source.text) else None
+    def matching(self, pattern: re.Pattern[str], word: str = "") -> Iterator[Module]:
+        """Yield the modules whose text matches, each parsed when it is reached; on request only those with a word."""
+        for path in self._by_word.get(word, ()) if word else self.sources:
+            module = self.module(path) if pattern.search(self.sources[path].text) else None
             if module is not None:
                 yield module
 
     def mentioning(self, name: str, called: bool = False) -> List[Function]:
         """Return the functions and top levels whose text mentions a name, or calls it."""
-        if self._by_word is None:
-            self._by_word = {}
-            for path, source in self.sources.items():
-                for word in said(source.text):
-                    self._by_word.setdefault(word, []).append(path)
         if (name, called) not in self._mentions:
-            modules = [self.module(path) for path in self._by_word.get(f"{name}(" if called else name, ())]
-            self._mentions[name, called] = [
-                function for module in modules if module is not None for function in module.mentioning(name, called)
-            ]
+            modules = map(self.module, self._by_word.get(f"{name}(" if called else name, ()))
+            found = [function for module in modules if module for function in module.mentioning(name, called)]
+            self._mentions[name, called] = found
         return self._mentions[name, called]
 
     def methods_named(self, name: str) -> List[Function]:
         """Return every method of this name in the checkout."""
         if name not in self._methods:
-            modules = [self.module(path) for path in self._defined.get(name, [])]
-            self._methods[name] = [
-                function
-                for module in modules
-                if module is not None
-                for function in module.named(name)
-                if function.owner is not None
-            ]
+            modules = self.matching(re.compile(rf"\bdef[ \t]+{name}\b"), name)
+            found = [function for module in modules for function in module.named(name)]
+            self._methods[name] = [function for function in found if function.owner is not None]
         return self._methods[name]
 
     # -- imports
 
-    def imported_from(self, module: Module, node: cst.ImportFrom) -> Optional[Module]:
+    def imported_from(self, module: Module, node: cst.ImportFrom, member: str = "") -> Optional[Module]:
         """Return the checkout's module that a ``from ... import`` statement names."""
-        return self.find_module(module, imported_name(node), len(node.relative))
+        return self.find_module(module, imported_name(node), len(node.relative), member)
 
-    def together(self, module: Module) -> Set[str]:
-        """Return the paths of the files that run together with another: all imports of the files that import it.
+    def find_module(self, module: Module, name: str, level: int, member: str = "") -> Optional[Module]:
+        """Return the checkout's module of this name, resolved from another; None where it is not the checkout's.
 
-        Imports inside of functions, and modules that are loaded by name, are not found.
+        A script can add any folder to sys.path: a module of one word is only found there if it defines the member.
         """
-        if module.path not in self._together:
-            users = _closure([module], self._users)
-            self._together[module.path] = {found.path for found in _closure(users, self._imports)}
-        return self._together[module.path]
-
-    def _users(self, module: Module) -> List[Module]:
-        """Return the modules that import another."""
-        path = PurePosixPath(module.path)
-        name = path.parent.name if path.name == "__init__.py" else path.stem
-        return [other for other in self.matching(re.compile(rf"\b{name}\b")) if module in self._imports(other)]
-
-    def _imports(self, module: Module) -> List[Module]:
-        """Return the checkout's modules that a module imports."""
-        found: List[Optional[Module]] = []
-        for node in module.top.flow.imports:
-            assert isinstance(node, (cst.Import, cst.ImportFrom))
-            names = [] if isinstance(node.names, cst.ImportStar) else [dotted(alias.name) or "" for alias in node.names]
-            if isinstance(node, cst.ImportFrom):
-                stem, level = imported_name(node), len(node.relative)
-                base = self.imported_from(module, node)
-                found.append(base)
-                if base is None and stem and not level:
-                    found.extend(self._on_path(module, stem, name) for name in names)
-                found.extend(self.find_module(module, f"{stem}.{name}" if stem else name, level) for name in names)
-            else:
-                found.extend(self.find_module(module, name, 0) for name in names)
-        return [other for other in found if other is not None]
-
-    def find_module(self, module: Module, name: str, level: int) -> Optional[Module]:
-        """Return the checkout's module of this name, resolved from another; None where it is not the checkout's."""
-        asked = (module.path, name, level)
+        asked = (module.path, name, level, member)
         if asked not in self._by_import:
-            self._by_import[asked] = self._find_module(module, name, level)
+            path = self._find_path(module.path, name.replace(".", "/"), level, member)
+            self._by_import[asked] = self.module(path) if path is not None else None
         return self._by_import[asked]
 
-    def _find_module(self, module: Module, name: str, level: int) -> Optional[Module]:
-        here = PurePosixPath(module.path).parent
-        inner = name.replace(".", "/")
-        if level:
-            for _ in range(level - 1):
-                here = here.parent
-            candidates = [here]
-        else:
-            candidates = [here, *here.parents, PurePosixPath("src")]
-        for base in candidates:
-            stem = (base / inner).as_posix() if inner else base.as_posix()
-            for path in (f"{stem}.py", f"{stem}/__init__.py" if stem != "." else "__init__.py"):
-                path = path[2:] if path.startswith("./") else path
-                if path in self.sources:
-                    return self.module(path)
-        if level or not inner:
+    def _find_path(self, path: str, inner: str, level: int, member: str) -> Optional[str]:
+        above = list(PurePosixPath(path).parents)
+        names = [inner]
+        if not level and "__init__.py" in self.sources:  # the checkout is itself a package
+            names.append(inner.partition("/")[2])
+        for base in above[level - 1 : level] if level else [*above, PurePosixPath("src")]:
+            for name in names:
+                files = [base / f"{name}.py", base / name / "__init__.py"] if name or level else []
+                for file in files:
+                    if file.as_posix() in self.sources:
+                        return file.as_posix()
+        if level or not ("/" in inner or member):
             return None
-        # Scripts extend sys.path: use the only file whose path ends so, or the nearest one.
-        known = self._ending.get(inner.rpartition("/")[2], []) if "/" in inner else []
-        ends = _nearest(module.path, [p for p in known if p.endswith((f"/{inner}.py", f"/{inner}/__init__.py"))])
-        return self.module(ends[0]) if len(ends) == 1 else None
-
-    def _on_path(self, module: Module, stem: str, name: str) -> Optional[Module]:
-        """Find the nearest ``base.py`` that defines a Trainer, for ``from base import Trainer``.
-
-        A script can add its folder to sys.path. In a checkout that is itself a package, the import may also be
-        ``from its_name.base import Trainer``.
-        """
-        defines = re.compile(rf"^(?:class|def)[ \t]+{re.escape(name)}\b", re.M)
-        own = stem.partition(".")[2].replace(".", "/") + ".py" if "__init__.py" in self.sources else ""
-        known = [own] if own in self.sources else self._ending.get(stem, [])
-        ends = [p for p in known if defines.search(self.sources[p].text)]
-        ends = _nearest(module.path, ends)
-        return self.module(ends[0]) if len(ends) == 1 else None
+        known = self._by_stem.get(PurePosixPath(inner).name, [])
+        ends = [file for file in known if file.endswith((f"/{inner}.py", f"/{inner}/__init__.py"))]
+        if "/" not in inner:
+            defines = re.compile(rf"^(?:class|def)[ \t]+{member}\b", re.M)
+            ends = [file for file in ends if defines.search(self.sources[file].text)]
+        shared = [len(set(above) & set(PurePosixPath(file).parents)) for file in ends]
+        nearest = [file for file, count in zip(ends, shared) if count == max(shared)]
+        return nearest[0] if len(nearest) == 1 else None
 
 
 def imported_name(node: cst.ImportFrom) -> str:
     """Return the dotted name after ``from``, without its leading dots."""
     return "" if node.module is None else (dotted(node.module) or "")
-
-
-def _closure(modules: Iterable[Module], following: Callable[[Module], List[Module]]) -> List[Module]:
-    """Return the modules and all that are reachable from them."""
-    found: Dict[str, Module] = {}
-    work = list(modules)
-    while work:
-        module = work.pop()
-        if module.path not in found:
-            found[module.path] = module
-            work.extend(following(module))
-    return list(found.values())
-
-
-def _nearest(path: str, others: List[str]) -> List[str]:
-    """Return the paths that share the most folders with a path."""
-    here = PurePosixPath(path).parents
-    shared = [len(set(here) & set(PurePosixPath(other).parents)) for other in others]
-    return [other for other, count in zip(others, shared) if count == max(shared)]

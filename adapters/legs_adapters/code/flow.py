@@ -1,33 +1,36 @@
-"""Walk one function body in the order of execution, and record what reaches each use.
+"""Reaching definitions: for every place that a function reads, the assignments that its value can come from.
 
-Branches are joined. A loop is walked twice, and once more for each further walk of a loop around it.
+A body is walked in the order of execution. Branches are joined; the body of an outermost loop is walked twice.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Callable, Dict, List, Optional, Sequence, Set, Tuple
+import re
+from typing import Any, Dict, FrozenSet, List, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.reaching import Definition, Env, Reaching, join
+from legs_adapters.code.reaching import Definition, Env
 from legs_adapters.code.syntax import (
     call_name,
     children,
-    constant,
     dotted,
     every_parameter,
+    key_of,
     names_where_false,
     names_where_true,
     path_of,
+    walk_expressions,
 )
 
 __all__ = ["Flow"]
 
+_PART = re.compile(r"[.\[]")
 _MUTATORS = {"append", "add", "extend", "insert", "update", "setdefault", "appendleft", "__setitem__"}
 
 
-class Flow(Reaching):
+class Flow:
     """Walk one function body, or a module's top level.
 
     Args:
@@ -36,11 +39,14 @@ class Flow(Reaching):
         most: the steps after which the walk ends.
 
     Attributes:
+        definitions: every definition by place, in source order: what a nested function sees.
         calls: every call in the body, in source order, nested functions excepted.
-        expressions: every call and binary operation, in source order.
+        expressions: every call and binary operation.
+        reads, places: every name that is read, in source order; with the attributes.
         returns: the expressions that it returns or yields.
-        contexts: by a node's id, the context managers around it: ``with torch.no_grad():``.
-        reads: every name that is read, in source order.
+        imports: its import statements.
+        contexts: by a node's id, the loops and the context managers around it (``with torch.no_grad():``), the
+            innermost last.
         conditions: by a call's id, the names that must be true where it runs: ``if tracking:``.
         steps: how many it took: nodes that were visited, and definitions that were copied, four a step.
     """
@@ -51,29 +57,99 @@ class Flow(Reaching):
         parameters: Optional[cst.Parameters] = None,
         most: float = math.inf,
     ) -> None:
-        super().__init__()
         self.steps: int = 0
         self._most = most
-        self.calls: List[cst.Call] = []
-        self.expressions: List[cst.CSTNode] = []
-        self.returns: List[cst.BaseExpression] = []
-        self.imports: List[cst.CSTNode] = []
+        self.definitions: Dict[str, List[Definition]] = {}
         self.contexts: Dict[int, Tuple[cst.CSTNode, ...]] = {}
-        self._seen: Set[int] = set()
         self.conditions: Dict[int, Tuple[str, ...]] = {}
-        self.reads: List[cst.Name] = []
+        self._reaching: Dict[int, Set[Definition]] = {}
+        self._visited: Dict[int, Tuple[cst.CSTNode, int]] = {}  # with the number of definitions made before
+        self._made: Dict[Tuple[int, str, str], Definition] = {}
+        self._holders: Set[str] = set()  # places of which a part is defined: ``x`` and ``x.y`` of ``x.y['z']``
         self._around: Tuple[cst.CSTNode, ...] = ()
-        self._conditions: Tuple[str, ...] = ()
-        self._carried: Dict[int, Optional[Env]] = {}  # by a loop's id: what its end hands back to its start
-        self._breaks: List[List[Env]] = []
-        self._continues: List[List[Env]] = []
-        env: Env = {}
-        if parameters is not None:
-            for param in every_parameter(parameters):
-                self._bind(env, Definition(param.name.value, "parameter", param, param.default))
-        self._block(_statements(body), env)
+        self._true: Tuple[str, ...] = ()
+        self._loop_ends: Dict[int, Env] = {}  # by a loop's id: what its end hands back to its start
+        self._exits: List[List[Env]] = []  # of the loops around: where a break or a continue leaves the body
+        env = Env()
+        for parameter in every_parameter(parameters) if parameters is not None else ():
+            self._bind(env, Definition(parameter.name.value, "parameter", parameter, parameter.default))
+        self._visit(body, env)
+        by_class: Dict[type, List[Any]] = {}  # isinstance on every node takes longer than the walk
+        for node, _ in self._visited.values():
+            by_class.setdefault(type(node), []).append(node)
+        self.calls: List[cst.Call] = by_class.get(cst.Call, [])
+        self.expressions: List[cst.CSTNode] = [*self.calls, *by_class.get(cst.BinaryOperation, ())]
+        self.reads: List[cst.Name] = by_class.get(cst.Name, [])
+        self.places: List[cst.Name | cst.Attribute] = [*self.reads, *by_class.get(cst.Attribute, ())]
+        self.imports: List[cst.CSTNode] = [*by_class.get(cst.Import, ()), *by_class.get(cst.ImportFrom, ())]
+        values = [node.value for node in [*by_class.get(cst.Return, ()), *by_class.get(cst.Yield, ())]]
+        self.returns: List[cst.BaseExpression] = [v for v in values if isinstance(v, cst.BaseExpression)]
+
+    # -- what it knows
+
+    @property
+    def every_definition(self) -> List[Definition]:
+        """All definitions, place by place."""
+        return [definition for definitions in self.definitions.values() for definition in definitions]
+
+    def reaching(self, node: cst.CSTNode) -> FrozenSet[Definition]:
+        """Return the definitions that this use of a place can come from; empty for what is not local."""
+        return frozenset(self._reaching.get(id(node), ()))
+
+    def assigned(self, node: cst.CSTNode) -> List[cst.CSTNode]:
+        """Return the values of the assignments that reach this use."""
+        return [d.value for d in self.reaching(node) if d.kind == "assign" and d.value is not None]
+
+    def value_of(self, node: cst.CSTNode) -> Optional[cst.CSTNode]:
+        """Return the value of a name, where exactly one assignment reaches it; else None."""
+        found = list(self.reaching(node)) if isinstance(node, cst.Name) else []
+        return found[0].value if len(found) == 1 and found[0].kind == "assign" else None
+
+    def unchanged(self, *nodes: cst.CSTNode) -> bool:
+        """Return whether the names in expressions are not reassigned anywhere in the body."""
+        for part in (part for node in nodes for part in walk_expressions(node)):
+            if isinstance(part, cst.Name) and self.reaching(part):
+                everywhere = {d for d in self.definitions.get(part.value, []) if d.kind != "store"}
+                if not everywhere <= self.reaching(part):
+                    return False
+        return True
+
+    def unchanged_at(self, call: cst.CSTNode, *nodes: cst.CSTNode) -> bool:
+        """Return whether nothing is assigned to the names in expressions between them and a later call."""
+        end = self._visited[id(call)][1]
+        for part in (part for node in nodes for part in walk_expressions(node)):
+            if isinstance(part, cst.Name) and id(part) in self._visited:
+                start = self._visited[id(part)][1]
+                if start > end or any(start < made.order <= end for made in self.definitions.get(part.value, ())):
+                    return False
+        return True
+
+    def loops_around(self, node: cst.CSTNode) -> List[cst.CSTNode]:
+        """Return the loops around a node of the body, the innermost first."""
+        return [each for each in reversed(self.contexts.get(id(node), ())) if isinstance(each, (cst.For, cst.While))]
 
     # -- definitions
+
+    def _bind(self, env: Env, definition: Definition) -> None:
+        definition = self._first(definition)
+        place = definition.place
+        if place in self._holders:  # a top level may bind thousands of names, and few of them have parts
+            for other in [other for other in env if other.startswith((place + ".", place + "["))]:
+                del env[other]
+        env[place] = frozenset([definition])
+
+    def _add(self, env: Env, definition: Definition) -> None:
+        definition = self._first(definition)
+        env[definition.place] = env.get(definition.place, frozenset()) | {definition}
+
+    def _first(self, made: Definition) -> Definition:
+        """Return the definition that a statement was recorded as when it was met first; a loop is walked twice."""
+        known = self._made.setdefault((id(made.node), made.place, made.kind), made)
+        if known is made:
+            made.order = len(self._made)
+            self.definitions.setdefault(made.place, []).append(made)
+            self._holders.update(made.place[: found.start()] for found in _PART.finditer(made.place))
+        return known
 
     def _assign(
         self,
@@ -85,287 +161,213 @@ class Flow(Reaching):
         index: Optional[int] = None,
     ) -> None:
         if isinstance(target, (cst.Tuple, cst.List)):
-            elements = target.elements
-            parts = value.elements if isinstance(value, (cst.Tuple, cst.List)) and kind == "assign" else None
-            plain = not any(isinstance(element, cst.StarredElement) for element in elements)
+            is_starred = any(isinstance(element, cst.StarredElement) for element in target.elements)
+            parts = value.elements if isinstance(value, (cst.Tuple, cst.List)) and kind == "assign" else ()
             # In [a, b], c = f() neither a nor b is the first result of f: they are parts of it.
             inner = "part" if kind == "element" and index is not None and not _counts(value) else "element"
-            for i, element in enumerate(elements):
-                if parts is not None and plain and len(parts) == len(elements):
+            for i, element in enumerate(target.elements):
+                if not is_starred and len(parts) == len(target.elements):
                     self._assign(env, element.value, parts[i].value, node)
                 else:
-                    self._assign(env, element.value, value, node, inner, i if plain else None)
-            return
-        if isinstance(target, cst.StarredElement):
-            self._assign(env, target.value, value, node, "element")
+                    self._assign(env, element.value, value, node, inner, None if is_starred else i)
             return
         place = path_of(target)
         if place is not None:
-            unpacked = kind in ("element", "part")
-            self._bind(env, Definition(place, kind, target if unpacked else node, value, index))
+            self._bind(env, Definition(place, kind, target if kind in ("element", "part") else node, value, index))
         if isinstance(target, (cst.Attribute, cst.Subscript)):
-            self._visit(target.value, env)
-            if isinstance(target, cst.Subscript):
-                for part in target.slice:
-                    self._visit(part, env)
-            whole = path_of(target.value)
-            while whole is None and isinstance(target.value, (cst.Attribute, cst.Subscript)):
-                target = target.value
-                whole = path_of(target.value)
-            if whole is not None:
-                key: object = None
-                if isinstance(target, cst.Attribute):
-                    key = "." + target.attr.value
-                elif len(target.slice) == 1 and isinstance(target.slice[0].slice, cst.Index):
-                    key = constant(target.slice[0].slice.value)
-                self._add(env, Definition(whole, "store", target, value, None, key))
-
-    # -- statements
-
-    def _block(self, statements: Sequence[cst.CSTNode], env: Optional[Env]) -> Optional[Env]:
-        for statement in statements:
-            if self.steps > self._most:
-                return None
-            if env is None:
-                # Unreachable (after a return or a continue), but its names are recorded.
-                self._statement(statement, {})
-                continue
-            env = self._statement(statement, env)
-        return env
-
-    def _statement(self, node: cst.CSTNode, env: Env) -> Optional[Env]:
-        if isinstance(node, cst.SimpleStatementLine):
-            return self._block(node.body, env)
-        if isinstance(node, cst.If):
-            self._visit(node.test, env)
-            outer = self._conditions
-            self._conditions = outer + names_where_true(node.test)
-            taken = self._block(_statements(node.body), self._copy(env))
-            self._conditions = outer + names_where_false(node.test)
-            left: Optional[Env] = env
-            if isinstance(node.orelse, cst.If):
-                left = self._statement(node.orelse, self._copy(env))
-            elif node.orelse is not None:
-                left = self._block(_statements(node.orelse.body), self._copy(env))
-            self._conditions = outer
-            return join([taken, left])
-        if isinstance(node, (cst.For, cst.While)):
-            return self._loop(node, env)
-        if isinstance(node, cst.With):
-            for item in node.items:
-                self._visit(item.item, env)
-                if item.asname is not None:
-                    self._assign(env, item.asname.name, item.item, item, "with")
-            outside = self._around
-            self._around = (*outside, *(item.item for item in node.items))
-            after = self._block(_statements(node.body), env)
-            self._around = outside
-            return after
-        if isinstance(node, (cst.Try, cst.TryStar)):
-            before = self._copy(env)
-            body = self._block(_statements(node.body), env)
-            ends = []
-            for handler in node.handlers:
-                entry = join([before, body]) or self._copy(before)
-                if handler.name is not None:
-                    self._assign(entry, handler.name.name, handler.type, handler, "with")
-                ends.append(self._block(_statements(handler.body), self._copy(entry)))
-            if node.orelse is not None:
-                body = self._block(_statements(node.orelse.body), body)
-            after = join([body, *ends])
-            if node.finalbody is not None:
-                reached = after is not None
-                after = self._block(_statements(node.finalbody.body), after if after is not None else dict(before))
-                return after if reached else None
-            return after
-        if isinstance(node, cst.FunctionDef):
-            for decorator in node.decorators:
-                self._visit(decorator.decorator, env)
-            if self._around:
-                self.contexts[id(node)] = self._around
-            self._bind(env, Definition(node.name.value, "function", node))
-            return env
-        if isinstance(node, cst.ClassDef):
-            self._bind(env, Definition(node.name.value, "class", node))
-            return env
-        if type(node).__name__ == "Match":
-            self._visit(node.subject, env)  # type: ignore[attr-defined]
-            ends = [env]
-            for case in node.cases:  # type: ignore[attr-defined]
-                ends.append(self._block(_statements(case.body), self._copy(env)))
-            return join(ends)
-        return self._small(node, env)
-
-    def _small(self, node: cst.CSTNode, env: Env) -> Optional[Env]:
-        if isinstance(node, cst.Assign):
-            self._visit(node.value, env)
-            for target in node.targets:
-                self._assign(env, target.target, node.value, node)
-        elif isinstance(node, cst.AnnAssign):
-            if node.value is not None:
-                self._visit(node.value, env)
-                self._assign(env, node.target, node.value, node)
-        elif isinstance(node, cst.AugAssign):
-            self._visit(node.target, env)
-            self._visit(node.value, env)
-            place = path_of(node.target)
-            if place is not None:
-                self._bind(env, Definition(place, "augment", node, node.value))
-            if isinstance(node.target, (cst.Attribute, cst.Subscript)):
-                whole = path_of(node.target.value)
-                if whole is not None:
-                    self._add(env, Definition(whole, "store", node, node.value))
-        elif isinstance(node, cst.Expr):
-            self._visit(node.value, env)
-            self._mutation(node.value, env)
-        elif isinstance(node, cst.Return):
-            if node.value is not None:
-                self._visit(node.value, env)
-                if self._is_first(node):
-                    self.returns.append(node.value)
-            return None
-        elif isinstance(node, cst.Raise):
-            return None
-        elif isinstance(node, cst.Break):
-            if self._breaks:
-                self._breaks[-1].append(env)
-            return None
-        elif isinstance(node, cst.Continue):
-            if self._continues:
-                self._continues[-1].append(env)
-            return None
-        elif isinstance(node, (cst.Import, cst.ImportFrom)):
-            self._import(node, env)
-        elif isinstance(node, cst.Del):
-            pass
-        else:
-            for child in children(node):
+            for child in children(target) if isinstance(target, cst.Subscript) else [target.value]:
                 self._visit(child, env)
-        return env
+            self._store(env, target, value)
 
-    def _loop(self, node: cst.For | cst.While, env: Env) -> Optional[Env]:
-        if isinstance(node, cst.For):
-            self._visit(node.iter, env)
-        breaks: List[Env] = []
-        for _ in range(1 if id(node) in self._carried else 2):
-            self._breaks.append([])
-            self._continues.append([])
-            around: Env = self._copy(join([env, self._carried.get(id(node))]) or {})
-            if isinstance(node, cst.For):
-                self._assign(around, node.target, node.iter, node, "element")
-            else:
-                self._visit(node.test, around)
-            end = self._block(_statements(node.body), around)
-            breaks = breaks + self._breaks.pop()
-            self._carried[id(node)] = join([end, *self._continues.pop()])
-        entry = join([env, self._carried[id(node)]])
-        if node.orelse is not None:
-            entry = self._block(_statements(node.orelse.body), entry)
-        return join([entry, *breaks])
+    def _store(
+        self, env: Env, target: cst.CSTNode, value: Optional[cst.CSTNode], node: Optional[cst.CSTNode] = None
+    ) -> None:
+        """Record ``x["key"] = v`` and ``x.y = v`` as definitions of ``x``, too."""
+        part, whole = target, None
+        while whole is None and isinstance(target, (cst.Attribute, cst.Subscript)):
+            part, target = target, target.value
+            whole = path_of(target)
+        if whole is not None:
+            key = "." + part.attr.value if isinstance(part, cst.Attribute) else key_of(part)
+            self._add(env, Definition(whole, "store", node or part, value, None, key))
 
-    def _copy(self, env: Env) -> Env:
-        self.steps += len(env) >> 2
-        return dict(env)
-
-    def _mutation(self, node: cst.CSTNode, env: Env) -> None:
-        if not isinstance(node, cst.Call) or not isinstance(node.func, cst.Attribute):
-            return
-        whole, name = path_of(node.func.value), node.func.attr.value
-        if whole is None:
-            return
-        if name in _MUTATORS:
-            self._add(env, Definition(whole, "mutate", node, node))
-        elif name.endswith("_") and not name.endswith("__"):
-            self._add(env, Definition(whole, "inplace", node, node))
-
-    def _import(self, node: cst.Import | cst.ImportFrom, env: Env) -> None:
-        if self._is_first(node):
-            self.imports.append(node)
-        if isinstance(node.names, cst.ImportStar):
-            return
-        for alias in node.names:
-            if alias.asname is not None:
-                name = path_of(alias.asname.name)
-            else:
-                name = (dotted(alias.name) or "").split(".")[0]
-            if name:
-                self._bind(env, Definition(name, "import", alias, node))
-
-    # -- expressions
+    # -- the walk
 
     def _visit(self, node: cst.CSTNode, env: Env) -> None:
-        """Record the definitions that reach an expression and its parts, in the order of evaluation."""
+        """Record the definitions that reach a node and its parts, in the order of execution."""
         self.steps += 1
+        if self.steps > self._most:
+            return
+        self._visited.setdefault(id(node), (node, len(self._made)))
         if self._around:
             self.contexts[id(node)] = self._around
-        visit = self._VISITS.get(type(node))  # by class: isinstance on every node takes half of the walk's time
-        if visit is not None:
-            visit(self, node, env)
-        else:
-            self._parts(node, env)
+        getattr(self, "_visit_" + type(node).__name__, self._parts)(node, env)
 
     def _parts(self, node: cst.CSTNode, env: Env) -> None:
         for child in children(node):
             self._visit(child, env)
 
-    def _is_first(self, node: cst.CSTNode) -> bool:
-        """Return whether a node is visited for the first time: the body of a loop is walked twice."""
-        first = id(node) not in self._seen
-        self._seen.add(id(node))
-        return first
+    def _copy(self, env: Env) -> Env:
+        self.steps += len(env) >> 2
+        return env.copied()
 
-    def _reach(self, node: cst.CSTNode, env: Env) -> None:
+    def _inside(self, env: Env, body: cst.BaseSuite, *around: cst.CSTNode) -> None:
+        """Visit the body of a loop or of a ``with``."""
+        outside = self._around
+        self._around = (*outside, *around)
+        self._visit(body, env)
+        self._around = outside
+
+    def _visit_If(self, node: cst.If, env: Env) -> None:
+        self._visit(node.test, env)
+        outside, branch = self._true, self._copy(env)
+        self._true = outside + names_where_true(node.test)
+        self._visit(node.body, branch)
+        self._true = outside + names_where_false(node.test)
+        if node.orelse is not None:
+            self._visit(node.orelse, env)
+        self._true = outside
+        env.join(branch, env)
+
+    def _visit_For(self, node: cst.For | cst.While, env: Env) -> None:
+        if isinstance(node, cst.For):
+            self._visit(node.iter, env)
+        before, around = self._copy(env), self._copy(env)
+        self._exits.append([])
+        for _ in range(2 if len(self._exits) == 1 else 1):
+            around.join(before, *([self._loop_ends[id(node)]] if id(node) in self._loop_ends else []))
+            if isinstance(node, cst.For):
+                self._assign(around, node.target, node.iter, node, "element")
+            else:
+                self._visit(node.test, around)
+            self._inside(around, node.body, node)
+            self._loop_ends[id(node)] = end = Env()
+            end.join(around, *self._exits[-1])
+        exits = self._exits.pop()
+        env.join(before, end)
+        if node.orelse is not None:
+            self._visit(node.orelse, env)
+        env.join(env, *exits)
+
+    _visit_While = _visit_For
+
+    def _visit_With(self, node: cst.With, env: Env) -> None:
+        for item in node.items:
+            self._visit(item.item, env)
+            if item.asname is not None:
+                self._assign(env, item.asname.name, item.item, item, "with")
+        self._inside(env, node.body, *(item.item for item in node.items))
+
+    def _visit_Try(self, node: cst.Try, env: Env) -> None:
+        before = self._copy(env)
+        self._visit(node.body, env)
+        handlers = [self._copy(before) for _ in node.handlers]
+        for handler, branch in zip(node.handlers, handlers):
+            branch.join(before, env)
+            self._visit(handler.body, branch)
+        if node.orelse is not None:
+            self._visit(node.orelse, env)
+        env.join(env, *handlers)
+        if node.finalbody is not None:
+            self._visit(node.finalbody, env)
+
+    _visit_TryStar = _visit_Try
+
+    def _visit_Match(self, node: cst.Match, env: Env) -> None:
+        self._visit(node.subject, env)
+        cases = [self._copy(env) for _ in node.cases]
+        for case, branch in zip(node.cases, cases):
+            self._visit(case.body, branch)
+        env.join(env, *cases)
+
+    def _visit_FunctionDef(self, node: cst.FunctionDef, env: Env) -> None:
+        for decorator in node.decorators:
+            self._visit(decorator.decorator, env)
+        self._bind(env, Definition(node.name.value, "function", node))
+
+    def _visit_ClassDef(self, node: cst.ClassDef, env: Env) -> None:
+        self._bind(env, Definition(node.name.value, "class", node))
+
+    def _visit_Import(self, node: cst.Import | cst.ImportFrom, env: Env) -> None:
+        for alias in () if isinstance(node.names, cst.ImportStar) else node.names:
+            name = alias.asname.name if alias.asname is not None else alias.name
+            self._bind(env, Definition((dotted(name) or "").split(".")[0], "import", alias, node))
+
+    _visit_ImportFrom = _visit_Import
+
+    def _visit_Return(self, node: cst.CSTNode, env: Env) -> None:
+        self._parts(node, env)
+        env.alive = False
+
+    def _visit_Break(self, node: cst.CSTNode, env: Env) -> None:
+        if self._exits:
+            self._exits[-1].append(self._copy(env))
+        env.alive = False
+
+    _visit_Raise = _visit_Return
+    _visit_Continue = _visit_Break
+
+    def _visit_Assign(self, node: cst.Assign, env: Env) -> None:
+        self._visit(node.value, env)
+        for target in node.targets:
+            self._assign(env, target.target, node.value, node)
+
+    def _visit_AnnAssign(self, node: cst.AnnAssign | cst.NamedExpr, env: Env) -> None:
+        if node.value is not None:
+            self._visit(node.value, env)
+            self._assign(env, node.target, node.value, node)
+
+    _visit_NamedExpr = _visit_AnnAssign
+
+    def _visit_AugAssign(self, node: cst.AugAssign, env: Env) -> None:
+        self._visit(node.target, env)
+        self._visit(node.value, env)
+        place = path_of(node.target)
+        if place is not None:
+            self._bind(env, Definition(place, "augment", node, node.value))
+        self._store(env, node.target, node.value, node)
+
+    def _visit_Expr(self, node: cst.Expr, env: Env) -> None:
+        self._visit(node.value, env)
+        called = node.value.func if isinstance(node.value, cst.Call) else None
+        whole = path_of(called.value) if isinstance(called, cst.Attribute) else None
+        if isinstance(called, cst.Attribute) and whole is not None:
+            name = called.attr.value
+            if name in _MUTATORS:
+                self._add(env, Definition(whole, "mutate", node.value, node.value))
+            elif name.endswith("_") and not name.endswith("__"):
+                self._add(env, Definition(whole, "inplace", node.value, node.value))
+
+    def _visit_Del(self, node: cst.Del, env: Env) -> None:
+        pass  # no read of a name
+
+    def _visit_Call(self, node: cst.Call, env: Env) -> None:
+        self.conditions[id(node)] = self._true
+        self._parts(node, env)
+
+    def _visit_Arg(self, node: cst.Arg, env: Env) -> None:
+        self._visit(node.value, env)  # the keyword is not a read of a name
+
+    def _visit_Name(self, node: cst.CSTNode, env: Env) -> None:
         place = path_of(node)
         if place is not None and place in env:
             self._reaching.setdefault(id(node), set()).update(env[place])
 
-    def _call(self, node: cst.Call, env: Env) -> None:
-        self.conditions[id(node)] = self._conditions
-        if self._snapshot is None or self._snapshot[0] is not env:
-            self._snapshot = env, self._copy(env)
-        self._names.setdefault(id(node), []).append(self._snapshot[1])
-        if self._is_first(node):
-            self.expressions.append(node)
-            self.calls.append(node)
-        self._parts(node, env)
-
-    def _argument(self, node: cst.Arg, env: Env) -> None:
-        self._visit(node.value, env)  # the keyword is not a read of a name
-
-    def _operation(self, node: cst.BinaryOperation, env: Env) -> None:
-        if self._is_first(node):
-            self.expressions.append(node)
-        self._parts(node, env)
-
-    def _name(self, node: cst.Name, env: Env) -> None:
-        if self._is_first(node):
-            self.reads.append(node)
-        self._reach(node, env)
-
-    def _attribute(self, node: cst.Attribute, env: Env) -> None:
-        self._reach(node, env)
+    def _visit_Attribute(self, node: cst.Attribute, env: Env) -> None:
+        self._visit_Name(node, env)
         self._visit(node.value, env)
 
-    def _subscript(self, node: cst.Subscript, env: Env) -> None:
-        self._reach(node, env)
+    def _visit_Subscript(self, node: cst.Subscript, env: Env) -> None:
+        self._visit_Name(node, env)
         self._parts(node, env)
 
-    def _named(self, node: cst.NamedExpr, env: Env) -> None:
-        self._visit(node.value, env)
-        self._assign(env, node.target, node.value, node)
-
-    def _yield(self, node: cst.Yield, env: Env) -> None:
-        if self._is_first(node) and isinstance(node.value, cst.BaseExpression):
-            self.returns.append(node.value)
-        self._parts(node, env)
-
-    def _lambda(self, node: cst.Lambda, env: Env) -> None:
+    def _visit_Lambda(self, node: cst.Lambda, env: Env) -> None:
         inner = self._copy(env)
-        for param in every_parameter(node.params):
-            self._bind(inner, Definition(param.name.value, "parameter", param, param.default))
+        for parameter in every_parameter(node.params):
+            self._bind(inner, Definition(parameter.name.value, "parameter", parameter, parameter.default))
         self._visit(node.body, inner)
 
-    def _comprehension(self, node: cst.BaseSimpleComp | cst.DictComp, env: Env) -> None:
+    def _visit_ListComp(self, node: cst.BaseSimpleComp | cst.DictComp, env: Env) -> None:
         inner = self._copy(env)
         loop: Optional[cst.CompFor] = node.for_in
         while loop is not None:
@@ -377,22 +379,7 @@ class Flow(Reaching):
         for part in (node.key, node.value) if isinstance(node, cst.DictComp) else (node.elt,):
             self._visit(part, inner)
 
-    _VISITS: Dict[type, Callable[..., None]] = {
-        cst.Call: _call,
-        cst.Arg: _argument,
-        cst.BinaryOperation: _operation,
-        cst.Name: _name,
-        cst.Attribute: _attribute,
-        cst.Subscript: _subscript,
-        cst.NamedExpr: _named,
-        cst.Yield: _yield,
-        cst.Lambda: _lambda,
-        **dict.fromkeys((cst.GeneratorExp, cst.ListComp, cst.SetComp, cst.DictComp), _comprehension),
-    }
-
-
-def _statements(body: cst.BaseSuite | cst.Module) -> Sequence[cst.CSTNode]:
-    return body.body
+    _visit_GeneratorExp = _visit_SetComp = _visit_DictComp = _visit_ListComp
 
 
 def _counts(value: Optional[cst.CSTNode]) -> bool:

@@ -21,7 +21,6 @@ __all__ = [
     "check_name",
     "folders_of",
     "foreign_folder",
-    "own_and_excluded",
     "walk",
     "why_left_out",
 ]
@@ -62,12 +61,6 @@ def walk(root: Path, exclude: Sequence[str] = ()) -> Iterator[str]:
         yield from files
 
 
-def own_and_excluded(root: Path, exclude: Sequence[str]) -> Tuple[List[str], List[str]]:
-    """Return the paths of the checkout's own Python files, and of those that ``exclude`` leaves out."""
-    own = list(walk(root, exclude))
-    return own, sorted(set(walk(root)) - set(own)) if exclude else []
-
-
 def why_left_out(root: Path, path: str, exclude: Sequence[str] = ()) -> Optional[str]:
     """Return why ``walk`` skips a file of the checkout; None where it yields it."""
     if _excluded(path, exclude):
@@ -103,52 +96,39 @@ def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
 def folders_of(root: Path, exclude: Sequence[str]) -> Iterator[Tuple[List[str], List[Skipped]]]:
     """Yield, a folder at a time, the Python files in it, and the folders in it that are not entered."""
     submodules = _submodules(root)
-    for here, folders, files in os.walk(str(root), followlinks=False):
-        relative = Path(here).relative_to(root).as_posix()
-        prefix = "" if relative == "." else relative + "/"
-        skipped = []
-        for name in sorted(folders):
-            why = _why_foreign(root, prefix + name, submodules)
-            if _excluded(prefix + name, exclude) or os.path.islink(os.path.join(here, name)):
-                folders.remove(name)
-            elif why is not None:
-                folders.remove(name)
-                skipped.append(Skipped(prefix + name, why))
-        folders.sort()
-        own = []
-        for name in sorted(files):
-            full = os.path.join(here, name)
-            if not name.endswith(".py") or _TEST_FILE.match(name) or _excluded(prefix + name, exclude):
-                continue
-            if not os.path.islink(full) and os.path.isfile(full):
-                own.append(prefix + name)
-        yield own, skipped
+    for here, folders, names in os.walk(str(root), followlinks=False):
+        relative = Path(here).relative_to(root)
+        paths = {name: (relative / name).as_posix() for name in sorted([*folders, *names])}
+        own = {
+            name: path
+            for name, path in paths.items()
+            if not _excluded(path, exclude) and not os.path.islink(os.path.join(here, name))
+        }
+        why = {name: _why_foreign(root, path, submodules) for name, path in own.items() if name in folders}
+        folders[:] = [name for name in own if name in why and why[name] is None]
+        files = [own[name] for name in names if name in own and name.endswith(".py") and not _TEST_FILE.match(name)]
+        regular = [path for path in sorted(files) if os.path.isfile(str(root / path))]
+        yield regular, [Skipped(own[name], reason) for name, reason in why.items() if reason is not None]
 
 
 def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[str]:
     """Return why a folder is skipped; None for the checkout's own code."""
-    full = str(root / path)
-    if path in submodules:
-        return SUBMODULE
-    name = os.path.basename(path)
-    if name in _FOREIGN:
-        return _FOREIGN[name]
-    if _is_dot_git(name):
-        return _FOREIGN[".git"]
-    if os.path.exists(os.path.join(full, "pyvenv.cfg")):
+    name = ".git" if _is_dot_git(os.path.basename(path)) else os.path.basename(path)
+    if path in submodules or name in _FOREIGN:
+        return SUBMODULE if path in submodules else _FOREIGN[name]
+    if (root / path / "pyvenv.cfg").exists():
         return "a virtual environment"
-    return _CHECKOUT if os.path.lexists(os.path.join(full, ".git")) else None
+    return _CHECKOUT if os.path.lexists(str(root / path / ".git")) else None
 
 
 def _excluded(path: str, patterns: Sequence[str]) -> bool:
     parts = path.split("/")
-    for pattern in patterns:
-        pattern = pattern.rstrip("/")
-        if any(fnmatch.fnmatch("/".join(parts[: i + 1]), pattern) for i in range(len(parts))):
-            return True
-        if "/" not in pattern and any(fnmatch.fnmatch(part, pattern) for part in parts):
-            return True
-    return False
+    above = ["/".join(parts[: i + 1]) for i in range(len(parts))]
+    return any(
+        fnmatch.fnmatch(name, pattern)
+        for pattern in (pattern.rstrip("/") for pattern in patterns)
+        for name in [*above, *(parts if "/" not in pattern else ())]
+    )
 
 
 def _submodules(root: Path) -> List[str]:

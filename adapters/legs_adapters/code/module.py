@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import re
-from typing import Callable, Dict, Iterator, List, Optional, Sequence, Set, Tuple
+from typing import Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, TypeVar
 
 import libcst as cst
 
 from legs_adapters.code.flow import Flow
 from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps
-from legs_adapters.code.parsing import Cut, Lines, Part, Place, body_part, outline_part
+from legs_adapters.code.parsing import STUB, Cut, Lines, Part, Place, body_part, outline_part
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
-from legs_adapters.code.syntax import arguments, dotted, loops_by_node
+from legs_adapters.code.syntax import arguments, children, dotted
 
-__all__ = ["CALLED", "Class", "Function", "Module", "blocks_of", "parse", "said"]
+__all__ = ["CALLED", "Class", "Function", "Module", "blocks_of", "index_by_word", "parse"]
 
 CALLED = ("forward", "__call__")  # what calling an instance runs: a torch module's own, and Python's
 
+_T = TypeVar("_T")
 _PRINT_STATEMENT = re.compile(
     r"^\s*(print\s+[\"'\w]|exec\s+[\"']|raise\s+\w+\s*,)|^\s*except\s+[\w.]+\s*,\s*\w+\s*:", re.M
 )
-_SAID = re.compile(r"(\w+)(?:\s*(\())?")  # a word, and whether it is called
+_WORD = re.compile(r"(\w+)(?:\s*(\())?")  # a word, and whether it is called
 _DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
@@ -55,7 +56,6 @@ class Function:
         self._body: Optional[cst.BaseSuite | cst.Module] = None
         self._inner: List[Function] = []
         self._flow: Optional[Flow] = None
-        self._loops: Optional[Dict[int, Tuple[cst.CSTNode, ...]]] = None
         if cut is not None:
             self.text: str = module.lines.data[cut.start : cut.end].decode("utf-8")
         else:
@@ -75,7 +75,7 @@ class Function:
                     header = self._part.tree.body[0]
                     assert isinstance(header, cst.FunctionDef)
                     self._body = header.body
-                    self._inner = self.module.collect(self._body.body, self)
+                    self._inner = self.module.collect(self._body, self)
                 except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
                     self.module.failure = _failure(self.module.path, self.module.text, error)
         return self._body
@@ -94,30 +94,14 @@ class Function:
             ValueError: LibCST would write another text than it read.
         """
         scope: Function = self
-        while scope._cut is None and scope.parent is not None:
+        while scope._part is None and scope.parent is not None:
             scope = scope.parent
         return (scope._part or self.module.outline).place(node, brackets)
 
     @property
     def line(self) -> int:
-        """The line of its ``def``, found in the text if possible: the positions of a whole outline take longer."""
-        if self._cut is None or self.parent is None:
-            return (self.parent or self).place(self.node).line
-        data, name, end = self.module.lines.data, self.name.encode(), self._cut.start
-        header = re.compile(rb"[ \t]*(?:async[ \t]+)?def[ \t]+(" + re.escape(name) + rb")\b")
-        while end > 0:
-            end = data.rfind(name, 0, end)
-            start = data.rfind(b"\n", 0, max(end, 0)) + 1
-            found = header.match(data, start)
-            if found is not None and found.start(1) == end:
-                return self.module.lines.place(start, start).line
-        return self.parent.place(self.node).line
-
-    def loops_around(self, node: cst.CSTNode) -> Tuple[cst.CSTNode, ...]:
-        """Return the loops around a node of its body, the innermost first."""
-        if self._loops is None:
-            self._loops = loops_by_node(self.body)
-        return self._loops.get(id(node), ())
+        """The line of its ``def``."""
+        return (self.parent or self).place(self.node).line
 
     @property
     def flow(self) -> Flow:
@@ -166,13 +150,9 @@ class Function:
     @property
     def decorators(self) -> List[str]:
         """The last names of its decorators."""
-        if not isinstance(self.node, cst.FunctionDef):
-            return []
-        names = []
-        for decorator in self.node.decorators:
-            node = decorator.decorator
-            names.append((dotted(node.func if isinstance(node, cst.Call) else node) or "").split(".")[-1])
-        return names
+        found = [each.decorator for each in self.node.decorators] if isinstance(self.node, cst.FunctionDef) else []
+        names = [dotted(node.func if isinstance(node, cst.Call) else node) or "" for node in found]
+        return [name.split(".")[-1] for name in names]
 
 
 class Class:
@@ -203,14 +183,12 @@ class Class:
 
 
 def _fields(node: cst.ClassDef) -> Iterator[Tuple[str, cst.BaseExpression]]:
-    for statement in node.body.body:
-        for small in statement.body if isinstance(statement, cst.SimpleStatementLine) else ():
-            if isinstance(small, cst.Assign):
-                for target in small.targets:
-                    if isinstance(target.target, cst.Name):
-                        yield target.target.value, small.value
-            elif isinstance(small, cst.AnnAssign) and isinstance(small.target, cst.Name) and small.value:
-                yield small.target.value, small.value
+    lines = [line.body for line in node.body.body if isinstance(line, cst.SimpleStatementLine)]
+    for small in (small for line in lines for small in line):
+        if isinstance(small, (cst.Assign, cst.AnnAssign)) and small.value is not None:
+            for target in [each.target for each in small.targets] if isinstance(small, cst.Assign) else [small.target]:
+                if isinstance(target, cst.Name):
+                    yield target.value, small.value
 
 
 class Module:
@@ -231,24 +209,22 @@ class Module:
         self.lines: Lines = Lines(text.encode("utf-8"))
         outline, cuts = outline_part(self.lines)
         self.outline: Part = outline
-        self.outline_text: str = self.outline.text.decode("utf-8")
+        self.outline_text: str = STUB.sub("0", self.outline.text.decode("utf-8"))
         self.failure: Optional[Unreadable] = None
         self.spend(parsing_steps(self.outline_text))
         self.classes: List[Class] = []
         self.by_node: Dict[int, Function | Class] = {}
         self.top: Function = Function(self, self.outline.tree)
-        self._by_word: Optional[Dict[str, List[Function]]] = None  # as ``said`` has them
+        self._by_word: Optional[Dict[str, List[Function]]] = None
         self._says: Dict[str, bool] = {}
         self._cuts: Iterator[Optional[Cut]] = iter(cuts)
-        self._functions = self.collect(self.outline.tree.body, self.top)
+        self._functions = self.collect(self.outline.tree, self.top)
         self._cuts = iter(())
 
-    def collect(
-        self, statements: Sequence[cst.CSTNode], parent: Function, owner: Optional[Class] = None
-    ) -> List[Function]:
-        """Record what statements define; return its functions, in source order."""
+    def collect(self, body: cst.CSTNode, parent: Function, owner: Optional[Class] = None) -> List[Function]:
+        """Record what a body defines; return its functions, in source order."""
         functions: List[Function] = []
-        for node in _definitions(statements):
+        for node in _definitions(body):
             if isinstance(node, cst.FunctionDef):
                 cut = next(self._cuts, None) if parent is self.top else None
                 function = Function(self, node, parent, owner, cut)
@@ -257,12 +233,12 @@ class Module:
                 if owner is not None:
                     owner.methods.setdefault(function.name, function)
                 if cut is None:
-                    function._inner = self.collect(node.body.body, function)
+                    function._inner = self.collect(node.body, function)
             else:
                 found = Class(self, node, parent)
                 self.classes.append(found)
                 self.by_node[id(node)] = found
-                functions += self.collect(node.body.body, parent, found)
+                functions += self.collect(node.body, parent, found)
         return functions
 
     def spend(self, steps: int) -> bool:
@@ -297,10 +273,7 @@ class Module:
     def mentioning(self, name: str, called: bool = False) -> Iterator[Function]:
         """Yield the scopes whose text has a word, or calls it, from an index of words."""
         if self._by_word is None:
-            self._by_word = {}
-            for scope in (self.top, *self._functions):
-                for word in said(scope.text):
-                    self._by_word.setdefault(word, []).append(scope)
+            self._by_word = index_by_word((scope, scope.text) for scope in (self.top, *self._functions))
         for scope in self._by_word.get(f"{name}(" if called else name, ()):
             yield scope
             if scope.inner:
@@ -308,18 +281,22 @@ class Module:
                 yield from _chosen(scope.inner, pattern.search, scope.text)
 
 
-def said(text: str) -> Set[str]:
-    """Return the words of a text; those that it calls also with a bracket appended."""
-    found = set(_SAID.findall(text))
-    return {word for word, _ in found} | {f"{word}(" for word, bracket in found if bracket}
+def index_by_word(texts: Iterable[Tuple[_T, str]]) -> Dict[str, List[_T]]:
+    """Return what has a word in its text, by the word; by ``word(`` what calls it."""
+    found: Dict[str, List[_T]] = {}
+    for entry, text in texts:
+        words = set(_WORD.findall(text))
+        for word in {name for name, _ in words}.union(name + bracket for name, bracket in words):
+            found.setdefault(word, []).append(entry)
+    return found
 
 
 def _chosen(
-    functions: Sequence[Function], says: Callable[[str], object], said: Optional[str] = None
+    functions: Sequence[Function], says: Callable[[str], object], matched: Optional[str] = None
 ) -> Iterator[Function]:
     """Yield the functions whose text matches; a text that several share is matched once."""
     for function in functions:
-        if function.text is said or says(function.text):
+        if function.text is matched or says(function.text):
             yield function
             yield from _chosen(function.inner, says, function.text)
 
@@ -344,23 +321,19 @@ def _failure(path: str, text: str, error: Exception) -> Unreadable:
     return Unreadable(path, f"cannot be parsed: {type(error).__name__}")
 
 
-def _definitions(statements: Sequence[cst.CSTNode]) -> Iterator[cst.FunctionDef | cst.ClassDef]:
-    """Yield the functions and classes that statements define, in branches and loops too, in source order."""
-    for node in statements:
-        if isinstance(node, (cst.FunctionDef, cst.ClassDef)):
-            yield node
-        elif isinstance(node, cst.BaseCompoundStatement):
-            for body in blocks_of(node):
-                yield from _definitions(body)
+def _definitions(node: cst.CSTNode) -> Iterator[cst.FunctionDef | cst.ClassDef]:
+    """Yield the functions and classes that a body defines, in branches and loops too, in source order."""
+    for child in children(node):
+        if isinstance(child, (cst.FunctionDef, cst.ClassDef)):
+            yield child
+        elif not isinstance(child, (cst.BaseExpression, cst.SimpleStatementLine)):
+            yield from _definitions(child)
 
 
 def blocks_of(node: cst.CSTNode) -> Iterator[Sequence[cst.CSTNode]]:
     """Yield the blocks of a statement: of a compound one those of all its branches."""
-    if isinstance(getattr(node, "body", None), cst.BaseSuite):
-        yield node.body.body  # type: ignore[attr-defined]
-    for clause in (*getattr(node, "handlers", ()), *getattr(node, "cases", ())):
-        yield clause.body.body
-    for name in ("orelse", "finalbody"):
-        clause = getattr(node, name, None)
-        if clause is not None:
-            yield from blocks_of(clause)
+    for child in children(node):
+        if isinstance(child, cst.BaseSuite):
+            yield child.body
+        elif not isinstance(child, cst.BaseExpression):
+            yield from blocks_of(child)

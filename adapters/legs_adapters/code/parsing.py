@@ -1,8 +1,8 @@
 """Parse a file in parts: its outline first, the body of a function on first use.
 
 LibCST makes a node of every space, and takes some fifteen times as long as Python's own parser. The latter finds the
-positions of the bodies; the outline has ``pass`` in their place. What it cannot read, or cannot locate (before Python
-3.8), is parsed in one part.
+positions of the bodies; the outline has a number and a comment of the same length in their place, so that every byte
+stays where it is. What Python cannot read, or cannot locate (before Python 3.8), is parsed in one part.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import ast
 import bisect
 import re
 import warnings
-from typing import Iterator, List, Mapping, NamedTuple, Optional, Sequence, Tuple, cast
+from typing import Iterator, List, Mapping, NamedTuple, Optional, Tuple, cast
 
 import libcst as cst
 from libcst.metadata import ByteSpanPositionProvider, CodeSpan
@@ -19,11 +19,15 @@ from libcst.metadata.span_provider import SpanProvidingCodegenState, byte_length
 
 from legs_adapters.code.syntax import code
 
-__all__ = ["Cut", "Lines", "Part", "Place", "body_part", "outline_part"]
+__all__ = ["STUB", "Cut", "Lines", "Part", "Place", "body_part", "outline_part"]
 
-_FORM_FEED = re.compile(rb"^[ \t\f]*\f", re.M)  # LibCST loses these
+STUB = re.compile("0#x*")  # what stands for a body
+
+_FORM_FEED = re.compile(rb"^[ \t\f]*\f[ \t\f]*(?=\r?$)", re.M)  # LibCST loses these lines: comments, to it
 _NEWLINE = re.compile(rb"\r\n|\r|\n")
 _LONE_RETURN = re.compile(rb"\r(?!\n)")
+_BODY = re.compile(rb"([ \t]*)(.*?)((?:\r\n|\n)?)\Z", re.S)  # its indentation, its statements, its end
+_COMPOUND = (ast.stmt, ast.excepthandler, getattr(ast, "match_case", ast.stmt))
 
 
 class Place(NamedTuple):
@@ -77,18 +81,19 @@ class _Written(ByteSpanPositionProvider):
 
 
 class Part:
-    """Bytes that were parsed separately, and how they map to the file.
+    """Bytes that were parsed separately.
 
     Attributes:
         tree: what was parsed.
         text: what it was parsed from.
+        shift: how many bytes further it stands in the file.
     """
 
-    def __init__(self, lines: Lines, text: bytes, shifts: Sequence[Tuple[int, int]]) -> None:
-        self.tree: cst.Module = cst.parse_module(text.decode("utf-8"))
-        self.text = text
+    def __init__(self, lines: Lines, text: bytes, shift: int = 0) -> None:
+        self.text = _FORM_FEED.sub(lambda found: b"#" * len(found.group()), text)
+        self.tree: cst.Module = cst.parse_module(self.text.decode("utf-8"))
+        self.shift = shift
         self._lines = lines
-        self._shifts = shifts
         self._spans: Mapping[cst.CSTNode, CodeSpan] = {}
 
     def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
@@ -98,19 +103,16 @@ class Part:
             ValueError: LibCST would write another text than it read.
         """
         if not self._spans:
-            text, self._spans = _Written().of(self.tree)
+            text, spans = _Written().of(self.tree)
             if text != self.text:
-                self._spans = {}
                 raise ValueError("LibCST would write another text")
+            self._spans = spans
         span = self._spans[node]
-        start, end = span.start, span.start + span.length
+        start, end = self.shift + span.start, self.shift + span.start + span.length
         if brackets and isinstance(node, cst.BaseExpression):
             start -= sum(len(code(part).encode()) for part in node.lpar)
             end += sum(len(code(part).encode()) for part in node.rpar)
-        return self._lines.place(self._in_file(start), self._in_file(end))
-
-    def _in_file(self, at: int) -> int:
-        return at + self._shifts[bisect.bisect_right(self._shifts, (at, len(self._lines.data))) - 1][1]
+        return self._lines.place(start, end)
 
 
 def outline_part(lines: Lines) -> Tuple[Part, List[Optional[Cut]]]:
@@ -122,16 +124,18 @@ def outline_part(lines: Lines) -> Tuple[Part, List[Optional[Cut]]]:
     Raises:
         libcst.ParserSyntaxError, RecursionError, ValueError: it does not parse.
     """
-    if _FORM_FEED.search(lines.data):
-        feeds = [(match.start(), match.end(), b"") for match in _FORM_FEED.finditer(lines.data)]
-        return Part(lines, *_replaced(lines.data, feeds)), []
-    cuts = _cuts(lines) if _LONE_RETURN.search(lines.data) is None else []
+    outline, cuts = bytearray(lines.data), _cuts(lines)
+    for cut in filter(None, cuts):
+        body = _BODY.match(lines.data[cut.start : cut.end])
+        assert body is not None
+        indent, statements, end = body.groups()
+        outline[cut.start : cut.end] = indent + b"0#".ljust(len(statements), b"x")[: len(statements)] + end
     try:
-        return Part(lines, *_replaced(lines.data, [_stub(lines.data, cut) for cut in cuts if cut is not None])), cuts
+        return Part(lines, bytes(outline)), cuts
     except cst.ParserSyntaxError:
         if not any(cuts):
             raise
-        return Part(lines, lines.data, [(0, 0)]), []
+        return Part(lines, lines.data), []
 
 
 def body_part(lines: Lines, cut: Cut) -> Part:
@@ -142,49 +146,28 @@ def body_part(lines: Lines, cut: Cut) -> Part:
     """
     newline = _NEWLINE.search(lines.data)
     header = b"async def _():" + (newline.group() if newline is not None else b"\n")
-    return Part(lines, header + lines.data[cut.start : cut.end], [(0, cut.start - len(header))])
-
-
-def _stub(data: bytes, cut: Cut) -> Tuple[int, int, bytes]:
-    body = data[cut.start : cut.end]
-    indent = body[: len(body) - len(body.lstrip(b" \t"))]
-    newline = re.search(rb"(\r\n|\r|\n)?\Z", body)
-    assert newline is not None
-    return cut.start, cut.end, indent + b"pass" + newline.group()
-
-
-def _replaced(data: bytes, spans: Sequence[Tuple[int, int, bytes]]) -> Tuple[bytes, List[Tuple[int, int]]]:
-    """Return the text with spans of it replaced, and (byte of it, how many bytes further it stands in the file)."""
-    shifts, parts, at, length = [(0, 0)], [], 0, 0
-    for start, end, stub in spans:
-        parts += [data[at:start], stub]
-        length += len(parts[-2]) + len(stub)
-        shifts.append((length, end - length))
-        at = end
-    return b"".join([*parts, data[at:]]), shifts
+    return Part(lines, header + lines.data[cut.start : cut.end], cut.start - len(header))
 
 
 def _cuts(lines: Lines) -> List[Optional[Cut]]:
+    if _LONE_RETURN.search(lines.data) is not None:
+        return []
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             tree = ast.parse(lines.data)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         return []  # Python 2, or newer than this Python: LibCST knows
-    return [_cut(lines, node) for node in _functions(tree.body)]
+    return [_cut(lines, node) for node in _functions(tree)]
 
 
-def _functions(statements: Sequence[ast.stmt]) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+def _functions(node: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
     """Yield the functions and methods that are not nested in another function, in source order."""
-    for node in statements:
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            yield node
-            continue
-        yield from _functions(getattr(node, "body", ()))
-        for clause in (*getattr(node, "handlers", ()), *getattr(node, "cases", ())):
-            yield from _functions(clause.body)
-        yield from _functions(getattr(node, "orelse", ()))
-        yield from _functions(getattr(node, "finalbody", ()))
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            yield child
+        elif isinstance(child, _COMPOUND):
+            yield from _functions(child)
 
 
 def _cut(lines: Lines, node: ast.FunctionDef | ast.AsyncFunctionDef) -> Optional[Cut]:

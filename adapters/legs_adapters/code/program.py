@@ -5,268 +5,292 @@ What Python decides at run time (a method of an unknown object) is looked up by 
 
 from __future__ import annotations
 
-from typing import List, Optional, Tuple
+from typing import Dict, FrozenSet, Iterable, Iterator, List, Mapping, NamedTuple, Optional, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.checkout import imported_name
-from legs_adapters.code.members import DEPTH, Members, Reference, unique
-from legs_adapters.code.module import Class, Function, Module
+from legs_adapters.code.checkout import Checkout, imported_name
+from legs_adapters.code.module import CALLED, Class, Function, Module
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.syntax import arguments, call_name, dotted, path_of
+from legs_adapters.code.sources import Source
+from legs_adapters.code.syntax import arguments, call_name, dotted, path_of, word_set
 
-__all__ = ["Program"]
+__all__ = ["Conventions", "Program", "Reference"]
 
-_MADE = ("instance", "made by")
+_MAX_DEPTH = 16  # how many names are followed, one to the next
+# Methods whose names are too common to resolve.
+_COMMON = word_set("__init__ get items keys values copy load save append update close write read format join split pop")
 
 
-class Program(Members):
-    """The files of a checkout, linked by the names in them."""
+class Reference(NamedTuple):
+    """A function, class, module or library name that an expression refers to.
+
+    ``kind``: "function", "class", "instance" (of a class), "module", "external" (a dotted name outside of the
+    checkout), "made by" (an object that a call of such a name returned), "lambda". ``guess``: found by its name alone.
+    """
+
+    kind: str
+    target: object
+    guess: bool = False
+
+
+class Conventions(NamedTuple):
+    """The conventions by which libraries pass objects on, which the checkout itself does not show.
+
+    Attributes:
+        returning_self: methods that return the object itself, ``model.cuda()``.
+        wrapping: functions that return their argument wrapped: ``DataParallel(model)``; dotted where the
+            name alone is ambiguous.
+        common: names of methods that are too common to resolve.
+    """
+
+    returning_self: FrozenSet[str] = frozenset()
+    wrapping: FrozenSet[str] = frozenset()
+    common: FrozenSet[str] = frozenset()
+
+
+class Program(Checkout):
+    """The files of a checkout, linked by the names in them.
+
+    Args:
+        sources: the readable files.
+        unread: by path, the text of ignored and unreadable files, which is only searched for names.
+        conventions: of the libraries that it uses.
+    """
+
+    def __init__(
+        self,
+        sources: Iterable[Source],
+        unread: Optional[Mapping[str, str]] = None,
+        conventions: Optional[Conventions] = None,
+    ) -> None:
+        super().__init__(sources, unread)
+        self._conventions = conventions or Conventions()
+        self._wrapping = tuple("." + name for name in self._conventions.wrapping)
+        self._common = _COMMON | self._conventions.common
+        # by expression and depth; each may be asked from many places, and asks for many others
+        self._resolved: Dict[Function, Dict[Tuple[int, int], Tuple[cst.CSTNode, List[Reference]]]] = {}
 
     def resolve(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[Reference]:
         """Return what an expression may refer to; empty where it is unknown."""
-        if depth > DEPTH:
+        if depth > _MAX_DEPTH:
             return []
         known = self._resolved.setdefault(function, {})
         if (id(node), depth) not in known:
-            found = self._resolve(function, node, depth) if function.module.spend(1) else []
+            found = _unique(self._resolve(function, node, depth + 1)) if function.module.spend(1) else []
             known[id(node), depth] = node, found  # the node, lest another gets its id
         return known[id(node), depth][1]
 
-    def _resolve(self, function: Function, node: cst.CSTNode, depth: int) -> List[Reference]:
+    def _resolve(self, function: Function, node: cst.CSTNode, depth: int) -> Iterable[Reference]:
         if isinstance(node, cst.Name):
-            found = self._definitions(function, node)
-            if found is None:
-                return self._global(function.module, node.value, depth + 1)
-            references: List[Reference] = []
-            for where, definition in found:
-                references.extend(self.of_definition(where, definition, depth + 1))
-            return unique(references)
+            definitions = self.lookup(function, node)
+            if definitions is None:
+                return self._member_of_module(function.module, node.value, depth)
+            return [ref for where, made in definitions for ref in self.of_definition(where, made, depth)]
         if isinstance(node, cst.Attribute):
-            return self._attribute(function, node, depth + 1)
+            return self._attribute(function, node, depth)
         if isinstance(node, cst.Call):
-            if call_name(node) == "partial" and node.args:
-                return self.resolve(function, node.args[0].value, depth + 1)
-            if call_name(node) == "super":
-                return []
-            if call_name(node) in self._conventions.returning_self and isinstance(node.func, cst.Attribute):
-                moved = [ref for ref in self.resolve(function, node.func.value, depth + 1) if ref.kind in _MADE]
-                if moved:
-                    return moved
-            wrapped = self._wrapped(function, node, 0, depth + 1)
-            if wrapped:
-                return wrapped
-            made = self.resolve(function, node.func, depth + 1)
-            instances = [Reference("instance", ref.target) for ref in made if ref.kind == "class"]
-            instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
-            return unique(instances + self._returned(made, None, depth + 1))
+            return self._call(function, node, depth)
         if isinstance(node, cst.Subscript):
-            return self._subscript(function, node, depth + 1)
+            return self._subscript(function, node, depth)
         if isinstance(node, cst.IfExp):
-            return unique(self.resolve(function, node.body, depth + 1) + self.resolve(function, node.orelse, depth + 1))
+            return self.resolve(function, node.body, depth) + self.resolve(function, node.orelse, depth)
         if isinstance(node, cst.BooleanOperation):
-            return unique(self.resolve(function, node.left, depth + 1) + self.resolve(function, node.right, depth + 1))
-        if isinstance(node, cst.Lambda):
-            return [Reference("lambda", node)]
-        return []
+            return self.resolve(function, node.left, depth) + self.resolve(function, node.right, depth)
+        return [Reference("lambda", node)] if isinstance(node, cst.Lambda) else []
 
     def lookup(self, function: Function, node: cst.CSTNode) -> Optional[List[Tuple[Function, Definition]]]:
         """Return the definitions that a place may come from, each with its function; None if unknown."""
-        return self._definitions(function, node)
-
-    def _definitions(self, function: Function, node: cst.CSTNode) -> Optional[List[Tuple[Function, Definition]]]:
         local = function.flow.reaching(node)
         if local:
-            return [(function, definition) for definition in sorted(local, key=_order)]
-        place = path_of(node)
-        scope = function.parent
-        while place is not None and scope is not None:
-            if scope.parent is None:  # the module's top level
-                break
+            return [(function, definition) for definition in sorted(local, key=lambda made: made.order)]
+        place, scope = path_of(node), function.parent or function
+        while place is not None:
             if place in scope.flow.definitions:
                 return [(scope, definition) for definition in scope.flow.definitions[place]]
+            if scope.parent is None:
+                break
             scope = scope.parent
-        if place is not None and place in function.module.top.flow.definitions:
-            return [(function.module.top, d) for d in function.module.top.flow.definitions[place]]
         return None
 
     def of_definition(self, where: Function, definition: Definition, depth: int = 0) -> List[Reference]:
         """Return what a definition may bind its place to."""
-        if definition.kind in ("function", "class"):
+        value, kind = definition.value, definition.kind
+        if kind in ("function", "class"):
             target = where.module.by_node.get(id(definition.node))
-            return [Reference(definition.kind, target)] if target is not None else []
-        if definition.kind == "import":
-            return self._imported(where.module, definition, depth)
-        if definition.kind in ("assign", "with") and definition.value is not None:
-            return self.resolve(where, definition.value, depth)
-        if definition.kind == "parameter" and definition.value is not None:
-            return self.resolve(where, definition.value, depth)
-        if definition.kind == "element" and definition.index is not None and isinstance(definition.value, cst.Call):
-            wrapped = self._wrapped(where, definition.value, definition.index, depth)
-            if wrapped:
-                return wrapped
-            return self._returned(self.resolve(where, definition.value.func, depth), definition.index, depth)
+            return [Reference(kind, target)] if target is not None else []
+        if kind == "import":
+            return self._imported(where.module, definition, depth + 1)
+        if kind in ("assign", "with", "parameter") and value is not None:
+            return self.resolve(where, value, depth + 1)
+        if kind == "element" and definition.index is not None and isinstance(value, cst.Call):
+            made = self._wrapped(where, value, definition.index, depth)
+            return made or self._returned(self.resolve(where, value.func, depth + 1), definition.index, depth)
         return []
+
+    # -- calls
+
+    def _call(self, function: Function, node: cst.Call, depth: int) -> List[Reference]:
+        name = call_name(node)
+        if name == "partial" and node.args:
+            return self.resolve(function, node.args[0].value, depth)
+        if name in self._conventions.returning_self and isinstance(node.func, cst.Attribute):
+            moved = [r for r in self.resolve(function, node.func.value, depth) if r.kind in ("instance", "made by")]
+            if moved:
+                return moved
+        wrapped = self._wrapped(function, node, 0, depth)
+        if wrapped:
+            return wrapped
+        made = self.resolve(function, node.func, depth)
+        instances = [Reference("instance", ref.target) for ref in made if ref.kind == "class"]
+        instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
+        return instances + self._returned(made, None, depth)
 
     def _wrapped(self, function: Function, node: cst.Call, index: int, depth: int) -> List[Reference]:
         """Resolve ``DataParallel(model)``, and ``model, optimizer = accelerator.prepare(model, optimizer)``."""
-        given = arguments(node)[0] if self._wraps(node) else []
-        if index >= len(given):
-            return []
-        return [ref for ref in self.resolve(function, given[index], depth + 1) if ref.kind == "instance"]
-
-    def _wraps(self, node: cst.Call) -> bool:
-        name = dotted(node.func) or ""
-        with_dot = [known for known in self._conventions.wrapping if "." in known]
-        return call_name(node) in self._conventions.wrapping or any(name.endswith(known) for known in with_dot)
+        name = "." + (dotted(node.func) or call_name(node))
+        given = arguments(node)[0] if name.endswith(self._wrapping) else []
+        found = self.resolve(function, given[index], depth + 1) if index < len(given) else []
+        return [reference for reference in found if reference.kind == "instance"]
 
     def _returned(self, made: List[Reference], index: Optional[int], depth: int) -> List[Reference]:
         """Resolve what functions return, or one of a tuple: ``render = get_renderer(kind)``, ``net = get_model()``."""
         found: List[Reference] = []
-        for ref in made:
-            if ref.kind != "function" or ref.guess or not isinstance(ref.target, Function) or depth > DEPTH:
-                continue
-            for value in ref.target.flow.returns:
-                part: cst.CSTNode = value
-                if index is not None:
-                    if not isinstance(value, cst.Tuple) or index >= len(value.elements):
-                        continue
-                    part = value.elements[index].value
-                if isinstance(part, (cst.Name, cst.Attribute, cst.Subscript, cst.Lambda, cst.Call)):
-                    found.extend(
-                        r
-                        for r in self.resolve(ref.target, part, depth + 1)
-                        if r.kind in ("function", "lambda", "instance") and not r.guess
-                    )
-        return unique(found)
+        for callee in [ref.target for ref in made if isinstance(ref.target, Function) and not ref.guess]:
+            for value in callee.flow.returns:
+                if index is None:
+                    found += self.resolve(callee, value, depth + 1)
+                elif isinstance(value, cst.Tuple) and index < len(value.elements):
+                    found += self.resolve(callee, value.elements[index].value, depth + 1)
+        return [r for r in found if r.kind in ("function", "lambda", "instance") and not r.guess]
 
-    def _global(self, module: Module, name: str, depth: int) -> List[Reference]:
-        if depth > DEPTH:
-            return []
-        definitions = module.top.flow.definitions.get(name)
+    def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> List[Reference]:
+        """Resolve ``LOSSES[kind]`` to all values of a dictionary, which may be imported."""
+        found: List[Reference] = []
+        for where, made in self.lookup(function, node.value) or ():
+            if made.kind == "import" and isinstance(made.value, cst.ImportFrom):
+                base = self.imported_from(where.module, made.value)
+                named = made.node.evaluated_name if isinstance(made.node, cst.ImportAlias) else ""
+                entries = [(base.top, each) for each in base.top.flow.definitions.get(named, [])] if base else []
+            else:
+                entries = [(where, made)]
+            for place, value in ((place, entry.value) for place, entry in entries if entry.kind == "assign"):
+                elements = value.elements if isinstance(value, cst.Dict) else ()
+                for element in (each for each in elements if isinstance(each, cst.DictElement)):
+                    found += self.resolve(place, element.value, depth)
+        return found
+
+    # -- modules
+
+    def _member_of_module(self, module: Module, name: str, depth: int) -> List[Reference]:
+        definitions = module.top.flow.definitions.get(name) if depth <= _MAX_DEPTH else ()
         if definitions:
-            references: List[Reference] = []
-            for definition in definitions:
-                references.extend(self.of_definition(module.top, definition, depth + 1))
-            return unique(references)
-        for node in module.top.flow.imports:
+            return [ref for definition in definitions for ref in self.of_definition(module.top, definition, depth)]
+        for node in module.top.flow.imports if definitions is None else ():
             if isinstance(node, cst.ImportFrom) and isinstance(node.names, cst.ImportStar):
                 other = self.imported_from(module, node)
-                if isinstance(other, Module) and other is not module:
-                    found = self._global(other, name, depth + 1)
-                    if found:
-                        return found
+                found = self._member_of_module(other, name, depth + 1) if other not in (None, module) else []
+                if found:
+                    return found
         return []
 
     def _imported(self, module: Module, definition: Definition, depth: int) -> List[Reference]:
         alias, node = definition.node, definition.value
         assert isinstance(alias, cst.ImportAlias)
         name = dotted(alias.name) or ""
-        if isinstance(node, cst.Import):
+        if not isinstance(node, cst.ImportFrom):
             full = name if alias.asname is not None else name.split(".")[0]
             found = self.find_module(module, full, 0)
-            return [Reference("module", found)] if isinstance(found, Module) else [Reference("external", full)]
-        assert isinstance(node, cst.ImportFrom)
-        base = self.imported_from(module, node)
-        inside = self.find_module(
-            module, ((imported_name(node) + ".") if imported_name(node) else "") + name, len(node.relative)
-        )
-        if isinstance(base, Module):
-            found_names = self._global(base, name, depth + 1)
-            if found_names:
-                return found_names
-        if isinstance(inside, Module):
+            return [Reference("external", full) if found is None else Reference("module", found)]
+        base = self.imported_from(module, node) or self.imported_from(module, node, name)
+        members = self._member_of_module(base, name, depth) if base is not None else []
+        full = f"{imported_name(node)}.{name}" if imported_name(node) else name
+        inside = None if members else self.find_module(module, full, len(node.relative))
+        if inside is not None:
             return [Reference("module", inside)]
-        if isinstance(base, Module):
-            return []
-        beside = self._on_path(module, imported_name(node), name) if imported_name(node) and not node.relative else None
-        if beside is not None:
-            return self._global(beside, name, depth + 1)
-        return [Reference("external", f"{imported_name(node)}.{name}" if imported_name(node) else name)]
+        return members if base is not None else [Reference("external", full)]
 
     # -- attributes
 
     def _attribute(self, function: Function, node: cst.Attribute, depth: int) -> List[Reference]:
         name = node.attr.value
-        local = function.flow.reaching(node)
-        if local:
-            references: List[Reference] = []
-            for definition in sorted(local, key=_order):
-                references.extend(self.of_definition(function, definition, depth))
+        if function.flow.reaching(node):
+            stored = self.lookup(function, node) or ()
+            references = [ref for where, definition in stored for ref in self.of_definition(where, definition, depth)]
             if references:
-                return unique(references)
+                return references
         if isinstance(node.value, cst.Name) and node.value.value in ("self", "cls"):
             owner = self.owner_of(function)
             if owner is not None:
-                return unique(self.member(owner, name, depth) + self.overrides(owner, name))
-        if isinstance(node.value, cst.Call) and call_name(node.value) == "super":
-            owner = self.owner_of(function)
-            found = [self.member(base, name, depth) for base in self.bases(owner)] if owner is not None else []
-            return unique([ref for refs in found for ref in refs])
+                return self.member(owner, name, depth) + self._overrides(owner, name)
         references = []
         for base in self.resolve(function, node.value, depth):
-            if base.kind == "module":
-                assert isinstance(base.target, Module)
-                references.extend(self._global(base.target, name, depth))
+            if isinstance(base.target, Module):
+                references += self._member_of_module(base.target, name, depth)
                 inner = self.find_module(base.target, name, 1)
                 if inner is not None and base.target.path.endswith("__init__.py"):
                     references.append(Reference("module", inner))
+            elif isinstance(base.target, Class):
+                references += self.member(base.target, name, depth)
             elif base.kind == "external":
                 references.append(Reference("external", f"{base.target}.{name}"))
-            elif base.kind in ("instance", "class"):
-                assert isinstance(base.target, Class)
-                references.extend(self.member(base.target, name, depth))
-        if references:
-            return unique(references)
-        if name in self._common:
-            return []
+        if references or name in self._common:
+            return references
         methods = self.methods_named(name)
-        if not function.module.spend(len(methods)):
-            return []
-        return [Reference("function", method, True) for method in methods]
+        known = methods if function.module.spend(len(methods)) else []
+        return [Reference("function", method, True) for method in known]
 
-    def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> List[Reference]:
-        definitions = self._definitions(function, node.value)
-        literals: List[Tuple[Function, cst.CSTNode]] = []
-        if definitions is not None:
-            literals = [(where, d.value) for where, d in definitions if d.value is not None and d.kind == "assign"]
-            references = []
-            for where, definition in definitions:
-                if definition.kind == "import":
-                    references.extend(self._dictionary(where, definition, depth))
-            if references:
-                return unique(references)
-        else:
-            literals = [(function, node.value)]
-        references = []
-        for where, value in literals:
-            references.extend(self._values(where, value, depth))
-        return unique(references)
+    # -- classes
 
-    def _dictionary(self, where: Function, definition: Definition, depth: int) -> List[Reference]:
-        alias, node = definition.node, definition.value
-        if not isinstance(node, cst.ImportFrom) or not isinstance(alias, cst.ImportAlias):
-            return []
-        base = self.imported_from(where.module, node)
-        if base is None:
-            return []
+    def owner_of(self, function: Function) -> Optional[Class]:
+        """Return the class whose ``self`` a function sees."""
+        scope: Optional[Function] = function
+        while scope is not None and scope.owner is None:
+            scope = scope.parent
+        return scope.owner if scope is not None else None
+
+    def bases(self, owner: Class) -> List[Class]:
+        """Return the base classes that are defined in the checkout."""
+        found = [ref.target for arg in owner.node.bases for ref in self.resolve(owner.parent, arg.value)]
+        return [base for base in found if isinstance(base, Class) and base is not owner]
+
+    def lineage(self, owner: Class) -> Iterator[Class]:
+        """Yield a class, then its base classes and theirs."""
+        known = [owner]
+        for current in known:  # which grows
+            yield current
+            known += [base for base in self.bases(current) if base not in known]
+
+    def member(self, owner: Class, name: str, depth: int = 0) -> List[Reference]:
+        """Return what ``instance.name`` may be: a method, or a value that methods of the class store."""
         references: List[Reference] = []
-        for d in base.top.flow.definitions.get(dotted(alias.name) or "", []):
-            if d.value is not None and d.kind == "assign":
-                references.extend(self._values(base.top, d.value, depth))
-        return references
+        for current in self.lineage(owner) if depth <= _MAX_DEPTH else ():
+            if name in current.methods:
+                references.append(Reference("function", current.methods[name]))
+                break
+            if name in current.fields:
+                references += self.resolve(current.parent, current.fields[name], depth + 1)
+            for method, definition in current.stores(name):
+                references += self.of_definition(method, definition, depth + 1)
+        return _unique(references)
 
-    def _values(self, where: Function, value: cst.CSTNode, depth: int) -> List[Reference]:
-        references: List[Reference] = []
-        if isinstance(value, cst.Dict):
-            for element in value.elements:
-                if isinstance(element, cst.DictElement):
-                    references.extend(self.resolve(where, element.value, depth))
-        elif isinstance(value, cst.Call) and call_name(value) == "dict":
-            for argument in arguments(value)[1].values():
-                references.extend(self.resolve(where, argument, depth))
-        return references
+    def _overrides(self, owner: Class, name: str) -> List[Reference]:
+        """Resolve ``self.step()`` in a base class: the methods of classes that derive from it."""
+        methods = self.methods_named(name) if name not in self._common and not name.startswith("__") else []
+        derived = [method for method in methods if method.owner is not None and method.owner is not owner]
+        return [Reference("function", each) for each in derived if each.owner and owner in self.lineage(each.owner)]
+
+    def run_by(self, reference: Reference) -> List[Function]:
+        """Return the functions that a call of a reference runs: itself, or the ``forward`` of an instance."""
+        found = [reference]
+        if reference.kind == "instance" and isinstance(reference.target, Class):
+            found = [ref for name in CALLED for ref in self.member(reference.target, name)]
+        return [ref.target for ref in found if isinstance(ref.target, Function)]
 
 
-def _order(definition: Definition) -> int:
-    return definition.order
+def _unique(references: Iterable[Reference]) -> List[Reference]:
+    """Return each reference once, in their order."""
+    found: Dict[Tuple[str, object], Reference] = {}
+    for ref in references:
+        found.setdefault((ref.kind, ref.target), ref)
+    return list(found.values())

@@ -9,7 +9,7 @@ import libcst as cst
 from legs_adapters.code.calls import callees
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, constant, same
+from legs_adapters.code.syntax import arguments, constant, every_parameter, same
 
 __all__ = [
     "called_makers",
@@ -24,97 +24,58 @@ __all__ = [
     "written",
 ]
 
+_MISSING = object()
 _Entry = Tuple[Function, cst.CSTNode]  # a value, and the function that it stands in
 
 
 def returned(function: Function, known: Dict[str, object]) -> Optional[cst.CSTNode]:
-    """Return what a function returns, its local names filled in; None where that is not one expression.
+    """Return what straight-line code returns, its local names filled in; None where that is not one expression.
 
     ``known`` are values of parameters, which decide the branches that test them.
     """
-    return _follow(function.body.body, {}, known)
+    names: Dict[str, cst.BaseExpression] = {}
+    work: List[cst.CSTNode] = list(function.body.body)
+    while work:
+        statement = work.pop(0)
+        if isinstance(statement, cst.SimpleStatementLine):
+            work[:0] = statement.body
+        elif isinstance(statement, cst.Return):
+            value = _filled(statement.value, names) if statement.value is not None else None
+            while isinstance(value, cst.IfExp) and _truth(value.test, known) is not None:
+                value = value.body if _truth(value.test, known) else value.orelse
+            return value
+        elif isinstance(statement, cst.Assign) and isinstance(statement.targets[0].target, cst.Name):
+            names[statement.targets[0].target.value] = _filled(statement.value, names)
+        elif isinstance(statement, cst.If) and _truth(statement.test, known) is not None:
+            branch = statement.body if _truth(statement.test, known) else statement.orelse
+            inside = branch.body if isinstance(branch, cst.Else) else branch
+            work[:0] = inside.body if isinstance(inside, cst.BaseSuite) else list(filter(None, [inside]))
+        elif not isinstance(statement, (cst.Assert, cst.Pass)) and not _is_text(statement):
+            return None
+    return None
 
 
 def known_arguments(function: Function, call: Optional[cst.Call]) -> Dict[str, object]:
     """Return the parameters whose values a call fixes: literals, and defaults of missing arguments."""
     assert isinstance(function.node, cst.FunctionDef)
-    if call is None:
+    if call is None or arguments(call)[2]:
         return {}
-    positional, keywords, starred = arguments(call)
-    known: Dict[str, object] = {}
-    missing = object()
-    if starred:
-        return known
-    params = [p for p in (*function.node.params.posonly_params, *function.node.params.params)]
-    params = [p for p in params if p.name.value in function.parameters]
-    for i, param in enumerate([*params, *function.node.params.kwonly_params]):
-        name = param.name.value
-        if i < len(positional) and param in params:
-            value = constant(positional[i], missing)
-        elif name in keywords:
-            value = constant(keywords[name], missing)
-        else:
-            value = constant(param.default, missing) if param.default is not None else missing
-        if value is not missing:
-            known[name] = value
-    return known
+    defaults = {each.name.value: each.default for each in every_parameter(function.node.params)}
+    given = {name: function.given(call, name) or default for name, default in defaults.items()}
+    values = {name: constant(value, _MISSING) for name, value in given.items()}
+    return {name: value for name, value in values.items() if value is not _MISSING}
 
 
-def _follow(
-    statements: object, names: Dict[str, cst.BaseExpression], known: Dict[str, object]
-) -> Optional[cst.CSTNode]:
-    """Return what straight-line code returns, its local names filled in; None where that is not one expression."""
-    flat: List[cst.CSTNode] = []
-    for statement in statements:  # type: ignore[attr-defined]
-        flat.extend(statement.body if isinstance(statement, cst.SimpleStatementLine) else [statement])
-    for statement in flat:
-        if isinstance(statement, cst.Return):
-            if statement.value is None:
-                return None
-            return _decide(_fill(statement.value, names), known)
-        if isinstance(statement, cst.Assign) and len(statement.targets) == 1:
-            target = statement.targets[0].target
-            if not isinstance(target, cst.Name):
-                return None
-            names[target.value] = _fill(statement.value, names)
-        elif isinstance(statement, cst.If):
-            truth = _truth(statement.test, known)
-            if truth is None:
-                return None
-            if truth:
-                returned = _follow(statement.body.body, names, known)
-                if returned is not None or _leaves(statement.body.body):
-                    return returned
-            elif isinstance(statement.orelse, cst.Else):
-                returned = _follow(statement.orelse.body.body, names, known)
-                if returned is not None or _leaves(statement.orelse.body.body):
-                    return returned
-            elif statement.orelse is not None:
-                return None
-        elif (
-            isinstance(statement, cst.Expr) and isinstance(statement.value, (cst.SimpleString, cst.ConcatenatedString))
-        ) or isinstance(statement, (cst.Assert, cst.Pass)):
-            continue
-        else:
-            return None
-    return None
+def _is_text(statement: cst.CSTNode) -> bool:
+    return isinstance(statement, cst.Expr) and isinstance(statement.value, (cst.SimpleString, cst.ConcatenatedString))
 
 
-def _leaves(statements: object) -> bool:
-    last = list(statements)[-1]  # type: ignore[call-overload]
-    return isinstance(last, cst.SimpleStatementLine) and isinstance(last.body[-1], (cst.Return, cst.Raise))
-
-
-def _fill(node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> cst.BaseExpression:
-    if not names:
-        return node
+def _filled(node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> cst.BaseExpression:
+    """Return an expression with the values of local names in their place."""
 
     class Fill(cst.CSTTransformer):
         def leave_Name(self, original_node: cst.Name, updated_node: cst.Name) -> cst.BaseExpression:
             return names.get(original_node.value, updated_node)
-
-        def visit_Attribute_attr(self, node: cst.Attribute) -> None:
-            pass
 
         def leave_Attribute(self, original_node: cst.Attribute, updated_node: cst.Attribute) -> cst.BaseExpression:
             return updated_node.with_changes(attr=original_node.attr)
@@ -122,71 +83,56 @@ def _fill(node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> cst
         def leave_Arg(self, original_node: cst.Arg, updated_node: cst.Arg) -> cst.Arg:
             return updated_node.with_changes(keyword=original_node.keyword)
 
-    filled = node.visit(Fill())
+    filled = node.visit(Fill()) if names else node
     assert isinstance(filled, cst.BaseExpression)
     return filled
 
 
-def _decide(node: cst.BaseExpression, known: Dict[str, object]) -> cst.BaseExpression:
-    if isinstance(node, cst.IfExp):
-        truth = _truth(node.test, known)
-        if truth is not None:
-            return _decide(node.body if truth else node.orelse, known)
-    return node
-
-
 def _truth(node: cst.BaseExpression, known: Dict[str, object]) -> Optional[bool]:
+    """Return whether a test of a parameter is true: ``mask is None``, ``not mask``; None where it is unknown."""
     if isinstance(node, cst.Name) and node.value in known:
         return bool(known[node.value])
     if isinstance(node, cst.UnaryOperation) and isinstance(node.operator, cst.Not):
         inner = _truth(node.expression, known)
         return None if inner is None else not inner
     if isinstance(node, cst.Comparison) and len(node.comparisons) == 1 and isinstance(node.left, cst.Name):
-        comparison = node.comparisons[0]
-        missing = object()
-        right = constant(comparison.comparator, missing)
-        if node.left.value in known and right is not missing:
-            left = known[node.left.value]
-            if isinstance(comparison.operator, (cst.Is, cst.Equal)):
-                return left == right
-            if isinstance(comparison.operator, (cst.IsNot, cst.NotEqual)):
-                return left != right
+        operator, right = node.comparisons[0].operator, constant(node.comparisons[0].comparator, _MISSING)
+        if node.left.value in known and right is not _MISSING:
+            if isinstance(operator, (cst.Is, cst.Equal)):
+                return known[node.left.value] == right
+            if isinstance(operator, (cst.IsNot, cst.NotEqual)):
+                return known[node.left.value] != right
     return None
 
 
 def passed_on(function: Function, node: cst.CSTNode) -> Optional[str]:
     """Return the parameter that an expression is, or is an element of, on every path."""
-    found: Set[Optional[str]] = set()
-    work, seen = [node], set()
-    while work:
-        part = work.pop()
+    found: Set[str] = set()
+    work: List[Optional[cst.CSTNode]] = [node]
+    for part in work:  # which grows
         while isinstance(part, cst.Subscript):
             part = part.value
-        if not isinstance(part, cst.Name):
+        definitions = function.flow.reaching(part) if isinstance(part, cst.Name) else ()
+        if not definitions:
             return None
-        for definition in function.flow.reaching(part):
-            value: Optional[cst.CSTNode] = definition.value
+        for definition in definitions:
+            value = definition.value
+            if definition.kind == "element" and isinstance(value, cst.Tuple):
+                index = len(value.elements) if definition.index is None else definition.index
+                value = value.elements[index].value if index < len(value.elements) else None
             if definition.kind == "parameter":
                 found.add(definition.place)
             elif definition.kind not in ("assign", "element") or value is None:
                 return None
-            elif id(definition) not in seen:
-                seen.add(id(definition))
-                if definition.kind == "element" and isinstance(value, cst.Tuple):
-                    if definition.index is None or definition.index >= len(value.elements):
-                        return None
-                    value = value.elements[definition.index].value
+            elif value not in work:
                 work.append(value)
     return found.pop() if len(found) == 1 else None
 
 
 def called_makers(program: Program, function: Function, package: cst.CSTNode) -> List[Function]:
     """Return the functions that ``package = render(...)`` calls, where that is the only definition of the package."""
-    made = list(function.flow.reaching(package))
-    call = made[0].value if len(made) == 1 and made[0].kind == "assign" else None
-    if not isinstance(call, cst.Call):
-        return []
-    return callees(program, function, call)
+    call = function.flow.value_of(package)
+    return callees(program, function, call) if isinstance(call, cst.Call) else []
 
 
 def forward_maker(function: Function, package: cst.CSTNode) -> List[Function]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Sequence
 
-from legs_adapters.code.folders import check_name, own_and_excluded
-from legs_adapters.code.limits import MAX_BYTES, MAX_FILE_BYTES, largest_over, too_deep
+from legs_adapters.code.folders import check_name, walk
+from legs_adapters.code.limits import MAX_BYTES, MAX_FILE_BYTES, largest_over
 from legs_loss import LegsError
 from legs_loss.system import read_regular
 
@@ -84,7 +84,8 @@ def check_root(path: str | os.PathLike[str]) -> Path:
 
 def read_files(root: Path, exclude: Sequence[str]) -> Files:
     """Read the Python files of a checkout, except for excluded ones."""
-    own, excluded = own_and_excluded(root, exclude)
+    own = list(walk(root, exclude))
+    excluded = sorted(set(walk(root)) - set(own)) if exclude else []
     over = largest_over({path: size for path, size in _sizes(root, own).items() if size <= MAX_FILE_BYTES}, MAX_BYTES)
     why = f"too large: all files have more than {MAX_BYTES >> 20} MiB together; leave others out by --exclude"
     read = [Unreadable(path, why) if path in over else read_source(root, path) for path in own]
@@ -115,8 +116,7 @@ def read_source(root: Path, path: str) -> Source | Unreadable:
     except OSError as error:
         large = f"larger than {MAX_FILE_BYTES >> 20} MiB" if error.errno == errno.EFBIG else ""
         return Unreadable(path, large or f"cannot be read: {error.strerror}")
-    deep = too_deep(data)
-    return Unreadable(path, deep) if deep else decode(path, data)
+    return decode(path, data)
 
 
 def decode(path: str, data: bytes) -> Source | Unreadable:

@@ -20,15 +20,12 @@ __all__ = [
     "dotted",
     "every_parameter",
     "key_of",
-    "loops_by_node",
     "names_where_false",
     "names_where_true",
     "one_line",
     "path_of",
     "root_of",
     "same",
-    "squeezed",
-    "strip_parens",
     "walk_all",
     "walk_expressions",
     "word_set",
@@ -40,8 +37,9 @@ __all__ = [
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _EMPTY = cst.Module(body=[])
 _MISSING = object()
-_NODES: Dict[type, bool] = {}
-_FIELDS: Dict[type, Tuple[str, ...]] = {}
+_PUNCTUATION = re.compile(
+    "whitespace|[lr]par|[lr]brac|leading_lines|trailing_whitespace|header|footer|comma|equal|semicolon"
+)
 
 
 def code(node: cst.CSTNode) -> str:
@@ -58,12 +56,8 @@ def one_line(node: cst.CSTNode) -> str:
 
 def dotted(node: cst.CSTNode) -> Optional[str]:
     """Return ``a.b.c`` for a chain of names, else None."""
-    if isinstance(node, cst.Name):
-        return node.value
-    if isinstance(node, cst.Attribute):
-        base = dotted(node.value)
-        return None if base is None else f"{base}.{node.attr.value}"
-    return None
+    path = path_of(node)
+    return None if path is None or "[" in path else path
 
 
 def word_set(text: str) -> FrozenSet[str]:
@@ -78,13 +72,12 @@ def words(name: str) -> Tuple[str, ...]:
 
 def constant(node: Optional[cst.CSTNode], default: Any = None) -> Any:
     """Return the value of a literal (also a negative number, a tuple of literals), else ``default``."""
-    if isinstance(node, (cst.SimpleString, cst.Integer, cst.Float)):
+    named = isinstance(node, cst.Name) and node.value in ("None", "True", "False")
+    if named or isinstance(node, (cst.SimpleString, cst.Integer, cst.Float)):
         try:
-            return _literal(node.value)
+            return _literal(node.value)  # type: ignore[union-attr]
         except (SyntaxError, ValueError):  # "\x", or of a newer Python
             return default
-    if isinstance(node, cst.Name) and node.value in ("None", "True", "False"):
-        return {"None": None, "True": True, "False": False}[node.value]
     if isinstance(node, cst.UnaryOperation) and isinstance(node.operator, cst.Minus):
         value = constant(node.expression, _MISSING)
         return -value if isinstance(value, (int, float)) else default
@@ -111,16 +104,13 @@ def key_of(node: cst.CSTNode) -> Any:
 
 def path_of(node: cst.CSTNode) -> Optional[str]:
     """Return one spelling for a place that can be assigned: ``x``, ``self.x``, ``losses['im']``; else None."""
-    kind = type(node)
-    if kind is cst.Name:
-        return node.value  # type: ignore[attr-defined]
-    if kind is cst.Attribute:
-        base = path_of(node.value)  # type: ignore[attr-defined]
-        return None if base is None else f"{base}.{node.attr.value}"  # type: ignore[attr-defined]
-    if kind is cst.Subscript:
-        base, key = path_of(node.value), key_of(node)  # type: ignore[attr-defined]
-        return None if base is None or key is None else f"{base}[{key!r}]"
-    return None
+    if isinstance(node, cst.Name):
+        return node.value
+    base = path_of(node.value) if isinstance(node, (cst.Attribute, cst.Subscript)) else None
+    if base is not None and isinstance(node, cst.Attribute):
+        return f"{base}.{node.attr.value}"
+    key = key_of(node) if base is not None else None
+    return None if key is None else f"{base}[{key!r}]"
 
 
 def attribute_chain(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
@@ -142,52 +132,25 @@ def root_of(node: cst.Name | cst.Attribute) -> str:
 
 def call_name(node: cst.Call) -> str:
     """Return the last name of the callee: ``f`` of ``a.b.f(x)``; empty without one."""
-    if isinstance(node.func, cst.Name):
-        return node.func.value
-    if isinstance(node.func, cst.Attribute):
-        return node.func.attr.value
-    return ""
+    return root_of(node.func) if isinstance(node.func, (cst.Name, cst.Attribute)) else ""
 
 
 def arguments(node: cst.Call) -> Tuple[List[cst.BaseExpression], Dict[str, cst.BaseExpression], bool]:
     """Return positional arguments, keyword arguments, and whether there is a ``*`` or ``**`` among them."""
-    positional: List[cst.BaseExpression] = []
-    keywords: Dict[str, cst.BaseExpression] = {}
-    starred = False
-    for arg in node.args:
-        if arg.star:
-            starred = True
-        elif arg.keyword is not None:
-            keywords[arg.keyword.value] = arg.value
-        else:
-            positional.append(arg.value)
-    return positional, keywords, starred
-
-
-def strip_parens(text: str) -> str:
-    """Return text without the pairs of brackets around all of it."""
-    text = text.strip()
-    while text.startswith("(") and text.endswith(")"):
-        depth = 0
-        for i, letter in enumerate(text):
-            depth += (letter == "(") - (letter == ")")
-            if depth == 0 and i < len(text) - 1:
-                return text
-        text = text[1:-1].strip()
-    return text
+    plain = [arg for arg in node.args if not arg.star]
+    positional = [arg.value for arg in plain if arg.keyword is None]
+    keywords = {arg.keyword.value: arg.value for arg in plain if arg.keyword is not None}
+    return positional, keywords, len(plain) < len(node.args)
 
 
 def children(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
     """Yield a node's direct children in source order, without white space and punctuation."""
     for name in _fields(type(node)):
         value = getattr(node, name)
-        kind = type(value)
-        if kind is list or kind is tuple:
-            for item in value:
-                if _is_node(type(item)):
-                    yield item
-        elif _is_node(kind):
-            yield value
+        for part in value if isinstance(value, (list, tuple)) else (value,):
+            kind: Any = type(part)
+            if _is_node(kind):
+                yield part
 
 
 def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
@@ -202,45 +165,27 @@ def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
         stack.extend(reversed(below))
 
 
-def loops_by_node(root: cst.CSTNode) -> Dict[int, Tuple[cst.CSTNode, ...]]:
-    """Return the loops around each node, the innermost first, by the node's id."""
-    found: Dict[int, Tuple[cst.CSTNode, ...]] = {}
-    stack: List[Tuple[cst.CSTNode, Tuple[cst.CSTNode, ...]]] = [(root, ())]
-    while stack:
-        part, loops = stack.pop()
-        found[id(part)] = loops
-        inner = (part, *loops) if isinstance(part, (cst.For, cst.While)) else loops
-        stack.extend((child, inner) for child in children(part))
-    return found
-
-
-def _is_node(kind: type) -> bool:
+@functools.lru_cache(maxsize=None)
+def _is_node(kind: Any) -> bool:
     """Return whether a class is one of LibCST's nodes, cached: isinstance on every node is slow."""
-    if kind not in _NODES:
-        _NODES[kind] = issubclass(kind, cst.CSTNode)
-    return _NODES[kind]
+    return issubclass(kind, cst.CSTNode)
 
 
-def _fields(kind: type) -> Tuple[str, ...]:
-    if kind not in _FIELDS:
-        _FIELDS[kind] = tuple(
-            field.name
-            for field in dataclasses.fields(kind)
-            if not field.name.startswith(("whitespace", "lpar", "rpar", "lbrac", "rbrac"))
-            and field.name
-            not in ("leading_lines", "trailing_whitespace", "header", "footer", "comma", "equal", "semicolon")
-        )
-    return _FIELDS[kind]
+@functools.lru_cache(maxsize=None)
+def _fields(kind: Any) -> Tuple[str, ...]:
+    """Return the fields of a class of nodes, without those of white space and punctuation."""
+    return tuple(field.name for field in dataclasses.fields(kind) if not _PUNCTUATION.match(field.name))
 
 
 def same(a: cst.CSTNode, b: cst.CSTNode) -> bool:
     """Return whether two expressions have the same text, brackets and spaces aside."""
-    return a is b or squeezed(a) == squeezed(b)
+    return a is b or _squeezed(a) == _squeezed(b)
 
 
-def squeezed(node: cst.CSTNode) -> str:
+def _squeezed(node: cst.CSTNode) -> str:
     """Return the text of an expression without brackets around it, spaces and comments."""
-    return re.sub(r"\s+|#[^\n]*", "", strip_parens(code(node)))
+    bare = node.with_changes(lpar=(), rpar=()) if isinstance(node, cst.BaseExpression) else node
+    return re.sub(r"\s+|#[^\n]*", "", code(bare))
 
 
 def names_where_true(test: cst.BaseExpression) -> Tuple[str, ...]:

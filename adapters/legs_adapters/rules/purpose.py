@@ -47,7 +47,7 @@ class Purposes:
 
     def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Purpose]:
         """Return the purpose of an expression that does not train, by the loops around it; None where it may."""
-        known = function, tuple(map(id, function.loops_around(node))), depth
+        known = function, tuple(map(id, function.flow.loops_around(node))), depth
         if known not in self._known:
             self._known[known] = self._purpose(function, node, depth)
         return self._known[known]
@@ -60,7 +60,7 @@ class Purposes:
         own = next((call for call in passes if function.place(call).end > at), passes[0])
         follows = self._follows(function, own, 0, False)
         inner: Set[int] = set()  # what the innermost loop with a backward pass calls
-        for scope in [*function.loops_around(node), function.body]:
+        for scope in [*function.flow.loops_around(node), function.body]:
             inside = {id(part) for part in walk_all(scope)}
             calls = [call for call in function.flow.calls if id(call) in inside]
             back = [call for call in calls if is_backward(call)]

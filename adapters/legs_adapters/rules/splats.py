@@ -45,9 +45,9 @@ class Splats:
         return False
 
     def _runs_with(self, module: Module, other: Module) -> bool:
-        """Return whether a module that calls a name can call this one: both run together, or lie near each other."""
-        near = other.path.split("/")[0] == module.path.split("/")[0] or "/" not in module.path
-        return near or other.path in self.program.together(module)
+        """Return whether a module that calls a name can call this one: it lies near, or mentions this one."""
+        stem = module.path.rpartition("/")[2][: -len(".py")]
+        return module.path.split("/")[0] in (other.path.split("/")[0], stem + ".py") or stem in other.text
 
     def _rendered(self, module: Module, function: Function, form: Form) -> bool:
         """Return whether a name in the term or a neighbouring file is about splats, and the file is not about rays."""
@@ -60,8 +60,7 @@ class Splats:
         near = [path for path in self.program.sources if not folder or path.startswith(folder + "/")]
         if rendered and folder:  # without Gaussians nearby: a mesh is rasterized, too
             top = folder.split("/")[0] + "/"
-            together = self.program.together(module)
-            near = [path for path in self.program.sources if path.startswith(top) or path in together]
+            near = [path for path in self.program.sources if path.startswith(top)]
             near = [path for path in near if SPLATS.search(self.program.sources[path].text)]
         return any(self._speaks_of_splats(path) for path in near)
 

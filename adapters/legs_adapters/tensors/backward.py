@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from typing import Callable, Dict, List, Optional, Set, Tuple
+from typing import Callable, Dict, List, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import given_to, handed
-from legs_adapters.code.module import Class, Function
+from legs_adapters.code.calls import callees, given_to, handed
+from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import arguments, call_name, children, constant, key_of
@@ -35,7 +35,7 @@ class Training:
 
     def __init__(self, program: Program, matters: Callable[[str], bool]) -> None:
         self.program = program
-        self._may_matter = matters
+        self._matters = matters
         self.roots: List[Function] = []
         self.sites: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
         self._trained: Set[int] = set()
@@ -45,14 +45,17 @@ class Training:
         self._work: List[Tuple[Function, cst.CSTNode, object]] = []
         for module in program.matching(_BACKWARD):
             for function in module.scopes(_BACKWARD.search):
-                self._start(function)
+                passes = [call for call in function.flow.calls if is_backward(call)]
+                self._begin(function, [value for call in passes for value in _trained_by(call)], bool(passes))
         for module in program.matching(_HOOK):
             for function in (f for name in sorted(HOOKS) for f in module.named(name)):
                 if function.owner is not None:
-                    self._root(function)
-                    for value in function.flow.returns:
-                        self._push(function, value)
-        self._run()
+                    self._begin(function, function.flow.returns, True)
+        while self._work:
+            function, node, key = self._work.pop()
+            if function.module.spend(1):
+                self._touched.add(function)
+                self._visit(function, node, key)
 
     def includes(self, node: cst.CSTNode) -> bool:
         """Return whether a backward pass reaches this expression."""
@@ -62,219 +65,157 @@ class Training:
         """Return whether a backward pass reaches an expression of this function."""
         return function in self._touched
 
-    # -- roots
-
-    def _root(self, function: Function) -> None:
-        if function not in self.roots:
+    def _begin(self, function: Function, values: Sequence[cst.CSTNode], is_root: bool) -> None:
+        if is_root and function not in self.roots:
             self.roots.append(function)
+        for value in values:
+            self._push(function, value)
+            for definition in function.flow.reaching(value):  # def step(loss): loss.backward()
+                if definition.kind == "parameter" and definition.place in function.parameters:
+                    for caller, given in given_to(self.program, function, definition.place):
+                        self._push(caller, given)
 
-    def _start(self, function: Function) -> None:
-        for call in function.flow.calls:
-            if not is_backward(call):
-                continue
-            self._root(function)
-            values = [arg.value for arg in call.args if arg.keyword is None or arg.keyword.value in ("loss", "tensors")]
-            if isinstance(call.func, cst.Attribute):
-                values.append(call.func.value)
-            for value in values:
-                self._push(function, value)
-                self._upwards(function, value)
-
-    def _upwards(self, function: Function, value: cst.CSTNode) -> None:
-        """Follow ``def step(loss): loss.backward()`` to its calls, which pass the trained value."""
-        for definition in function.flow.reaching(value):
-            if definition.kind != "parameter" or definition.place not in function.parameters:
-                continue
-            for caller, given in given_to(self.program, function, definition.place):
-                if given is not None:
-                    self._push(caller, given)
-
-    # -- the slice
-
-    def _push(self, function: Function, node: cst.CSTNode, key: object = _ANY) -> None:
+    def _push(self, function: Function, node: Optional[cst.CSTNode], key: object = _ANY) -> None:
         mark = (id(node), key if isinstance(key, (str, int)) else _ANY)
-        if mark not in self._done:
+        if node is not None and mark not in self._done:
             self._done.add(mark)
             self._work.append((function, node, key))
 
-    def _run(self) -> None:
-        while self._work:
-            function, node, key = self._work.pop()
-            if function.module.spend(1):
-                self._touched.add(function)
-                self._visit(function, node, key)
-
     def _visit(self, function: Function, node: cst.CSTNode, key: object) -> None:
         """Mark what ``node`` (or, with a key, ``node[key]``) gets its value from."""
-        if (
-            isinstance(key, int)
-            and isinstance(node, (cst.Tuple, cst.List))
-            and -len(node.elements) <= key < len(node.elements)
-        ):
-            self._push(function, node.elements[key].value)
+        entries = _entries(node, key)
+        for entry in entries:
+            self._push(function, entry)
+        if entries:
             return
-        if key is not _ANY and isinstance(node, cst.Dict):
-            literal = [e for e in node.elements if isinstance(e, cst.DictElement)]
-            matching = [e for e in literal if constant(e.key) == key]
-            if matching and len(literal) == len(node.elements):
-                for element in matching:
-                    self._push(function, element.value)
-                return
         self._trained.add(id(node))
         if isinstance(node, cst.Call):
             self._call(function, node, key)
-        elif isinstance(node, (cst.Name, cst.Attribute)):
-            if not (isinstance(node, cst.Attribute) and node.attr.value in SIZES):
-                self._place(function, node, key)
-        elif isinstance(node, cst.Subscript):
-            if not self._place(function, node, key):
-                inner = key_of(node)
-                self._push(function, node.value, _ANY if inner is None else inner)
-        elif isinstance(node, (cst.GeneratorExp, cst.ListComp, cst.SetComp)):
-            self._push(function, node.elt)
-            self._loops(function, node.for_in)
-        elif isinstance(node, cst.DictComp):
-            self._push(function, node.value)
-            self._loops(function, node.for_in)
-        elif isinstance(node, cst.Lambda):
-            self._push(function, node.body)
+        elif isinstance(node, cst.Attribute) and node.attr.value in SIZES:
+            pass
+        elif isinstance(node, (cst.Name, cst.Attribute, cst.Subscript)):
+            self._place(function, node, key)
+        elif isinstance(node, (cst.BaseSimpleComp, cst.DictComp)):
+            self._push(function, node.value if isinstance(node, cst.DictComp) else node.elt)
+            loop: Optional[cst.CompFor] = node.for_in
+            while loop is not None:
+                self._push(function, loop.iter)
+                loop = loop.inner_for_in
         elif isinstance(node, cst.IfExp):
             self._push(function, node.body, key)
             self._push(function, node.orelse, key)
-        elif isinstance(node, cst.Comparison):
-            return
-        else:
+        elif not isinstance(node, cst.Comparison):
             for child in children(node):
                 self._push(function, child)
 
-    def _loops(self, function: Function, loop: Optional[cst.CompFor]) -> None:
-        while loop is not None:
-            self._push(function, loop.iter)
-            loop = loop.inner_for_in
-
     def _call(self, function: Function, node: cst.Call, key: object) -> None:
-        name = call_name(node)
-        if name in ENDS_GRADIENT | SIZES | BACKWARD and isinstance(node.func, cst.Attribute):
+        name, owner = call_name(node), node.func.value if isinstance(node.func, cst.Attribute) else None
+        positional, keywords, _ = arguments(node)
+        literal = constant(positional[0]) if positional else None
+        if owner is not None and name in ENDS_GRADIENT | SIZES | BACKWARD:
             return
-        if (
-            isinstance(node.func, cst.Attribute)
-            and name == "get"
-            and node.args
-            and isinstance(constant(node.args[0].value), str)
-        ):
-            self._push(function, node.func.value, constant(node.args[0].value))
+        if owner is not None and name == "get" and isinstance(literal, str):
+            self._push(function, owner, literal)
             return
-        if isinstance(node.func, cst.Name) and name == "dict" and isinstance(key, str):
-            keywords = arguments(node)[1]
-            if key in keywords:
-                self._push(function, keywords[key])
-                return
+        if name == "dict" and key in keywords:
+            self._push(function, keywords[str(key)])
+            return
         references = self.program.resolve(function, node.func)
         if not references and isinstance(node.func, cst.Name):
             references = handed(self.program, function, node.func)
         for reference in references:
-            if reference.kind == "lambda" and isinstance(reference.target, cst.Lambda):
-                self._push(function, reference.target)
+            if isinstance(reference.target, cst.Lambda):
+                self._push(function, reference.target.body)
             for callee in self.program.run_by(reference):
-                self._called(function, node, callee)
-                self._returned(callee, key)
-        for arg in node.args:
-            self._push(function, arg.value)
-        if isinstance(node.func, cst.Attribute):
-            self._push(function, node.func.value)
-        elif not isinstance(node.func, cst.Name):
-            self._push(function, node.func)
+                self._record(function, node, callee)
+                self._return(callee, key)
+        for value in [arg.value for arg in node.args]:
+            self._push(function, value)
+        if not isinstance(node.func, cst.Name):
+            self._push(function, owner or node.func)
 
-    def _called(self, caller: Function, call: cst.Call, callee: Function) -> None:
+    def _record(self, caller: Function, call: cst.Call, callee: Function) -> None:
         """Record a call through which a function contributes."""
         if (callee, id(call)) not in self._met:
             self._met.add((callee, id(call)))
             self.sites.setdefault(callee, []).append((caller, call))
 
-    def _returned(self, function: Function, key: object = _ANY) -> None:
-        if self._matters(function):
-            for value in function.flow.returns:
-                self._push(function, value, key)
+    def _return(self, function: Function, key: object = _ANY) -> None:
+        for value in function.flow.returns if self._matters(function.text) else ():
+            self._push(function, value, key)
 
-    def _matters(self, function: Function) -> bool:
-        return self._may_matter(function.text)
-
-    def _place(self, function: Function, node: cst.CSTNode, key: object) -> bool:
+    def _place(self, function: Function, node: cst.CSTNode, key: object) -> None:
         definitions = self.program.lookup(function, node)
         if isinstance(node, cst.Name) and (isinstance(key, str) or _begins_empty(definitions)):
-            self._filled_in(function, node, key)
-        if definitions:
-            for where, definition in definitions:
-                self._definition(where, definition, key)
-            return True
-        if isinstance(node, cst.Attribute):
-            if isinstance(node.value, cst.Name) and node.value.value == "self":
-                owner = self.program.owner_of(function)
-                stores = self._stores(owner, node.attr.value) if owner is not None else []
-                for method, definition in stores:
-                    self._definition(method, definition, key)
-            else:
+            self._fill(function, node, key)
+        if not definitions and isinstance(node, cst.Subscript):
+            inner = key_of(node)
+            self._push(function, node.value, _ANY if inner is None else inner)
+        elif not definitions and isinstance(node, cst.Attribute):
+            owner = self.program.owner_of(function)
+            if not isinstance(node.value, cst.Name) or node.value.value != "self":
                 self._push(function, node.value, "." + node.attr.value)
-        return False
+            elif owner is not None:
+                matters = [one.stores(node.attr.value, self._is_near) for one in self.program.lineage(owner)]
+                definitions = [entry for stores in matters for entry in stores]
+        for where, definition in definitions or ():
+            self._definition(where, definition, key)
 
-    def _filled_in(self, function: Function, node: cst.Name, key: object) -> None:
+    def _is_near(self, function: Function) -> bool:
+        return self._matters(function.text)
+
+    def _fill(self, function: Function, node: cst.Name, key: object) -> None:
         """Follow ``self.compute(image, output)``, which puts ``output["loss"]`` into the dictionary trained on."""
         for call in function.flow.calls if function.module.spend(len(function.flow.calls)) else ():
-            positional, keywords, starred = arguments(call)
-            named: List[Tuple[object, cst.BaseExpression]] = [*enumerate(positional), *keywords.items()]
-            for name, value in named:
-                if not isinstance(value, cst.Name) or value.value != node.value or starred:
-                    continue
-                for reference in self.program.resolve(function, call.func):
-                    callee = reference.target
-                    if reference.kind != "function" or not isinstance(callee, Function) or not self._matters(callee):
-                        continue
-                    names = callee.parameters
-                    parameter = name if isinstance(name, str) else ""
-                    if isinstance(name, int) and name < len(names):
-                        parameter = names[name]
-                    stores = [d for d in callee.flow.definitions.get(parameter, []) if d.kind in ("store", "mutate")]
-                    if isinstance(key, str):
-                        stores += callee.flow.definitions.get(f"{parameter}[{key!r}]", [])
-                    if stores:
-                        self._called(function, call, callee)
-                    for definition in stores:
-                        self._definition(callee, definition, key)
-
-    def _stores(self, owner: Class, attribute: str) -> List[Tuple[Function, Definition]]:
-        owners = [owner, *self.program.bases(owner)]
-        return [entry for one in owners for entry in one.stores(attribute, self._matters)]
+            if not any(isinstance(arg.value, cst.Name) and arg.value.value == node.value for arg in call.args):
+                continue
+            for callee in filter(self._is_near, callees(self.program, function, call)):
+                for parameter in callee.parameters:
+                    given, known = callee.given(call, parameter), callee.flow.definitions
+                    if isinstance(given, cst.Name) and given.value == node.value:
+                        stores = [d for d in known.get(parameter, []) if d.kind in ("store", "mutate")]
+                        stores += known.get(f"{parameter}[{key!r}]", [])
+                        if stores:
+                            self._record(function, call, callee)
+                        for definition in stores:
+                            self._definition(callee, definition, key)
 
     def _definition(self, function: Function, definition: Definition, key: object) -> None:
-        value = definition.value
-        if definition.kind in ("function", "import", "class"):
+        value, kind = definition.value, definition.kind
+        if kind in ("function", "import", "class"):
             for reference in self.program.of_definition(function, definition):
-                if reference.kind == "function" and isinstance(reference.target, Function):
-                    self._returned(reference.target)
-            return
-        if definition.kind == "store":
-            if definition.key is not None and key is not _ANY and definition.key != key:
-                return
-            if value is not None:
+                if isinstance(reference.target, Function):
+                    self._return(reference.target)
+        elif kind == "store":
+            if definition.key in (None, key) or key is _ANY:
                 self._push(function, value)
-            return
-        if definition.kind == "augment":
-            assert isinstance(definition.node, cst.AugAssign)
+        elif isinstance(definition.node, cst.AugAssign):
             self._push(function, definition.node.target, key)
-            if value is not None:
-                self._push(function, value)
-            return
-        if value is None:
-            return
-        if definition.kind == "element":
-            self._push(function, value, _ANY if definition.index is None else definition.index)
-        elif definition.kind == "part":
             self._push(function, value)
-        elif definition.kind in ("mutate", "inplace") and isinstance(value, cst.Call):
+        elif kind in ("element", "part"):
+            self._push(function, value, _ANY if definition.index is None or kind == "part" else definition.index)
+        elif kind in ("mutate", "inplace") and isinstance(value, cst.Call):
             for arg in value.args:
                 self._push(function, arg.value, key if call_name(value) == "update" else _ANY)
         else:
             self._push(function, value, key)
+
+
+def _trained_by(call: cst.Call) -> List[cst.BaseExpression]:
+    """Return the value whose gradients a backward pass takes."""
+    values = [arg.value for arg in call.args if arg.keyword is None or arg.keyword.value in ("loss", "tensors")]
+    return [*values, call.func.value] if isinstance(call.func, cst.Attribute) else values
+
+
+def _entries(node: cst.CSTNode, key: object) -> Sequence[cst.CSTNode]:
+    """Return the entry of a literal tuple, list or dictionary under a key; nothing where it is not known."""
+    if isinstance(node, (cst.Tuple, cst.List)) and isinstance(key, int):
+        return [each.value for each in node.elements][key:][:1] if -len(node.elements) <= key else []
+    if isinstance(node, cst.Dict) and key is not _ANY:
+        literal = [each for each in node.elements if isinstance(each, cst.DictElement)]
+        found = [each.value for each in literal if constant(each.key) == key]
+        return found if len(literal) == len(node.elements) else []
+    return []
 
 
 def _begins_empty(definitions: Optional[List[Tuple[Function, Definition]]]) -> bool:

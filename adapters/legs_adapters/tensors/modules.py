@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from legs_adapters.code.members import Conventions
+from legs_adapters.code.program import Conventions
 from legs_adapters.tensors.operations import EVERYDAY, MODULE_SELF, MODULE_WRAPS
 
 __all__ = ["TORCH"]

@@ -7,7 +7,7 @@ from typing import Iterable, List
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import call_name, children, constant, walk_all, words, words_under
+from legs_adapters.code.syntax import call_name, walk_all, words, words_under
 from legs_adapters.tensors.operations import BACKWARD, OPTIMISERS, SCHEDULES, STEPS
 
 __all__ = [
@@ -18,8 +18,6 @@ __all__ = [
     "may_step",
 ]
 
-_NOTHING = object()
-
 
 def is_backward(call: cst.Call) -> bool:
     """Return whether a call runs a backward pass."""
@@ -28,8 +26,10 @@ def is_backward(call: cst.Call) -> bool:
 
 def is_step(call: cst.Call) -> bool:
     """Return whether a call steps an optimiser: ``optimizer.step()``, ``optimizers.optimizer_step_all()``."""
-    said = set(words(call_name(call)))
-    if not isinstance(call.func, cst.Attribute) or not (said == {"step"} or ("step" in said and said & OPTIMISERS)):
+    tokens = set(words(call_name(call)))
+    if not isinstance(call.func, cst.Attribute) or not (
+        tokens == {"step"} or ("step" in tokens and tokens & OPTIMISERS)
+    ):
         return False
     return not _is_of_schedule(call)
 
@@ -49,31 +49,7 @@ def has_step(function: Function) -> bool:
 
 
 def gradients_read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
-    """Return the gradients that are read, ``xyz.grad``; none where a manual step uses one of them."""
-    asked = {id(p) for part in parts if _asks(part) for p in walk_all(part)}
-    taken = {id(p) for part in parts for given in _taken(part) for p in walk_all(given)}
-    read = [p for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in asked]
-    return [] if any(id(p) in taken for p in read) else read
-
-
-def _empties(node: cst.CSTNode) -> bool:
-    """Return whether a node is ``xyz.grad = None``, which resets the gradients."""
-    if not isinstance(node, cst.Assign) or constant(node.value, _NOTHING) is not None:
-        return False
-    return any(isinstance(t.target, cst.Attribute) and t.target.attr.value == "grad" for t in node.targets)
-
-
-def _asks(node: cst.CSTNode) -> bool:
-    """Return whether a gradient is only compared or reset: ``xyz.grad is not None``."""
-    return isinstance(node, cst.Comparison) or _empties(node)
-
-
-def _taken(node: cst.CSTNode) -> List[cst.CSTNode]:
-    """Return the operands of a manual step: ``xyz -= lr * xyz.grad``, ``xyz.data.add_(-lr * xyz.grad)``."""
-    if isinstance(node, cst.AugAssign):
-        return [node.value] if isinstance(node.operator, cst.SubtractAssign) else []
-    if isinstance(node, cst.BinaryOperation):  # xyz.grad - other.grad compares the two
-        of_grads = any(isinstance(p, cst.Attribute) and p.attr.value == "grad" for p in walk_all(node.left))
-        return [node.right] if isinstance(node.operator, cst.Subtract) and not of_grads else []
-    in_place = isinstance(node, cst.Call) and call_name(node).endswith("_")
-    return [child.value for child in children(node) if in_place and isinstance(child, cst.Arg)]
+    """Return the gradients that are read, ``xyz.grad``; not those that are only compared, assigned or reset."""
+    others = [part for part in parts if isinstance(part, (cst.Comparison, cst.AssignTarget))]
+    asked = {id(each) for part in others for each in walk_all(part)}
+    return [p for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in asked]

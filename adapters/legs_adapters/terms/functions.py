@@ -7,9 +7,8 @@ from typing import Dict, List, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.members import Reference
 from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program
+from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import known_arguments, returned
 from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, walk_expressions
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name

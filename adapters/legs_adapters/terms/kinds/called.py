@@ -9,9 +9,8 @@ from typing import List, Optional, Tuple
 import libcst as cst
 
 from legs_adapters.code.calls import given_to
-from legs_adapters.code.members import Reference
 from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program
+from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.syntax import arguments, call_name, code, constant, words
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
 from legs_adapters.lexicon.words import PERCEPTUAL

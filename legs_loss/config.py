@@ -100,7 +100,7 @@ def find_config(
 
 
 def is_off(environ: Optional[Mapping[str, str]] = None) -> bool:
-    """Return whether LEGS_OFF selects the codebase's own loss, to the last bit.
+    """Return whether LEGS_OFF selects the codebase's own loss, bit-identical.
 
     Args:
         environ: in place of ``os.environ``.

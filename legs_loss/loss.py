@@ -35,7 +35,7 @@ def weighted_l1(
         target: the same shape; an image beside a batch of one image is a batch of one.
         weight: one value a pixel, in the images' shape with one channel or without the channel, and for a batch one a
             view or one for all; None is 1 everywhere, and then the result is
-            ``torch.abs(prediction - target).mean()`` to the last bit. It is not divided by its mean, as in the paper.
+            ``torch.abs(prediction - target).mean()``, bit-identical. It is not divided by its mean, as in the paper.
         mask: bool, or floats in [0, 1], in the weight's shapes: zeroes the weight where it is 0.
         renormalise: divide by the mask's mean, so that masked pixels do not count as pixels without error.
         channels_last: where the channel stands, for a shape that does not show it, as [3, 100, 4].
@@ -85,7 +85,7 @@ def ssim(
 
     A Gaussian window of 11x11 and sigma 1.5, each channel by itself, C1 = 0.01^2, C2 = 0.03^2 (source: Inria's
     utils/loss_utils.py; Wang et al. 2004). Where neither image is trained on (``no_grad``, evaluation) it is 3DGS's own
-    value to the last bit. In a training step value and gradient come from a backend where one takes the images
+    value, bit-identical. In a training step value and gradient come from a backend where one takes the images
     (docs/performance.md): equal up to rounding, differentiable once; with LEGS_OFF=1 they are 3DGS's own there, too.
 
     Args:
@@ -141,7 +141,7 @@ def legs_loss(
     Args:
         prediction: the rendering, floats in [0, 1], in a shape that :func:`weighted_l1` takes.
         target: the photograph of the same view, the same shape.
-        spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own to the last bit. A spec that is normalised
+        spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own, bit-identical. A spec that is normalised
             over the scene uses the images of this call as the scene; ``LEGSLoss`` and ``l1_loss`` use all so far.
         weight: the target's weight map, if known; the spec is not used then.
         mask: zeroes the L1 weight where it is 0. SSIM is not masked, as in 3DGS's code.

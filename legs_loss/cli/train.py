@@ -170,7 +170,7 @@ def _print(metrics: Dict[str, Any]) -> None:
 
     for views, split in (("training views", "train"), ("held-out views", "test")):
         scores = metrics[split] or {}
-        told = [f"{METRICS[key].label} {value:{METRICS[key].format}}" for key, value in scores.items()]
-        if told:
-            say(f"{views}: {', '.join(told)}")
+        texts = [f"{METRICS[key].label} {value:{METRICS[key].format}}" for key, value in scores.items()]
+        if texts:
+            say(f"{views}: {', '.join(texts)}")
     say(f"{metrics['gaussians']} Gaussians, {metrics['seconds']:.0f} s")

@@ -37,12 +37,12 @@ __all__ = [
     "Comparison",
     "Row",
     "identity",
-    "keep",
     "read_json",
     "read_rows",
     "scene_of",
     "versions",
     "write_json",
+    "write_or_check",
 ]
 
 _LARGEST = 256 << 20  # bytes of a file of a comparison
@@ -192,7 +192,7 @@ class Comparison:
         }
         path = self.out / "comparison.json"
         with alone_in(self.out, make=True):
-            keep(path, dict(settings, baseline=None), SETTINGS, ("path", "baseline"))
+            write_or_check(path, dict(settings, baseline=None), SETTINGS, ("path", "baseline"))
         # Each time: a resumed comparison may run with newer code.
         self.proof: Dict[str, Any] = prove_unweighted(self.data.train, self.base)
         write_json(path, dict(read_json(path, SETTINGS), baseline=self.proof))
@@ -260,7 +260,7 @@ def identity(scene: Scene) -> Dict[str, Any]:
     return {"name": scene.root.resolve().name, "views": len(scene.views), "sha256": digest.hexdigest()[:16]}
 
 
-def keep(path: Path, values: Dict[str, Any], names: Sequence[str], free: Sequence[str] = ()) -> None:
+def write_or_check(path: Path, values: Dict[str, Any], names: Sequence[str], free: Sequence[str] = ()) -> None:
     """Write values, or check them against an existing file; those of the names in ``free`` may differ."""
     if not path.is_file():
         write_json(path, values)

@@ -61,8 +61,8 @@ def score_cells(mean: Mapping[str, float], spread: Mapping[str, float]) -> List[
     for column in COLUMNS:
         middle, deviation = mean[column.label], spread[column.label]
         cell = MISSING if math.isnan(middle) else format(middle, column.format)
-        told = column.spread and not math.isnan(deviation)
-        cells.append(f"{cell} ± {format(deviation, column.format)}" if told else cell)
+        has_spread = column.spread and not math.isnan(deviation)
+        cells.append(f"{cell} ± {format(deviation, column.format)}" if has_spread else cell)
     return cells
 
 

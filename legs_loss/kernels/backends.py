@@ -30,7 +30,7 @@ def fused_loss(
     """
     unweighted = weights.map is weights.mask is None and (weights.spec is None or weights.spec.unweighted)
     if padding != "zeros" or lambda_dssim == 0.0 or (unweighted and not forced_backend()):
-        return None  # unweighted it is 3DGS's own loss, to the last bit
+        return None  # unweighted it is 3DGS's own loss, bit-identical
     return _fused("loss", prediction, target, weights, lambda backend, *given: backend.loss(*given, lambda_dssim))
 
 

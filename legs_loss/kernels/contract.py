@@ -77,7 +77,7 @@ class Backend:
         return spec == known and spec.operator in self.operators and spec.p in self.norms and spec.curve in self.curves
 
     def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
-        """Return the least response of each view, and the greatest less the least: float32 [B, 2] on its device.
+        """Return the min response of each view, and max - min: float32 [B, 2] on its device.
 
         It depends on the spec's operator and p only. On the CPU a target with NaN, infinity or values of 0..255 is
         refused (LegsError); on other devices a NaN makes both numbers NaN, and so each weight.

@@ -46,7 +46,7 @@ class WeightSource(NamedTuple):
 
     curve: of the weight that is made from the target; 0 makes none.
     beta: of that weight.
-    ranges: float32 [views, 2]: the least response, and the reciprocal of the greatest less the least plus eps.
+    ranges: float32 [views, 2]: the min response, and the reciprocal of max - min + eps.
     stencil, side, middle, norm: an Operator's; a parallel loop takes no group in a group.
     map, mask: float32 [height * width] for all views, or [views * height * width], or empty.
     """
@@ -97,7 +97,7 @@ def _factor(values: Optional[Tensor], name: str, images: Images, target: Tensor)
 
 
 def response_range(target: Tensor, spec: WeightSpec) -> Tensor:
-    """Return of each view of [C, H, W] or [B, C, H, W] the least response, and the greatest less the least, [B, 2].
+    """Return of each view of [C, H, W] or [B, C, H, W] the min response, and max - min, [B, 2].
 
     Raises:
         LegsError: a target with NaN, infinity or plainly of 0..255.

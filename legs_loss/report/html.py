@@ -242,12 +242,12 @@ def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[i
     return " ".join(shlex.quote(word) for word in words)
 
 
-def _arms(rows: Sequence[Row], asked: Optional[Sequence[str]]) -> List[str]:
+def _arms(rows: Sequence[Row], wanted: Optional[Sequence[str]]) -> List[str]:
     there = list(dict.fromkeys(row["arm"] for row in rows))
     order = [BASELINE, "eggs", "legs-l", "legs"]
-    if asked is None:
+    if wanted is None:
         return sorted(there, key=lambda arm: (order.index(arm) if arm in order else len(order), arm))
-    names = list(dict.fromkeys(parse_arm(arm).name for arm in asked))
+    names = list(dict.fromkeys(parse_arm(arm).name for arm in wanted))
     for name in names:
         if name not in there:
             raise LegsError(f"no row of the arm {name} is trained: there are {', '.join(there)}")
@@ -264,14 +264,14 @@ def _scene_levels(scene: Scene, base: TrainConfig, rows: Mapping[str, Row]) -> D
     return {arm: levels_of((view.image for view in views), spec) for arm, spec in specs.items()}
 
 
-def _views(scene: Scene, asked: Optional[Sequence[str]]) -> List[View]:
+def _views(scene: Scene, wanted: Optional[Sequence[str]]) -> List[View]:
     train, test = split_views(scene)
-    if asked is None:
+    if wanted is None:
         candidates = test or train
         count = min(VIEWS, len(candidates))
         return [candidates[(2 * index + 1) * len(candidates) // (2 * count)] for index in range(count)]
     chosen = []
-    for part in asked:
+    for part in wanted:
         found = [view for view in [*test, *train] if part in view.name]
         if not found:
             raise LegsError(f"{scene.root}: no view has {part!r} in its name")

@@ -20,7 +20,7 @@ from examples.reproduce_paper.codebases.profile import Profile
 from examples.reproduce_paper.codebases.training import Checkout, check_copy, copy_checkout, train_and_score
 from legs_loss.errors import LegsError
 from legs_loss.experiments.arms import BASELINE, ArmSpec, needed, parse_arm
-from legs_loss.experiments.running import Row, identity, keep, read_json, versions, write_json
+from legs_loss.experiments.running import Row, identity, read_json, versions, write_json, write_or_check
 from legs_loss.reference.training.checkpoint import alone_in
 from legs_loss.reference.training.dataset import load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
@@ -106,9 +106,9 @@ class UpstreamComparison:
         path = self.out / "comparison.json"
         with alone_in(self.out, make=True):
             if path.is_file():  # else it is written last: a checkout that cannot be copied leaves none
-                keep(path, settings, tuple(settings), ("path", "baseline"))
+                write_or_check(path, settings, tuple(settings), ("path", "baseline"))
             check_copy(root, copy, edits) if copy.is_dir() else copy_checkout(root, copy, edits)
-            keep(path, settings, tuple(settings), ("path", "baseline"))
+            write_or_check(path, settings, tuple(settings), ("path", "baseline"))
         self._mean_weights: Dict[WeightSpec, float] = {}
 
     def check(self, arms: Sequence[ArmSpec]) -> None:

@@ -119,21 +119,21 @@ def read_profile(path: Path) -> Profile:
     return _profile(path, _read(path))
 
 
-def find_profile(root: Path, asked: Optional[str] = None) -> Profile:
+def find_profile(root: Path, wanted: Optional[str] = None) -> Profile:
     """Return the profile of a checkout.
 
     Args:
         root: the checkout.
-        asked: a built-in profile's name or the path of a TOML file; None: the built-in one that fits.
+        wanted: a built-in profile's name or the path of a TOML file; None: the built-in one that fits.
 
     Raises:
         LegsError: none fits, or the one that was asked for cannot be read.
     """
     built_in = {path.stem: path for path in sorted(PROFILES.glob("*.toml"))}
-    if asked is not None:
-        path = built_in.get(asked, Path(asked))
+    if wanted is not None:
+        path = built_in.get(wanted, Path(wanted))
         if not path.exists():
-            raise LegsError(f"{asked} is no file, nor a built-in profile ({', '.join(built_in)})")
+            raise LegsError(f"{wanted} is no file, nor a built-in profile ({', '.join(built_in)})")
         return read_profile(path)
     fitting = [profile for profile in map(read_profile, built_in.values()) if profile.fits(root)]
     # A fork of 3DGS has 3DGS's options too: the fork's own profile is more specific.

@@ -272,9 +272,9 @@ def _once(
         part.unlink() if part.exists() else None
         prefix = [sys.executable, str(LAUNCH), str(part.resolve()), str(seed)]
         words = [*prefix, *(["--cpu", "--ssim"] if checkout.cpu else []), *words]
-        with open(str(log), "ab") as said:
+        with open(str(log), "ab") as output:
             code = subprocess.run(
-                words, cwd=str(checkout.root), env=_environment(spec, seed), stdout=said, stderr=said,
+                words, cwd=str(checkout.root), env=_environment(spec, seed), stdout=output, stderr=output,
                 stdin=subprocess.DEVNULL,
             ).returncode  # fmt: skip
         if code != 0 or not part.is_file():

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.reference.training import perceptual
+from legs_loss.reference.training.perceptual import NEEDS_LPIPS
 from legs_loss.responses import response
 
 __all__ = ["METRICS", "Metric", "left_out", "mean_scores", "psnr", "score", "strongest"]
@@ -110,16 +111,7 @@ METRICS: Mapping[str, Metric] = {
             ("test",),
             lambda prediction, target: psnr(prediction, target, ~strongest(target)),
         ),
-        Metric(
-            "lpips",
-            "LPIPS",
-            ".4f",
-            ("test",),
-            perceptual.lpips,
-            ("test",),
-            perceptual.has_lpips,
-            perceptual.NEEDS_LPIPS,
-        ),
+        Metric("lpips", "LPIPS", ".4f", ("test",), perceptual.lpips, ("test",), perceptual.has_lpips, NEEDS_LPIPS),
     )
 }
 

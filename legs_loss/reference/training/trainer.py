@@ -3,7 +3,7 @@
     from legs_loss.reference.training import TrainConfig, train
     result = train(read_scene("my_scene"), TrainConfig(spec="legs"), out="output/my_scene")
 
-The same seed gives the same Gaussians to the last bit, whether or not the run was interrupted and resumed.
+The same seed gives bit-identical Gaussians, whether or not the run was interrupted and resumed.
 """
 
 from __future__ import annotations

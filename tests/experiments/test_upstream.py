@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import doctest
 import json
 import os
 import re
@@ -12,10 +13,11 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-from examples.reproduce_paper.codebases import training
+from examples.reproduce_paper.codebases import comparison, profile, training
 from examples.reproduce_paper.codebases.comparison import UpstreamComparison
 from examples.reproduce_paper.codebases.profile import PROFILES, Edit, Threshold, fill, find_profile, read_profile
 from examples.reproduce_paper.codebases.training import (
@@ -38,6 +40,12 @@ pytest.importorskip("libcst")
 pytest.importorskip("numba")
 
 # Profiles
+
+
+@pytest.mark.parametrize("module", [comparison, profile], ids=lambda module: module.__name__.rpartition(".")[2])
+def test_the_examples_in_docstrings(module: ModuleType) -> None:
+    done = doctest.testmod(module)
+    assert done.attempted and not done.failed
 
 
 @pytest.mark.parametrize("path", sorted(PROFILES.glob("*.toml")), ids=lambda path: path.stem)

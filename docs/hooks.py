@@ -42,3 +42,9 @@ def on_page_content(content: str, page: Any, config: Any, **_: Any) -> str:
         f'aria-label="Filter the codebases" placeholder="filter: a name, a kind, a verdict"><table id="codebases">'
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div><script>{FILTER}</script>"
     )
+
+
+def on_post_build(config: Any, **_: Any) -> None:
+    """Write the index of the search as a script, too: a page that is opened from the disk cannot read the other."""
+    index = Path(config["site_dir"], "search", "search_index.json")
+    index.with_suffix(".js").write_text(f"var __index = {index.read_text(encoding='utf-8')}", encoding="utf-8")

@@ -1,10 +1,12 @@
-"""Fixtures of all tests: the real capture, where it is present, and a fixed seed."""
+"""Fixtures of all tests: the real capture and a browser, where they are present, and a fixed seed."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from pathlib import Path
+from typing import Any, Iterator
 
 import pytest
 import torch
@@ -57,3 +59,16 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     root = tmp_path_factory.mktemp("tiny") / "table"
     return write_embedded_scene(root, views=12, width=64, height=48, points=900, samples=2)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("there is no Chromium (Debian: apt-get install chromium)")
+    with sync_api.sync_playwright() as playwright:
+        # A container's root has no sandbox; the page is our own.
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()

@@ -49,6 +49,17 @@ class TestSite:
             for host in ("fonts.googleapis.com", "unpkg.com/mermaid"):
                 assert host not in text, page
 
+    def test_the_search_works_where_the_page_is_opened_from_the_disk(self, site, browser):
+        page = browser.new_page()
+        troubles = []
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.goto((site / "index.html").as_uri())
+        page.keyboard.press("f")
+        page.locator("input.md-search__input").first.type("precompute", delay=50)
+        page.wait_for_selector(".md-search-result__item", state="attached", timeout=60_000)
+        assert troubles == []
+        page.close()
+
 
 @pytest.mark.slow
 def test_the_notebook_runs_and_comes_to_a_decision(tmp_path, monkeypatch):

@@ -138,19 +138,6 @@ def test_another_scene_and_a_place_that_cannot_be_written(
 # In a browser
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api")
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if path is None:
-        pytest.skip("there is no Chromium (Debian: apt-get install chromium)")
-    with sync_api.sync_playwright() as playwright:
-        # A container's root has no sandbox; the page is our own.
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield browser
-        browser.close()
-
-
 @pytest.fixture(params=["light", "dark"])
 def page(request: Any, browser: Any, page_path: Path) -> Iterator[Any]:
     context = browser.new_context(color_scheme=request.param, viewport={"width": 1280, "height": 900}, offline=True)

@@ -140,6 +140,21 @@ class TestBrowser:
             page.wait_for_timeout(500)
         pytest.fail(f"red and green: {self.shares(page)}; errors: {page.errors}")
 
+    def test_the_panel_folds_on_a_narrow_screen(self, page, runs, tiny_scene):
+        from legs_loss.viewer.server import serve
+
+        server, address = serve(find_content(runs / "red", tiny_scene), port=free_port())
+        try:
+            page.set_viewport_size({"width": 400, "height": 700})
+            page.goto(address)
+            label = page.locator("text=red: 400 Gaussians").first
+            label.wait_for(timeout=60_000)
+            assert 0 <= label.bounding_box()["x"] < 400
+            page.locator("text=Connected").first.click()
+            label.wait_for(state="hidden")
+        finally:
+            server.stop()
+
     def test_cameras_show_photographs_and_weight_maps(self, page, runs, tiny_scene):
         from legs_loss.viewer.server import serve
 

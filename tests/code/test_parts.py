@@ -73,7 +73,7 @@ def check(text: str) -> Module:
     whole = cst.parse_module(text)
     data = text.encode()
     wanted = [node.name.value for node in _functions(whole)]
-    functions = [module.top, *module.functions(bool)]
+    functions = [*module.scopes(bool)]
     assert [function.name for function in functions[1:]] == wanted
     counted = 0
     for function in functions:
@@ -119,7 +119,7 @@ def test_a_body_is_parsed_only_when_it_is_asked_for(monkeypatch: pytest.MonkeyPa
     again = Module("file.py", module.text)
     if len(again.outline_text) < len(module.text):  # before Python 3.8 a file is parsed as a whole
         assert not any("return" in text for text in parsed)
-        assert [f.name for f in again.functions(lambda text: "c(" in text)] == ["g"]
+        assert [f.name for f in again.scopes(lambda text: "c(" in text)] == ["g"]
         next(again.named("f")).flow.calls.clear()
         assert any("b(x" in text for text in parsed) and not any("c(1" in text for text in parsed)
 

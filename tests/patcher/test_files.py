@@ -231,7 +231,7 @@ class TestWhereItLooks:
         [
             (b"print 'hello'\n", "Python 2"),
             (b"def f(:\n", "does not parse (line 2)"),
-            (b"# -*- coding: latin-1 -*-\nx = '\xe9'\n", "not UTF-8 (it declares latin-1)"),
+            (b"# -*- coding: latin-1 -*-\nx = '\xe9'\n", "not UTF-8 (byte 31)"),
             (b"x = '\xe9'\n", "not UTF-8 (byte 5)"),
         ],
     )

@@ -156,7 +156,7 @@ class Function:
 
 
 class Class:
-    """A class: its methods, and the values that they store in its attributes."""
+    """A class: its methods, what its body assigns, and the values that methods store in its attributes."""
 
     def __init__(self, module: Module, node: cst.ClassDef, parent: Function) -> None:
         self.module = module
@@ -164,12 +164,8 @@ class Class:
         self.parent = parent
         self.name: str = node.name.value
         self.methods: Dict[str, Function] = {}
-        self.fields: Dict[str, cst.BaseExpression] = dict(_fields(node))
-
-    @property
-    def bases(self) -> List[str]:
-        """The last names of its base classes."""
-        return [(dotted(arg.value) or "").split(".")[-1] for arg in self.node.bases]
+        own = Flow(node.body).definitions
+        self.fields: Dict[str, Definition] = {name: made[-1] for name, made in own.items() if made[-1].kind == "assign"}
 
     def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
         """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""
@@ -182,22 +178,12 @@ class Class:
         return found
 
 
-def _fields(node: cst.ClassDef) -> Iterator[Tuple[str, cst.BaseExpression]]:
-    lines = [line.body for line in node.body.body if isinstance(line, cst.SimpleStatementLine)]
-    for small in (small for line in lines for small in line):
-        if isinstance(small, (cst.Assign, cst.AnnAssign)) and small.value is not None:
-            for target in [each.target for each in small.targets] if isinstance(small, cst.Assign) else [small.target]:
-                if isinstance(target, cst.Name):
-                    yield target.value, small.value
-
-
 class Module:
     """A parsed file.
 
     Attributes:
         text, lines: the file's text.
         outline, outline_text: the file without the bodies of its functions.
-        classes: every class in it, but for those that functions define.
         failure: why a body of it could not be parsed, or is not analysed further.
         budget: what its analysis may take, with that of the other files.
     """
@@ -212,11 +198,9 @@ class Module:
         self.outline_text: str = STUB.sub("0", self.outline.text.decode("utf-8"))
         self.failure: Optional[Unreadable] = None
         self.spend(parsing_steps(self.outline_text))
-        self.classes: List[Class] = []
         self.by_node: Dict[int, Function | Class] = {}
         self.top: Function = Function(self, self.outline.tree)
         self._by_word: Optional[Dict[str, List[Function]]] = None
-        self._says: Dict[str, bool] = {}
         self._cuts: Iterator[Optional[Cut]] = iter(cuts)
         self._functions = self.collect(self.outline.tree, self.top)
         self._cuts = iter(())
@@ -236,7 +220,6 @@ class Module:
                     function._inner = self.collect(node.body, function)
             else:
                 found = Class(self, node, parent)
-                self.classes.append(found)
                 self.by_node[id(node)] = found
                 functions += self.collect(node.body, parent, found)
         return functions
@@ -247,16 +230,6 @@ class Module:
         if why and self.failure is None:
             self.failure = Unreadable(self.path, why)
         return self.failure is None
-
-    def says(self, piece: str) -> bool:
-        """Return whether a piece of text is in the file, cached: each of its functions may ask."""
-        if piece not in self._says:
-            self._says[piece] = piece in self.text
-        return self._says[piece]
-
-    def functions(self, says: Callable[[str], object]) -> Iterator[Function]:
-        """Yield the functions whose text matches, methods and nested functions included, in source order."""
-        return _chosen(self._functions, says)
 
     def named(self, name: str) -> Iterator[Function]:
         """Yield the functions of this name."""

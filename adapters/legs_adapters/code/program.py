@@ -269,7 +269,7 @@ class Program(Checkout):
                 references.append(Reference("function", current.methods[name]))
                 break
             if name in current.fields:
-                references += self.resolve(current.parent, current.fields[name], depth + 1)
+                references += self.of_definition(current.parent, current.fields[name], depth)
             for method, definition in current.stores(name):
                 references += self.of_definition(method, definition, depth + 1)
         return _unique(references)

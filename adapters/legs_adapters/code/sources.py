@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
-import re
+import tokenize
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Sequence
@@ -19,9 +20,6 @@ __all__ = ["BOM", "Files", "Source", "Unreadable", "check_root", "decode", "read
 
 _MAX_UNREAD_BYTES = 64 << 20  # bytes in total; files over it are not searched for names
 BOM = b"\xef\xbb\xbf"
-
-_CODING = re.compile(rb"^[ \t\f]*#.*?coding[:=][ \t]*([-\w.]+)")
-_UTF8_NAMES = {"utf8", "utf-8", "utf_8", "u8", "utf8-sig", "utf-8-sig", "ascii", "us-ascii"}
 
 
 @dataclass(frozen=True)
@@ -121,17 +119,13 @@ def read_source(root: Path, path: str) -> Source | Unreadable:
 
 def decode(path: str, data: bytes) -> Source | Unreadable:
     """Decode a file's bytes as Python would, if it is UTF-8."""
-    for line in data[len(BOM) if data.startswith(BOM) else 0 :].split(b"\n")[:2]:
-        match = _CODING.match(line)
-        if match is not None:
-            name = match.group(1).decode("ascii", "replace").lower()
-            if name not in _UTF8_NAMES:
-                return Unreadable(path, f"not UTF-8 (it declares {name})")
-            break
-        if line.strip() and not line.lstrip().startswith(b"#"):
-            break
     try:
         text = data.decode("utf-8-sig")
+        encoding = tokenize.detect_encoding(io.BytesIO(data).readline)[0]
     except UnicodeDecodeError as error:
         return Unreadable(path, f"not UTF-8 (byte {error.start})")
+    except SyntaxError as error:
+        return Unreadable(path, f"not UTF-8 ({error})")
+    if encoding not in ("utf-8", "utf-8-sig", "ascii", "us-ascii"):
+        return Unreadable(path, f"not UTF-8 (it declares {encoding})")
     return Source(path, data, text)

@@ -22,6 +22,7 @@ from legs_adapters.code.syntax import (
     one_line,
     path_of,
     walk_expressions,
+    words,
 )
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.terms.findings import Findings, Left, Problem, Site
@@ -35,6 +36,7 @@ __all__ = ["with_masks"]
 
 _MASKED = f"{PACKAGE}.masked"
 _MOST = 100  # expressions that a rendering is followed through
+_SIDES = {"width", "height"}
 _ALL = (0, math.inf)
 _LEAVES = (cst.Return, cst.Continue, cst.Break, cst.Raise)
 
@@ -168,7 +170,7 @@ class _Finder:
             read = self._leak(pair.function, pair.prediction)
             if read is not None:
                 self.problems.append(pair.problem(pair.function, pair.node, "the rendering has no name"))
-        return [_site(line) for line in self.lines], self.problems
+        return [_site(line) for line in self.lines], list(dict.fromkeys(self.problems))
 
     # -- the place
 
@@ -229,7 +231,7 @@ class _Finder:
             for part, index in _places(node):
                 meaning = self.analysis.meanings.of(where, part)
                 is_picture = meaning.kind in ("image", None) and meaning.role in ("render", "both")
-                if part is not rendering and not is_picture:
+                if part is not rendering and not (is_picture and not _SIDES & set(words(path_of(part) or ""))):
                     continue
                 carriers.append(_Read(where, part, index))
                 for made in where.flow.reaching(part) if len(work) < _MOST else ():

@@ -1,0 +1,178 @@
+"""`legs-patch --masks` on a small script that trains on the CPU, from a scene with masks: every term is masked."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.patcher.support import checkout, files, legs_patch, snapshot
+from tests.support import legs_environment
+
+LINE = "        image = legs_loss.masked(image, gt_image)\n"
+SCRIPT = """
+import json
+import sys
+
+import torch
+from gaussian_renderer import render
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from utils.loss_utils import l1_loss, ssim
+
+
+def training(source_path):
+    gaussians = GaussianModel(3)
+    optimizer = torch.optim.SGD([gaussians._xyz], lr=0.1)
+    for viewpoint_cam in Scene(source_path).getTrainCameras():
+        image = render(viewpoint_cam, gaussians, None, None)["render"]
+        image.retain_grad()
+        drawn = image
+        gt_image = viewpoint_cam.original_image.to("cpu")
+        Ll1 = l1_loss(image, gt_image)
+        loss = 0.8 * Ll1 + 0.2 * (1.0 - ssim(image, gt_image))
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        print(json.dumps([float(loss).hex(), drawn.grad.abs().sum(0).tolist()]))
+
+
+if __name__ == "__main__":
+    training(sys.argv[2])
+"""
+FILES = {
+    **files("inria"),
+    "train.py": SCRIPT,
+    "scene/__init__.py": """
+from pathlib import Path
+
+import numpy
+import torch
+from PIL import Image
+from scene.cameras import Camera
+
+
+class Scene:
+    def __init__(self, source_path):
+        self.paths = sorted(Path(source_path, "images").iterdir())
+
+    def getTrainCameras(self):
+        pixels = [torch.from_numpy(numpy.array(Image.open(path))).float().div(255) for path in self.paths]
+        return [Camera(path.stem, one.movedim(-1, 0)) for path, one in zip(self.paths, pixels)]
+""",
+    "scene/gaussian_model.py": """
+import torch
+
+
+class GaussianModel:
+    def __init__(self, sh_degree):
+        self._xyz = torch.nn.Parameter(torch.full((3, 16, 20), 0.5))
+
+    def __call__(self, camera):
+        return self._xyz * 1.0
+""",
+}
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Two photographs of noise; of the first the left half does not count. With a store, and without."""
+    generator = np.random.default_rng(0)
+    for folder in ("images", "masks"):
+        (tmp_path / "scene" / folder).mkdir(parents=True)
+    for name in ("a", "b"):
+        pixels = generator.integers(0, 256, (16, 20, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(tmp_path / "scene" / "images" / f"{name}.png")
+    mask = np.full((16, 20), 255, np.uint8)
+    mask[:, :10] = 0
+    Image.fromarray(mask).save(tmp_path / "scene" / "masks" / "a.png")
+    return tmp_path / "scene"
+
+
+def python(*words, **options):
+    done = subprocess.run(
+        [sys.executable, *map(str, words)],
+        env=legs_environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+        **options,
+    )
+    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")], done.stderr
+
+
+def precompute(scene):
+    command = ["-m", "legs_loss", "precompute", scene, "--masks", "masks", "--workers", "1"]
+    subprocess.run([sys.executable, *map(str, command)], env=legs_environment(), capture_output=True, check=True)
+
+
+def test_a_patched_run_masks_every_term_and_without_masks_nothing_changes(scene, tmp_path):
+    plain, masked = (checkout(tmp_path / name, FILES) for name in ("plain", "masked"))
+    assert legs_patch(plain).returncode == 0
+    before = snapshot(masked)
+    assert legs_patch("--masks", masked).returncode == 0
+    assert (masked / "train.py").read_text().count(LINE) == 1
+    without = [python("train.py", "-s", scene, cwd=root)[0] for root in (plain, masked)]
+    assert without[0] == without[1]  # no store: the same to the last bit
+    precompute(scene)
+    (first, second), said = python("train.py", "-s", scene, cwd=masked)
+    gradient = np.array(first[1])
+    assert not gradient[:, :10].any() and gradient[:, 10:].all()
+    assert np.array(second[1]).all()  # it has no mask
+    assert "masks: 1 view(s) masked, 1 without a mask counted whole" in said and "in the L1 alone" not in said
+    (first, _), said = python("train.py", "-s", scene, cwd=plain)
+    assert np.array(first[1])[:, :10].any() and "in the L1 alone: legs-patch --masks" in said  # by its SSIM
+    assert legs_patch("--undo", masked).returncode == 0
+    assert snapshot(masked) == before
+
+
+def test_in_memory(scene, tmp_path):
+    precompute(scene)
+    root = checkout(tmp_path / "gs", FILES)
+    before = snapshot(root)
+    (first, _), said = python("-m", "legs_loss", "run", "--masks", root / "train.py", "-s", scene)
+    assert not np.array(first[1])[:, :10].any()
+    assert "is masked, in every term that gets the rendering, in this run" in said
+    assert snapshot(root) == before
+
+
+def test_a_codebase_that_was_patched_before_gets_the_line_and_nothing_twice(tmp_path):
+    root = checkout(tmp_path, FILES)
+    before = snapshot(root)
+    assert legs_patch(root).returncode == 0
+    once = (root / "train.py").read_text()
+    diff = legs_patch("--masks", "--diff", root).stdout
+    assert [line for line in diff.splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")] == [
+        f"+{LINE.rstrip()}"
+    ]
+    found = json.loads(legs_patch("--masks", "--json", root).stdout)
+    assert [(site["line"], site["term"]) for site in found["sites"]] == [(21, "mask")]
+    assert (root / "train.py").read_text().replace(LINE, "") == once
+    assert "nothing to do" in legs_patch("--masks", root).stdout
+    assert legs_patch("--undo", root).returncode == 0
+    assert snapshot(root) == before
+
+
+def test_a_line_that_has_to_be_written_by_hand(tmp_path):
+    text = SCRIPT.replace("l1_loss(image, gt_image)", 'l1_loss(image, gt_image.to("cpu"))')
+    root = checkout(tmp_path, {**FILES, "train.py": text})
+    done = legs_patch("--masks", root)
+    assert done.returncode == 1 and "wrote train.py" in done.stdout
+    assert "not masked: the photograph has no name" in done.stderr
+    assert 'image = legs_loss.masked(image, gt_image.to("cpu")) before every term' in done.stderr
+    strict = legs_patch("--masks", "--strict", checkout(tmp_path / "strict", {**FILES, "train.py": text}))
+    assert strict.returncode == 2 and "nothing was changed" in strict.stderr
+
+
+def test_line_ends_and_an_edit_since(tmp_path):
+    root = checkout(tmp_path, {**FILES, "train.py": SCRIPT.replace("\n", "\r\n")})
+    assert legs_patch("--masks", root).returncode == 0
+    data = (root / "train.py").read_bytes()
+    assert data.count(b"\n") == data.count(b"\r\n") and LINE.encode().strip() in data
+    (root / "train.py").write_bytes(data.replace(b"0.8", b"0.7"))
+    assert legs_patch("--undo", "--force", root).returncode == 0
+    assert (root / "train.py").read_bytes() == SCRIPT.replace("\n", "\r\n").replace("0.8", "0.7").encode()

@@ -131,8 +131,10 @@ def masked(prediction: Tensor, target: Tensor) -> Tensor:
     first = layout.channels_first(aligned)
     with torch.no_grad():
         mask = run.source.own(first, [None] * (first.shape[0] if first.dim() == 4 else 1), MASK)
+    run.tell_at_end()
     if mask is None:
         return prediction
+    counted.hidden += 1
     left_out = layout.restored((mask == 0).expand_as(first)).reshape(prediction.shape)
     return torch.where(left_out, aligned.reshape(prediction.shape).to(prediction.dtype), prediction)
 

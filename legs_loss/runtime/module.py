@@ -14,7 +14,7 @@ from legs_loss.levels import RunningLevels, response_levels
 from legs_loss.loss import legs_loss
 from legs_loss.responses import response
 from legs_loss.runtime.call import Call
-from legs_loss.runtime.state import Run
+from legs_loss.runtime.state import Run, counted
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.weights import weight_map
 
@@ -105,6 +105,7 @@ class LEGSLoss(nn.Module):
             if mask is not None:  # the call's own is not renormalised: a factor of the weight
                 weight = mask.float() if weight is None else weight * mask
             mask, renormalise = found.mask, True
+            counted.hidden += 1
             prediction = torch.where(mask == 0, target.to(prediction.dtype), prediction)
         run.say_what_is_used()
         return legs_loss(

@@ -46,8 +46,9 @@ class Counts:
         remembered: images whose weight was taken from the memo.
         stored: images whose weight map was taken from the store.
         computed: images whose weight was computed from them.
-        masked: images that were trained on with a mask of the store.
-        unmasked: images that were not found in a store with masks, and counted whole.
+        masked: images whose L1 was the mean over what a mask of the store counts.
+        unmasked: images of the L1 that were not found in a store with masks, and counted whole.
+        hidden: renderings whose masked pixels were hidden from the other terms, by `masked` or `LEGSLoss`.
     """
 
     weighted: int = 0
@@ -57,6 +58,7 @@ class Counts:
     computed: int = 0
     masked: int = 0
     unmasked: int = 0
+    hidden: int = 0
 
 
 class WeightSource:
@@ -81,7 +83,8 @@ class WeightSource:
         """Return the weights of a call's target, with the user's own, and count their sources."""
         names = call.view_names()
         weights = Weights() if self.config.spec.unweighted else self._made_weights(call, names)
-        own, mask = (self.own(call.target, names, kind) for kind in (WEIGHTS, MASK))
+        own = self.own(call.target, names, WEIGHTS)
+        mask = self.own(call.target, names, MASK, counted=True)
         if own is not None:
             weights = weights._replace(map=own if weights.map is None else weights.map * own)
         return weights if mask is None else weights._replace(mask=mask, renormalise=True)
@@ -90,7 +93,7 @@ class WeightSource:
         """Return whether the store has masks or weights of the user's, which hold for every preset."""
         return self.stored.has(MASK) or self.stored.has(WEIGHTS)
 
-    def own(self, target: Tensor, names: Sequence[Optional[str]], kind: str) -> Optional[Tensor]:
+    def own(self, target: Tensor, names: Sequence[Optional[str]], kind: str, counted: bool = False) -> Optional[Tensor]:
         """Return the user's masks or weights of a target, [1, H, W] or [B, 1, H, W]; None where all counts whole.
 
         Raises:
@@ -104,7 +107,7 @@ class WeightSource:
             self.memo.recall(image, partial(self.stored.own, image, name, kind), kind)
             for image, name in zip(_images(target), names)
         ]
-        if kind == MASK:
+        if counted:
             self._counts.masked += sum(one.dim() == 3 for one in maps)
             self._counts.unmasked += sum(one.dim() == 2 for one in maps)
         if not any(one.dim() == 3 for one in maps):

@@ -75,12 +75,17 @@ class Run:
             weights = f"maps from {self.config.store}, but for {counted.computed} image(s), whose weight is computed"
         if self.source.stored.has(MASK):
             weights += f"; masks from {self.config.store}"
-            _masked.append(self)
+            self.tell_at_end()
         self.say_once(
             "active",
             f"L1 weighted, preset {self.config.preset}: {spec.operator}, {spec.curve}, beta {spec.beta:g}; {weights}; "
             f"settings from {self.config.source}",
         )
+
+    def tell_at_end(self) -> None:
+        """Have the process's last line say what the masks of this run were used for."""
+        if not _masked or _masked[-1] is not self:
+            _masked.append(self)
 
 
 class _Thread(threading.local):
@@ -112,7 +117,8 @@ def current_run() -> Run:
 def _say_masked() -> None:
     """Print, as the process ends, what the masks of its last run were used for."""
     if _masked:
-        say(f"legs-loss: {_masked[-1].source.stored.masked.summary(counted.unmasked)}", sys.stderr)
+        masked, in_l1_alone = _masked[-1].source.stored.masked, counted.masked > 0 and counted.hidden == 0
+        say(f"legs-loss: {masked.summary(counted.unmasked, in_l1_alone)}", sys.stderr)
 
 
 def spec_to_compile(version: int) -> Optional[WeightSpec]:

@@ -41,11 +41,12 @@ class Masked:
         self.views: Set[str] = set()
         self.whole: Set[str] = set()
 
-    def summary(self, absent: int) -> str:
+    def summary(self, absent: int, in_l1_alone: bool) -> str:
         """Return the line of a run's end; ``absent`` is how often an image was not found."""
         parts = [f"{len(self.views)} view(s) masked"]
         parts += [f"{len(self.whole)} without a mask counted whole"] if self.whole else []
         parts += [f"{absent} training image(s) were NOT FOUND in the store, so NOT MASKED"] if absent else []
+        parts += ["in the L1 alone: legs-patch --masks hides masked pixels from other terms"] if in_l1_alone else []
         return f"masks: {', '.join(parts)}"
 
 

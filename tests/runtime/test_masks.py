@@ -19,6 +19,7 @@ from tests.runtime.support import plain
 from tests.support import legs_environment
 
 HEIGHT, WIDTH = 9, 8
+ALONE = "legs-patch --masks hides masked pixels from other terms"
 
 
 @pytest.fixture
@@ -83,7 +84,7 @@ class TestLoss:
             found = torch.autograd.grad(loss, prediction)[0]
             torch.testing.assert_close(found, torch.autograd.grad(expected, prediction)[0], rtol=2e-3, atol=1e-8)
             assert not found[:, torch.from_numpy(mask == 0)].any()
-        assert (counts().masked, counts().unmasked) == (2, 0)
+        assert (counts().masked, counts().unmasked, counts().hidden) == (2, 0, 0)
 
     def test_what_a_codebase_does_with_the_map_is_the_mean_over_what_counts_too(self, scene):
         stored(scene, masks="masks")
@@ -136,11 +137,15 @@ class TestMasked:
             left_out = torch.from_numpy(mask == 0)
             assert torch.equal(image[:, left_out], target[:, left_out])
             assert torch.equal(image[:, ~left_out], prediction[:, ~left_out])
-            loss = l1_loss(image, target) + legs_loss.d_ssim(image, target) + (image - target).square().mean()
+            loss = l1_loss(image, target)
+            assert (counts().masked, counts().hidden) == (1, 1)  # a view that both get is not counted twice
+            state.reset_counts()
+            loss = loss + legs_loss.d_ssim(image, target) + (image - target).square().mean()
             loss.backward()
             assert not prediction.grad[:, left_out].any()
             assert prediction.grad[:, ~left_out].all()
             torch.testing.assert_close(l1_loss(image, target), l1_loss(prediction, target))
+            state.reset_counts()
 
     def test_it_keeps_the_predictions_shape(self, scene):
         stored(scene, masks="masks")
@@ -182,7 +187,7 @@ class TestNoSilence:
             call(torch.rand(target.shape, requires_grad=True), target)
         said = capsys.readouterr().err
         assert said.count("NOT MASKED") == 1 and reason in said
-        assert counts().unmasked == 3
+        assert counts().unmasked == (3 if call is l1_loss else 0)
 
     def test_every_target_is_looked_up_however_many_are_not_found(self, scene):
         stored(scene, masks="masks")
@@ -231,7 +236,8 @@ class TestNoSilence:
         stored(scene, "3dgs", masks="masks")
         assert active()
 
-    def test_the_end_says_what_was_masked(self, scene):
+    @pytest.mark.parametrize("hidden", [False, True])
+    def test_the_end_says_what_was_masked(self, scene, hidden):
         stored(scene, masks="masks")
         code = (
             "import sys, numpy, torch, legs_loss; from PIL import Image\n"
@@ -240,17 +246,78 @@ class TestNoSilence:
             f"    pixels = numpy.array(Image.open({str(scene / 'images')!r} + f'/{{name}}.png'))\n"
             "    target = torch.from_numpy(pixels).float().div(255).movedim(-1, 0)\n"
             "    for one in (target, target.flip(-1)):\n"
-            "        legs_loss.l1_loss(torch.rand(one.shape, requires_grad=True), one)\n"
+            "        image = torch.rand(one.shape, requires_grad=True)\n"
+            f"        image = legs_loss.masked(image, one) if {hidden} else image\n"
+            "        legs_loss.l1_loss(image, one)\n"
         )
         done = subprocess.run(
             [sys.executable, "-c", code], env=legs_environment(), capture_output=True, text=True, check=True
         )
         lines = done.stderr.splitlines()
-        assert lines[-1] == (
+        whole = (
             "legs-loss: masks: 2 view(s) masked, 1 without a mask counted whole, "
             "3 training image(s) were NOT FOUND in the store, so NOT MASKED"
         )
+        assert lines[-1] == whole + ("" if hidden else ", in the L1 alone: " + ALONE)
         assert sum("masks from" in line for line in lines) == 1
+
+
+class TestLibraries:
+    """gsplat's and nerfstudio's losses, as their hooks have them: no term sees a masked pixel."""
+
+    def test_gsplat(self, scene, tmp_path, monkeypatch):
+        stored(scene, masks="masks")
+        package = tmp_path / "gsplat"
+        package.mkdir()
+        (package / "__init__.py").write_text("")
+        (package / "losses.py").write_text(
+            "def l1_loss(pred, target):\n    return (pred - target).abs()\n\n\n"
+            "def ssim_loss(pred, target, padding='valid'):\n    return (pred - target).square().mean()\n"
+        )
+        monkeypatch.syspath_prepend(str(tmp_path))
+        prediction, target = rendering(), photograph(scene, "a")
+        with legs_loss.apply_to_gsplat():
+            from gsplat import losses
+
+            image, pixels = prediction.movedim(0, -1)[None], target.movedim(0, -1)[None]
+            loss = losses.l1_loss(image, pixels).mean()
+            loss = loss + losses.ssim_loss(image.permute(0, 3, 1, 2), pixels.permute(0, 3, 1, 2), padding="valid")
+        sys.modules.pop("gsplat.losses"), sys.modules.pop("gsplat")
+        loss.backward()
+        left_out = torch.from_numpy(masks()["a"] == 0)
+        assert not prediction.grad[:, left_out].any() and prediction.grad[:, ~left_out].all()
+        assert (counts().masked, counts().hidden) == (1, 1)
+
+    def test_nerfstudio(self, scene):
+        from legs_adapters.upstreams.nerfstudio import weighted
+
+        stored(scene, masks="masks")
+        target = photograph(scene, "a").movedim(0, -1)
+
+        class Model:
+            class config:
+                ssim_lambda = 0.2
+
+            def get_gt_img(self, image):
+                return image
+
+            def composite_with_background(self, image, background):
+                return image
+
+            def get_loss_dict(self, outputs, batch, metrics_dict=None):
+                difference = outputs["rgb"] - batch["image"]
+                return {"main_loss": 0.8 * difference.abs().mean() + 0.2 * difference.square().mean()}
+
+        prediction = torch.rand(HEIGHT, WIDTH, 3, requires_grad=True)
+        outputs, batch = {"rgb": prediction, "background": None}, {"image": target}
+        loss = weighted(Model(), Model().get_loss_dict, outputs, batch, None)["main_loss"]
+        loss.backward()
+        left_out = torch.from_numpy(masks()["a"] == 0)
+        assert not prediction.grad[left_out].any() and prediction.grad[~left_out].all()
+        seen = torch.where(left_out[..., None], target, prediction.detach())
+        expected = 0.8 * by_hand(prediction.movedim(-1, 0), target.movedim(-1, 0), masks()["a"])
+        expected = expected + 0.2 * (seen - target).square().mean()
+        assert loss.item() == pytest.approx(expected.item(), rel=2e-4)
 
 
 class TestModule:

@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import importlib
 import sys
-from typing import Any, Dict, Optional
+from typing import Any, Callable, Dict, Optional
 
 import legs_loss
 from legs_loss.config import find_config
@@ -65,8 +65,9 @@ def apply(applied: Applied) -> None:
 
     @functools.wraps(own)
     def get_loss_dict(self: Any, outputs: Any, batch: Any, metrics_dict: Any = None) -> Dict[str, Any]:
-        losses = own(self, outputs, batch, metrics_dict)
-        return losses if isinstance(self, _Weighted) else weighted(self, losses, outputs, batch)
+        if isinstance(self, _Weighted):
+            return own(self, outputs, batch, metrics_dict)
+        return weighted(self, functools.partial(own, self), outputs, batch, metrics_dict)
 
     applied.replace(model, "get_loss_dict", get_loss_dict)
 
@@ -87,7 +88,7 @@ def legs_model(base: Any) -> Any:
 
         def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> Dict[str, Any]:
             """Return splatfacto's losses, the L1 share of ``main_loss`` weighted."""
-            return weighted(self, super().get_loss_dict(outputs, batch, metrics_dict), outputs, batch)
+            return weighted(self, super().get_loss_dict, outputs, batch, metrics_dict)
 
     SplatfactoLegsModel.__module__, SplatfactoLegsModel.__qualname__ = __name__, "SplatfactoLegsModel"
     return SplatfactoLegsModel
@@ -107,16 +108,25 @@ def _configure(config: Any) -> None:
         legs_loss.configure(dataclasses.replace(base, **given) if given else preset)
 
 
-def weighted(model: Any, losses: Dict[str, Any], outputs: Any, batch: Any) -> Dict[str, Any]:
-    """Return splatfacto's losses with the L1 share of ``main_loss`` weighted, in training and while LEGS is on."""
+def weighted(
+    model: Any, own: Callable[..., Dict[str, Any]], outputs: Any, batch: Any, metrics_dict: Any
+) -> Dict[str, Any]:
+    """Return splatfacto's losses with the L1 share of ``main_loss`` weighted, in training and while LEGS is on.
+
+    Masked pixels of a store are hidden from all of them.
+    """
+    if not outputs["rgb"].requires_grad or not active():
+        return own(outputs, batch, metrics_dict)
     # The rendering and the photograph as splatfacto's own loss compares them.
     target = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
     prediction = outputs["rgb"]
     if "mask" in batch:
         mask = model._downscale_if_required(batch["mask"]).to(model.device)
         prediction, target = prediction * mask, target * mask
-    if not prediction.requires_grad or not active():
-        return losses
+    else:
+        prediction = legs_loss.masked(prediction, target)
+        outputs = {**outputs, "rgb": prediction}
+    losses = own(outputs, batch, metrics_dict)
     plain = legs_loss.weighted_l1(prediction, target, channels_last=True)
     change = legs_loss.l1_loss(prediction, target, channels_last=True) - plain
     return {**losses, "main_loss": losses["main_loss"] + (1.0 - model.config.ssim_lambda) * change}

@@ -1,6 +1,7 @@
 """Draw a contact sheet (PNG): photograph, mask, response and weight map of some views, and the curves.
 
-The maps of a SCENE or an IMAGE are computed; those of a STORE are drawn with the photographs of its scene.
+The maps of a SCENE or an IMAGE are computed; those of a STORE are drawn with the photographs of its scene. Masks are of
+--masks or of the scene's own store.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("path", metavar="SCENE|STORE|IMAGE", help="what to show")
     parser.add_argument("--views", nargs="+", metavar="VIEW", help=f"names of views; default: {_AT_MOST} spread evenly")
+    parser.add_argument("--masks", metavar="DIR|alpha", help="as of legs precompute; default: those of a store")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="default: legs")
     parser.add_argument("--out", default="sheet.png", metavar="PNG", help="default: sheet.png")
 
@@ -40,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draw and save the sheet."""
     from legs_loss.errors import LegsError
+    from legs_loss.precompute.own_maps import OwnMaps, is_below
     from legs_loss.report.sheet import save_sheet
     from legs_loss.scenes import View, read_scene
     from legs_loss.spec import as_spec
@@ -49,14 +52,15 @@ def run(args: argparse.Namespace) -> int:
     if not path.exists():
         raise LegsError(f"there is no file or folder {path}: give a scene, a store or a photograph")
     shown: Dict[str, Callable[[], Shown]] = {}  # by the view's name
-    if path.is_file() and path.name != MANIFEST:
-        shown[path.name] = partial(_computed, View(path.name, path), spec, None)
-    elif (path / MANIFEST).is_file():
+    if (path / MANIFEST).is_file():
+        if args.masks is not None:
+            raise LegsError("--masks is for a scene or a photograph: a store has the masks that it was made with")
         shown = _stored(path, spec)
     else:
-        views = read_scene(path).views
-        scene = _levels(views, spec)
-        shown = {view.name: partial(_computed, view, spec, scene) for view in views}
+        views = (View(path.name, path),) if path.is_file() else read_scene(path).views
+        views = tuple(view for view in views if not is_below(view.path, path, OwnMaps(args.masks)))
+        masks, scene = _masks(path, views, args.masks), _levels(views, spec)
+        shown = {view.name: partial(_computed, view, spec, scene, masks.get(view.name)) for view in views}
     names = _choose(list(shown), args.views)
     title = f"{args.preset}: {spec.operator}, p = {spec.p:g}, {spec.curve}, beta = {spec.beta:g}"
     save_sheet(args.out, [shown[name]() for name in names], spec, f"{path.resolve().name}   ·   {title}")
@@ -64,15 +68,39 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor]) -> Shown:
+def _masks(path: Path, views: Sequence[View], named: Optional[str]) -> Dict[str, Callable[[], np.ndarray]]:
+    """Return what reads the mask of each view that has one: of a folder, its alpha, or of the scene's store."""
+    from legs_loss.config import STORE_FOLDER
+    from legs_loss.precompute.own_maps import ALPHA, own_folder
+    from legs_loss.scenes import image_size
+    from legs_loss.scenes.own_maps import find_maps, has_alpha, read_alpha, read_map_file
+    from legs_loss.store import MANIFEST, MASK, WeightStore
+
+    if named == ALPHA:
+        return {view.name: partial(read_alpha, view.path) for view in views if has_alpha(view.path)}
+    if named is not None:
+        sizes = {view.name: image_size(view.path) for view in views}
+        found = find_maps(own_folder(path, named), views)
+        return {name: partial(read_map_file, file, sizes[name]) for name, file in found.items()}
+    if not (path / STORE_FOLDER / MANIFEST).is_file():
+        return {}
+    store = WeightStore(path / STORE_FOLDER)
+    return {entry.view: partial(store.own_map, entry) for entry in store.of_kind(MASK)}
+
+
+def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor], mask: Optional[Callable[[], np.ndarray]]) -> Shown:
     from legs_loss.precompute import normalised_map, response_map
     from legs_loss.report.sheet import Shown
     from legs_loss.scenes import load_training_image
+    from legs_loss.scenes.own_maps import averaged
 
     photograph = load_training_image(view)
     if spec.over == "image":
-        return Shown(view.name, photograph, normalised_map(photograph, spec))
-    return Shown(view.name, photograph, _over_scene(response_map(photograph, spec), spec, scene))
+        normalised = normalised_map(photograph, spec)
+    else:
+        normalised = _over_scene(response_map(photograph, spec), spec, scene)
+    height, width = normalised.shape
+    return Shown(view.name, photograph, normalised, None if mask is None else averaged(mask(), (width, height)))
 
 
 def _over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor]) -> np.ndarray:

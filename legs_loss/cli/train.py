@@ -173,4 +173,6 @@ def _print(metrics: Dict[str, Any]) -> None:
         texts = [f"{METRICS[key].label} {value:{METRICS[key].format}}" for key, value in scores.items()]
         if texts:
             say(f"{views}: {', '.join(texts)}")
+    if "masked_views" in metrics:
+        say(f"masks: {metrics['masked_views']} training views masked; scores are of the pixels that count")
     say(f"{metrics['gaussians']} Gaussians, {metrics['seconds']:.0f} s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Dict, Sequence
 
 import torch
@@ -33,7 +34,7 @@ def prove_unweighted(views: Sequence[TrainingView], config: TrainConfig) -> Dict
     generator = torch.Generator().manual_seed(0)
     ours_sum = theirs_sum = worst = 0.0
     for view in views:
-        weight = step_weight(view.weight, view, config)
+        weight = step_weight(view.weight, replace(view, mask=None), config)
         if weight is not None and not bool((weight == 1).all()):
             raise LegsError(
                 f"the baseline is weighted: {view.name} has a weight map of mean {float(weight.mean()):.3f}: "

@@ -19,7 +19,7 @@ from legs_loss.experiments.running import read_rows, scene_of
 from legs_loss.experiments.statistics import COLUMNS, Difference, difference, summarise_all, times_gaussians
 from legs_loss.experiments.tables import LABELS, MISSING, difference_cell, score_cells, times_cell, with_values
 from legs_loss.levels import levels_of
-from legs_loss.reference.training.dataset import load_dataset, load_view, split_views
+from legs_loss.reference.training.dataset import load_dataset, load_view, open_store, split_views, with_own_maps
 from legs_loss.reference.training.trainer import TrainConfig
 from legs_loss.report.html_pictures import FORMATS as IMAGE_FORMATS
 from legs_loss.report.html_pictures import Pictures, draw_row, encode
@@ -68,8 +68,8 @@ def write_report(
     base = TrainConfig.from_dict(settings["base"])
     levels = _scene_levels(read, base, first)
     folders = {arm: run / parse_arm(arm).folder / f"seed-{first[arm]['seed']}" for arm in names}
-    drawn = []
-    for view in (load_view(read, view, base.resolution) for view in shown):
+    drawn, store = [], open_store(read)
+    for view in (with_own_maps(load_view(read, view, base.resolution), store, needed=False) for view in shown):
         drawn.append((view, {arm: draw_row(first[arm], folders[arm], view, levels.get(arm)) for arm in names}))
     for form in IMAGE_FORMATS:
         page = _page(settings, rows, names, [encode(view, each, form) for view, each in drawn], first, run)

@@ -18,6 +18,7 @@ from legs_loss.reference.ply import read_ply
 from legs_loss.reference.training.dataset import TrainingView, shuffled
 from legs_loss.reference.training.trainer import TrainConfig, draw, point_cloud, step_weight
 from legs_loss.scenes import image_tensor, open_image
+from legs_loss.scenes.own_maps import dimmed
 from legs_loss.weights import weight_map
 
 __all__ = ["KINDS", "Drawn", "Pictures", "differing", "draw_row", "encode", "read_picture"]
@@ -42,7 +43,8 @@ class Drawn(NamedTuple):
 class Pictures(NamedTuple):
     """A view as a report shows it.
 
-    images: data URIs by arm and kind of picture; the photograph is an arm named "photograph" with a rendering only.
+    images: data URIs by arm and kind of picture; the photograph is an arm named "photograph" with a rendering only,
+        darkened where its mask leaves it out, as are errors there.
     most_error, most_weight: what the brightest colour of the error and of the weight maps stands for.
     crops: for each pair of arms, sorted, windows (left, top, width, height) where their errors differ most.
     """
@@ -93,10 +95,10 @@ def encode(view: TrainingView, drawn: Mapping[str, Drawn], form: Mapping[str, An
     """Return a view's pictures. All error maps have one scale, and so have all weight maps (from 0)."""
     from matplotlib import colormaps
 
-    errors = {arm: (one.rendering - view.image).abs().mean(0) for arm, one in drawn.items()}
+    errors = {arm: (view.hidden(one.rendering) - view.image).abs().mean(0) for arm, one in drawn.items()}
     most_error = float(np.quantile(torch.stack(list(errors.values())).numpy(), 0.995)) or 1.0
     most_weight = max(2.0, *(float(one.weight.max()) for one in drawn.values()))
-    images = {"photograph": {"rendering": _uri(_bytes(view.image), form)}}
+    images = {"photograph": {"rendering": _uri(_bytes(dimmed(view.image, view.mask)), form)}}
     for arm, one in drawn.items():
         images[arm] = {
             "rendering": _uri(_bytes(one.rendering), form),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Dict, Iterable, List, Sequence, Tuple, Type
+from typing import Any, Dict, Iterable, List, Sequence, Tuple, Type
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from legs_loss.scenes.images import colour_mode, open_image
 from legs_loss.scenes.model import View
 from legs_loss.system import open_regular, write_whole
 
-__all__ = ["averaged", "file_names", "find_maps", "has_alpha", "read_alpha", "read_map_file", "write_gray"]
+__all__ = ["averaged", "dimmed", "file_names", "find_maps", "has_alpha", "read_alpha", "read_map_file", "write_gray"]
 
 _GRAY = 32  # of 255: the colours of a pixel of a gray JPEG differ less
 _LARGEST = 1 << 29  # values of a .npy
@@ -137,6 +137,11 @@ def averaged(values: np.ndarray, size: Tuple[int, int]) -> np.ndarray:
     if values.shape == (size[1], size[0]):
         return values
     return np.asarray(Image.fromarray(values).resize(size, _BOX))
+
+
+def dimmed(image: Any, mask: Any) -> Any:
+    """Return a photograph [3, H, W] with what its mask [H, W] leaves out at a quarter of its light; None: as it is."""
+    return image if mask is None else image * (0.25 + 0.75 * mask)
 
 
 def _check_ratio(map_size: Tuple[int, int], size: Tuple[int, int]) -> None:

@@ -11,8 +11,11 @@ import numpy as np
 
 from legs_loss.errors import LegsError
 from legs_loss.reference.ply import read_ply
+from legs_loss.reference.training.dataset import open_store
 from legs_loss.scenes import View, image_tensor, load_training_image
+from legs_loss.scenes.own_maps import averaged, dimmed
 from legs_loss.spec import as_spec
+from legs_loss.store import MASK
 from legs_loss.system import say
 from legs_loss.viewer.content import Content
 from legs_loss.viewer.guard import Guard, check_address
@@ -161,6 +164,8 @@ class _Cameras:
         step = max(1, -(-len(with_camera) // _CAMERAS))
         self.content, self.spec, self.views = content, as_spec(preset), with_camera[::step]
         self.levels: Any = None
+        self.store = open_store(content.scene)
+        self.masks = {entry.view: entry for entry in self.store.of_kind(MASK)} if self.store is not None else {}
         poses = [_pose(view) for view in self.views]
         size = 0.08 * float(np.ptp([position for _, position in poses], axis=0).max()) if len(poses) > 1 else 0.2
         self.handles = [self._add(server, view, *pose, size or 0.2) for view, pose in zip(self.views, poses)]
@@ -199,10 +204,17 @@ class _Cameras:
         key = self.what.value, view.name
         if key not in self.pictures:
             try:
-                self.pictures[key] = self._weight(view) if key[0] == "weight map" else _photograph(view)
+                self.pictures[key] = self._weight(view) if key[0] == "weight map" else self._photograph(view)
             except LegsError:
                 return None  # the photograph is missing: the outline stays
         return self.pictures[key]
+
+    def _photograph(self, view: View) -> np.ndarray:
+        """Return a photograph, darkened where its mask leaves it out, uint8 [H, W, 3]."""
+        image, mask = _image(view).expand(3, -1, -1).numpy(), None
+        if view.name in self.masks and self.store is not None:
+            mask = averaged(self.store.own_map(self.masks[view.name]), image.shape[:0:-1])
+        return (dimmed(image, mask).transpose(1, 2, 0) * 255).round().astype(np.uint8)
 
     def _weight(self, view: View) -> np.ndarray:
         """Return a weight map from black (1) to white (1 + beta), uint8 [H, W, 3]."""
@@ -213,11 +225,6 @@ class _Cameras:
             self.levels = levels_of(map(_image, self.views), self.spec)
         gray = (weight_map(_image(view), self.spec, scene=self.levels)[0].numpy() - 1) / max(self.spec.beta, 1e-6)
         return np.repeat((gray.clip(0, 1) * 255).round().astype(np.uint8)[..., None], 3, axis=2)
-
-
-def _photograph(view: View) -> np.ndarray:
-    """Return a photograph, uint8 [H, W, 3]."""
-    return (_image(view).expand(3, -1, -1).permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
 
 
 def _image(view: View) -> Any:

@@ -76,6 +76,8 @@ def test_from_masks_to_images_for_other_programs(scene, tmp_path):
     assert "2 maps; white is a weight of 11" in legs("export", scene, out)
     for folder, most, step in (("weights_8bit", 255, 1), ("weights_16bit", 65535, 8)):
         first, second = (np.asarray(Image.open(out / folder / f"cam/{name}.png")) for name in "ab")
+        header = (out / folder / "cam/a.png").read_bytes()[24:26]
+        assert tuple(header) == (16 if most > 255 else 8, 0)  # bits, gray: as other programs read it
         assert second.max() == most and first[:, :20].max() == 0
         # Flat, so W = 1, times the user's 0.5, of a largest weight of 11.
         assert abs(int(first[20, 30]) - most * 0.5 / 11) <= step
@@ -93,6 +95,40 @@ def test_a_mostly_masked_view_is_named(scene):
     Image.fromarray(mask).save(scene / "masks/b.png")
     legs("precompute", scene, "--workers", 1, "--masks", "masks")
     assert "masked by more than half: images/cam/b.png" in legs("info", scene)
+
+
+def test_show_draws_masks_before_there_is_a_store_and_of_the_store(scene, tmp_path):
+    pytest.importorskip("matplotlib")
+    legs("masks", scene, "--from", "saturated", "dark")
+
+    def drawn(*options):
+        legs("show", scene, "--out", tmp_path / "sheet.png", *options)
+        with Image.open(tmp_path / "sheet.png") as sheet:
+            return np.array(sheet.convert("RGB")).astype(int)
+
+    plain, masked = drawn(), drawn("--masks", "masks")
+    assert masked.shape[0] > plain.shape[0]
+    legs("precompute", scene, "--workers", 1, "--masks", "masks")
+    np.testing.assert_array_equal(drawn(), masked)
+    said = legs("show", scene / "legs_weights", "--masks", "masks", code=2)
+    assert "a store has the masks that it was made with" in said
+
+
+def test_the_viewer_darkens_what_a_mask_leaves_out(scene):
+    pytest.importorskip("numba")
+    from legs_loss.scenes import read_scene
+    from legs_loss.store import MASK, WeightStore
+    from legs_loss.viewer.server import _Cameras
+
+    legs("masks", scene, "--from", "saturated", "dark")
+    legs("precompute", scene, "--workers", 1, "--masks", "masks")
+    cameras = object.__new__(_Cameras)
+    cameras.store = WeightStore(scene / "legs_weights")
+    cameras.masks = {entry.view: entry for entry in cameras.store.of_kind(MASK)}
+    picture = cameras._photograph(next(view for view in read_scene(scene).views if view.name.endswith("a.png")))
+    width = picture.shape[1]
+    assert abs(int(picture[0, 2, 0]) - 255 * 0.25) <= 1  # white, left out
+    assert picture[0, width // 2, 0] == 128  # it counts
 
 
 def test_the_sheet_has_a_row_for_the_mask(tmp_path):

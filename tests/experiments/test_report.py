@@ -7,12 +7,14 @@ import hashlib
 import io
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, Iterator, List
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from legs_loss import LegsError
 from legs_loss.cli import main
@@ -23,10 +25,10 @@ pytest.importorskip("matplotlib")
 
 from legs_loss.experiments.arms import parse_arms
 from legs_loss.experiments.running import Comparison, read_rows
-from legs_loss.reference.training.dataset import load_view, split_views
+from legs_loss.reference.training.dataset import TrainingView, load_view, split_views
 from legs_loss.reference.training.trainer import TrainConfig
 from legs_loss.report import html as report
-from legs_loss.report.html_pictures import differing, draw_row
+from legs_loss.report.html_pictures import FORMATS, Drawn, differing, draw_row, encode
 from legs_loss.scenes import read_scene
 from legs_loss.weights import weight_map
 
@@ -79,6 +81,24 @@ def test_pictures_are_the_arms_own(comparison: Path, tiny_scene: Path) -> None:
     assert torch.equal(drawn["legs"].weight, legs)
     assert torch.allclose(drawn["legs:scale"].weight, torch.tensor(rows["legs:scale", 0]["config"]["l1_scale"]))
     assert torch.equal(drawn["legs:shuffled"].weight.flatten().sort().values, legs.flatten().sort().values)
+
+
+def test_a_mask_darkens_the_photograph_and_hides_errors(comparison: Path, tiny_scene: Path) -> None:
+    scene = read_scene(tiny_scene)
+    view = load_view(scene, split_views(scene)[1][0], 1)
+    mask = torch.ones(1, *view.image.shape[1:])
+    mask[..., :16] = 0
+    drawn = {"3dgs": Drawn((view.image + 0.5).clamp(0, 1), torch.ones_like(mask))}
+
+    def pixels(view: TrainingView, arm: str, kind: str) -> np.ndarray:
+        uri = encode(view, drawn, FORMATS[0]).images[arm][kind]
+        return np.array(Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))).astype(float)
+
+    plain, masked = (pixels(one, "photograph", "rendering") for one in (view, replace(view, mask=mask)))
+    np.testing.assert_allclose(masked[:, :16], plain[:, :16] / 4, atol=1)
+    np.testing.assert_array_equal(masked[:, 16:], plain[:, 16:])
+    error = pixels(replace(view, mask=mask), "3dgs", "error")
+    assert np.ptp(error[:, :16], axis=(0, 1)).max() == 0 and error[:, :16].sum() < error[:, 16:32].sum()
 
 
 def test_crops_are_where_errors_differ() -> None:

@@ -14,7 +14,7 @@ from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.scenes import Camera, Scene, View, image_tensor, load_training_image
 from legs_loss.spec import WeightSpec
-from legs_loss.store import Entry, WeightStore, fingerprint
+from legs_loss.store import Entry, Found, WeightStore
 from legs_loss.weights import weight_from_response, weight_map, weight_maps, weight_over_scene
 
 __all__ = [
@@ -23,9 +23,11 @@ __all__ = [
     "extent",
     "load_dataset",
     "load_view",
+    "open_store",
     "pinhole_camera",
     "shuffled",
     "split_views",
+    "with_own_maps",
 ]
 
 HOLD_OUT = 8  # every 8th view, sorted by name, as usual for 3DGS
@@ -33,16 +35,30 @@ HOLD_OUT = 8  # every 8th view, sorted by name, as usual for 3DGS
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """A photograph float32 [3, H, W] in [0, 1], its camera at that size, and its weight map [1, H, W] if it has one."""
+    """A photograph float32 [3, H, W] in [0, 1], and its camera at that size.
+
+    Attributes:
+        weight, mask: its weight map, and the user's mask in [0, 1], each [1, H, W]; None without.
+    """
 
     name: str
     camera: Camera
     image: Tensor
     weight: Optional[Tensor] = None
+    mask: Optional[Tensor] = None
+
+    def hidden(self, rendering: Tensor) -> Tensor:
+        """Return a rendering [3, H, W] with the photograph's pixels where the mask is 0; the rendering without one."""
+        return rendering if self.mask is None else torch.where(self.mask == 0, self.image, rendering)
+
+    @property
+    def counts(self) -> Optional[Tensor]:
+        """Pixels that count, bool [H, W]; None where all do."""
+        return None if self.mask is None else self.mask[0] > 0
 
 
 class Dataset(NamedTuple):
-    """The views to train on and those held out; held-out views have no weight."""
+    """The views to train on and those held out; held-out views have a mask, and no weight."""
 
     train: List[TrainingView]
     test: List[TrainingView]
@@ -84,28 +100,49 @@ def load_dataset(
         resolution: 3DGS's ``-r``.
         white_background: what alpha is laid on, where the loader does so.
         store: a store of weight maps; default: ``legs_weights`` in the scene folder, if it is there. A map is used
-            only for exactly the image that it was made from, else it is computed.
+            only for exactly the image that it was made from, else it is computed. Masks and weights of the user's in
+            it have to be found.
         weights: explicit maps [1, H, W] by view name, in place of the spec's: for experiments.
 
     Raises:
         LegsError: a view has no pinhole camera, a photograph cannot be read, an explicit map is missing or does not
-            fit, or the store has masks, which are not applied here.
+            fit, or the store has masks or weights of the user's, and does not know a photograph.
     """
     train, test = (
         [load_view(scene, view, resolution, white_background) for view in views] for views in split_views(scene)
     )
+    opened = open_store(scene, store)
     if weights is not None:
         train = [replace(view, weight=_explicit(weights, view)) for view in train]
-        return Dataset(train, test)
-    opened = _open_store(scene, store)
-    if opened is not None and any(entry.is_own for entry in opened.entries.values()):
-        raise LegsError(
-            f"{opened.path} has masks or weights of your own, which this trainer does not apply: train with a "
-            "codebase's own script (legs run), or give the trainer a store without them (--store)"
-        )
-    if not spec.unweighted:
+    elif not spec.unweighted:
         train = [replace(view, weight=weight) for view, weight in zip(train, _weights(opened, train, spec))]
-    return Dataset(train, test)
+    if opened is None or not any(entry.is_own for entry in opened.entries.values()):
+        return Dataset(train, test)
+    train = [with_own_maps(view, opened, own_weights=weights is None) for view in train]
+    return Dataset(train, [with_own_maps(view, opened) for view in test])
+
+
+def with_own_maps(
+    view: TrainingView, store: Optional[WeightStore], own_weights: bool = False, needed: bool = True
+) -> TrainingView:
+    """Return a view with the user's mask, and on request its weight times the user's, as a store has them.
+
+    Raises:
+        LegsError: they are needed, and the store does not know the photograph.
+    """
+    found = None if store is None else _found(store, view, WeightSpec())
+    if store is None or (found is None and not needed):
+        return view
+    if found is None:
+        height, width = view.image.shape[1:]
+        raise LegsError(
+            f"{store.path} has masks or weights of your own, and does not know {view.name} of {width}x{height}: give "
+            "legs precompute the training's -r and --images"
+        )
+    mask, weight = (None if one is None else torch.from_numpy(store.own_map(one))[None] for one in found[2:])
+    if not own_weights or weight is None:
+        return replace(view, mask=mask)
+    return replace(view, mask=mask, weight=weight if view.weight is None else weight * view.weight)
 
 
 def load_view(scene: Scene, view: View, resolution: int = -1, white_background: bool = False) -> TrainingView:
@@ -156,7 +193,8 @@ def pinhole_camera(scene: Scene, view: View) -> Camera:
     raise LegsError(f"{scene.root}: {view.name} has no camera: training needs a scene with poses (COLMAP's sparse/0)")
 
 
-def _open_store(scene: Scene, store: Optional[Path]) -> Optional[WeightStore]:
+def open_store(scene: Scene, store: Optional[Path] = None) -> Optional[WeightStore]:
+    """Open a store of weight maps; without one named the scene's own, None where it has none."""
     if store is not None:
         return WeightStore(store)
     default = scene.root / STORE_FOLDER
@@ -185,11 +223,12 @@ def _over_scene(store: WeightStore, entry: Entry, spec: WeightSpec) -> Tensor:
 
 
 def _entry(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional[Entry]:
-    height, width = view.image.shape[1:]
-    entry = store.find(view.name, height, width, spec)
-    if entry is None or entry.fingerprint not in (fingerprint(view.image), fingerprint(view.image[:1])):
-        return None
-    return entry
+    found = _found(store, view, spec)
+    return None if found is None else found.response
+
+
+def _found(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional[Found]:
+    return store.find_image(view.image, spec) or store.find_image(view.image[:1], spec)  # a gray photograph
 
 
 def _explicit(weights: Mapping[str, Tensor], view: TrainingView) -> Tensor:

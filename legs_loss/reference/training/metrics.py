@@ -27,22 +27,25 @@ class Metric(NamedTuple):
         label: its name for people.
         format: of a value in a table, as ``format()`` takes it.
         splits: the views it is computed for, "train", "test" (the held-out ones) or both.
-        compute: (rendering, photograph), each [3, H, W] in [0, 1], to the value.
+        compute: (rendering, photograph), each [3, H, W] in [0, 1], to the value. Where the photograph has a mask, the
+            rendering has the photograph's pixels there.
         differences: the splits for which `legs compare` tells differences between arms in the terminal; the HTML page
             tells all.
         available: whether its requirements are installed; None without requirements. Rows lack unavailable metrics, and
             tables omit columns that no row has.
         needs: how to make it available, in words.
+        by_pixel: whether ``compute`` also takes the pixels that count, bool [H, W], or None.
     """
 
     key: str
     label: str
     format: str
     splits: Tuple[str, ...]
-    compute: Callable[[Tensor, Tensor], float]
+    compute: Callable[..., float]
     differences: Tuple[str, ...] = ()
     available: Optional[Callable[[], bool]] = None
     needs: str = ""
+    by_pixel: bool = False
 
     def computes(self, split: str) -> bool:
         """Return whether the metric can be had of an image of a split."""
@@ -85,6 +88,10 @@ def strongest(image: Tensor, fraction: float = 0.1) -> Tensor:
     return mask.reshape(strength.shape)
 
 
+def _both(pixels: Tensor, counts: Optional[Tensor]) -> Tensor:
+    return pixels if counts is None else pixels & counts
+
+
 def _ssim(prediction: Tensor, target: Tensor) -> float:
     from legs_loss.kernels.numba_loss import fused_loss
 
@@ -94,22 +101,24 @@ def _ssim(prediction: Tensor, target: Tensor) -> float:
 METRICS: Mapping[str, Metric] = {
     metric.key: metric
     for metric in (
-        Metric("psnr", "PSNR", ".2f", ("train", "test"), psnr, differences=("train", "test")),
+        Metric("psnr", "PSNR", ".2f", ("train", "test"), psnr, differences=("train", "test"), by_pixel=True),
         Metric("ssim", "SSIM", ".4f", ("train", "test"), _ssim, differences=("test",)),
         Metric(
             "psnr_strong",
             "strongest 10%",  # PSNR of the pixels with the strongest Laplacian response of the photograph
             ".2f",
             ("test",),
-            lambda prediction, target: psnr(prediction, target, strongest(target)),
+            lambda prediction, target, counts: psnr(prediction, target, _both(strongest(target), counts)),
             differences=("test",),
+            by_pixel=True,
         ),
         Metric(
             "psnr_rest",
             "the rest",  # PSNR of all others
             ".2f",
             ("test",),
-            lambda prediction, target: psnr(prediction, target, ~strongest(target)),
+            lambda prediction, target, counts: psnr(prediction, target, _both(~strongest(target), counts)),
+            by_pixel=True,
         ),
         Metric("lpips", "LPIPS", ".4f", ("test",), perceptual.lpips, ("test",), perceptual.has_lpips, NEEDS_LPIPS),
     )
@@ -122,10 +131,17 @@ def left_out() -> str:
     return f"Left out: {'; '.join(missing)}." if missing else ""
 
 
-def score(prediction: Tensor, target: Tensor, split: str = "test") -> Dict[str, float]:
-    """Return by key the metrics of one rendering [3, H, W] (clipped to [0, 1]) of a photograph of a split."""
+def score(prediction: Tensor, target: Tensor, split: str = "test", counts: Optional[Tensor] = None) -> Dict[str, float]:
+    """Return by key the metrics of one rendering [3, H, W] (clipped to [0, 1]) of a photograph of a split.
+
+    counts: bool [H, W], the pixels that count; the rendering has the photograph's pixels elsewhere.
+    """
     prediction = prediction.clamp(0.0, 1.0)
-    return {key: metric.compute(prediction, target) for key, metric in METRICS.items() if metric.computes(split)}
+    return {
+        key: metric.compute(prediction, target, *((counts,) if metric.by_pixel else ()))
+        for key, metric in METRICS.items()
+        if metric.computes(split)
+    }
 
 
 def mean_scores(scores: Sequence[Mapping[str, float]]) -> Dict[str, float]:

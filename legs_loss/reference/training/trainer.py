@@ -270,10 +270,10 @@ class _Run:
         degree = min(self.config.sh_degree, self.iteration // self.schedule.sh_every)
         viewspace = torch.zeros(len(gaussians), 2, requires_grad=True)
         drawn = _rasterize(gaussians, view, self.config, degree, viewspace)
-        loss = step_loss(drawn.image, view.image, self.weights[index], self.config.lambda_dssim)
+        loss = step_loss(view.hidden(drawn.image), view.image, self.weights[index], self.config.lambda_dssim)
         loss.backward()
         if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
-            self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image))
+            self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image, view.counts))
         steps = self.config.position_lr_max_steps or self.config.iterations
         self.adam.step(position_rate(min(1.0, self.iteration / steps), self.extent))
         if self.evaluate_every is not None and self.iteration % self.evaluate_every == 0:
@@ -290,7 +290,9 @@ class _Run:
     def metrics(self) -> Dict[str, Any]:
         """Return scores over training and held-out views, and what they cost."""
         train, test = self._scores("train"), self._scores("test")
+        masked = sum(view.mask is not None for view in self.data.train)
         return {
+            **({"masked_views": masked} if masked else {}),
             "train": mean_scores(list(train.values())),
             "test": mean_scores(list(test.values())) if test else None,
             "gaussians": len(self.adam.gaussians),
@@ -306,7 +308,7 @@ class _Run:
 
     def _scores(self, split: str) -> Dict[str, Dict[str, float]]:
         views = self.data.train if split == "train" else self.data.test
-        return {view.name: score(self._drawn(view), view.image, split) for view in views}
+        return {view.name: score(view.hidden(self._drawn(view)), view.image, split, view.counts) for view in views}
 
     def _drawn(self, view: TrainingView) -> Tensor:
         return draw(self.adam.gaussians, view, self.config)
@@ -321,7 +323,7 @@ class _Run:
         if self.psnr is not None:
             point["train_psnr"] = self.psnr
         if self.data.test:
-            values = [psnr(self._drawn(view).clamp(0.0, 1.0), view.image) for view in self.data.test]
+            values = [psnr(self._drawn(view).clamp(0.0, 1.0), view.image, view.counts) for view in self.data.test]
             point["test_psnr"] = sum(values) / len(values)
         self.history.append(point)
         self.scoring += _clocks() - begun
@@ -360,10 +362,16 @@ def _rasterize(
 
 
 def step_weight(weight: Optional[Tensor], view: TrainingView, config: TrainConfig) -> Optional[Tensor]:
-    """Return the factor of the L1 term of a view whose weight map is ``weight``; None without one."""
-    if config.l1_scale == 1.0:
-        return weight
-    return config.l1_scale * (torch.ones_like(view.image[:1]) if weight is None else weight)
+    """Return the factor of the L1 term of a view whose weight map is ``weight``; None without one.
+
+    With a mask M it has the factor M / mean(M): the term is the mean over what counts.
+    """
+    factor = None if view.mask is None else view.mask / view.mask.mean()
+    if config.l1_scale != 1.0:
+        factor = config.l1_scale * (torch.ones_like(view.image[:1]) if factor is None else factor)
+    if factor is None or weight is None:
+        return weight if factor is None else factor
+    return factor * weight
 
 
 def _clocks() -> np.ndarray:

@@ -221,7 +221,8 @@ def _has_default(field: Any) -> bool:
 
 def _is(value: Any, kind: str) -> bool:
     if kind in ("int", "float"):
-        return isinstance(value, (int, float) if kind == "float" else int) and not isinstance(value, bool) and value > 0
+        is_number = isinstance(value, (int, float) if kind == "float" else int) and not isinstance(value, bool)
+        return is_number and 0 < value < float("inf")
     if kind == "str":
         return isinstance(value, str)
     if kind.startswith("Mapping"):

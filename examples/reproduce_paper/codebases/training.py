@@ -311,9 +311,11 @@ def _only(folder: Path, pattern: str) -> Path:
 
 def _found(folder: Path, pattern: str) -> List[Path]:
     try:
-        return list(folder.glob(pattern))
+        if ".." not in Path(pattern).parts:
+            return list(folder.glob(pattern))
     except (ValueError, NotImplementedError, IndexError):
-        raise LegsError(f"{pattern!r} is no pattern of files: see pathlib.Path.glob") from None
+        pass
+    raise LegsError(f"{pattern!r} is no pattern of files in the run's folder: see pathlib.Path.glob")
 
 
 def _scores(renders: Path, truths: Path, split: str) -> Dict[str, Mapping[str, float]]:

@@ -7,7 +7,6 @@ pinhole cameras, poses and points in sparse/0/.
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from pathlib import Path
 from typing import Any, Callable, List, NamedTuple, Optional, Sequence, Tuple
@@ -66,23 +65,22 @@ def reconstruct(
         raise LegsError(f"{out} exists already: choose another folder, or remove it")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.part-", dir=str(out.parent)))
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.part-", dir=str(out.parent)) as folder:
+            work = Path(folder)
+            database = work / "database.db"
+            tell(f"features of {len(names)} photographs")
+            _extract(pycolmap, database, photographs, names, max_size, threads)
+            tell("features that photographs share")
+            _match(pycolmap, database, overlap, threads)
+            tell("cameras and points")
+            model = _map(pycolmap, database, photographs, work / "models", threads)
+            tell("undistorted photographs")
+            scene = _undistort(pycolmap, model, photographs, work, max_size, threads)
+            placed = sorted(image.name for image in model.images.values() if image.has_pose)
+            os.replace(str(scene), str(out))
     except OSError as error:
-        raise LegsError(f"cannot write {out}: {error.strerror or error}") from None
-    try:
-        database = work / "database.db"
-        tell(f"features of {len(names)} photographs")
-        _extract(pycolmap, database, photographs, names, max_size, threads)
-        tell("features that photographs share")
-        _match(pycolmap, database, overlap, threads)
-        tell("cameras and points")
-        model = _map(pycolmap, database, photographs, work / "models", threads)
-        tell("undistorted photographs")
-        scene = _undistort(pycolmap, model, photographs, work, max_size, threads)
-        placed = sorted(image.name for image in model.images.values() if image.has_pose)
-        os.replace(str(scene), str(out))
-    finally:
-        shutil.rmtree(str(work), ignore_errors=True)
+        why = "made by another meanwhile" if out.exists() else error.strerror or error
+        raise LegsError(f"cannot write {out}: {why}") from None
     lost = tuple(sorted(set(names) - set(placed)))
     return Reconstructed(out, tuple(placed), lost, len(model.points3D), float(model.compute_mean_reprojection_error()))
 

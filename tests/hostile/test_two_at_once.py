@@ -19,7 +19,9 @@ from legs_adapters.journal import JOURNAL
 from legs_adapters.plan import plan, write
 from legs_adapters.undo import undo
 
+from legs_loss import LegsError
 from legs_loss.experiments.running import read_json, read_rows, write_json
+from legs_loss.reference.embedded import write_embedded_scene
 from legs_loss.reference.gaussians import Gaussians
 from legs_loss.reference.ply import read_ply, write_ply
 from legs_loss.reference.training.checkpoint import read_checkpoint, write_checkpoint
@@ -506,3 +508,83 @@ def test_two_comparisons_at_once(tiny_scene, tmp_path):
     results = at_once([*command, "--out", out], [*command, "--out", out, "--iterations", 21])
     assert sorted(code for _, code in results) == [0, 2], results
     assert "was started with another base.iterations" in next(said for said, code in results if code)
+
+
+class Model:
+    """What pycolmap would have found, of a size."""
+
+    images, points3D = {}, {}
+
+    def compute_mean_reprojection_error(self):
+        return 0.5
+
+
+def make_scene(photographs, out, size):
+    """Run ``reconstruct`` with stand-ins for pycolmap's steps, and return what it raises, or ""."""
+    from legs_loss.scenes import reconstruct as module
+
+    def undistort(pycolmap, model, photographs, work, *_):
+        (work / "scene" / "images").mkdir(parents=True)
+        for number in range(size):
+            (work / "scene" / "images" / f"{number}.png").write_text(str(size))
+        return work / "scene"
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_pycolmap", lambda: None)
+        patch.setattr(module, "_extract", lambda *_: None)
+        patch.setattr(module, "_match", lambda *_: None)
+        patch.setattr(module, "_map", lambda *_: Model())
+        patch.setattr(module, "_undistort", undistort)
+        try:
+            module.reconstruct(photographs, out)
+        except LegsError as error:
+            return str(error)
+    return ""
+
+
+def test_100_pairs_of_scenes(tmp_path):
+    """One of them makes the folder, whole; the other says that it is there."""
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for number in range(3):
+        (photographs / f"{number}.png").write_bytes(b"a photograph")
+    both = 0
+    for pair in range(100):
+        out, ended = tmp_path / f"out{pair}", []
+        go, tell = os.pipe()
+        for size in (2, 40):
+            read, written = os.pipe()
+            child = os.fork()
+            if child == 0:
+                os.read(go, 1)
+                os.write(written, make_scene(photographs, out, size).encode())
+                os._exit(0)
+            os.close(written)
+            ended.append((child, read))
+        os.write(tell, b"..")
+        said = []
+        for child, read in ended:
+            with os.fdopen(read) as file:
+                said.append(file.read())
+            assert os.waitpid(child, 0)[1] == 0
+        os.close(go)
+        os.close(tell)
+        assert sorted(bool(error) for error in said) == [False, True], said
+        both += "meanwhile" in "".join(said)
+        assert all("exists already" in error or "meanwhile" in error for error in said if error)
+        assert {path.read_text() for path in (out / "images").iterdir()} == {str(len(os.listdir(str(out / "images"))))}
+    assert both, "never at the same moment"
+    assert not list(tmp_path.glob(".*")), "what was begun is swept"
+
+
+@pytest.mark.slow
+def test_two_legs_scene_at_once(tmp_path):
+    pytest.importorskip("pycolmap")
+    drawn = write_embedded_scene(tmp_path / "drawn", views=16, width=320, height=240, points=500)
+    command = ["scene", drawn / "images", tmp_path / "out", "--threads", 1]
+    results = at_once(command, command)
+    assert sorted(code == 2 for _, code in results) == [False, True], results
+    refused = next(said for said, code in results if code == 2)
+    assert "exists already" in refused or "made by another meanwhile" in refused
+    assert len(read_scene(tmp_path / "out").views) > 8
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drawn", "out"]

@@ -192,9 +192,10 @@ def _patch(args: argparse.Namespace) -> int:
     root = check_root(args.folder)
     settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
     text = settings_text(root, settings)
+    writes = bool(settings) or not (root / SETTINGS_FILE).exists()  # else the user's, or an earlier run's, stays
     found = plan(root, args.exclude, [_site(root, text) for text in args.site], ssim=args.ssim, masks=args.masks)
     problems, is_decided = found.findings.problems, bool(found.findings.sites or found.findings.patched)
-    if is_decided and (settings or not (root / SETTINGS_FILE).exists()):  # else the user's, or an earlier run's, stays
+    if is_decided and writes:
         found = found._replace(settings=text)
     if not is_decided or (problems and args.strict):
         _show(args, found)

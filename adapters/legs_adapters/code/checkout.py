@@ -92,11 +92,11 @@ class Checkout:
 
         A script can add any folder to sys.path: a module of one word is only found there if it defines the member.
         """
-        asked = (module.path, name, level, member)
-        if asked not in self._by_import:
+        question = (module.path, name, level, member)
+        if question not in self._by_import:
             path = self._find_path(module.path, name.replace(".", "/"), level, member)
-            self._by_import[asked] = self.module(path) if path is not None else None
-        return self._by_import[asked]
+            self._by_import[question] = self.module(path) if path is not None else None
+        return self._by_import[question]
 
     def _find_path(self, path: str, inner: str, level: int, member: str) -> Optional[str]:
         above = list(PurePosixPath(path).parents)

@@ -239,9 +239,9 @@ class Module:
             if name in function.text:
                 yield from (inner for inner in _chosen(function.inner, bool) if inner.name == name)
 
-    def scopes(self, says: Callable[[str], object]) -> Iterator[Function]:
+    def scopes(self, matches: Callable[[str], object]) -> Iterator[Function]:
         """Yield the top level and the functions whose text matches."""
-        return _chosen([self.top, *self._functions], says)
+        return _chosen([self.top, *self._functions], matches)
 
     def mentioning(self, name: str, called: bool = False) -> Iterator[Function]:
         """Yield the scopes whose text has a word, or calls it, from an index of words."""
@@ -265,13 +265,13 @@ def index_by_word(texts: Iterable[Tuple[_T, str]]) -> Dict[str, List[_T]]:
 
 
 def _chosen(
-    functions: Sequence[Function], says: Callable[[str], object], matched: Optional[str] = None
+    functions: Sequence[Function], matches: Callable[[str], object], matched: Optional[str] = None
 ) -> Iterator[Function]:
     """Yield the functions whose text matches; a text that several share is matched once."""
     for function in functions:
-        if function.text is matched or says(function.text):
+        if function.text is matched or matches(function.text):
             yield function
-            yield from _chosen(function.inner, says, function.text)
+            yield from _chosen(function.inner, matches, function.text)
 
 
 def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadable:

@@ -71,7 +71,7 @@ class Lines:
 class _Written(ByteSpanPositionProvider):
     """Write a tree once, for its text and its spans: LibCST's own wrapper walks it three times."""
 
-    def of(self, tree: cst.Module) -> Tuple[bytes, Mapping[cst.CSTNode, CodeSpan]]:
+    def write(self, tree: cst.Module) -> Tuple[bytes, Mapping[cst.CSTNode, CodeSpan]]:
         """Return the bytes of a tree, and the spans of its nodes."""
         state = SpanProvidingCodegenState(
             tree.default_indent, tree.default_newline, provider=self, get_length=byte_length_in_utf8
@@ -103,7 +103,7 @@ class Part:
             ValueError: LibCST would write another text than it read.
         """
         if not self._spans:
-            text, spans = _Written().of(self.tree)
+            text, spans = _Written().write(self.tree)
             if text != self.text:
                 raise ValueError("LibCST would write another text")
             self._spans = spans

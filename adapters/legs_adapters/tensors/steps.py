@@ -51,5 +51,5 @@ def has_step(function: Function) -> bool:
 def gradients_read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
     """Return the gradients that are read, ``xyz.grad``; not those that are only compared, assigned or reset."""
     others = [part for part in parts if isinstance(part, (cst.Comparison, cst.AssignTarget))]
-    asked = {id(each) for part in others for each in walk_all(part)}
-    return [p for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in asked]
+    unread = {id(each) for part in others for each in walk_all(part)}
+    return [p for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in unread]

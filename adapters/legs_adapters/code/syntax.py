@@ -31,7 +31,6 @@ __all__ = [
     "word_set",
     "words",
     "words_in",
-    "words_under",
 ]
 
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
@@ -219,11 +218,6 @@ def walk_all(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
         part = stack.pop()
         yield part
         stack.extend(children(part))
-
-
-def words_under(node: cst.CSTNode) -> Set[str]:
-    """Return the words of the names and strings in an expression."""
-    return words_in(walk_all(node))
 
 
 def words_in(nodes: Iterable[cst.CSTNode]) -> Set[str]:

@@ -7,7 +7,7 @@ from typing import Iterable, List
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import call_name, walk_all, words, words_under
+from legs_adapters.code.syntax import call_name, walk_all, words, words_in
 from legs_adapters.tensors.operations import BACKWARD, OPTIMISERS, SCHEDULES, STEPS
 
 __all__ = [
@@ -40,7 +40,7 @@ def may_step(calls: Iterable[cst.Call]) -> bool:
 
 
 def _is_of_schedule(call: cst.Call) -> bool:
-    return isinstance(call.func, cst.Attribute) and bool(words_under(call.func.value) & SCHEDULES)
+    return isinstance(call.func, cst.Attribute) and bool(words_in(walk_all(call.func.value)) & SCHEDULES)
 
 
 def has_step(function: Function) -> bool:

@@ -40,17 +40,14 @@ WORST_FIRST = ("wrong weight", "missed", "error")
 # Attributes of the patcher, and what each returns where it is switched off. One that is gone is no part any more.
 _OFF = {
     "form": {
-        "PassedByName": {"terms.kinds.callback:Callbacks.of": [], "terms.kinds.callback:Callbacks.uncalled": ()},
-        "RunTime": {"rules.find:chosen_at_run_time": []},
-        "Fused": {"rules.find:fused_losses": ()},
+        "PassedByName": {"terms.kinds.callback:Callbacks.assigned_in": []},
         "Registered": {"upstreams.registered:forms_of": []},
     },
     "reader": {
         "masks: rows": {"rules.verdict:is_rows": False},
-        "masks: picked pixels": {"rules.verdict:picked_from": None},
-        "error maps": {"rules.verdict:shared_of": None},
-        "uses of a body": {"rules.uses:Uses.of": [], "rules.uses:Uses.unsettled": None},
-        "doubts": {"rules.doubts:Doubts.is_doubtful": False, "rules.doubts:Doubts.of_uncalled": ()},
+        "error maps": {"rules.verdict:reads_of": ([], [])},
+        "uses of a body": {"rules.verdict:uses_of": [], "rules.verdict:unsettled": None},
+        "doubts": {"rules.verdict:Verdicts.doubt": None},
         "purposes": {"rules.purpose:Purposes.purpose": None},
     },
 }
@@ -88,14 +85,14 @@ def rules() -> Dict[str, List[Any]]:
     tuples = [value for name, value in vars(order).items() if isinstance(value, tuple) and name != "SSIM"]
     found: Dict[str, List[Any]] = {}
     for rule in {id(rule): rule for some in tuples for rule in some if isinstance(rule, base)}.values():
-        if not type(rule).__module__.endswith((".structural", ".ssim")):
+        if not type(rule).__module__.endswith(".ssim"):
             found.setdefault(rule.id, []).append(rule)
     return found
 
 
 def kinds_of_form() -> List[Any]:
     """Return the forms that are found in a call by themselves."""
-    return list(_module("terms.forms")._kinds())
+    return list(_module("terms.forms").KINDS)
 
 
 def lists() -> Dict[str, Any]:
@@ -169,7 +166,7 @@ def switch_off(kind: str, name: str) -> None:
     """Let a part behave as if it did not exist, from now on: fork first."""
     if kind == "rule":
         for rule in rules()[name]:
-            rule.evidence = rule.of_call = lambda *_: []
+            rule.evidence = rule.evidence_of_call = lambda *_: []
     elif kind == "words":
         _replace(lists()[name], _without(name))
     elif name in _OFF.get(kind, ()):
@@ -179,7 +176,7 @@ def switch_off(kind: str, name: str) -> None:
                 setattr(*holder, lambda *_, answer=answer, **__: answer)
     else:
         others = [form for form in kinds_of_form() if form.__name__ != name]
-        _module("terms.forms")._kinds = lambda: others
+        _module("terms.forms").KINDS = others
 
 
 def _without(name: str) -> Any:
@@ -263,7 +260,8 @@ def listen() -> Callable[[], Set[str]]:
     words: Dict[str, Set[str]] = {}
     for name, some in rules().items():
         for rule in some:
-            _listen_to(rule, "found", noted.setdefault(f"rule: {name}", set()))
+            for asked in ("evidence", "evidence_of_call"):
+                _listen_to(rule, asked, noted.setdefault(f"rule: {name}", set()))
     for form in kinds_of_form():
         _listen_to(form, "find", noted.setdefault(f"form: {form.__name__}", set()))
     for kind, table in _OFF.items():
@@ -318,7 +316,7 @@ class Checkout:
     def _reuse_parsed(self) -> None:
         """Let later plans use the files and syntax trees of the first; what rules do not decide is kept, too."""
         planning, analysis = _module("plan"), _module("rules.analysis").Analysis
-        read, analyse, made = planning.read_files, analysis.of, {}
+        read, analyse, made = planning.read_files, analysis.of_files, {}
         self._anew = False
 
         def read_once(*given: Any) -> Any:
@@ -329,7 +327,7 @@ class Checkout:
                 made["analysis"] = analyse(*given)
             return analysis(made["analysis"].program) if self._anew else made["analysis"]
 
-        planning.read_files, analysis.of = read_once, analyse_once
+        planning.read_files, analysis.of_files = read_once, analyse_once
 
     def ablate(self) -> Dict[str, Any]:
         """Return the plan, the parts that have a say, the plans that differ without one, and what was not reached."""

@@ -60,9 +60,8 @@ def rewrite(
     package, is_imported = _package_name(module)
     edits: List[Edit] = []
     for site in sites:
-        form = site.form.moved(on_one_line(site.form.selection))
-        writing = Writing(package, site.swapped, on_one_line(site.selection), f"{site.path}:{site.line}", in_place)
-        edits += form.edits(Text(source, site.scope), writing)
+        writing = Writing(package, site.swapped, on_one_line(site.selection), in_place)
+        edits += site.form.edits(Text(source, site.scope), writing)
     for call in kept:
         text = Text(source, call.scope)
         start, end = text.span(call.call.func, True)

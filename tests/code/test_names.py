@@ -33,12 +33,10 @@ KINDS = {
     "image_mask": "mask",  # laid over an image
     "scaling": "parameter",
     "colors_precomp": "parameter",  # a colour for each Gaussian
-    "image_and_depth": None,  # of two kinds
     "image_no_sh": "image",
     "sky_rgb": "image",
     "offset_image": "image",
     "image_offset": "parameter",
-    "original_image_train_light": "image",
     "left_image": "image",
     "iteration": None,
 }

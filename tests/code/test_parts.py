@@ -152,6 +152,6 @@ def test_what_can_lead_to_an_l1_is_found_by_its_words(text: str) -> None:
     other = "def render(camera):\n    return camera.project(points)\n"
     prospects = Prospects([text + other])
     module = Module("file.py", text + other)
-    assert prospects.of(next(module.named("training")).text)
+    assert prospects.may_lead(next(module.named("training")).text)
     if len(module.outline_text) < len(module.text):
-        assert not prospects.of(next(module.named("render")).text)
+        assert not prospects.may_lead(next(module.named("render")).text)

@@ -116,7 +116,7 @@ class TestCommandLine:
         assert "l1_loss(image_a, image_b)" in (root / "train.py").read_text()
 
     def test_nothing_is_changed_where_nothing_can_be_decided(self, tmp_path, run):
-        root = checkout(tmp_path, files("fused_l1_ssim_kernel_error"))
+        root = checkout(tmp_path, files("pixels_reshaped_to_list_error"))
         before = snapshot(root)
         done = run(root)
         assert done.returncode == 2

@@ -28,33 +28,20 @@ def more_special(word: Optional[str], flow: Optional[str]) -> Optional[str]:
 def mix(parts: Iterable[Meaning]) -> Meaning:
     """Join the meanings of an expression's parts: a mask or a number applied to an image gives an image."""
     known = [part for part in parts if part != UNKNOWN]
-    if not known:
-        return UNKNOWN
-    pictures = [part for part in known if part.kind not in (None, "mask", "parameter")]
-    if pictures:
-        kind = min((part.kind for part in pictures if part.kind is not None), key=KINDS.index)
-        roles = {part.role for part in pictures if part.role is not None}
-    else:
-        kinds = [part.kind for part in known if part.kind is not None]
-        kind = min(kinds, key=KINDS.index) if kinds else None  # type: ignore[assignment]
-        roles = {part.role for part in known if part.role is not None}
+    known = [part for part in known if part.kind not in (None, "mask", "parameter")] or known
+    kinds = [part.kind for part in known if part.kind is not None]
+    roles = {part.role for part in known if part.role is not None}
     role = roles.pop() if len(roles) == 1 else "both" if roles else None
-    return Meaning(kind, role)
+    return Meaning(min(kinds, key=KINDS.index) if kinds else None, role)
 
 
 def swapped(a: Meaning, b: Meaning) -> Optional[bool]:
-    """Return whether the first of two is the ground truth; None where that is not clear."""
-    if b.role == "target" and a.role != "target":
+    """Return whether the first of two is the ground truth; None where that is not clear.
+
+    Of a composite of both and one of them, the composite is the other.
+    """
+    if (b.role == "target" and a.role != "target") or (a.role == "render" and b.role in (None, "both")):
         return False
-    if a.role == "target" and b.role != "target":
-        return True
-    if a.role == "render" and b.role is None:
-        return False
-    if b.role == "render" and a.role is None:
-        return True
-    # of a composite of both and one of them, the composite is the other
-    if (a.role == "render" and b.role == "both") or (a.role == "both" and b.role == "target"):
-        return False
-    if (a.role == "both" and b.role == "render") or (a.role == "target" and b.role == "both"):
+    if (a.role == "target" and b.role != "target") or (b.role == "render" and a.role in (None, "both")):
         return True
     return None

@@ -11,7 +11,6 @@ from legs_adapters.lexicon.words import (
     KIND_OF,
     KINDS,
     LAID_OVER,
-    LIT_BY,
     OF_ONE,
     OF_PICTURES,
     PICTURES,
@@ -31,20 +30,11 @@ _L1_NAME = re.compile(
 def kind_of_words(name: str) -> Optional[str]:
     """Return the kind of image in a name; the most specific of several."""
     spoken = words(name)
-    if "and" in spoken:  # image_and_depth holds one of each
-        at = spoken.index("and")
-        both = {kind_of_words("_".join(part)) for part in (spoken[:at], spoken[at + 1 :])}
-        if "image" in both and len(both - {None}) > 1:
-            return None
-    if "no" in spoken[1:]:  # image_no_sh
-        spoken = spoken[: spoken.index("no", 1)]
     said = [word for word in spoken if not word.isdigit() and word not in HELD_IN | WHICH]
     if said and said[-1] in LAID_OVER:
         return "mask"  # applied to an image, it gives an image
     kinds = {KIND_OF[word] for word in spoken if word in KIND_OF}
     if "image" in kinds:  # sky_rgb, render_sh
-        if spoken[-1] in LIT_BY and "image" in spoken and TARGET.intersection(spoken):
-            spoken = spoken[:-1]  # original_image_train_light
         if spoken[-1] in PICTURES:
             spoken = tuple(word for word in spoken if word not in OF_ONE)  # offset_image, not image_offset
         kinds = {KIND_OF[word] for word in spoken if word in KIND_OF and word not in OF_PICTURES}

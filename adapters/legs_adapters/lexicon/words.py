@@ -31,13 +31,11 @@ WORDS = {
     "feature": """
         feature features feat feats semantic semantics sem language lang clip dino dinov2 lseg sam embedding embeddings
         latent latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors
-        classes obj objects wavelet wavelets haar dwt fft rfft dct census
-        stokes aolp dolp phasor phasors
+        classes obj objects wavelet wavelets haar fft rfft dct phasor phasors stokes
     """,
     # sds, inpaint, edit: GaussianDreamer, GaussianEditor; pseudo, unseen, virtual: codebases with few views
     "warp": f"""
-        {" ".join(sorted(WARPED))} pseudo virtual unseen sds diffusion inpaint inpainted
-        outpaint outpainted edit edited
+        {" ".join(sorted(WARPED))} pseudo virtual unseen sds diffusion inpaint inpainted outpaint outpainted edit edited
     """,
     "gradient": "grad gradient gradients edge edges laplacian sobel curv curvature hessian canny dx dy",
     "mask": """
@@ -46,12 +44,11 @@ WORDS = {
     """,
     # of Gaussians, cameras, light and materials (GS-IR, GaussianShader), bodies and faces (GaussianAvatar)
     "parameter": """
-        pointmap pointmaps scaling scalings scale scales xyz xyzs
-        rotation rotations rot rots quat quats sh shs sh0 shn offset offsets grid
-        grids plane planes pose poses deform deformation delta deltas residual means mean2d pts points point light
-        lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds c2w w2c intrinsics
-        extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints vertex vertices verts
-        bone bones smpl center centers knn kpt kpts keypoint keypoints mu std
+        pointmap pointmaps scaling scalings scale scales xyz xyzs rotation rotations rot rots quat quats sh shs sh0 shn
+        offset offsets grid grids plane planes pose poses deform deformation delta deltas residual means mean2d pts
+        points point light lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds
+        c2w w2c intrinsics extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints
+        vertex vertices verts bone bones smpl center centers knn kpt kpts keypoint keypoints mu std
     """,
     "image": """
         image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering
@@ -60,7 +57,6 @@ WORDS = {
 }
 KINDS = tuple(WORDS)
 KIND_OF = {word: kind for kind in reversed(KINDS) for word in WORDS[kind].split()}
-COMPARED = {"image", "depth", "normal", "flow"}  # the kinds that a loss class is named for
 LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}  # the kinds that a photograph's name may speak of, too
 TARGET = word_set("gt gts target targets tgt ground truth original orig real true observed reference pixels")
 RENDERERS = word_set("render rendering rasterize rasterization rasterizer renderer raster splat splatting")
@@ -70,18 +66,14 @@ RENDER = RENDERERS | word_set(
     synthesized network student recon reconstructed reconstruction est estimated
     """
 )
-RESULT = word_set("output outputs")  # of anything, not only of a renderer
 LAID_OVER = word_set("mask masks valid weight weights diff error errors")
 WHICH = word_set("first second third last left right front back")  # of several of a kind
 OF_PICTURES = word_set("sky sh shs prior time dx dy")  # a mask, for example, unless something shows that it is an image
-STEPS_OR_DYNAMIC = word_set("dx dy")  # steps from pixel to pixel, or render_dy: the dynamic part
 PICTURES = word_set("image images img imgs photo photos frame frames")
-LIT_BY = word_set("light lights")
 OF_ONE = word_set("scale scales scaling scalings offset offsets center centers mean light lights")  # scaled or shifted
 HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
 BACKGROUND = word_set("bg bkgd background backgrounds")  # a colour to lay things over, whoever keeps it
 PICKING = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
-MASKED = word_set("mask masked")  # of a function that takes a mask beside two pictures
 STATISTICS = word_set("histc histogram bincount entropy gram moments")  # of a picture, no picture
 MATCHED = word_set("match matching matched equalize equalized")  # histogram_matching(image, photo) is a picture
 LOADING = word_set("load read get open fetch")
@@ -97,10 +89,8 @@ CAMERAS = _CAMERA | word_set("view views viewpoint viewpoints")
 DATA = CAMERAS | word_set(
     "data batch sample item items datum info infos keyframe frame dataset input inputs entry"
 )  # what holds photographs
-LOADERS = word_set("loader dataloader")
 POSES = _CAMERA | word_set("pose poses c2w w2c extrinsic extrinsics camtoworld camtoworlds tracking se3")
 EMBEDDING = word_set("embedding embeddings")
-EMBEDDINGS = EMBEDDING | word_set("embed emb appearance exposure")
 GAUSSIANS = word_set("gaussian gaussians gs splat splats")
 MODELS = GAUSSIANS | word_set(
     """
@@ -110,12 +100,10 @@ MODELS = GAUSSIANS | word_set(
 )
 PARAMETERS = word_set("params param parameters variables splats gauss_params")  # names of what holds a model's
 PLUMBING = word_set("torch optim adam params parameters lr name eps self")  # around what an optimiser is given
-POINTS = word_set("point points")
 
 # -- purposes
 
 LOSS = word_set("loss losses")
-LOSS_CLASS = LOSS | {"criterion"}
 EVALUATING = word_set("eval evaluate evaluation evaluator test")
 _SHOWING = word_set("render validate validation")
 # A function's first word, where it does not train ...
@@ -126,7 +114,6 @@ REPORTING = (
     | _SHOWING
     | word_set("testing report reports metric metrics valid visualize vis benchmark compare psnr quality")
 )
-FITTING = word_set("optimize optimise fit optim eval")  # an embedding, to a test view
 SCORING = word_set(
     "score scores scoring importance densify densification prune pruning sensitivity sample sampling error"
 )
@@ -138,11 +125,14 @@ MAPPING = word_set("mapping map mapper")  # a class that tracks and maps does no
 # Files of Gaussian splatting, and of those the ones that cannot be about meshes.
 SPLATS = re.compile(r"splat|gaussians|gaussian_?(model|render|scene|raster)|diff_\w*raster|3dgs|surfel", re.I)
 DRAWS_SPLATS = re.compile(SPLATS.pattern + r"|rasteriz|render_pkg", re.I)
-# Rays of a NeRF: nerfstudio's bundles, rays_o and rays_d of others, and their colours in avatars made of both.
-RAYS = re.compile(r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid", re.I)
+# Rays of a NeRF: nerfstudio's bundles, rays_o and rays_d of others, and what renders a field.
+RAYS = re.compile(
+    r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid|radiance_?field"
+    r"|(octree|voxel|volume|volumetric|nerf)_?(render|raster)",
+    re.I,
+)
 RAY_BUNDLES = word_set("ray_bundle ray_samples")
 OF_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
-FIELD = re.compile(r"(octree|voxel|volume|volumetric|nerf)_?(render|raster)|radiance_?field", re.I)
 STRUCTURAL = re.compile("ssim", re.I)
 SPEAKS_OF_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(")
 SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)

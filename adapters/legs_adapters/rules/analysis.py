@@ -15,7 +15,7 @@ from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.kinds.callback import Callbacks
 from legs_adapters.terms.prospects import Prospects
-from legs_adapters.terms.structural.calls import SsimCalls
+from legs_adapters.terms.ssim.calls import SsimCalls
 
 __all__ = ["Analysis"]
 
@@ -31,9 +31,11 @@ class Analysis:
         program: its files, linked by names.
         prospects: which text can lead to an L1.
         training: what its backward passes depend on.
-        meanings: what its expressions depict.
+        meanings, origins: what its expressions depict: by their names, and by what is assigned to them.
         forms: its L1 expressions.
         purposes: the purposes of its backward passes.
+        callbacks: the L1 functions that are passed by name.
+        ssims: its SSIM functions, by their code.
         splats: which of its functions are about Gaussian splatting.
     """
 
@@ -41,29 +43,16 @@ class Analysis:
         self.program = program
         texts = [source.text for source in program.sources.values()]
         self.prospects: Prospects = Prospects(texts, speaks) if speaks is not None else Prospects(texts)
-        self.training: Training = Training(self.program, self.prospects.of)
+        self.training: Training = Training(self.program, self.prospects.may_lead)
         self.meanings: Meanings = Meanings(self.program, self.training)
+        self.origins: Meanings = Meanings(self.program, self.training, by_name=False)
         self.forms: Forms = Forms(L1Functions(self.program, self.prospects))
         self.purposes: Purposes = Purposes(self.program, self.training)
         self.splats: Splats = Splats(self.program, self.training)
-        self._callbacks: Optional[Callbacks] = None
-        self._ssims: Optional[SsimCalls] = None
+        self.callbacks: Callbacks = Callbacks(self.program, self.training, self.forms)
+        self.ssims: SsimCalls = SsimCalls(self.program)
 
     @classmethod
-    def of(cls, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> Analysis:
+    def of_files(cls, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> Analysis:
         """Analyse the L1 terms of these files; ``unread`` are the texts of ignored files."""
         return cls(Program(sources, unread, TORCH))
-
-    @property
-    def callbacks(self) -> Callbacks:
-        """The L1 functions that are passed by name."""
-        if self._callbacks is None:
-            self._callbacks = Callbacks(self.program, self.training, self.forms)
-        return self._callbacks
-
-    @property
-    def ssims(self) -> SsimCalls:
-        """The SSIM functions of the program, by their code."""
-        if self._ssims is None:
-            self._ssims = SsimCalls(self.program)
-        return self._ssims

@@ -229,7 +229,7 @@ class _Finder:
         carriers: List[_Read] = []
         for where, node in work:  # which grows
             for part, index in _places(node):
-                meaning = self.analysis.meanings.of(where, part)
+                meaning = self.analysis.meanings.meaning(where, part)
                 is_picture = meaning.kind in ("image", None) and meaning.role in ("render", "both")
                 if part is not rendering and not (is_picture and not _SIDES & set(words(path_of(part) or ""))):
                     continue

@@ -13,14 +13,14 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import walk_expressions
 from legs_adapters.lexicon.meaning import Meaning, swapped
-from legs_adapters.terms.findings import Decider, Evidence
+from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.sides import Pair, pair_of
 
 if TYPE_CHECKING:
     from legs_adapters.rules.analysis import Analysis
 
-__all__ = ["CallContext", "CallOfTerm", "Rule", "Term", "header", "source_of"]
+__all__ = ["CallContext", "Rule", "Term", "header", "source_of"]
 
 _DEPTH = 3
 
@@ -32,20 +32,19 @@ class CallContext:
         analysis: those analyses.
         function: the function that the call stands in.
         call: the call.
+        given: what it passes to a function that compares two of its parameters: for the rendering, where that is known,
+            and for the photograph.
         here: the call, or the term, as evidence.
     """
 
-    def __init__(self, analysis: Analysis, function: Function, call: cst.CSTNode) -> None:
+    def __init__(
+        self, analysis: Analysis, function: Function, call: cst.CSTNode, given: Sequence[Meaning] = ()
+    ) -> None:
         self.analysis = analysis
         self.function = function
         self.call = call
+        self.given = given
         self.here: List[Decider] = [(function, call)]
-
-    @property
-    def class_name(self) -> str:
-        """The name of the class that the function is a method of; empty without."""
-        owner = self.analysis.program.owner_of(self.function)
-        return owner.name if owner is not None else ""
 
     @property
     def names_around(self) -> Iterator[Tuple[str, Decider]]:
@@ -62,40 +61,21 @@ class Term(CallContext):
     Attributes:
         form: the expression.
         pair: its two sides, and what they depict.
+        target, prediction: the side that is the photograph, the second where neither name says so; and the other.
     """
 
-    def __init__(self, analysis: Analysis, function: Function, form: Form, pair: Optional[Pair] = None) -> None:
+    def __init__(self, analysis: Analysis, function: Function, form: Form) -> None:
         super().__init__(analysis, function, form.call)
         self.form = form
         self.here: List[Decider] = [(function, form.node)]
-        self.pair: Pair = pair or pair_of(analysis.meanings, function, form)
+        self.pair: Pair = pair_of(analysis.meanings, function, form)
+        sides = self.pair.first, self.pair.second
+        self.target, self.prediction = sides if swapped(self.pair.a, self.pair.b) else sides[::-1]
 
     @property
     def sides(self) -> Sequence[cst.BaseExpression]:
         """Both sides as they are written."""
         return self.form.first, self.form.second
-
-    @property
-    def target(self) -> cst.BaseExpression:
-        """The side that is the photograph; the second where neither name says so."""
-        return self.pair.first if swapped(self.pair.a, self.pair.b) else self.pair.second
-
-    @property
-    def prediction(self) -> cst.BaseExpression:
-        """The other side."""
-        return self.pair.second if swapped(self.pair.a, self.pair.b) else self.pair.first
-
-
-class CallOfTerm(CallContext):
-    """A call of a function that compares two of its parameters.
-
-    Attributes:
-        given: what the call passes for the rendering, where that is known, and for the photograph.
-    """
-
-    def __init__(self, analysis: Analysis, caller: Function, call: cst.Call, given: Sequence[Meaning]) -> None:
-        super().__init__(analysis, caller, call)
-        self.given = given
 
 
 class Rule:
@@ -107,9 +87,6 @@ class Rule:
         why: why a term is skipped, a sentence; default: the docstring.
         VALID, INVALID: code whose terms are weighted, and code with a term that the rule skips; the body of a training
             step, or functions.
-        is_picture: the term compares pictures in a training step, of another kind than photographs.
-        is_always_listed: the report lists the term, also where it is a bare absolute difference.
-        is_listed_for_pictures: the report lists a bare absolute difference where it is of a rendering and a photograph.
         needs_target: warn of the term only if a side is known to be the photograph.
         is_doubted_beside_sites: warn of the term also where the codebase has other terms.
     """
@@ -117,11 +94,8 @@ class Rule:
     id: str = ""
     reason: str = ""
     why: str = ""
-    VALID: List[str] = []
+    VALID: List[str] = ["loss = l1_loss(image, gt)"]
     INVALID: List[str] = []
-    is_picture = False
-    is_always_listed = False
-    is_listed_for_pictures = False
     needs_target = True
     is_doubted_beside_sites = True
 
@@ -129,13 +103,9 @@ class Rule:
         """Return the evidence to skip a term; nothing where the rule does not apply."""
         raise NotImplementedError
 
-    def of_call(self, call: CallOfTerm) -> List[Decider]:
+    def evidence_of_call(self, call: CallContext) -> List[Decider]:
         """Return the evidence that a call is not for the loss; nothing where the rule does not apply."""
         return []
-
-    def found(self, deciders: Sequence[Decider]) -> Evidence:
-        """Return these nodes as evidence for this rule."""
-        return Evidence(self.id, self.reason, deciders)
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether a term that this rule skipped needs a warning, if nothing else is found."""
@@ -162,10 +132,10 @@ def source_of(
     for part in parts:
         if says is not None and isinstance(part, (cst.Name, cst.SimpleString)) and says(part.value):
             return function, part
-    for part in parts if depth < _DEPTH else ():
-        for made in sorted(function.flow.reaching(part), key=lambda definition: definition.order):
-            if made.value is not None:
-                found = source_of(function, made.value, says, depth + 1) if says else (function, made.value)
-                if found is not None:
-                    return header(function) if made.kind == "parameter" else found  # a default stands in the header
+    definitions = [d for part in parts for d in sorted(function.flow.reaching(part), key=lambda d: d.order)]
+    for made in definitions if depth < _DEPTH else ():
+        if made.value is not None:
+            found = source_of(function, made.value, says, depth + 1) if says else (function, made.value)
+            if found is not None:
+                return header(function) if made.kind == "parameter" else found  # a default stands in the header
     return None

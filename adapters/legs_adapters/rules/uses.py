@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Optional, Sequence, Tuple
+from typing import List, NamedTuple, Optional, Sequence
 
 import libcst as cst
 
 from legs_adapters.code.calls import calls_of
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import arguments, attribute_chain, key_of
-from legs_adapters.lexicon.meaning import Meaning, swapped
+from legs_adapters.code.syntax import key_of
+from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.analysis import Analysis
-from legs_adapters.rules.order import first_of_call
-from legs_adapters.rules.rule import CallOfTerm
+from legs_adapters.rules.order import first
+from legs_adapters.rules.rule import CallContext
 from legs_adapters.tensors.gradients import detaches, is_without_grad
 from legs_adapters.terms.findings import Evidence
 
-__all__ = ["Use", "Uses"]
+__all__ = ["Use", "unsettled", "uses_of"]
 
 
 class Use(NamedTuple):
@@ -25,13 +25,13 @@ class Use(NamedTuple):
     Attributes:
         caller, call: the call, and the function that it stands in.
         other: the evidence that it is not for the loss; None where it is.
-        sure: whether its arguments show that.
+        is_sure: whether its arguments show that.
     """
 
     caller: Function
     call: cst.Call
     other: Optional[Evidence]
-    sure: bool
+    is_sure: bool
 
     @property
     def where(self) -> str:
@@ -39,59 +39,43 @@ class Use(NamedTuple):
         return f"{self.caller.module.path}:{self.caller.place(self.call).line}"
 
 
-class Uses:
-    """Answer for one program."""
-
-    def __init__(self, analysis: Analysis) -> None:
-        self.analysis = analysis
-
-    def of(self, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> List[Use]:
-        """Classify the calls, in the training step, of a function that compares two of its parameters."""
-        found: List[Tuple[Use, Optional[str]]] = []
-        prediction, target = _whole(prediction), _whole(target)
-        if not isinstance(target, cst.Name):
-            return []
-        calls = self.analysis.training.sites.get(function, [])
-        for caller, call in sorted(calls, key=lambda site: (site[0].module.path, site[0].place(site[1]).line)):
-            photograph = function.given(call, target.value)
-            rendering = function.given(call, prediction.value) if isinstance(prediction, cst.Name) else None
-            if photograph is not None:
-                given = [node for node in (rendering, photograph) if node is not None]
-                meanings = [self.analysis.meanings.of(caller, node) for node in given]
-                sure = not arguments(call)[2] and not any(self._is_handed_on(caller, node) for node in given)
-                if meanings[-1].role is None and detaches(photograph):  # a photograph needs no detach()
-                    meanings[-1], sure = meanings[-1]._replace(role="render"), False
-                other = first_of_call(CallOfTerm(self.analysis, caller, call, meanings))
-                sure = sure and (other is not None or _are_pair(meanings))
-                found.append((Use(caller, call, other, sure), meanings[0].kind))
-        pictures = any(kind == "image" for _, kind in found)
-        return [
-            use._replace(other=_unknown(use), sure=False) if pictures and kind is None and use.other is None else use
-            for use, kind in found
-        ]
-
-    def unsettled(self, function: Function, uses: Sequence[Use]) -> Optional[str]:
-        """Return the place of a call, or possible call, of unknown purpose; None without one.
-
-        Nothing is weighted without gradients, so the purpose of such a call does not matter.
-        """
-        sure = {id(use.call) for use in uses if use.sure}
-        calls = calls_of(self.analysis.program, function)
-        for caller, call in calls.known:
-            if id(call) not in sure and not is_without_grad(caller, call):
-                return f"{caller.module.path}:{caller.place(call).line}"
-        return calls.lost
-
-    def _is_handed_on(self, caller: Function, node: cst.CSTNode) -> bool:
-        """Return whether the caller got it from several calls of its own, which may pass different kinds."""
-        several = len(self.analysis.training.sites.get(caller, ())) > 1
-        given = [made for part in attribute_chain(node) for made in caller.flow.reaching(part)] if several else []
-        return any(made.kind == "parameter" for made in given)
+def uses_of(analysis: Analysis, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> List[Use]:
+    """Classify the calls, in the training step, of a function that compares two of its parameters."""
+    prediction, target = _whole(prediction), _whole(target)
+    found: List[Use] = []
+    kinds: List[Optional[str]] = []
+    calls = analysis.training.sites.get(function, []) if isinstance(target, cst.Name) else []
+    for caller, call in sorted(calls, key=lambda site: (site[0].module.path, site[0].place(site[1]).line)):
+        sides = [function.given(call, side.value) for side in (prediction, target) if isinstance(side, cst.Name)]
+        if sides[-1] is not None:
+            given = [analysis.meanings.meaning(caller, side) for side in sides if side is not None]
+            is_pair = given[-1].role == "target" and swapped(given[0], given[-1]) is False
+            is_cut = given[-1].role is None and detaches(sides[-1])  # a photograph needs no detach()
+            given[-1] = given[-1]._replace(role="render") if is_cut else given[-1]
+            other = first(CallContext(analysis, caller, call, given))
+            passed_on = any(side is not None and caller.is_parameter(side) for side in sides)
+            several = passed_on and len(analysis.training.sites.get(caller, ())) > 1
+            is_sure = (other is not None or is_pair) and not several and not is_cut
+            found.append(Use(caller, call, other, is_sure))
+            kinds.append(given[0].kind)
+    for at, use in enumerate(found):
+        if kinds[at] is None and "image" in kinds and use.other is None:
+            unknown = Evidence("unknown", "something unknown", [(use.caller, use.call)])
+            found[at] = use._replace(other=unknown, is_sure=False)
+    return found
 
 
-def _unknown(use: Use) -> Evidence:
-    """Return the evidence that the purpose of a call is unknown."""
-    return Evidence("unknown", "something unknown", [(use.caller, use.call)])
+def unsettled(analysis: Analysis, function: Function, uses: Sequence[Use]) -> Optional[str]:
+    """Return the place of a call, or possible call, of unknown purpose; None without one.
+
+    Nothing is weighted without gradients, so the purpose of such a call does not matter.
+    """
+    sure = {id(use.call) for use in uses if use.is_sure}
+    calls = calls_of(analysis.program, function)
+    for caller, call in calls.known:
+        if id(call) not in sure and not is_without_grad(caller, call):
+            return f"{caller.module.path}:{caller.place(call).line}"
+    return calls.lost
 
 
 def _whole(node: cst.CSTNode) -> cst.CSTNode:
@@ -99,8 +83,3 @@ def _whole(node: cst.CSTNode) -> cst.CSTNode:
     while isinstance(node, cst.Subscript) and not isinstance(key_of(node), str):
         node = node.value
     return node
-
-
-def _are_pair(meanings: Sequence[Meaning]) -> bool:
-    """Return whether the first is a rendering and the second surely a photograph."""
-    return meanings[-1].role == "target" and swapped(meanings[0], meanings[-1]) is False

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import re
-from typing import Optional, Sequence, Tuple
-
-import libcst as cst
+from typing import Optional, Sequence
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
-from legs_adapters.code.syntax import arguments, code, one_line
-from legs_adapters.lexicon.masks import is_rows, picked_from
+from legs_adapters.code.syntax import one_line
+from legs_adapters.lexicon.masks import is_rows
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.analysis import Analysis
-from legs_adapters.rules.order import DEFINITION, ORDER, RULES, first, first_of_call
-from legs_adapters.rules.rule import CallOfTerm, Term
-from legs_adapters.rules.uses import Use, Uses
-from legs_adapters.terms.error_maps import reads_of
-from legs_adapters.terms.findings import Kept, Left, Problem, Site
+from legs_adapters.rules.order import RULES, first
+from legs_adapters.rules.rule import Term
+from legs_adapters.rules.uses import Use, unsettled, uses_of
+from legs_adapters.terms.error_maps import is_measured, reads_of
+from legs_adapters.terms.findings import Evidence, Kept, Left, Problem, Site
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import Callback
-from legs_adapters.terms.kinds.named import Named
 from legs_adapters.terms.kinds.reread import Reread
+from legs_adapters.terms.sides import is_role, same_root
 from legs_adapters.terms.writing import Writing
 
 __all__ = ["Verdicts"]
@@ -32,126 +29,114 @@ class Verdicts:
 
     def __init__(self, analysis: Analysis) -> None:
         self.analysis = analysis
-        self.uses: Uses = Uses(analysis)
 
-    def of(self, function: Function, form: Form, place: Place, by_hand: bool) -> Site | Left | Problem:
+    def decide(self, function: Function, form: Form, place: Place, by_hand: bool) -> Site | Left | Problem:
         """Return the verdict on a form; ``by_hand`` where the user named it as the loss."""
         term = Term(self.analysis, function, form)
-        pair = term.pair
-        evidence = None if by_hand else first(term, (*DEFINITION, *ORDER))
+        evidence = None if by_hand else first(term)
         if evidence is not None:
             return Left.at(function, place, evidence)
-        target_first = swapped(pair.a, pair.b)
-        if target_first is None and not by_hand:
-            sides = f"{one_line(pair.first)} and {one_line(pair.second)}"
-            why = f"cannot tell which of {sides} is the rendering and which the photograph"
-            return self.problem(function, form, place, why)
-        flipped = bool(target_first)
-        if not by_hand and "target" not in (pair.a.role, pair.b.role):
-            why = f"nothing shows that {one_line(pair.first if flipped else pair.second)} is a photograph"
-            return self.problem(function, form, place, why, flipped)
-        picked = None if pair.selection else self._picked(function, form)
-        if picked is not None:
-            form = Named.of(form, picked[0].value, picked[1].value, _index(picked[0]))
-            pair = pair._replace(first=form.first, second=form.second)
-        prediction, target = (pair.second, pair.first) if flipped else (pair.first, pair.second)
-        if is_rows(self.analysis.meanings, function, pair.first) or is_rows(
-            self.analysis.meanings, function, pair.second
-        ):
-            why = "the sides are lists of pixels: a weight map needs whole images"
-            return self.problem(function, form, place, why, flipped)
-        if form.why_by_hand():
-            return self.problem(function, form, place, form.why_by_hand(), flipped)
-        if form.is_named and not function.flow.unchanged_at(form.call, form.first, form.second):
-            return self.problem(function, form, place, "the images change before the absolute value is taken", flipped)
-        uses = self.uses.of(function, prediction, target)
-        others = [(use, use.other) for use in uses if use.other is not None]
+        why = self._why_by_hand(term, by_hand)
+        if why:
+            return self.problem(term, place, why)
+        uses = uses_of(self.analysis, function, term.prediction, term.target)
+        others = [use for use in uses if use.other is not None]
         if others and len(others) == len(uses):
-            return Left.at(function, place, others[0][1])
-        unsettled = self.uses.unsettled(function, uses) if others else None
-        if unsettled is not None:  # one body cannot serve both
-            use, other = others[0]
-            why = f"{function.name} is also called for {other.reason} at {use.where}"
-            why += f"; the purpose of the call at {unsettled} is unknown" if unsettled != use.where else ""
-            problem = self.problem(function, form, place, why, flipped)
-            return problem._replace(advice=problem.advice + _in_a_copy(function, uses))
+            return Left.at(function, place, others[0].other or "")
+        lost = unsettled(self.analysis, function, uses) if others else None
+        if lost is not None:  # one body cannot serve both
+            return self._of_two_uses(term, place, uses, lost)
         loss, others_read = reads_of(self.analysis.training, function, form)
         if others_read and not loss:
-            return Left.at(function, place, RULES["untrained"].found(term.here))
+            return Left.at(function, place, Evidence("untrained", "untrained", term.here))
         if others_read:
             alone = len(loss) == 1 and loss[0] not in others_read and len(function.flow.reaching(loss[0])) == 1
             if not alone or not function.flow.unchanged(form.first, form.second):
-                why = f"{one_line(form.node)} has other uses than the loss"
-                return self.problem(function, form, place, why, flipped)
-            form = Reread.of(form, loss[0])
+                return self.problem(term, place, f"{one_line(form.node)} has other uses than the loss")
+            form = Reread(loss[0], form.call, form.first, form.second)
             place = function.place(form.node)
         stands = (function.module.path, place.line, place.column, place.last_line)
-        kept = tuple(self._kept(function, use, other.reason) for use, other in others)
-        selection, why = pair.selection + form.selection, self._why(function, target)
-        return Site(*stands, form, flipped, selection, why, function, kept)
+        flipped, why = term.target is term.pair.first, self._why_photograph(term)
+        kept = tuple(_kept(function, use) for use in others)
+        return Site(*stands, form, flipped, term.pair.selection, why, function, kept)
 
-    def of_callback(self, holder: Function, callback: Callback) -> Site | Left:
-        """Return the verdict on an L1 function that is passed as a callback, from the arguments of its call."""
+    def decide_callback(self, holder: Function, callback: Callback) -> Site | Left:
+        """Return the verdict on an L1 function that is passed by name, from the arguments of its call."""
         term = Term(self.analysis, callback.caller, callback.form)
-        unknown = RULES["unknown"].found(term.here)
         evidence = first(term)
-        if evidence is None and callback.outer is not None:
-            given = [self.analysis.meanings.of(holder, value) for value in arguments(callback.outer)[0][:2]]
-            evidence = first_of_call(CallOfTerm(self.analysis, holder, callback.outer, given)) if given else unknown
         if evidence is None and swapped(term.pair.a, term.pair.b) is not False:
-            evidence = unknown
+            evidence = Evidence("unknown", "unknown", term.here)
         if evidence is not None:
             return Left.at(holder, holder.place(callback.form.node), evidence)
         return self.callable(holder, callback.form)
 
     @staticmethod
     def callable(function: Function, form: Form) -> Site:
-        """Return a callback as a site."""
+        """Return a function that is passed by name as a site."""
         place = function.place(form.node)
         stands = (function.module.path, place.line, place.column, place.line)
         return Site(*stands, form, False, "", "passed by name", function)
 
-    @staticmethod
-    def _kept(function: Function, use: Use, purpose: str) -> Kept:
-        module, line = use.caller.module, use.caller.place(use.call).line
-        return Kept(module.path, line, module.lines.text(line), purpose, _called(function), use.call, use.caller)
-
-    def _picked(self, function: Function, form: Form) -> Optional[Tuple[cst.Subscript, cst.Subscript]]:
-        """Return ``image[:, mask]`` and ``photo[:, mask]`` of a form that compares names of theirs.
-
-        None where the names have other values, or where image, photo or mask is reassigned before the term.
-        """
-        if not form.takes_index:
+    def doubt(self, function: Function, form: Form, place: Place, left: Left) -> Optional[Problem]:
+        """Return the warning of a skipped term that may be the loss, if nothing else is found; None of any other."""
+        term = Term(self.analysis, function, form)
+        rule = RULES[left.evidence.rule] if left.evidence is not None else None
+        if rule is None or not rule.may_be_loss(term) or is_measured(function, form) or same_root(form):
             return None
-        one, other = (picked_from(self.analysis.meanings, function, side) for side in (form.first, form.second))
-        if one is None or other is None or not function.flow.unchanged_at(form.call, one, other):
+        pictures = "image" in (term.pair.a.kind, term.pair.b.kind)
+        pictures = pictures or (function.runs_by_instance and is_role(form.first) and is_role(form.second))
+        if not pictures or (rule.needs_target and "target" not in (term.pair.a.role, term.pair.b.role)):
             return None
-        alike = re.sub(r"\s+", "", _index(one)) == re.sub(r"\s+", "", _index(other))
-        return (one, other) if alike else None
+        return self.problem(term, place, f"nothing shows that this is the loss ({left.reason})")
 
-    def _why(self, function: Function, target: cst.BaseExpression) -> str:
+    def problem(self, term: Term, place: Place, reason: str) -> Problem:
+        """Return a term as a problem, with the advice for the manual edit."""
+        advice = term.form.advice(Writing(swapped=term.target is term.pair.first))
+        if self._has_rows(term):
+            advice = "legs_loss.l1_loss(rendering, photograph), on the images before they are flattened"
+        return Problem.at(term.function, place, reason, advice)
+
+    def _why_by_hand(self, term: Term, by_hand: bool) -> str:
+        """Return why no edit gives the images their weights; empty where one may."""
+        pair = term.pair
+        if swapped(pair.a, pair.b) is None and not by_hand:
+            sides = f"{one_line(pair.first)} and {one_line(pair.second)}"
+            return f"cannot tell which of {sides} is the rendering and which the photograph"
+        if "target" not in (pair.a.role, pair.b.role) and not by_hand:
+            return f"nothing shows that {one_line(term.target)} is a photograph"
+        if self._has_rows(term):
+            return "the sides are lists of pixels: a weight map needs whole images"
+        return term.form.why_by_hand()
+
+    def _has_rows(self, term: Term) -> bool:
+        return any(is_rows(self.analysis.meanings, term.function, side) for side in (term.pair.first, term.pair.second))
+
+    def _of_two_uses(self, term: Term, place: Place, uses: Sequence[Use], lost: str) -> Problem:
+        use = next(use for use in uses if use.other is not None)
+        assert use.other is not None
+        why = f"{term.function.name} is also called for {use.other.reason} at {use.where}"
+        why += f"; the purpose of the call at {lost} is unknown" if lost != use.where else ""
+        problem = self.problem(term, place, why)
+        calls = [use.where for use in uses if use.other is None]
+        shown = ", ".join(calls[:3]) + (f" and {len(calls) - 3} more" if len(calls) > 3 else "")
+        copy = f", in a copy of {_called(term.function)} for {shown}" if calls else ""
+        return problem._replace(advice=problem.advice + copy)
+
+    def _why_photograph(self, term: Term) -> str:
         """Return what shows that a side is the photograph."""
-        name = one_line(target)
-        if self.analysis.meanings.origin(function, target).role == "target":
+        name = one_line(term.target)
+        if self.analysis.meanings.origin(term.function, term.target).role == "target":
             return f"{name} is the photograph"
-        return f"{name} is a parameter" if function.is_parameter(target) else f"{name} is the photograph by its name"
-
-    def problem(self, function: Function, form: Form, place: Place, reason: str, flipped: bool = False) -> Problem:
-        """Return a form as a problem, with the advice for the manual edit."""
-        rows = any(is_rows(self.analysis.meanings, function, side) for side in (form.first, form.second))
-        text = form.advice(Writing(swapped=flipped), rows)
-        return Problem.at(function, place, reason, text)
+        is_parameter = term.function.is_parameter(term.target)
+        return f"{name} is a parameter" if is_parameter else f"{name} is the photograph by its name"
 
 
-def _index(node: cst.Subscript) -> str:
-    return code(node)[len(code(node.value)) :].strip()
-
-
-def _in_a_copy(function: Function, uses: Sequence[Use]) -> str:
-    """Return the advice to weight a copy of a function, for the calls of the loss; empty without such a call."""
-    calls = [use.where for use in uses if use.other is None]
-    shown = ", ".join(calls[:3]) + (f" and {len(calls) - 3} more" if len(calls) > 3 else "")
-    return f", in a copy of {_called(function)} for {shown}" if calls else ""
+def _kept(function: Function, use: Use) -> Kept:
+    """Return a call that is not for the loss as one that is not weighted."""
+    assert use.other is not None
+    module, line = use.caller.module, use.caller.place(use.call).line
+    reason, text = use.other.reason, module.lines.text(line)
+    return Kept(module.path, line, text, reason, _called(function), use.call, use.caller)
 
 
 def _called(function: Function) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Set
+from typing import List, NamedTuple
 
 import libcst as cst
 
@@ -14,7 +14,7 @@ from legs_adapters.tensors.gradients import under_no_grad
 from legs_adapters.tensors.operations import EXTREMES, LEAVES, SIZES
 from legs_adapters.terms.form import Form
 
-__all__ = ["Reads", "is_asked", "is_measured", "reads_of"]
+__all__ = ["Reads", "is_measured", "reads_of"]
 
 
 class Reads(NamedTuple):
@@ -29,44 +29,32 @@ def reads_of(training: Training, function: Function, form: Form) -> Reads:
     made = [d for d in function.flow.every_definition if d.kind == "assign" and d.value is form.node]
     if not form.is_map or not made or "." in made[0].place:
         return Reads([], [])
-    reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
-    unused = {id(part) for call in function.flow.calls if call_name(call) in LEAVES for part in attribute_chain(call)}
-    changed = [d.node.target for d in function.flow.every_definition if isinstance(d.node, cst.AugAssign)]
-    unused |= {id(part) for target in changed for part in attribute_chain(target)}
-    masks: Set[int] = set()
-    ranges: Set[int] = set()
-    squared: Set[int] = set()  # or compared: a weight would move a threshold
+    unused: List[cst.CSTNode] = []
+    masks: List[cst.CSTNode] = []
+    compared: List[cst.CSTNode] = []  # or squared, or scaled: a weight moves the threshold
     for part in walk_expressions(function.body):
-        if isinstance(part, cst.Attribute) and part.attr.value in SIZES:
-            unused.add(id(part.value))
-        elif isinstance(part, cst.Comparison) or (
-            isinstance(part, cst.BinaryOperation) and isinstance(part.operator, cst.Power)
-        ):
-            squared.add(id(part.left))
+        is_square = isinstance(part, cst.BinaryOperation) and isinstance(part.operator, cst.Power)
+        if is_square or isinstance(part, cst.Comparison):
+            compared.append(part.left)  # type: ignore[attr-defined]
+        elif isinstance(part, cst.Attribute) and part.attr.value in SIZES:
+            unused.append(part.value)
         elif isinstance(part, cst.Call) and call_name(part) in EXTREMES and not part.args:
-            ranges |= {id(node) for node in attribute_chain(part.func)}
+            compared += attribute_chain(part.func)
+        elif isinstance(part, cst.AugAssign):
+            unused += attribute_chain(part.target)
+        elif isinstance(part, cst.Call) and call_name(part) in LEAVES:
+            unused += attribute_chain(part)
         elif isinstance(part, cst.Call) and makes_mask(part):
-            masks |= {
-                id(node) for given in (part.func, *(arg.value for arg in part.args)) for node in attribute_chain(given)
-            }
-    reads = [read for read in reads if id(read) not in unused and not under_no_grad(function, read)]
-    loss = [read for read in reads if training.includes(read) and id(read) not in masks]
-    if any(id(read) in ranges for read in reads):
-        loss = []  # it is only scaled to 0..1
-    if any(id(read) in squared for read in reads):
-        return Reads(loss, reads)
-    return Reads(loss, [read for read in reads if read not in loss])
+            masks += [node for each in (part.func, *(arg.value for arg in part.args)) for node in attribute_chain(each)]
+    reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
+    reads = [read for read in reads if read not in unused and not under_no_grad(function, read)]
+    loss = [read for read in reads if training.includes(read) and read not in masks]
+    is_compared = any(read in compared for read in reads)
+    return Reads(loss, reads if is_compared else [read for read in reads if read not in loss])
 
 
 def is_measured(function: Function, form: Form) -> bool:
-    """Return whether a term is converted to a number, ``error.mean().item()``, which has no gradient."""
-    return any(
-        call_name(call) in LEAVES and any(part is form.node for part in attribute_chain(call))
-        for call in function.flow.calls
-    )
-
-
-def is_asked(function: Function, form: Form) -> bool:
-    """Return whether a term is only compared with something, ``while abs(height - wanted) > 0.1``."""
-    parts = walk_expressions(function.body)
-    return any(isinstance(part, cst.Comparison) and part.left is form.node for part in parts)
+    """Return whether a term is only a number: ``error.mean().item()``, or compared, ``abs(height - wanted) > 0.1``."""
+    numbers = [part for call in function.flow.calls if call_name(call) in LEAVES for part in attribute_chain(call)]
+    compared = [part.left for part in walk_expressions(function.body) if isinstance(part, cst.Comparison)]
+    return any(part is form.node for part in (*numbers, *compared))

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar, List, Optional, Tuple, TypeVar
+from dataclasses import dataclass
+from typing import ClassVar, List, Optional, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import one_line
-from legs_adapters.lexicon.masks import without_rows
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text
 from legs_adapters.terms.writing import Writing
 
 __all__ = ["Form"]
-
-_F = TypeVar("_F", bound="Form")
 
 
 @dataclass(frozen=True)
@@ -30,11 +27,8 @@ class Form:
         callee: what is called, for a form that is a call of a function; None for ``abs``.
         extras: the call's further arguments.
         difference: the ``a - b``, for a form that is an absolute value.
-        selection: the index of a named difference, ``[mask]``; empty without.
         makes: what becomes of the differences: "mean", "none" (the map), or "own", anything else that is an L1; see
             `L1Functions.shape`.
-        order: of several kinds that recognise a call, the one with the lowest order is used.
-        is_named: whether the difference is assigned to a name first, so that no single expression can be replaced.
         weighs: whether the edit weights the term.
         term: what it is a term of, in the JSON report.
         done: what the edit does to it, in words.
@@ -47,11 +41,8 @@ class Form:
     callee: Optional[cst.BaseExpression] = None
     extras: Tuple[cst.Arg, ...] = ()
     difference: Optional[cst.BinaryOperation] = None
-    selection: str = ""
     makes: str = "own"
 
-    order: ClassVar[int] = 0
-    is_named: ClassVar[bool] = False
     weighs: ClassVar[bool] = True
     term: ClassVar[str] = "l1"
     done: ClassVar[str] = "is weighted"
@@ -71,11 +62,6 @@ class Form:
         """Return whether the term is the plain mean."""
         return self.makes == "mean"
 
-    @property
-    def takes_index(self) -> bool:
-        """Return whether `indexed` keeps the term's value."""
-        return False
-
     def why_by_hand(self) -> str:
         """Return why the form cannot be edited, empty where it can."""
         return ""
@@ -88,23 +74,10 @@ class Form:
         """
         raise NotImplementedError(type(self).__name__)
 
-    def advice(self, writing: Writing, rows: bool) -> str:
-        """Return the advice for a manual edit; ``rows`` where the images are lists of pixels."""
-        prediction, target = writing.ordered(self.first, self.second)
-        whole, other = without_rows(prediction), without_rows(target)
-        if whole is not prediction and other is not target:
-            image, photo = one_line(whole), one_line(other)
-            return writing.call(image, f"{photo}.reshape({image}.shape)")
-        return self._advice(writing, one_line(prediction), one_line(target), rows)
-
-    def _advice(self, writing: Writing, prediction: str, target: str, rows: bool) -> str:
-        if rows:
-            return f"{writing.package}.l1_loss(rendering, photograph), on the images before they are flattened"
+    def advice(self, writing: Writing) -> str:
+        """Return what to write by hand."""
+        prediction, target = writing.ordered(one_line(self.first), one_line(self.second))
         return writing.call(prediction, target, self.is_map, self._own(writing))
 
     def _own(self, writing: Writing) -> str:
         return ""
-
-    def moved(self: _F, selection: str) -> _F:
-        """Return the form with another selection."""
-        return replace(self, selection=selection)

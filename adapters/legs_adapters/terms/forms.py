@@ -1,11 +1,8 @@
-"""Find the L1 expressions of a function: each of its calls is given to every kind in ``terms/kinds``."""
+"""Find the L1 expressions of a function: each of its calls is given to every kind that is found in calls."""
 
 from __future__ import annotations
 
-import importlib
-import inspect
-import pkgutil
-from typing import Dict, List, Optional, Set, Type
+from typing import Dict, List, Optional, Set, Tuple, Type
 
 import libcst as cst
 
@@ -13,11 +10,15 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import call_name, walk_expressions
 from legs_adapters.tensors.absolute import is_abs
 from legs_adapters.tensors.operations import TRANSFORMS
-from legs_adapters.terms import kinds
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
+from legs_adapters.terms.kinds.absolute import Absolute
+from legs_adapters.terms.kinds.called import Called
+from legs_adapters.terms.kinds.indirect import Indirect
 
-__all__ = ["Forms"]
+__all__ = ["KINDS", "Forms"]
+
+KINDS: Tuple[Type[Form], ...] = (Absolute, Indirect, Called)  # the first that recognises a call
 
 
 class Forms:
@@ -25,10 +26,9 @@ class Forms:
 
     def __init__(self, functions: L1Functions) -> None:
         self.functions = functions
-        self._kinds = _kinds()
         self._known: Dict[Function, List[Form]] = {}
 
-    def of(self, function: Function) -> List[Form]:
+    def in_function(self, function: Function) -> List[Form]:
         """Return the L1 expressions in a function's own body, in source order; the widest where they nest."""
         if function not in self._known:
             self._known[function] = self._find(function)
@@ -37,32 +37,17 @@ class Forms:
     def _find(self, function: Function) -> List[Form]:
         found: List[Form] = []
         inside = _transformed(function)
-        for node in function.flow.expressions:
-            if id(node) in inside or not isinstance(node, cst.Call):
-                continue
-            form = self._recognise(function, node)
+        for call in function.flow.calls:
+            form = self._recognise(function, call) if id(call) not in inside else None
             if form is not None:
                 found.append(form)
                 inside.add(id(form.call))
-                if form.difference is None or form.callee is None:
-                    inside.update(id(n) for n in walk_expressions(form.node) if isinstance(n, cst.Call) and is_abs(n))
+                inside.update(id(n) for n in walk_expressions(form.node) if isinstance(n, cst.Call) and is_abs(n))
         return found
 
     def _recognise(self, function: Function, call: cst.Call) -> Optional[Form]:
-        forms = (kind.find(self.functions, function, call) for kind in self._kinds)
+        forms = (kind.find(self.functions, function, call) for kind in KINDS)
         return next((form for form in forms if form is not None), None)
-
-
-def _kinds() -> List[Type[Form]]:
-    """Return the kinds of L1 that are found in calls, in their order."""
-    modules = [
-        importlib.import_module(f"{kinds.__name__}.{info.name}") for info in pkgutil.iter_modules(kinds.__path__)
-    ]
-    classes = {value for module in modules for value in vars(module).values() if inspect.isclass(value)}
-    found = [
-        kind for kind in classes if issubclass(kind, Form) and "find" in vars(kind) and kind is not Form and kind.weighs
-    ]
-    return sorted(found, key=lambda kind: kind.order)
 
 
 def _transformed(function: Function) -> Set[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Dict, List, Optional, Set, Tuple
+from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
@@ -13,14 +13,34 @@ from legs_adapters.code.returned import known_arguments, returned
 from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, walk_expressions
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
-from legs_adapters.tensors.absolute import abs_argument, is_abs, mean_of
+from legs_adapters.tensors.absolute import abs_argument, is_abs, is_difference, mean_of
 from legs_adapters.tensors.operations import ASKS, LIKE, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
 from legs_adapters.terms.prospects import Prospects
 
 __all__ = ["L1Functions"]
 
+_DEPTH = 4
 _GSPLAT_L1 = re.compile(r"^gsplat\.losses\.l1_loss$")
+_AS_MAP = (["reduction='none'"], ['reduction="none"'])
 _TORCH_MODULE = re.compile(r"(^|\.)L1Loss$")  # nerfstudio hands torch's on
+
+
+class _Body(NamedTuple):
+    """A function's body.
+
+    Attributes:
+        pairs: its first two parameters, and the names of equal selections of both.
+        selecting: the ids of the parts of those selections.
+    """
+
+    function: Function
+    pairs: Sequence[Tuple[str, str]]
+    selecting: Set[int]
+    depth: int
+
+    def is_pair(self, left: cst.CSTNode, right: cst.CSTNode) -> bool:
+        """Return whether two expressions are the same of the one and of the other."""
+        return any(_are_mirrored(left, right, *pair) for pair in self.pairs)
 
 
 class L1Functions:
@@ -54,203 +74,156 @@ class L1Functions:
         return self._shape(function, call, depth)
 
     def _shape(self, function: Function, call: Optional[cst.Call], depth: int) -> Optional[str]:
-        names = function.parameters
-        if len(names) < 2 or depth > 4 or not self._prospects.of(function.text):
+        if len(function.parameters) < 2 or depth > _DEPTH or not self._prospects.may_lead(function.text):
             return None
-        a, b = names[:2]
-        if not self._only_differences(function, a, b, depth):
+        if function not in self._only:
+            self._only[function] = False  # for recursion
+            self._only[function] = self._compares_only(function, depth)
+        if not self._only[function]:
             return None
         if set(function.decorators) - TRANSPARENT:
             return "own"  # the decorator may change what is returned: a mean, a weight
-        known = known_arguments(function, call)
-        value = returned(function, known)
-        if value is not None:
-            shape = self._shape_of(function, value, a, b, depth)
-            if shape is not None:
-                return shape
-        return "own" if SPEAKS_OF_LOSS.search(function.name) or function.runs_by_instance else None
+        value = returned(function, known_arguments(function, call))
+        shape = self._shape_of(function, value, depth) if isinstance(value, cst.Call) else None
+        return shape or ("own" if SPEAKS_OF_LOSS.search(function.name) or function.runs_by_instance else None)
 
-    def shape_of_reference(self, reference: Reference, node: cst.Call) -> Optional[str]:
+    def _shape_of(self, function: Function, node: cst.Call, depth: int) -> Optional[str]:
+        """Return what a returned call makes of the two: "mean" or "none", None for anything else."""
+        pair, meant = function.parameters[:2], mean_of(node)
+        difference = abs_argument(meant or node)
+        if isinstance(difference, cst.BinaryOperation) and is_difference(difference):
+            sides = {code(side).strip("() ") for side in (difference.left, difference.right)}
+            return ("none" if meant is None else "mean") if sides == set(pair) else None
+        references = self.program.resolve(function, node.func)
+        if [code(arg.value) for arg in node.args[:2]] != pair or len(references) != 1:
+            return None
+        if TORCH_L1.search(str(references[0].target)):
+            return "none" if [code(arg).replace(" ", "") for arg in node.args[2:]] in _AS_MAP else None
+        shape = self.shape_of_reference(references[0], node, depth + 1) if len(node.args) == 2 else None
+        return shape if shape != "own" else None
+
+    def shape_of_reference(self, reference: Reference, node: cst.Call, depth: int = 0) -> Optional[str]:
         """Return what `shape` does for the function of a call, torch's functions included."""
+        name = str(reference.target)
+        if reference.kind == "external" and _GSPLAT_L1.match(name):
+            return "none"
         if reference.kind == "external":
-            name = str(reference.target)
-            if _GSPLAT_L1.match(name):
-                return "none"
-            if TORCH_L1.search(name):
-                return "own"
-            return "own" if is_l1_name(name.split(".")[-1]) and not name.endswith("L1Loss") else None
+            is_l1 = is_l1_name(name.split(".")[-1]) and not name.endswith("L1Loss")
+            return "own" if is_l1 or TORCH_L1.search(name) else None
         if reference.kind == "made by":
-            return "own" if _TORCH_MODULE.search(str(reference.target)) else None
+            return "own" if _TORCH_MODULE.search(name) else None
         if reference.kind == "function" and isinstance(reference.target, Function):
-            return self.shape(reference.target, node)
-        if reference.kind == "instance":
+            return self.shape(reference.target, node, depth)
+        if reference.kind == "instance" and depth == 0:
             methods = self.program.member(reference.target, "forward")  # type: ignore[arg-type]
             if len(methods) == 1 and isinstance(methods[0].target, Function):
                 return "own" if self.shape(methods[0].target, node) else None
         return None
 
-    def is_l1(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
-        """Return whether an expression is an L1 function, torch's or the codebase's own."""
+    # -- what a body may do with the two
 
-        def known(reference: Reference) -> bool:
-            if isinstance(reference.target, Function):
-                return not reference.guess and self.shape(reference.target, None, depth + 1) is not None
-            return reference.kind == "external" and TORCH_L1.search(str(reference.target)) is not None
-
-        references = self.program.resolve(function, node)
-        return bool(references) and all(map(known, references))
-
-    def _shape_of(self, function: Function, node: cst.CSTNode, a: str, b: str, depth: int) -> Optional[str]:
-        if not isinstance(node, cst.Call):
-            return None
-        meant = mean_of(node)
-        argument = abs_argument(meant if meant is not None else node)
-        if isinstance(argument, cst.BinaryOperation) and isinstance(argument.operator, cst.Subtract):
-            if {code(argument.left).strip("() "), code(argument.right).strip("() ")} == {a, b}:
-                return "mean" if meant is not None else "none"
-            return None
-        positional, keywords, starred = arguments(node)
-        if [code(value) for value in positional[:2]] != [a, b] or starred:
-            return None
-        references = self.program.resolve(function, node.func)
-        if len(references) != 1:
-            return None
-        reference = references[0]
-        if reference.kind == "external" and TORCH_L1.search(str(reference.target)) and len(positional) == 2:
-            return "none" if list(keywords) == ["reduction"] and constant(keywords["reduction"]) == "none" else None
-        if reference.kind == "function" and isinstance(reference.target, Function) and len(node.args) == 2:
-            shape = self.shape(reference.target, node, depth + 1)
-            return shape if shape in ("mean", "none") else None
-        return None
-
-    def _only_differences(self, function: Function, a: str, b: str, depth: int) -> bool:
-        """Return whether a function uses its first two parameters in differences only."""
-        if function not in self._only:
-            self._only[function] = False  # for recursion
-            self._only[function] = self._meet_in_differences(function, a, b, depth)
-        return self._only[function]
-
-    def _meet_in_differences(self, function: Function, a: str, b: str, depth: int) -> bool:
-        assert isinstance(function.node, cst.FunctionDef)
-        nodes: List[cst.CSTNode] = []
-        for statement in function.body.body:
-            nodes.extend(walk_expressions(statement))
-        pairs, allowed = _picked_pairs(function, nodes, a, b)
-        absolute = False
-        changed: List[Tuple[str, cst.CSTNode, cst.BaseExpression]] = []
-
-        def mirrored(left: cst.BaseExpression, right: cst.BaseExpression) -> bool:
-            return any(_mirrored(left, right, *pair) for pair in pairs)
-
+    def _compares_only(self, function: Function, depth: int) -> bool:
+        """Return whether a function takes an L1 of its first two parameters, and does nothing else with them."""
+        nodes = [node for statement in function.body.body for node in walk_expressions(statement)]
+        pairs, selecting = _selected(function, nodes)
+        body, allowed = _Body(function, pairs, selecting, depth), set(selecting)
         for node in nodes:
-            if isinstance(node, cst.BinaryOperation):
-                if isinstance(node.operator, cst.Power) and depends(function, node.left, {a, b}):
-                    return False
-                if isinstance(node.operator, cst.Multiply) and constant(node.right, 1) == 0:
-                    allowed.update(id(n) for n in walk_expressions(node))
-                if isinstance(node.operator, cst.Subtract) and mirrored(node.left, node.right):
-                    if self._is_made_by(function, node.left):
-                        return False  # edges(a) - edges(b): of what is made of the two
-                    allowed.update(id(n) for n in walk_expressions(node))
-            elif isinstance(node, cst.Call):
-                name = call_name(node)
-                if name in TRANSFORMS | OTHER_LOSSES:
-                    return False
-                if name in ASKS | LIKE:
-                    allowed.update(id(n) for arg in node.args for n in walk_expressions(arg))
-                absolute = absolute or is_abs(node)
-                positional = arguments(node)[0]
-                spread = any(arg.star == "*" for arg in node.args)
-                pair = len(positional) >= 2 and not spread and mirrored(positional[0], positional[1])
-                if pair and (
-                    any(
-                        self._is_l1_reference(function, r, node, depth)
-                        for r in self.program.resolve(function, node.func)
-                    )
-                    or any(self._is_handed_l1(function, value, depth) for value in positional[2:])
-                ):
-                    allowed.update(id(n) for value in positional[:2] for n in walk_expressions(value))
-                    absolute = True
-            elif isinstance(node, cst.Comparison):
-                # A mask made from the second, `gt != 0`: it is handed over as it is.
-                allowed.update(id(n) for n in walk_expressions(node) if isinstance(n, cst.Name) and n.value == b)
-            elif isinstance(node, cst.Attribute) and node.attr.value in SIZES:
-                allowed.add(id(node.value))
-            elif isinstance(node, cst.Subscript) and isinstance(node.value, cst.Name) and isinstance(key_of(node), str):
-                if node.value.value in (a, b):
-                    return False  # what is compared is in them: no pictures themselves
-            elif isinstance(node, (cst.Assign, cst.AugAssign)):
-                # `a = a[mask]`, then `b = b[mask]`, is as good as a mask on the difference.
-                targets = [t.target for t in node.targets] if isinstance(node, cst.Assign) else [node.target]
-                taken = [t.value for t in targets if isinstance(t, cst.Name) and t.value in (a, b)]
-                if taken and (isinstance(node, cst.AugAssign) or len(targets) != 1):
-                    return False
-                if taken:
-                    changed.append((taken[0], targets[0], node.value))
-        if not absolute or len(changed) % 2:
-            return False
+            may_be = _MAY_BE.get(type(node))
+            parts = may_be(self, body, node) if may_be is not None else ()
+            if parts is None:
+                return False
+            allowed.update(id(part) for each in parts for part in walk_expressions(each))
         beside = [
             each.value for value in function.flow.returns if isinstance(value, cst.Tuple) for each in value.elements
         ]
-        if not all(depends(function, each, {a, b}) for each in beside):
+        if not all(depends(function, each, set(pairs[0])) for each in beside):
             return False  # return loss, mask
-        for (one, target, value), (other, other_target, other_value) in zip(changed[::2], changed[1::2]):
-            if {one, other} != {a, b} or not _mirrored(value, other_value, a, b):
-                return False
-            for part in (target, value, other_target, other_value):
-                allowed.update(id(n) for n in walk_expressions(part))
         compared = {name for pair in pairs for name in pair}
         names = [node for node in nodes if isinstance(node, cst.Name) and node.value in compared]
-        return bool(names) and all(id(node) in allowed for node in names)
+        absolute = any(isinstance(node, cst.Call) and (is_abs(node) or self._is_l1(body, node)) for node in nodes)
+        return absolute and bool(names) and all(id(node) in allowed for node in names)
 
-    def _is_l1_reference(self, function: Function, reference: Reference, node: cst.Call, depth: int) -> bool:
-        if reference.kind == "made by" and not function.runs_by_instance:
-            return False  # self.l1_loss(...) in a method of its name: there it is the term itself
-        if reference.kind == "function" and isinstance(reference.target, Function):
-            return self.shape(reference.target, node, depth + 1) is not None
-        return reference.kind in ("external", "made by") and self.shape_of_reference(reference, node) is not None
+    def _in_operation(self, body: _Body, node: cst.BinaryOperation) -> Optional[List[cst.CSTNode]]:
+        if isinstance(node.operator, cst.Power) and depends(body.function, node.left, set(body.pairs[0])):
+            return None
+        if is_difference(node) and body.is_pair(node.left, node.right):
+            calls = [part for part in walk_expressions(node.left) if isinstance(part, cst.Call)]
+            made = [r for call in calls for r in self.program.resolve(body.function, call.func) if not r.guess]
+            return None if any(r.kind == "function" for r in made) else [node]  # edges(a) - edges(b)
+        return [node] if isinstance(node.operator, cst.Multiply) and constant(node.right, 1) == 0 else []
 
-    def _is_handed_l1(self, function: Function, node: cst.BaseExpression, depth: int) -> bool:
-        """Return whether an argument is an L1 function itself, as in ``masked_loss(pred, gt, l1, mask=mask)``."""
-        return isinstance(node, cst.Name) and self.is_l1(function, node, depth)
+    def _in_call(self, body: _Body, node: cst.Call) -> Optional[List[cst.CSTNode]]:
+        if call_name(node) in TRANSFORMS | OTHER_LOSSES:
+            return None
+        if call_name(node) in ASKS | LIKE:
+            return list(node.args)
+        return list(node.args[:2]) if self._is_l1(body, node) else []
 
-    def _is_made_by(self, function: Function, node: cst.CSTNode) -> bool:
-        """Return whether an expression calls a function of the codebase."""
-        calls = [part for part in walk_expressions(node) if isinstance(part, cst.Call)]
-        return any(
-            r.kind == "function" and not r.guess for call in calls for r in self.program.resolve(function, call.func)
-        )
+    def _in_comparison(self, body: _Body, node: cst.Comparison) -> List[cst.CSTNode]:
+        """A mask that is made from the second, ``gt != 0``: it is handed over as it is."""
+        target = body.pairs[0][1]
+        return [part for part in walk_expressions(node) if isinstance(part, cst.Name) and part.value == target]
+
+    def _in_attribute(self, body: _Body, node: cst.Attribute) -> List[cst.CSTNode]:
+        return [node.value] if node.attr.value in SIZES else []
+
+    def _in_subscript(self, body: _Body, node: cst.Subscript) -> Optional[List[cst.CSTNode]]:
+        """What is compared is in a dictionary: the parameters are no pictures themselves."""
+        is_entry = isinstance(node.value, cst.Name) and isinstance(key_of(node), str)
+        return None if is_entry and node.value.value in body.pairs[0] else []  # type: ignore[attr-defined]
+
+    def _in_assignment(self, body: _Body, node: cst.Assign | cst.AugAssign) -> Optional[List[cst.CSTNode]]:
+        targets = [each.target for each in node.targets] if isinstance(node, cst.Assign) else [node.target]
+        is_new = any(isinstance(target, cst.Name) and target.value in body.pairs[0] for target in targets)
+        return None if is_new and id(node) not in body.selecting else []
+
+    def _is_l1(self, body: _Body, node: cst.Call) -> bool:
+        """Return whether a call is of an L1 with both, torch's or the codebase's own."""
+        positional = arguments(node)[0]
+        spread = any(arg.star == "*" for arg in node.args)
+        if len(positional) < 2 or spread or not body.is_pair(*positional[:2]):
+            return False
+        references = self.program.resolve(body.function, node.func)
+        # self.l1_loss(...) in a method of its name: there it is the term itself
+        known = [r for r in references if r.kind != "made by" or body.function.runs_by_instance]
+        return any(self.shape_of_reference(reference, node, body.depth + 1) for reference in known)
 
 
-def _picked_pairs(
-    function: Function, nodes: List[cst.CSTNode], a: str, b: str
-) -> Tuple[List[Tuple[str, str]], Set[int]]:
+_MAY_BE: Dict[type, Callable[..., Optional[Iterable[cst.CSTNode]]]] = {
+    cst.BinaryOperation: L1Functions._in_operation,
+    cst.Call: L1Functions._in_call,
+    cst.Comparison: L1Functions._in_comparison,
+    cst.Attribute: L1Functions._in_attribute,
+    cst.Subscript: L1Functions._in_subscript,
+    cst.Assign: L1Functions._in_assignment,
+    cst.AugAssign: L1Functions._in_assignment,
+}  # by the type of a node: the parts in which it may have the two; None where the function is no L1
+
+
+def _selected(function: Function, nodes: Sequence[cst.CSTNode]) -> Tuple[List[Tuple[str, str]], Set[int]]:
     """Return the two parameters and equal selections of both, ``x = a[:, mask]``, ``y = b[:, mask]``.
 
     Returns:
-        Those pairs of names, and the ids of the assignments' parts.
+        Those pairs of names, and the ids of the assignments' parts; ``a = a[mask]``, ``b = b[mask]`` are such, too.
     """
-    pairs, parts = [(a, b)], set()
-    picked: List[Tuple[str, cst.Assign]] = []
-    for node in nodes:
-        if isinstance(node, cst.Assign) and len(node.targets) == 1 and isinstance(node.value, cst.Subscript):
-            target = node.targets[0].target
-            if isinstance(target, cst.Name) and len(function.flow.definitions.get(target.value, [])) == 1:
-                picked.append((target.value, node))
-    for (one, first), (other, second) in zip(picked, picked[1:]):
-        of = [node.value.value for node in (first, second) if isinstance(node.value, cst.Subscript)]
-        texts = [code(part) for part in of]
-        if sorted(texts) == sorted([a, b]) and _mirrored(first.value, second.value, a, b):
-            pairs.append((one, other) if texts[0] == a else (other, one))
-            parts |= {id(part) for node in (first, second) for part in walk_expressions(node)}
-    return pairs, parts
+    a, b = function.parameters[:2]
+    pairs, selecting = [(a, b)], set()
+    assigned = [(node, node.targets[0].target) for node in nodes if isinstance(node, cst.Assign)]
+    for (first, one), (second, other) in zip(assigned, assigned[1:]):
+        if not (isinstance(one, cst.Name) and isinstance(other, cst.Name)):
+            continue
+        is_new = all(len(function.flow.definitions.get(name.value, ())) == 1 for name in (one, other))
+        is_new = is_new and isinstance(first.value, cst.Subscript)
+        if (is_new or {one.value, other.value} == {a, b}) and _are_mirrored(first.value, second.value, a, b):
+            in_order = re.search(rf"\b{re.escape(a)}\b", code(first.value)) is not None
+            pairs.append((one.value, other.value) if in_order else (other.value, one.value))
+            selecting |= {id(part) for node in (first, second) for part in walk_expressions(node)}
+    return pairs, selecting
 
 
-def _mirrored(left: cst.BaseExpression, right: cst.BaseExpression, a: str, b: str) -> bool:
+def _are_mirrored(left: cst.CSTNode, right: cst.CSTNode, a: str, b: str) -> bool:
     """Return whether two expressions are equal except for ``a`` in one and ``b`` in the other."""
-    swap = re.compile(rf"\b({re.escape(a)}|{re.escape(b)})\b")
+    either = re.compile(rf"\b({re.escape(a)}|{re.escape(b)})\b")
     texts = [re.sub(r"\s+", "", code(node)).strip("()") for node in (left, right)]
-    found = [swap.findall(text) for text in texts]
-    if not found[0] or not found[1] or len(set(found[0])) != 1 or len(set(found[1])) != 1 or found[0][0] == found[1][0]:
-        return False
-    return swap.sub("?", texts[0]) == swap.sub("?", texts[1])
+    one, other = (set(either.findall(text)) for text in texts)
+    return len(one) == len(other) == 1 and one != other and either.sub("?", texts[0]) == either.sub("?", texts[1])

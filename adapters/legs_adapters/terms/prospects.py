@@ -25,7 +25,7 @@ _GIVEN = re.compile(
     re.M,
 )
 _ADDED = re.compile(r"\bself\.(\w+)\.(?:append|add|extend|update|setdefault)\(([^\n]*)")
-_CALLEE = re.compile(r"([\w.]+)[ \t]*\(")
+_SINGLE_CALL = re.compile(r"([\w.]+)[ \t]*\((?:[^()]|\([^()]*\))*\)[ \t]*(?:#.*)?$")
 _RENAMED = re.compile(r"\b(\w+)[ \t]+as[ \t]+(\w+)")
 _DEFAULT = re.compile(r"\b(\w+)(?:[ \t]*:[^=,()\n]+)?[ \t]*=[ \t]*([\w.]*[lL]1\w*)(?![\w.]*[ \t]*\()")
 
@@ -50,7 +50,6 @@ class Prospects:
             else:
                 for word in known.intersection(_WORD.findall(text)):
                     speakers.setdefault(word, []).append(name)
-        self._near = set(self._names)
         work = list(self._names)
         while work:
             for name in speakers.get(work.pop(), ()):
@@ -59,15 +58,11 @@ class Prospects:
                     work.append(name)
         self._answers: Dict[str, bool] = {}
 
-    def of(self, text: str) -> bool:
+    def may_lead(self, text: str) -> bool:
         """Return whether a text can lead to an L1."""
         if text not in self._answers:
             self._answers[text] = bool(self._speaks.search(text)) or not self._names.isdisjoint(_WORD.findall(text))
         return self._answers[text]
-
-    def near(self, text: str) -> bool:
-        """Return whether a text mentions an L1, or a name whose own text does."""
-        return bool(self._speaks.search(text)) or not self._near.isdisjoint(_WORD.findall(text))
 
 
 def _said(text: str) -> Iterator[Tuple[str, str]]:
@@ -86,20 +81,9 @@ def _said(text: str) -> Iterator[Tuple[str, str]]:
             yield classes[-1][1], text[match.end() : end]
     for match in _GIVEN.finditer(text):
         if not match.group(1).startswith("__") and match.group(1) != "_":
-            yield match.group(1), _made(match.group(2))
+            made = _SINGLE_CALL.match(match.group(2))  # what its function makes: arguments do not change that
+            single = made is not None and made.group(1) not in HOLDERS
+            yield match.group(1), made.group(1).split(".")[-1] if made and single else match.group(2)
     for pattern in (_ADDED, _DEFAULT):
         yield from ((match.group(1), match.group(2)) for match in pattern.finditer(text))
     yield from ((match.group(2), match.group(1)) for match in _RENAMED.finditer(text))
-
-
-def _made(value: str) -> str:
-    """Return what produces a value: for a single call the function, since arguments do not change it."""
-    call = _CALLEE.match(value)
-    if call is None or call.group(1) in HOLDERS:
-        return value
-    depth = 0
-    for i, letter in enumerate(value[call.end() - 1 :], call.end()):
-        depth += (letter in "([{") - (letter in ")]}")
-        if depth == 0:
-            return call.group(1).split(".")[-1] if not value[i:].split("#")[0].strip() else value
-    return value

@@ -8,15 +8,15 @@ from typing import List, NamedTuple
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import code, constant, key_of, same, walk_expressions, words
+from legs_adapters.code.syntax import attribute_chain, call_name, code, constant, key_of, same, walk_expressions, words
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.masks import is_mask
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
-from legs_adapters.lexicon.words import OF_RAYS
+from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
 from legs_adapters.terms.form import Form
 
-__all__ = ["Pair", "are_counterparts", "is_role", "of_rays", "pair_of", "same_root"]
+__all__ = ["Pair", "are_counterparts", "is_beside_ssim", "is_role", "of_rays", "pair_of", "same_root"]
 
 
 class Pair(NamedTuple):
@@ -50,7 +50,7 @@ def pair_of(meanings: Meanings, function: Function, form: Form) -> Pair:
             # the weight map needs the whole image
             first, second, selection = first.value, second.value, inner[0].strip()
     left, right = _without_shared_factors(first, second)
-    return Pair(first, second, selection, meanings.of(function, left), meanings.of(function, right))
+    return Pair(first, second, selection, meanings.meaning(function, left), meanings.meaning(function, right))
 
 
 def _without_shared_factors(first: cst.BaseExpression, second: cst.BaseExpression) -> List[cst.BaseExpression]:
@@ -90,6 +90,19 @@ def are_counterparts(form: Form) -> bool:
 def of_rays(form: Form) -> bool:
     """Return whether the names are about rays or a radiance field: lists of colours."""
     return any(OF_RAYS.search(code(node)) for node in (form.first, form.second))
+
+
+def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
+    """Return whether an SSIM is computed of the same two expressions: they are images then, whatever their names."""
+    calls = [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
+    return any(all(_is_given(function, call, side) for side in (first, second)) for call in calls)
+
+
+def _is_given(function: Function, call: cst.Call, picture: cst.CSTNode) -> bool:
+    """Return whether an image, or one with another axis, ``image.unsqueeze(0)``, is an argument of a call beside it."""
+    flow, parts = function.flow, [part for arg in call.args for part in attribute_chain(arg.value)]
+    given = [part for part in parts if same(part, picture)]
+    return any(flow.unchanged_at(call, picture) or flow.unchanged_at(picture, part) for part in given)
 
 
 def is_role(node: cst.CSTNode) -> bool:

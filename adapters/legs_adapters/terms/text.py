@@ -46,7 +46,7 @@ class Text:
         """Return the text of a span of bytes."""
         return self.bytes[start:end].decode("utf-8")
 
-    def of(self, node: cst.CSTNode, brackets: bool = False) -> str:
+    def written(self, node: cst.CSTNode, brackets: bool = False) -> str:
         """Return a node as written."""
         return self.between(*self.span(node, brackets))
 

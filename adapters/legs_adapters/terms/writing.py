@@ -23,23 +23,21 @@ class Writing(NamedTuple):
         package: the name that legs_loss has in the file.
         swapped: whether the target is the first of the two sides.
         selection: the index by a mask that both images carry, with its brackets; empty without.
-        where: the file and line, for errors.
         in_place: whether every line has to keep its number.
     """
 
     package: str = PACKAGE
     swapped: bool = False
     selection: str = ""
-    where: str = ""
     in_place: bool = False
 
     def ordered(self, first: _Side, second: _Side) -> Tuple[_Side, _Side]:
         """Return the two sides as prediction and target."""
         return (second, first) if self.swapped else (first, second)
 
-    def call(self, prediction: str, target: str, as_map: bool = False, own: str = "", residue: str = "") -> str:
+    def call(self, prediction: str, target: str, as_map: bool = False, own: str = "") -> str:
         """Return the whole call of two images."""
-        return f"{self.package}.l1_loss({prediction}, {target}{self.settings(as_map, own)}{residue})"
+        return f"{self.package}.l1_loss({prediction}, {target}{self.settings(as_map, own)})"
 
     def settings(self, as_map: bool = False, own: str = "") -> str:
         """Return the arguments after the two images, each with its comma.

@@ -15,16 +15,8 @@ __all__ = ["Definition"]
 class Definition(Rule):
     """The term is in the body of the codebase's own L1 function, whose calls are decided one by one."""
 
-    VALID = ["loss = l1_loss(image, gt)"]
-    INVALID = [
-        """
-        def photometric(image, gt):
-            return torch.abs(image - gt).mean()
-        """
-    ]
-
     id = reason = "definition"
-    is_always_listed = True
+    INVALID = ["def photometric(image, gt):\n    return torch.abs(image - gt).mean()"]
     is_doubted_beside_sites = False
 
     def evidence(self, term: Term) -> List[Decider]:
@@ -33,8 +25,8 @@ class Definition(Rule):
         if shape(function) is None:
             return []
         calls = analysis.training.sites.get(function) or list(sure_calls(analysis.program, function))
-        known = {id(form.call) for caller, _ in calls for form in analysis.forms.of(caller)}
-        own = analysis.callbacks.includes(function) or all(
+        known = {id(form.call) for caller, _ in calls for form in analysis.forms.in_function(caller)}
+        own = function in analysis.callbacks.assigned or all(
             id(call) in known or shape(caller) is not None for caller, call in calls
         )
         return [header(function)] if own else []

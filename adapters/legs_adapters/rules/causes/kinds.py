@@ -9,11 +9,10 @@ import libcst as cst
 from legs_adapters.code.syntax import call_name, key_of, words
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words
-from legs_adapters.lexicon.words import LAID_OVER_PICTURES, MASKED
-from legs_adapters.rules.rule import CallOfTerm, Rule, Term, source_of
+from legs_adapters.lexicon.words import LAID_OVER_PICTURES
+from legs_adapters.rules.rule import CallContext, Rule, Term, source_of
 from legs_adapters.terms.findings import Decider
-from legs_adapters.terms.form import Form
-from legs_adapters.terms.ssim import is_beside_ssim
+from legs_adapters.terms.sides import is_beside_ssim
 
 __all__ = ["KINDS", "OtherKind"]
 
@@ -25,29 +24,28 @@ class OtherKind(Rule):
         id: the rule's name.
         kind: the kind, a row of the words in ``lexicon/words.py``.
         what: the kind in words.
-        invalid: code that it skips.
+        invalid: what a step compares that it skips.
         reason: the word in the report; default: the id.
     """
 
     VALID = ["loss = l1_loss(image * camera.mask, gt * camera.mask)", 'loss = l1_loss(package["render"], gt)']
-    is_picture = True
 
-    def __init__(self, id: str, kind: str, what: str, invalid: List[str], reason: str = "") -> None:
+    def __init__(self, id: str, kind: str, what: str, invalid: str, reason: str = "") -> None:
         self.id: str = id
         self.kind: str = kind
         self.reason: str = reason or id
         self.why: str = f"One side is {what}."
-        self.INVALID: List[str] = invalid
+        self.INVALID: List[str] = [f"loss = l1_loss({invalid})"]
 
     def evidence(self, term: Term) -> List[Decider]:
         """Return what shows the kind of the first side that is of any of these kinds."""
         pair = term.pair
         for meaning, side, beside in ((pair.a, pair.first, pair.b), (pair.b, pair.second, pair.a)):
-            if meaning.kind in _NAMES and not _is_named_picture(term, meaning, side, beside):
+            if meaning.kind in _NAMES and not _is_named_picture(term, side, meaning, beside):
                 return self._shown(term, side) if meaning.kind == self.kind else []
         return []
 
-    def of_call(self, call: CallOfTerm) -> List[Decider]:
+    def evidence_of_call(self, call: CallContext) -> List[Decider]:
         """Return the call, where what it passes is of this kind."""
         kinds = [meaning.kind for meaning in call.given if meaning.kind in _NAMES]
         return call.here if kinds[:1] == [self.kind] else []
@@ -58,45 +56,32 @@ class OtherKind(Rule):
 
 
 KINDS = (
-    OtherKind("depth", "depth", "a depth map", ['loss = l1_loss(package["depth"], camera.invdepthmap)']),
-    OtherKind("normals", "normal", "a normal map", ['loss = l1_loss(package["normals"], camera.normal_map)']),
-    OtherKind(
-        "features",
-        "feature",
-        "a feature map, a label map or a transform of an image",
-        ['loss = l1_loss(package["features"], camera.semantic_feature)'],
-    ),
-    OtherKind("flow", "flow", "optical flow or motion", ['loss = l1_loss(package["flow"], camera.optical_flow)']),
-    OtherKind("mask", "mask", "a mask or an opacity map", ['loss = l1_loss(package["alpha"], camera.mask)']),
-    OtherKind(
-        "synthetic",
-        "warp",
-        "a warped, edited, inpainted or generated image, not a photograph",
-        ["loss = l1_loss(image, warped_image)"],
-    ),
-    OtherKind(
-        "gradients", "gradient", "an edge map or an image gradient", ["loss = l1_loss(sobel(image), camera.edges)"]
-    ),
+    OtherKind("depth", "depth", "a depth map", 'package["depth"], camera.invdepthmap'),
+    OtherKind("normals", "normal", "a normal map", 'package["normals"], camera.normal_map'),
+    OtherKind("features", "feature", "a feature or label map", 'package["features"], camera.semantic_feature'),
+    OtherKind("flow", "flow", "optical flow or motion", 'package["flow"], camera.optical_flow'),
+    OtherKind("mask", "mask", "a mask or an opacity map", 'package["alpha"], camera.mask'),
+    OtherKind("synthetic", "warp", "a warped, edited or generated image, no photograph", "image, warped_image"),
+    OtherKind("gradients", "gradient", "an edge map or an image gradient", "sobel(image), camera.edges"),
     OtherKind(
         "parameter",
         "parameter",
         "a parameter of the model, of a camera or of a material",
-        ["loss = torch.abs(gaussians.get_scaling - initial_scaling).mean()"],
+        "gaussians.get_scaling, initial_scaling",
         "regulariser",
     ),
 )
 _NAMES = {rule.kind for rule in KINDS}
 
 
-def _is_named_picture(term: Term, meaning: Meaning, side: cst.CSTNode, beside: Meaning) -> bool:
-    """Return whether a side is an image although its name has a word for a mask, a parameter or a gradient."""
+def _is_named_picture(term: Term, side: cst.CSTNode, meaning: Meaning, beside: Meaning) -> bool:
+    """Return whether a side is an image although its name has a word for a mask, a parameter or a gradient.
+
+    An SSIM of the same two shows it, or a call with a mask: ``l1_loss_masked(image, data["seg_im"], mask)``.
+    """
     if meaning.kind not in LAID_OVER_PICTURES or beside.kind != "image":
         return False
-    return is_beside_ssim(term.function, *term.sides) or _is_under_mask(term.form, side, meaning)
-
-
-def _is_under_mask(form: Form, side: cst.CSTNode, meaning: Meaning) -> bool:
-    """Return whether a call compares a masked photograph: ``l1_loss_masked(image, data["seg_im"], mask)``."""
-    masked = form.callee is not None and MASKED & set(words(call_name(form.call))) and form.extras
-    name = side.value if isinstance(side, cst.Name) else str(key_of(side) or "")
-    return bool(masked) and meaning.kind == "mask" and any(kind_of_words(word) == "image" for word in words(name))
+    spoken = words(side.value if isinstance(side, cst.Name) else str(key_of(side) or ""))
+    is_under_mask = bool(term.form.extras) and "masked" in words(call_name(term.form.call)) and meaning.kind == "mask"
+    is_picture = is_under_mask and any(kind_of_words(word) == "image" for word in spoken)
+    return is_picture or is_beside_ssim(term.function, *term.sides)

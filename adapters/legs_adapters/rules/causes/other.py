@@ -5,12 +5,10 @@ from __future__ import annotations
 import re
 from typing import List
 
-from legs_adapters.lexicon.masks import picked_from
 from legs_adapters.lexicon.words import RAY_BUNDLES
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
-from legs_adapters.terms.sides import of_rays
-from legs_adapters.terms.ssim import is_beside_ssim
+from legs_adapters.terms.sides import is_beside_ssim, of_rays
 
 __all__ = ["NotSplats"]
 
@@ -26,19 +24,17 @@ class NotSplats(Rule):
     id = "not-splats"
     reason = "other"
     is_doubted_beside_sites = False
-    VALID = ["loss = l1_loss(image, gt)"]
     INVALID = ["loss = l1_loss(image[ray_indexes], gt[ray_indexes])"]
 
     def evidence(self, term: Term) -> List[Decider]:
-        function, analysis = term.function, term.analysis
-        if _OTHER_FRAMEWORK.search(function.module.text) and not _TORCH.search(function.module.text):
+        text = term.function.module.text
+        if _OTHER_FRAMEWORK.search(text) and not _TORCH.search(text):
             return term.here
-        if not analysis.splats.about(function, term.form):
-            return [header(function)]
-        picked = all(picked_from(analysis.meanings, function, side) for side in term.sides)
+        if not term.analysis.splats.is_about(term.function, term.form):
+            return [header(term.function)]
         by_class = _ray_method(term)
-        rays = (of_rays(term.form) and not picked) or by_class
-        return (by_class or term.here) if rays and not is_beside_ssim(function, *term.sides) else []
+        rays = bool(by_class) or of_rays(term.form)
+        return (by_class or term.here) if rays and not is_beside_ssim(term.function, *term.sides) else []
 
     def may_be_loss(self, term: Term) -> bool:
         return True

@@ -17,7 +17,6 @@ class Unknown(Rule):
     """Neither side is known to be an image, or nothing shows which is the photograph and not both names are images."""
 
     id = reason = "unknown"
-    VALID = ["loss = l1_loss(image, gt)"]
     INVALID = [
         "loss = l1_loss(network(camera), camera.something)",
         "loss = l1_loss(fused_image(camera), other(camera))",

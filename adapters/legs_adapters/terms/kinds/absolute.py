@@ -27,8 +27,6 @@ class Absolute(Form):
         after: loss = legs_loss.l1_loss(image, gt_image)
     """
 
-    order = 10
-
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
         """Find ``abs`` of a difference that is not of numbers."""
@@ -40,11 +38,6 @@ class Absolute(Form):
         if _is_number(difference.left) or _is_number(difference.right):
             return None
         return cls(call, found.call, difference.left, difference.right, difference=difference, makes=found.makes)
-
-    @property
-    def takes_index(self) -> bool:
-        """The absolute value is taken pixel by pixel."""
-        return True
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace what stands before, between and after the two sides, comments kept."""

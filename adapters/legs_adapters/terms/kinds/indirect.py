@@ -8,7 +8,7 @@ from typing import Iterator, Optional
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import one_line
+from legs_adapters.code.syntax import code, one_line
 from legs_adapters.tensors.absolute import absolute_value, is_difference
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
@@ -21,14 +21,12 @@ _DEPTH = 4
 
 @dataclass(frozen=True)
 class Indirect(Form):
-    """The absolute value of a difference that was changed before: filtered, scaled, weighted.
+    """The absolute value of a difference that has a name, or that was changed before: filtered, scaled, weighted.
 
     Example:
         before: diff = image - gt_image; diff = diff[diff ** 2 < 0.1]; loss = diff.abs().mean()
         advice: torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))
     """
-
-    order = 40
 
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
@@ -40,14 +38,16 @@ class Indirect(Form):
         return cls(call, found.call, made.left, made.right, difference=made, makes=found.makes)
 
     def why_by_hand(self) -> str:
-        """Return that the difference is changed."""
+        """Return that the difference stands elsewhere."""
         assert self.difference is not None
-        return f"{one_line(self.difference)} is changed before its absolute value is taken"
+        return f"{one_line(self.difference)} may change before its absolute value is taken"
 
-    def _advice(self, writing: Writing, prediction: str, target: str, rows: bool) -> str:
+    def advice(self, writing: Writing) -> str:
+        """Return the absolute value of the weighted difference."""
         assert self.difference is not None
-        made = one_line(self.difference)
-        return f"torch.abs({writing.package}.weight_map({target}) * {made if made.startswith('(') else f'({made})'})"
+        _, target = writing.ordered(self.first, self.second)
+        made = f"({code(self.difference.with_changes(lpar=[], rpar=[]))})"
+        return f"torch.abs({writing.package}.weight_map({one_line(target)}) * {' '.join(made.split())})"
 
 
 def _differences(function: Function, node: cst.CSTNode, depth: int) -> Iterator[cst.BinaryOperation]:

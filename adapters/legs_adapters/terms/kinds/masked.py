@@ -36,7 +36,7 @@ class Masked(Form):
 
     def line(self, text: Text, package: str) -> str:
         """Return the line without its indentation."""
-        prediction, target = (on_one_line(text.of(side, True)) for side in (self.first, self.second))
+        prediction, target = (on_one_line(text.written(side, True)) for side in (self.first, self.second))
         return f"{prediction} = {package}.masked({prediction}, {target})"
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import List
 
-import libcst as cst
-
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.text import Edit, Text, on_one_line
 from legs_adapters.terms.writing import Writing
@@ -23,14 +21,8 @@ class Reread(Form):
         after: loss = legs_loss.l1_loss(image, gt_image, reduction="none").mean(); log(seen)
     """
 
-    @classmethod
-    def of(cls, form: Form, read: cst.BaseExpression) -> Reread:
-        """Return the read of a form's map as a form of its own."""
-        return cls(read, form.call, form.first, form.second, selection=form.selection)
-
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Write the weighted map in the read's place."""
-        carried = writing.selection[: len(writing.selection) - len(self.selection)]
-        first, second = (on_one_line(text.argument(side, carried)) for side in (self.first, self.second))
-        call = writing.call(*writing.ordered(first, second), as_map=True)
+        sides = (on_one_line(text.argument(side, writing.selection)) for side in (self.first, self.second))
+        call = writing.call(*writing.ordered(*sides), as_map=True)
         return [text.replace(*text.span(self.node, True), call + writing.selection)]

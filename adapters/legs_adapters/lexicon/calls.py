@@ -1,0 +1,195 @@
+"""Find what a call depicts: a rendering, a loaded photograph, or a function of an image.
+
+`_READINGS` are asked in their order; the first that knows a call decides. What stands earlier is more certain: what
+torch's operations do, then what a name says, then what the arguments are, then what the called function returns.
+"""
+
+from __future__ import annotations
+
+from typing import Callable, List, Optional, Tuple
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.program import Program
+from legs_adapters.code.syntax import arguments, call_name, constant, root_of, words
+from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
+from legs_adapters.lexicon.names import kind_of_words, role_of_words
+from legs_adapters.lexicon.words import CAMERAS, GAUSSIANS, LOADING, MATCHED, OF_DIFFUSION, RENDERERS, STATISTICS
+from legs_adapters.tensors.operations import (
+    ASKS,
+    EXTREMES,
+    JOINS,
+    MODULES,
+    NUMBERS,
+    PICTURE_FUNCTIONS,
+    PICTURE_METHODS,
+    REDUCES,
+)
+
+__all__ = ["CallReading", "meaning_of_call"]
+
+
+class CallReading:
+    """A call in a function, and whom to ask about the expressions in it.
+
+    Args:
+        program, function, node: the call, the function that it stands in, and the program.
+        meaning_of: what an expression of a function depicts.
+        role_of_holder: the role of what an expression of this function holds.
+
+    Attributes:
+        name: the last name of the callee.
+        positional, keywords, values: its arguments: the positional ones, the others by name, all of them.
+        owner: the object whose method is called; None for a function, of a module too.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        function: Function,
+        node: cst.Call,
+        meaning_of: Callable[[Function, cst.CSTNode], Meaning],
+        role_of_holder: Callable[[cst.CSTNode], Optional[str]],
+    ) -> None:
+        self.program = program
+        self.function = function
+        self.node = node
+        self.meaning_of = meaning_of
+        self.role_of_holder = role_of_holder
+        self.name: str = call_name(node)
+        self.positional, self.keywords, _ = arguments(node)
+        self.values: List[cst.BaseExpression] = [*self.positional, *self.keywords.values()]
+        base = node.func.value if isinstance(node.func, cst.Attribute) else None
+        self.owner: Optional[cst.BaseExpression] = None if self._is_module(base) else base
+
+    def ask(self, node: cst.CSTNode) -> Meaning:
+        """Return the meaning of an expression of the function."""
+        return self.meaning_of(self.function, node)
+
+    def _is_module(self, node: Optional[cst.CSTNode]) -> bool:
+        """Return whether a name is a module's, ``th`` of ``import torch as th``."""
+        if not isinstance(node, cst.Name):
+            return False
+        found = self.program.lookup(self.function, node)
+        return node.value in MODULES or (bool(found) and all(isinstance(d.value, cst.Import) for _, d in found or ()))
+
+
+def meaning_of_call(call: CallReading) -> Meaning:
+    """Return what a call depicts, from its name, its arguments and the definition of the function."""
+    return next((known for known in (reading(call) for reading in _READINGS) if known is not None), UNKNOWN)
+
+
+def _entry(call: CallReading) -> Optional[Meaning]:
+    """``batch.get("image")``."""
+    key = constant(call.positional[0]) if call.name == "get" and call.positional else None
+    if not isinstance(key, str) or not isinstance(call.node.func, cst.Attribute):
+        return None
+    return Meaning(kind_of_words(key), role_of_words(key) or call.role_of_holder(call.node.func.value))
+
+
+def _painted(call: CallReading) -> Optional[Meaning]:
+    paints = "prompt" in call.keywords and OF_DIFFUSION & set(call.keywords)
+    return Meaning("warp", None) if paints else None
+
+
+def _number(call: CallReading) -> Optional[Meaning]:
+    """A number, or what has only the shape of its argument."""
+    is_number = call.name in NUMBERS if isinstance(call.node.func, cst.Name) else call.name == "item"
+    return UNKNOWN if is_number or call.name in ASKS else None
+
+
+def _extreme(call: CallReading) -> Optional[Meaning]:
+    """The brightest pixel, or of each pixel the brightest channel: a prior, no photograph."""
+    of = call.owner or next(iter(call.positional), None)
+    if call.name not in EXTREMES or of is None:
+        return None
+    meaning, axes = call.ask(of), call.positional[0 if call.owner is not None else 1 :]
+    by_axis = "dim" in call.keywords or any(isinstance(constant(axis), int) for axis in axes)
+    return meaning._replace(kind="parameter") if meaning.kind == "image" and by_axis else meaning
+
+
+def _reduced(call: CallReading) -> Optional[Meaning]:
+    """A number of the whole image, or one a channel."""
+    axes = call.positional if call.owner is not None else call.positional[1:]
+    axes = [*axes, *(value for name, value in call.keywords.items() if name in ("dim", "axis"))]
+    whole = call.name in REDUCES and all(isinstance(constant(axis), tuple) for axis in axes)
+    return Meaning("parameter", None) if whole else None
+
+
+def _selected(call: CallReading) -> Optional[Meaning]:
+    return mix(map(call.ask, call.values[1:])) if call.name == "where" and len(call.values) == 3 else None
+
+
+def _statistic(call: CallReading) -> Optional[Meaning]:
+    spoken = set(words(call.name))
+    is_statistic = spoken & STATISTICS and not spoken & MATCHED and call.values
+    return Meaning("feature", call.ask(call.values[0]).role) if is_statistic else None
+
+
+def _filtered(call: CallReading) -> Optional[Meaning]:
+    filters = call.name in ("conv2d", "filter2d", "spatial_gradient") and "stride" not in call.keywords
+    return Meaning("gradient", call.ask(call.values[0]).role) if filters and call.values else None
+
+
+def _moved(call: CallReading) -> Optional[Meaning]:
+    """An operation of torch that returns its argument in another shape, type or size."""
+    if call.name in JOINS and call.values:
+        return call.ask(call.values[0])
+    if call.owner is not None and call.name in (*PICTURE_METHODS, "pop", "popleft", "__getitem__"):
+        return call.ask(call.owner)
+    is_function = call.owner is None and call.name in PICTURE_FUNCTIONS
+    return call.ask(call.values[0]) if is_function and call.values else None
+
+
+def _rendered(call: CallReading) -> Optional[Meaning]:
+    """Named as a renderer, or given Gaussians and a camera: ``imlsplat(gaussians, viewpoint_cam, background)``."""
+    kind = kind_of_words(call.name)
+    names = [set(words(root_of(each))) for each in call.values if isinstance(each, (cst.Name, cst.Attribute))]
+    draws = kind is None and any(each & GAUSSIANS for each in names) and any(each & CAMERAS for each in names)
+    if not draws and not set(words(call.name)) & RENDERERS:
+        return None
+    return Meaning("image" if kind in (None, "parameter") else kind, "render")  # points_to_render(...)
+
+
+def _named(call: CallReading) -> Optional[Meaning]:
+    kind, role = kind_of_words(call.name), role_of_words(call.name)
+    if kind not in (None, "image", "mask", "parameter"):
+        return Meaning(kind, role)
+    if kind == "image" and (role == "target" or set(words(call.name)) & LOADING):
+        holder = call.role_of_holder(call.owner) if call.owner is not None else None
+        return Meaning("image", role or holder or "target")
+    return None
+
+
+def _of_images(call: CallReading) -> Optional[Meaning]:
+    """A function of an image is an image, unless its name says otherwise: exposure, appearance, a background."""
+    images = [meaning for meaning in map(call.ask, call.values) if meaning.kind == "image"]
+    return mix(images) if images else None
+
+
+def _returned(call: CallReading) -> Optional[Meaning]:
+    """What the called function returns; of ``Renderer(settings)(**means)``, what ``Renderer`` makes."""
+    if isinstance(call.node.func, cst.Call):
+        return call.ask(call.node.func)
+    for reference in call.program.resolve(call.function, call.node.func):
+        target = reference.target
+        if set(words(getattr(target, "name", str(target)))) & RENDERERS:
+            return Meaning("image", "render")
+        if reference.kind == "function" and isinstance(target, Function) and not reference.guess:
+            found = [call.meaning_of(target, value) for value in target.flow.returns]
+            if found and UNKNOWN not in found:
+                return mix(found)
+    return None
+
+
+def _of_owner(call: CallReading) -> Optional[Meaning]:
+    kind = kind_of_words(call.name)
+    return Meaning(kind, call.ask(call.owner).role if kind and call.owner is not None else None)
+
+
+_READINGS: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
+    *(_entry, _painted, _number, _extreme, _reduced, _selected, _statistic, _filtered, _moved),
+    *(_rendered, _named),
+    *(_of_images, _returned, _of_owner),
+)

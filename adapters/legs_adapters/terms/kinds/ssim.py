@@ -1,0 +1,56 @@
+"""``ssim(image, gt)``: the structural term, computed by ``legs_loss.ssim`` with the same value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, List, Optional
+
+import libcst as cst
+
+from legs_adapters.code.module import Function
+from legs_adapters.code.syntax import arguments, call_name, constant
+from legs_adapters.lexicon.words import STRUCTURAL
+from legs_adapters.terms.form import Form
+from legs_adapters.terms.functions import L1Functions
+from legs_adapters.terms.text import Edit, Text, residue
+from legs_adapters.terms.writing import Writing
+
+__all__ = ["Ssim"]
+
+_NO_LITERAL = object()
+
+
+@dataclass(frozen=True)
+class Ssim(Form):
+    """A call of an SSIM with two images; only legs-patch --ssim looks for it.
+
+    Example:
+        before: loss = l1_loss(image, gt_image) + 1.0 - ssim(image, gt_image)
+        after: 1.0 - legs_loss.ssim(image, gt_image)
+    """
+
+    weighs: ClassVar[bool] = False
+    term: ClassVar[str] = "ssim"
+    done: ClassVar[str] = "is computed by legs_loss.ssim"
+
+    @classmethod
+    def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Ssim]:
+        """Find a call of a function that is named as an SSIM; what it computes is checked later."""
+        inner = call_name(call.func) if isinstance(call.func, cst.Call) else ""  # SSIM()(image, gt)
+        if not STRUCTURAL.search(call_name(call) or inner):
+            return None
+        positional, _, starred = arguments(call)
+        pair = [side for side in positional[:2] if constant(side, _NO_LITERAL) is _NO_LITERAL]
+        references = functions.program.resolve(function, call.func)
+        is_patched = any(r.kind == "external" and str(r.target).startswith("legs_loss.") for r in references)
+        if is_patched or starred or len(pair) < 2:
+            return None
+        return cls(call, call, pair[0], pair[1], call.func, tuple(call.args[2:]))
+
+    def edits(self, text: Text, writing: Writing) -> List[Edit]:
+        """Replace the function; the further arguments are the defaults of ``legs_loss.ssim``, and are dropped."""
+        edits = [text.replace(*text.span(self.call.func, True), f"{writing.package}.ssim")]
+        if self.extras:
+            start, end = text.span(self.call.args[1])[1], text.span(self.call.args[-1])[1]
+            edits.append(text.replace(start, end, residue(text.between(start, end))))
+        return edits

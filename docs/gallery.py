@@ -14,7 +14,7 @@ from legs_loss import WeightSpec, response, weight_map
 from legs_loss.cli.masks import mask_of
 from legs_loss.operators import OPERATORS
 from legs_loss.reference.embedded import write_embedded_scene
-from legs_loss.responses import normalise_response
+from legs_loss.responses import gaussian_blur, normalise_response
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
 
 PICTURES = Path(__file__).resolve().parent / "pictures"
@@ -56,6 +56,11 @@ def main() -> None:
     sheet("beta", 2, titled)
     masked = ("weight times mask", mask * weight_map(image), "viridis", 11.0)
     sheet("masks", 3, [photograph, ("mask: legs masks --from sharpness", mask, "gray", 1.0), masked])
+    rendering = 0.6 * gaussian_blur(image, 2.0)
+    hidden = torch.where(mask == 0, image, rendering)
+    difference = (hidden - image).abs().mean(0, keepdim=True)
+    shown = [("a rendering, too dark", rendering, "", 1.0), ("masked(rendering, photograph)", hidden, "", 1.0)]
+    sheet("masked", 3, [*shown, ("what every loss sees: the difference", difference, "magma", float(difference.max()))])
 
 
 if __name__ == "__main__":

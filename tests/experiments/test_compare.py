@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Dict, List
 
 import pytest
 import torch
+from PIL import Image
 
 from legs_loss import LegsError, weight_map
 from legs_loss.cli import main
@@ -25,6 +27,7 @@ pytest.importorskip("scipy")
 
 
 from legs_loss.experiments.running import Comparison, read_rows
+from legs_loss.precompute import OwnMaps, precompute
 from legs_loss.reference.training import trainer
 from legs_loss.reference.training.checkpoint import CHECKPOINT
 from legs_loss.reference.training.side_by_side import train_arm
@@ -68,6 +71,23 @@ def test_rows_are_complete_and_can_be_run_alone(tiny_scene: Path, tmp_path: Path
     del told[:]
     assert comparison.train(arms, [0, 1], 2, lambda name, progress: told.append(name)) == rows
     assert not told
+
+
+def test_masks_of_the_scenes_store_hold_for_every_arm(tiny_scene: Path, tmp_path: Path) -> None:
+    shutil.copytree(str(tiny_scene), str(tmp_path / "scene"))
+    (tmp_path / "scene/masks").mkdir()
+    views = read_scene(tmp_path / "scene").views
+    for view in views:
+        mask = Image.new("L", (64, 48), 255)
+        mask.paste(0, (0, 0, 16, 48))
+        mask.save(str(tmp_path / "scene/masks" / f"{PurePosixPath(view.name).stem}.png"))
+    precompute(read_scene(tmp_path / "scene"), resolution=2, maps=OwnMaps("masks"))
+    comparison = Comparison(tmp_path / "scene", BASE, tmp_path / "out")
+    rows = [comparison.train_one(arm, 0) for arm in parse_arms(["3dgs", "legs:scale"])]
+    assert [row["metrics"]["masked_views"] for row in rows] == [10, 10]
+    assert rows[0]["metrics"]["mean_weight"] == pytest.approx(1.0, abs=1e-6)
+    maps = [weight_map(view.image, "legs")[..., 8:].double().mean() for view in comparison.data.train]
+    assert rows[1]["metrics"]["mean_weight"] == pytest.approx(float(sum(maps)) / len(maps), rel=1e-3)
 
 
 def test_an_interrupted_row_goes_on(tiny_scene: Path, tmp_path: Path) -> None:

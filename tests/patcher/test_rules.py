@@ -178,3 +178,37 @@ def test_explain_of_an_unknown_rule_is_one_line():
 def test_the_table_of_reasons_in_the_documents_is_current():
     page = (Path(__file__).parents[2] / "docs" / "patching.md").read_text(encoding="utf-8")
     assert f"-->\n{table()}<!-- end of the rules -->" in page
+
+
+def test_a_loss_of_modules_in_a_list_is_quoted_and_what_stands_beside_it_is_not(tmp_path):
+    texts = {
+        "losses.py": """import torch
+
+class ImageLoss(torch.nn.Module):
+    def forward(self, prediction, batch, mask):
+        delta = prediction.color - batch["image"]
+        delta = delta[mask]
+        return delta.abs().mean()
+
+class SmoothLoss(torch.nn.Module):
+    def forward(self, prediction, batch, mask):
+        img = batch["image"]
+        return torch.mean(torch.abs(img[..., :-1] - img[..., 1:]), 1, keepdim=True).mean()
+
+class PerceptualLoss(torch.nn.Module):
+    def forward(self, pred, target):
+        return torch.mean(torch.abs(pred - target))
+""",
+        "evaluate.py": "def evaluate(model, view):\n    return model.forward(view)\n",
+        "train.py": """from gsplat import rasterization
+
+def step(model, losses, batch, mask, optimizer):
+    prediction = model.forward(batch)
+    loss = sum(loss_fn.forward(prediction, batch, mask) for loss_fn in losses)
+    loss.backward()
+    optimizer.step()
+""",
+    }
+    shown = json.loads(legs_patch("--check", "--json", checkout(tmp_path, texts)).stdout)
+    assert [(problem["file"], problem["line"]) for problem in shown["problems"]] == [("losses.py", 7)]
+    assert shown["sites"] == []

@@ -6,9 +6,10 @@ from typing import Optional, Sequence
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
-from legs_adapters.code.syntax import one_line
+from legs_adapters.code.syntax import one_line, words
 from legs_adapters.lexicon.masks import is_rows
 from legs_adapters.lexicon.meaning import swapped
+from legs_adapters.lexicon.words import PERCEPTUAL
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import RULES, first
 from legs_adapters.rules.rule import Term
@@ -82,6 +83,8 @@ class Verdicts:
         term = Term(self.analysis, function, form)
         rule = RULES[left.evidence.rule] if left.evidence is not None else None
         if rule is None or not rule.may_be_loss(term) or is_measured(function, form) or same_root(form):
+            return None
+        if any(PERCEPTUAL & set(words(name)) for name, _ in term.names_around):
             return None
         pictures = "image" in (term.pair.a.kind, term.pair.b.kind)
         pictures = pictures or (function.runs_by_instance and is_role(form.first) and is_role(form.second))

@@ -8,7 +8,7 @@ from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.tensors.absolute import is_difference
 from legs_adapters.terms.findings import Decider
-from legs_adapters.terms.sides import are_counterparts
+from legs_adapters.terms.sides import are_counterparts, same_root
 
 __all__ = ["Unknown"]
 
@@ -26,7 +26,7 @@ class Unknown(Rule):
         pair = term.pair
         pictures = "image" in (pair.a.kind, pair.b.kind) or are_counterparts(term.form)
         sure = swapped(pair.a, pair.b) is not None or pair.speaks_of_images
-        changes = all(map(is_difference, term.sides))  # of two views, or of neighbours
+        changes = same_root(term.form) or all(map(is_difference, term.sides))  # of two views, or of neighbours
         return [] if pictures and sure and not changes else term.here
 
     def may_be_loss(self, term: Term) -> bool:

@@ -100,7 +100,7 @@ def _above(term: Term) -> Iterator[Function]:
 
 
 def _callers(term: Term, function: Function) -> List[Function]:
-    if not function.name or function.name.startswith("__"):
+    if function.name in ("", "forward") or function.name.startswith("__"):  # any module's has that name
         return []
     calls = likely_calls(term.analysis.program, function)
     return list(dict.fromkeys(caller for caller, _ in calls if caller.parent is not None))[:MAX_CALLERS]

@@ -207,8 +207,7 @@ def _patch(args: argparse.Namespace) -> int:
                 *said_instead(found.findings.program.sources.values()),
             )
         _advise(problems)
-        hint = "(--site FILE:LINE takes your word, --exclude leaves files out)"
-        say(f"legs-patch: nothing was changed {hint}", sys.stderr)
+        say("legs-patch: nothing was changed: --site FILE:LINE takes your word, --exclude leaves files out", sys.stderr)
         return 2
     for doubt in found.findings.doubts:
         where = f"{doubt.path}:{doubt.line}"
@@ -277,9 +276,8 @@ def _undo(args: argparse.Namespace) -> int:
     if args.diff:
         print(as_diff(done.changes, _is_coloured()), end="")
     else:
-        for what, names in (("restored", done.restored), ("removed", done.removed)):
-            for name in names:
-                say(f"{what} {name}")
+        for line in [f"restored {name}" for name in done.restored] + [f"removed {name}" for name in done.removed]:
+            say(line)
     for name, reason in done.kept:
         say(f"kept {name}: {reason}", stream=sys.stderr if args.diff else sys.stdout)
     return 0

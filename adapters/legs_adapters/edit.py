@@ -80,10 +80,9 @@ def why_not_compiled(data: bytes) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            compile(data, "<file>", "exec", dont_inherit=True)
+            compile(data, "file", "exec", dont_inherit=True)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        where = f"line {error.lineno}: {error.msg}" if isinstance(error, SyntaxError) else str(error)
-        return f"Python {sys.version_info[0]}.{sys.version_info[1]} cannot compile it ({where})"
+        return f"Python {sys.version_info[0]}.{sys.version_info[1]} cannot compile it: {error}"
     return ""
 
 

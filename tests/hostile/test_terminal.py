@@ -72,6 +72,7 @@ class TestLegs:
         self.legs("info", tmp_path / "nowhere\x1b[2J", code=2)
         self.legs("show", scene, "--views", "nowhere\x1b[2J", code=2)
         self.legs("scene\x1b[2J", code=2)
+        pytest.importorskip("matplotlib")
         self.legs("report", scene, code=2)
         self.legs("view", tmp_path / "nowhere\x1b[2J", code=2)
         self.legs("compare", scene, "--out", tmp_path / "rows", code=2)

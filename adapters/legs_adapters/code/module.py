@@ -257,9 +257,12 @@ class Module:
 def index_by_word(texts: Iterable[Tuple[_T, str]]) -> Dict[str, List[_T]]:
     """Return what has a word in its text, by the word; by ``word(`` what calls it."""
     found: Dict[str, List[_T]] = {}
+    before, known = "", frozenset([""])
     for entry, text in texts:
-        words = set(_WORD.findall(text))
-        for word in {name for name, _ in words}.union(name + bracket for name, bracket in words):
+        if text is not before:  # before Python 3.8 all functions of a file share its text
+            words = set(_WORD.findall(text))
+            before, known = text, frozenset(name for name, _ in words).union(map("".join, words))
+        for word in known:
             found.setdefault(word, []).append(entry)
     return found
 

@@ -25,7 +25,7 @@ from legs_adapters.code.returned import (
     stored,
     written,
 )
-from legs_adapters.code.syntax import arguments, call_name, constant, key_of, root_of, same, walk_expressions, words
+from legs_adapters.code.syntax import arguments, call_name, constant, key_of, root_of, same, words
 from legs_adapters.lexicon.calls import CallReading, meaning_of_call
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
@@ -174,7 +174,7 @@ class Meanings:
             return self.meaning(function, node).role
         name = root_of(node)
         role = role_of_words(name)
-        if role is None and set(words(name)) & DATA and not _is_rendered(function, node):
+        if role is None and set(words(name)) & DATA:
             is_given = isinstance(node, cst.Name) and self._is_given_renderings(function, node)
             return "render" if is_given else "target"  # a camera may have been anywhere before
         if isinstance(node, cst.Attribute):
@@ -300,10 +300,3 @@ def _is_of_neighbours(node: cst.BinaryOperation) -> bool:
     left, right = node.left, node.right
     are_parts = isinstance(left, cst.Subscript) and isinstance(right, cst.Subscript) and same(left.value, right.value)
     return are_parts and isinstance(node.operator, cst.Subtract)
-
-
-def _is_rendered(function: Function, node: cst.CSTNode) -> bool:
-    """Return whether ``view = render(camera)`` made it; ``data = render(data)`` keeps its earlier entries, too."""
-    made = [d.value for d in function.flow.reaching(node) if isinstance(d.value, cst.Call)]
-    made = [call for call in made if set(words(call_name(call))) & RENDERERS]
-    return any(not any(same(part, node) for arg in call.args for part in walk_expressions(arg.value)) for call in made)

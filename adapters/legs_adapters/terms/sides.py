@@ -16,7 +16,7 @@ from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
 from legs_adapters.terms.form import Form
 
-__all__ = ["Pair", "are_counterparts", "is_beside_ssim", "is_role", "of_rays", "pair_of", "same_root"]
+__all__ = ["Pair", "is_beside_ssim", "is_role", "of_rays", "pair_of", "same_root"]
 
 
 class Pair(NamedTuple):
@@ -72,19 +72,6 @@ def same_root(form: Form) -> bool:
     if not (isinstance(a, cst.Subscript) and isinstance(b, cst.Subscript)) or isinstance(key_of(a), str):
         return False
     return same(a.value, b.value) and not same(a, b)
-
-
-def are_counterparts(form: Form) -> bool:
-    """Return whether two names are of one thing, rendered and photographed: ``lips`` and ``gt_lips``."""
-    names = []
-    for node in (form.first, form.second):
-        key = key_of(node)
-        text = node.value if isinstance(node, cst.Name) else key if isinstance(key, str) else ""
-        names.append((role_of_words(text), [w for w in words(text) if role_of_words(w) is None], words(text)))
-    (a, rest_a, _), (b, rest_b, _) = names
-    spoken = {word for _, _, each in names for word in each}
-    rendered = any(word.startswith("render") for word in spoken)
-    return {a, b} == {"render", "target"} and bool(rest_a) and rest_a == rest_b and rendered
 
 
 def of_rays(form: Form) -> bool:

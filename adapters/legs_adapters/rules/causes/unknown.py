@@ -8,7 +8,10 @@ from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.tensors.absolute import is_difference
 from legs_adapters.terms.findings import Decider
+<<<<<<< HEAD
 from legs_adapters.terms.sides import are_counterparts, same_root
+=======
+>>>>>>> 78550c4 (The lexicon loses two questions that no codebase answers with yes: counterparts by name, and a camera that a renderer made)
 
 __all__ = ["Unknown"]
 
@@ -24,7 +27,7 @@ class Unknown(Rule):
 
     def evidence(self, term: Term) -> List[Decider]:
         pair = term.pair
-        pictures = "image" in (pair.a.kind, pair.b.kind) or are_counterparts(term.form)
+        pictures = "image" in (pair.a.kind, pair.b.kind)
         sure = swapped(pair.a, pair.b) is not None or pair.speaks_of_images
         changes = same_root(term.form) or all(map(is_difference, term.sides))  # of two views, or of neighbours
         return [] if pictures and sure and not changes else term.here

@@ -8,10 +8,7 @@ from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.tensors.absolute import is_difference
 from legs_adapters.terms.findings import Decider
-<<<<<<< HEAD
-from legs_adapters.terms.sides import are_counterparts, same_root
-=======
->>>>>>> 78550c4 (The lexicon loses two questions that no codebase answers with yes: counterparts by name, and a camera that a renderer made)
+from legs_adapters.terms.sides import same_root
 
 __all__ = ["Unknown"]
 

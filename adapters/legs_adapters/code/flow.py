@@ -116,7 +116,7 @@ class Flow:
 
     def unchanged_at(self, call: cst.CSTNode, *nodes: cst.CSTNode) -> bool:
         """Return whether nothing is assigned to the names in expressions between them and a later call."""
-        end = self._visited[id(call)][1]
+        end = self._visited[id(call)][1] if id(call) in self._visited else -1
         for part in (part for node in nodes for part in walk_expressions(node)):
             if isinstance(part, cst.Name) and id(part) in self._visited:
                 start = self._visited[id(part)][1]

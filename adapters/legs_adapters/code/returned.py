@@ -9,11 +9,10 @@ import libcst as cst
 from legs_adapters.code.calls import callees
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, constant, every_parameter, same
+from legs_adapters.code.syntax import arguments, constant, every_parameter
 
 __all__ = [
     "called_makers",
-    "computed_key",
     "default_key",
     "formatted_key",
     "forward_maker",
@@ -186,18 +185,6 @@ def formatted_key(node: cst.Subscript) -> Optional[str]:
     return "_".join(p.value for p in element.value.parts if isinstance(p, cst.FormattedStringText)) or None
 
 
-def computed_key(function: Function, node: cst.Subscript) -> Optional[str]:
-    """Return the literal part of the key of ``target["target_" + key]``; nothing for ``pred[key]`` beside it."""
-    index = node.slice[0].slice
-    if len(node.slice) != 1 or not isinstance(index, cst.Index):
-        return None
-    if isinstance(index.value, cst.BinaryOperation):
-        return _added_text(index.value)
-    sums = [part for part in function.flow.expressions if isinstance(part, cst.BinaryOperation) and _added_text(part)]
-    known = any(same(side, index.value) for part in sums for side in (part.left, part.right))
-    return "" if known and isinstance(index.value, cst.Name) else None
-
-
 def default_key(function: Function, node: cst.Subscript) -> object:
     """Return ``"rgb"`` for ``preds[key]`` of a function with the parameter ``key="rgb"``."""
     index = node.slice[0].slice
@@ -205,9 +192,3 @@ def default_key(function: Function, node: cst.Subscript) -> object:
         return None
     found = list(function.flow.reaching(index.value))
     return constant(found[0].value) if len(found) == 1 and found[0].kind == "parameter" else None
-
-
-def _added_text(node: cst.BinaryOperation) -> Optional[str]:
-    """Return ``target_`` of ``"target_" + key``."""
-    texts = [text for text in map(constant, (node.left, node.right)) if isinstance(text, str)]
-    return "_".join(texts) if texts and isinstance(node.operator, cst.Add) else None

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import cuda_compile, cuda_instructions
 
-# A step of nine instructions; of these two write a row of two in a loop, and two are the slow path of a division.
+# A loop with a short way that only loads, and two that store: one with the slow path of a division, one by a jump.
 SASS = """
 .text.other:
         /*0000*/                   EXIT ;
@@ -18,35 +18,47 @@ SASS = """
         /*0000*/                   MOV R1, c[0x0][0x28] ;
 .L_x_1:
         /*0010*/                   LDG.E R0, [R2] ;
-        /*0020*/                   BAR.SYNC.DEFER_BLOCKING 0x0 ;
-        /*0030*/                   MUFU.RCP R4, R0 ;
-        /*0040*/               @P0 BRA `(.L_x_2) ;
-        /*0050*/                   MOV R9, 0x70 ;
-        /*0060*/                   CALL.REL.NOINC `($slow) ;
+        /*0020*/               @P3 BRA `(.L_x_1) ;
+        /*0030*/                   BAR.SYNC.DEFER_BLOCKING 0x0 ;
+        /*0040*/                   MUFU.SQRT R4, R0 ;
+        /*0050*/               @P0 CALL.REL.NOINC `(.L_x_2) ;
+        /*0060*/                   MOV R9, 0x70 ;
+        /*0070*/                   FMUL R9, R9, R9 ;
+        /*0080*/                   FADD R9, R9, R9 ;
+        /*0090*/                   BRA `(.L_x_3) ;
 .L_x_2:
-        /*0070*/                   FFMA R5, R4, R0, R5 ;
-        /*0080*/                   STG.E [R6], R5 ;
-        /*0090*/                   FADD R5, R4, R0 ;
-        /*00a0*/                   STG.E [R6+0x4], R5 ;
-        /*00b0*/              @!P1 BRA `(.L_x_2) ;
-        /*00c0*/                   IADD3 R7, R7, 0x4, RZ ;
-        /*00d0*/               @P2 BRA `(.L_x_1) ;
-        /*00e0*/                   EXIT ;
+        /*00a0*/                   FFMA R5, R4, R0, R5 ;
+        /*00b0*/              @!P1 BRA `(.L_x_3) ;
+        /*00c0*/                   CALL.REL.NOINC `($slow) ;
+.L_x_3:
+        /*00d0*/                   STG.E [R6], R5 ;
+        /*00e0*/                   STS [R7], R5 ;
+        /*00f0*/               @P2 BRA `(.L_x_1) ;
+        /*0100*/                   EXIT ;
 \t.section\t.text.last
 """
 
 
-def test_a_step_is_counted_as_it_runs() -> None:
+def test_the_shortest_way_that_does_a_steps_work_is_counted() -> None:
     instructions = cuda_instructions.read(SASS, "kernel")
-    assert len(instructions) == 15 and instructions[-2].target == 1 and instructions[4].target == 7
-    assert dict(cuda_instructions.executed(instructions)) == {
-        "global": 1 + 2 * 2,  # a load, and a loop of two rounds that stores two values
+    assert len(instructions) == 17 and cuda_instructions.loops_of(instructions) == [(1, 2), (1, 15)]
+    assert instructions[5].target == 10 and instructions[12].target is None
+    assert dict(cuda_instructions.shortest(instructions, 1, 15, cuda_instructions.Way(1, 1))) == {
+        "global": 1 + 1,
         "barrier": 1,
         "special": 1,
-        "control": 1 + 0 + 2 * 1 + 1,  # the branch around the slow path, no call, the loops' own
-        "integer": 0 + 1,
-        "fp32": 2 * 2,
+        "control": 1 + 1 + 1 + 1,  # three branches and the jump
+        "fp32": 1,
+        "shared": 1,
     }
+    light = cuda_instructions.shortest(instructions, 1, 15, cuda_instructions.Way(1, 0, 0))
+    assert dict(light) == {"global": 1, "control": 1}
+
+
+def test_a_way_that_is_not_there_is_an_error() -> None:
+    instructions = cuda_instructions.read(SASS, "kernel")
+    with pytest.raises(SystemExit, match="no way through the loop"):
+        cuda_instructions.shortest(instructions, 1, 15, cuda_instructions.Way(2))
 
 
 def test_its_example() -> None:

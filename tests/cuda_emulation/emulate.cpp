@@ -3,7 +3,7 @@
 #include <cstring>
 
 #define EMULATED
-#define THREADS 128
+#define THREADS 256
 #define DEVICE static inline
 #define SHARED alignas(16)
 #define LANES(type, name) type name[THREADS]
@@ -37,9 +37,19 @@ static inline To same_bits(From from) {
     std::memcpy(&to, &from, sizeof to);
     return to;
 }
+static inline long long whole(long long bytes) { return bytes; }
+static inline int anew(int x) { return x; }
 static inline float as_float(unsigned bits) { return same_bits<float>(bits); }
 static inline unsigned as_bits(float value) { return same_bits<unsigned>(value); }
-static inline float reciprocal(float x) { return 1.f / x; }
+// The device's approximations, with the error that their makers state: one unit in the last place, up or down.
+static inline float one_off(float exact) {
+    const unsigned bits = as_bits(exact);
+    if ((bits & 0x7fffffffu) - 1u >= 0x7f7fffffu) return exact;  // 0, infinite or no number
+    return as_float((bits * 2654435761u) >> 31 ? bits + 1u : bits - 1u);
+}
+static inline float rough_reciprocal(float x) { return one_off(1.f / x); }
+static inline float root(float x) { return one_off(std::sqrt(x)); }
+static inline float saturated(float x) { return x > 0.f ? (x < 1.f ? x : 1.f) : 0.f; }
 static inline float half_to_float(unsigned short bits) { return (float)same_bits<_Float16>(bits); }
 static inline unsigned short float_to_half(float value) { return same_bits<unsigned short>((_Float16)value); }
 

@@ -14,7 +14,7 @@
 typedef int Result;
 enum { SUCCESS = 0, INVALID_VALUE = 1, INVALID_IMAGE = 200, INVALID_CONTEXT = 201, UNSUPPORTED_PTX = 222,
        INVALID_HANDLE = 400, NOT_FOUND = 500, OUT_OF_RESOURCES = 701, CAPTURE_UNSUPPORTED = 900 };
-enum { DEVICES = 8, THREADS = 128, RELAXED = 2 };
+enum { DEVICES = 8, THREADS = 256, RELAXED = 2 };
 
 struct Context { int device; Result fault; };
 struct Module { Context* context; void* library; };

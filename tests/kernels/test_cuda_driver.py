@@ -15,7 +15,7 @@ from legs_loss import legs_loss
 from legs_loss.kernels import available
 from legs_loss.kernels.available import BACKENDS, Known
 from legs_loss.kernels.contract import DeviceFault, NotNow, Weights
-from legs_loss.kernels.cuda.backend import CudaBackend, Task
+from legs_loss.kernels.cuda.backend import THREADS, CudaBackend, Task
 from legs_loss.kernels.cuda.driver import CudaDriver, DriverError, OutOfMemory
 from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules, Variant
 from legs_loss.kernels.cuda.nvrtc import Compiler, CompilerError
@@ -56,25 +56,24 @@ def modules(driver, tmp_path):
 def sums(modules, values):
     """Launch legs_finish on partial sums of two blocks; return the loss."""
     partial, result = torch.tensor(values), torch.zeros(())
-    task = Task(partial=partial.data_ptr(), result=result.data_ptr(), count=2, views=1, channels=1, height=1, width=2)
-    task.l1_share = 1.0
-    modules.driver.launch(modules.function("legs_finish", PLAIN), 1, 128, task)
+    task = Task(partial=partial.data_ptr(), result=result.data_ptr(), count=2)
+    modules.driver.launch(modules.function("legs_finish", PLAIN), 1, THREADS, task)
     return result.item()
 
 
 class TestLaunch:
     def test_a_kernel_is_launched_through_the_driver(self, modules, cuda):
-        assert sums(modules, [1.0, 2.0, 0.0, 0.0]) == 1.5
+        assert sums(modules, [1.0, 2.0]) == 3.0
         assert cuda.test_calls(b"cuLaunchKernel") == 1
         assert cuda.test_current_device() == -1  # the thread has again the context that it had
 
     def test_a_thread_of_its_own_gets_the_context(self, modules):
         modules.load(PLAIN)
         found = []
-        thread = threading.Thread(target=lambda: found.append(sums(modules, [3.0, 5.0, 0.0, 0.0])))
+        thread = threading.Thread(target=lambda: found.append(sums(modules, [3.0, 5.0])))
         thread.start()
         thread.join()
-        assert found == [4.0]
+        assert found == [8.0]
 
     def test_two_devices_have_contexts_of_their_own(self, cuda, runtime):
         built = []
@@ -83,12 +82,12 @@ class TestLaunch:
             second.current_device = lambda index=index: index
             driver = CudaDriver(torch.device("cpu"), cuda, second)
             built.append(Modules(driver, Compiler(libraries().nvrtc), BinaryCache(libraries().cache)))
-        assert [sums(each, [2.0, 2.0, 0.0, 0.0]) for each in built] == [2.0, 2.0]
+        assert [sums(each, [2.0, 2.0]) for each in built] == [4.0, 4.0]
         foreign = built[0].function("legs_finish", PLAIN)
         with pytest.raises(DriverError, match=r"cuLaunchKernel failed: .*\(400\)"):
-            built[1].driver.launch(foreign, 1, 128, Task())
+            built[1].driver.launch(foreign, 1, THREADS, Task())
 
-    @pytest.mark.parametrize(("blocks", "threads", "code"), [(2**31, 128, 1), (0, 128, 1), (1, 256, 701)])
+    @pytest.mark.parametrize(("blocks", "threads", "code"), [(2**31, THREADS, 1), (0, THREADS, 1), (1, 128, 701)])
     def test_what_the_hardware_refuses_is_an_error(self, modules, blocks, threads, code):
         with pytest.raises(DriverError, match=rf"cuLaunchKernel failed: .*\({code}\)"):
             modules.driver.launch(modules.function("legs_finish", PLAIN), blocks, threads, Task())
@@ -97,7 +96,7 @@ class TestLaunch:
 class TestLoading:
     def test_a_full_card_is_tried_again_after_torch_gave_memory_back(self, modules, cuda, runtime):
         cuda.test_fail(b"cuModuleLoadData", 2, 1)
-        assert sums(modules, [1.0, 1.0, 0.0, 0.0]) == 1.0
+        assert sums(modules, [1.0, 1.0]) == 2.0
         assert runtime.emptied == 1
 
     def test_a_card_that_stays_full_is_for_torch_this_once(self, modules, cuda):
@@ -137,7 +136,7 @@ class TestLoading:
             "or install a torch for a newer CUDA"
         )
         modules.load(PLAIN)  # with a newer driver its PTX loads
-        assert sums(modules, [1.0, 3.0, 0.0, 0.0]) == 2.0
+        assert sums(modules, [1.0, 3.0]) == 4.0
 
     def test_a_source_that_does_not_compile_says_where(self, modules, monkeypatch):
         monkeypatch.setattr("legs_loss.kernels.cuda.modules.source", lambda: b"int bad = missing;\n")
@@ -146,7 +145,7 @@ class TestLoading:
 
     def test_a_capture_of_another_thread_outlives_what_is_loaded_meanwhile(self, modules, cuda):
         cuda.test_capture(1)
-        assert sums(modules, [1.0, 2.0, 0.0, 0.0]) == 1.5
+        assert sums(modules, [1.0, 2.0]) == 3.0
         assert cuda.test_capture_is_valid()
 
     def test_the_stand_in_ends_a_capture_where_the_mode_is_not_relaxed(self, driver, cuda, monkeypatch):

@@ -29,15 +29,15 @@ class TestLaunch:
     def test_every_row_is_done_by_one_block(self):
         for shape in ((1, 3, 1080, 1920), (1, 3, 533, 800), (2, 1, 7, 5), (1, 3, 2160, 3840)):
             for multiprocessors in (1, 30, 132):
-                for wanted, core in ((True, 108), (False, 118)):
+                for wanted, core in ((True, 236), (False, 244)):
                     strip, blocks = strip_of(torch.empty(shape, device="meta"), multiprocessors, wanted)
                     assert strip % 4 == 0
                     assert blocks == shape[0] * shape[1] * -(-shape[2] // strip) * -(-shape[3] // core)
 
     def test_a_photograph_fills_a_large_gpu(self):
         _, blocks = strip_of(torch.empty(1, 3, 1080, 1920, device="meta"), 132, True)
-        assert 0.8 * 528 <= blocks <= 1056
-        assert 132 <= chunks_of(torch.empty(1, 3, 1080, 1920, device="meta"), 132) <= 16 * 132
+        assert 0.8 * 264 <= blocks <= 528
+        assert chunks_of(torch.empty(1, 3, 1080, 1920, device="meta")) == 8 * 135  # tiles of 256 columns, 8 rows
 
     def test_strides_beyond_31_bits_between_views_are_fine(self):
         task, layout = Task(), Layout(2**40, 2**33, 3840, 1)
@@ -134,11 +134,9 @@ class TestNothingWaits:
     def test_launches_of_a_step(self, on_meta):
         prediction, target = (torch.empty(3, 1080, 1920, device="meta") for _ in range(2))
         loss = legs_loss(prediction.requires_grad_(), target)
-        assert on_meta.launches == [
-            *("legs_range", "legs_range_finish", "legs_weights", "legs_loss_gradient", "legs_finish")
-        ]
+        assert on_meta.launches == ["legs_range", "legs_range_finish", "legs_loss_gradient", "legs_finish"]
         loss.backward()
-        assert on_meta.launches[5:] == ["legs_scale"]
+        assert on_meta.launches[4:] == ["legs_scale"]
 
 
 class TestDropIn:

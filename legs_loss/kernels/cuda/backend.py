@@ -33,7 +33,8 @@ __all__ = [
     "strip_of",
 ]
 
-THREADS = 128
+THREADS = 256
+RUN = 8  # rows of a thread of the pixelwise passes
 VALUES = {torch.float32: 0, torch.float16: 1, torch.bfloat16: 2}
 # kind of stencil, the weights of a gradient's outer and middle rows
 STENCILS: Dict[str, Tuple[int, float, float]] = {
@@ -47,7 +48,7 @@ NORMS = {1.0: 1, 2.0: 2, float("inf"): 3}
 CURVES = {"C1": 1, "C2": 2, "C3": 3, "C4": 4, "C5": 5}
 
 _REACH = 5  # of SSIM's window
-_BLOCKS_AT_A_TIME = 4  # of a multiprocessor: 128 registers a thread
+_BLOCKS_AT_A_TIME = 2  # of a multiprocessor: 128 registers a thread
 _MOST = 2**31 - 1
 _PLANS = 256  # of a device; a codebase with more shapes of images begins again
 
@@ -68,12 +69,12 @@ class Task(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("prediction", "target", "gradient", "scaled", "step", "partial")),
-        *((name, ctypes.c_void_p) for name in ("result", "map", "mask", "covered", "range", "response")),
+        *((name, ctypes.c_void_p) for name in ("result", "map", "range", "response")),
         *((name, Layout) for name in ("of_prediction", "of_target", "of_gradient")),
-        *((name, ctypes.c_longlong) for name in ("map_view", "mask_view", "count")),
+        ("count", ctypes.c_longlong),
         *((name, ctypes.c_int) for name in ("views", "channels", "height", "width", "strip", "curve", "chunks")),
-        *((name, ctypes.c_float) for name in ("side", "middle", "beta", "eps")),
-        *((name, ctypes.c_float) for name in ("l1_share", "ssim_share", "constant")),
+        ("map_view", ctypes.c_int),
+        *((name, ctypes.c_float) for name in ("side", "middle", "beta", "eps", "l1_step", "ssim_step", "constant")),
     ]
 
 
@@ -217,7 +218,7 @@ class _Device:
         if plan.gradient is not None:
             gradient = torch.empty_strided(x.shape, plan.gradient, dtype=torch.float32, device=x.device)
             task.gradient = gradient.data_ptr()
-        partial = torch.empty(2 * plan.blocks, dtype=torch.float32, device=x.device)
+        partial = torch.empty(plan.blocks, dtype=torch.float32, device=x.device)
         loss = torch.empty((), dtype=torch.float32, device=x.device)
         task.prediction, task.target = x.data_ptr(), y.data_ptr()
         task.partial, task.result = partial.data_ptr(), loss.data_ptr()
@@ -229,7 +230,7 @@ class _Device:
     def _add_weights(
         self, task: Task, y: Tensor, weights: Weights, spec: Optional[WeightSpec], streams: bool
     ) -> List[Tensor]:
-        """Set a task's weights, for the streaming pass as one map that is made here; return the memory they are in."""
+        """Set a task's weights, of the streaming pass with the responses; return the memory they are in."""
         held, response = [], None
         views, _, height, width = y.shape
         if spec is not None:
@@ -245,27 +246,15 @@ class _Device:
             if response is not None:
                 task.response = response.data_ptr()
                 held.append(response)
-        for name, values in (("map", weights.map), ("mask", weights.mask)):
-            if values is None:
-                continue
-            values = values.detach().to(torch.float32).contiguous()
-            if values.numel() not in (height * width, views * height * width):
-                raise ValueError(f"a {name} {list(values.shape)} does not fit images {list(y.shape)}")
-            setattr(task, name, values.data_ptr())
-            setattr(task, f"{name}_view", height * width if values.numel() > height * width else 0)
-            held.append(values)
-            if name == "mask" and weights.renormalise:
-                covered = values.mean()
-                task.covered = covered.data_ptr()
-                held.append(covered)
-        if streams and (response is not None or (task.map and task.mask)):
-            made = torch.empty((views, height, width), device=y.device) if response is None else response
-            task.result, task.chunks = made.data_ptr(), chunks_of(y, self._modules.driver.multiprocessors)
-            self._launch(self._modules.function("legs_weights", PLAIN), task.chunks * views, THREADS, task)
-            task.map, task.map_view = made.data_ptr(), height * width
-            held.append(made)
-        elif streams and task.mask:
-            task.map, task.map_view = task.mask, task.mask_view
+        factors = [values for values in (weights.map, _mask_of(weights)) if values is not None]
+        if factors:
+            for values in factors:
+                if values.numel() not in (height * width, views * height * width):
+                    raise ValueError(f"weights {list(values.shape)} do not fit images {list(y.shape)}")
+            planes = [values.detach().to(torch.float32).reshape(-1, height, width) for values in factors]
+            product = (planes[0] if len(planes) == 1 else planes[0] * planes[1]).contiguous()
+            task.map, task.map_view = product.data_ptr(), product.shape[0] > 1
+            held.append(product)
         return held
 
     def _scaled(self, gradient: Tensor, step: Tensor, dtype: torch.dtype) -> Tensor:
@@ -291,11 +280,12 @@ class _Device:
         task = _task_of(x, spec)
         task.of_prediction = _layout_of(x.contiguous() if copies[0] else x)
         task.of_target = _layout_of(y.contiguous() if copies[1] else y)
-        task.l1_share, task.ssim_share, task.constant = shares
+        task.l1_step, task.ssim_step = shares.l1 / x.numel(), 4.0 * shares.ssim / x.numel()
+        task.constant = shares.constant
         term = "l1" if shares.ssim == 0.0 else ("loss" if shares.l1 else "ssim")
         task.strip, blocks = strip_of(x, modules.driver.multiprocessors, wanted)
         if term == "l1":
-            task.chunks = chunks_of(x, modules.driver.multiprocessors)
+            task.chunks = chunks_of(x)
             blocks = task.chunks * task.views
         task.count = blocks
         strides = None
@@ -312,7 +302,7 @@ class _Device:
         copied = not _is_addressable(y)
         task = _task_of(y, spec)
         task.of_target = _layout_of(y.contiguous() if copied else y)
-        task.chunks = chunks_of(y, modules.driver.multiprocessors)
+        task.chunks = chunks_of(y)
         task.count = y.shape[0] * task.chunks
         own, finish = (modules.function(name, variant) for name in ("legs_range", "legs_range_finish"))
         return _Plan(own, finish, task.count, task, (False, copied), None)
@@ -331,25 +321,32 @@ def strip_of(images: Tensor, multiprocessors: int, wanted: bool) -> Tuple[int, i
     Every strip repeats the rows above and below it, so strips are long; but all multiprocessors should have work.
     """
     views, channels, height, width = images.shape
-    halo = 2 * _REACH if wanted else _REACH
+    halo = 2 * _REACH if wanted else _REACH + 1
     tiles = -(-width // (THREADS - 2 * halo)) * views * channels
     at_a_time = _BLOCKS_AT_A_TIME * multiprocessors
 
     def cost(strip: int) -> int:
         return -(-tiles * -(-height // strip) // at_a_time) * (min(strip, height) + 2 * halo)
 
-    strip = min(range(16, 513, 16), key=cost)
+    strip = min(range(16, 513, 4), key=cost)
     return strip, tiles * -(-height // strip)
 
 
-def chunks_of(images: Tensor, multiprocessors: int) -> int:
+def chunks_of(images: Tensor) -> int:
     """Return how many blocks a view gets in a pass that goes pixel by pixel."""
-    views, _, height, width = images.shape
-    return max(1, min(-(-height * width // (4 * THREADS)), -(-16 * multiprocessors // views)))
+    return -(-images.shape[3] // THREADS) * -(-images.shape[2] // RUN)
 
 
 def _batch(images: Tensor) -> Tensor:
     return images.unsqueeze(0) if images.dim() == 3 else images
+
+
+def _mask_of(weights: Weights) -> Optional[Tensor]:
+    """Return the mask, divided by its mean where the L1 is to be."""
+    if weights.mask is None or not weights.renormalise:
+        return weights.mask
+    mask = weights.mask.to(torch.float32)
+    return mask / mask.mean().clamp_min(torch.finfo(torch.float32).tiny)
 
 
 def _task_of(images: Tensor, spec: Optional[WeightSpec]) -> Task:
@@ -369,8 +366,8 @@ def _layout_of(images: Tensor) -> Layout:
 def _is_addressable(images: Tensor) -> bool:
     """Return whether the kernels can address the planes of images [B, C, H, W]: all strides but huge ones."""
     _, _, row, column = images.stride()
-    reach = (images.shape[2] - 1) * row + (images.shape[3] - 1) * column
-    return max(row, column, reach) <= _MOST
+    reach = (images.shape[2] + 31) * row + (images.shape[3] - 1) * column
+    return max(row, column, reach) <= _MOST  # rows below the image are computed, not read
 
 
 def _open(device: torch.device) -> Modules:

@@ -15,7 +15,7 @@
 #define BLOCK ((long long)blockIdx.x)
 #define BLOCKS ((long long)gridDim.x)
 #define LANES(type, name) type name
-#define THREADS 128
+#define THREADS 256
 template <class Lane, class Body>
 DEVICE void phase(Lane& lane, Body body) {
     body(lane, (int)threadIdx.x);
@@ -31,26 +31,34 @@ DEVICE unsigned short float_to_half(float value) {
     asm("cvt.rn.f16.f32 %0, %1;" : "=h"(bits) : "f"(value));
     return bits;
 }
-DEVICE float reciprocal(float x) {  // to the last bit or its neighbour; no path for subnormal numbers
+DEVICE float rough_reciprocal(float x) {  // 1 ulp; no path for subnormal numbers
     float y;
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
-    return fmaf(y, fmaf(-x, y, 1.f), y);
+    return y;
+}
+DEVICE float root(float x) {  // 1 ulp; subnormal numbers are 0
+    float y;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+}
+DEVICE float saturated(float x) { return __saturatef(x); }  // into [0, 1]; a NaN is 0
+DEVICE long long whole(long long bytes) {  // keeps the compiler from repeating the sum in every later address
+    asm("" : "+l"(bytes));
+    return bytes;
+}
+DEVICE int anew(int x) {  // keeps it from holding what depends on x in registers
+    asm volatile("" : "+r"(x));
+    return x;
 }
 DEVICE float as_float(unsigned bits) { return __uint_as_float(bits); }
 DEVICE unsigned as_bits(float value) { return __float_as_uint(value); }
 #endif
 
-#define ROWS 4             // rows a step of the streaming pass
-// Rows that the vertical blurs of a step unroll: of the moments, of the slopes. More of them spill a few bytes.
-#if defined(__CUDACC_VER_MAJOR__) && __CUDACC_VER_MAJOR__ < 12
-#define MOMENT_ROWS 2
-#define SLOPE_ROWS 1
-#else
-#define MOMENT_ROWS ROWS
-#define SLOPE_ROWS 2
-#endif
-#define REACH 5            // of SSIM's window
-#define PITCH (THREADS + 16)  // a row with its margins: 5 zeros before it, 11 after it
+#define ROWS 4                // rows of a step of the streaming pass
+#define RUN 8                 // rows of a thread of the pixelwise passes
+#define REACH 5               // of SSIM's window
+#define GROUPS (THREADS / 4)  // of four columns, in a row of a tile
+#define PITCH (THREADS + 12)  // of a row that a horizontal blur reads: three zeros before it, some after it
 #define INFINITE as_float(0x7f800000u)
 
 // Eleven taps of a Gaussian of sigma 1.5, symmetric.
@@ -61,12 +69,16 @@ DEVICE unsigned as_bits(float value) { return __float_as_uint(value); }
 #define G4 0.21300552785396576f
 #define G5 0.26601171493530273f
 
+// SSIM's constants.
+#define K1 0.0001f
+#define K2 0.0009f
+
 struct Layout {  // strides in values
     long long view, channel;
     int row, column;
 };
 
-// What every kernel is given; kernels/cuda/launch.py packs the same. What is absent is a null pointer.
+// What every kernel is given; kernels/cuda/backend.py packs the same. What is absent is a null pointer.
 struct Task {
     const void* prediction;
     const void* target;
@@ -76,25 +88,25 @@ struct Task {
     float* partial;        // a block's sums
     float* result;         // the loss; of the range pass [views, 2]
     const float* map;      // [views or 1, height, width]
-    const float* mask;     // the same
-    const float* covered;  // the mask's mean, where the L1 is divided by it
     const float* range;    // [views, 2]: the least response, the greatest less the least
-    float* response;       // [views, height, width], of the range pass; in its place the weights of the streaming pass
+    float* response;       // [views, height, width]: written by the range pass, read by the streaming pass
     Layout of_prediction, of_target, of_gradient;
-    long long map_view, mask_view;  // strides between views, 0 for one map for all
-    long long count;                // values (scale); blocks whose sums are to be added (finish)
+    long long count;       // values (scale); blocks whose sums are to be added (finish)
     int views, channels, height, width;
     int strip;    // rows of a block of the streaming pass
     int curve;    // 1 to 5
     int chunks;   // blocks a view of the pixelwise passes
+    int map_view;  // whether each view has a map of its own
     float side, middle;  // of a gradient's stencil: the outer and middle rows
     float beta, eps;
-    float l1_share, ssim_share, constant;  // the loss is l1_share * L1 + ssim_share * SSIM + constant
+    float l1_step;    // the share of the weighted L1 in the loss, divided by the number of values
+    float ssim_step;  // four times that of SSIM
+    float constant;   // the rest of the loss
 };
 
+DEVICE float read(const float* at) { return *at; }
 #if VALUE == 0
 typedef float Value;
-DEVICE float read(const Value* at) { return *at; }
 DEVICE void write(Value* at, float value) { *at = value; }
 #else
 typedef unsigned short Value;
@@ -111,10 +123,30 @@ DEVICE void write(Value* at, float value) {  // to the nearest, ties to even
 #endif
 #endif
 
-DEVICE float greater(float a, float b) { return a > b ? a : b; }
-DEVICE float sign(float d) { return d > 0.f ? 1.f : (d < 0.f ? -1.f : 0.f); }
+DEVICE float reciprocal(float x) {  // to the last bit or its neighbour
+    const float y = rough_reciprocal(x);
+    return fmaf(y, fmaf(-x, y, 1.f), y);
+}
 DEVICE const Value* plane_of(const void* images, const Layout& of, long long view, long long channel) {
     return (const Value*)images + view * of.view + channel * of.channel;
+}
+
+// N rows of a column, from row `from` on, 0 outside the image; `at` goes on to the row after them.
+template <class T, int N>
+DEVICE void read_rows(const T*& at, int stride, int from, int height, float (&out)[N]) {
+    if (from >= 0 && from + N <= height) {
+#pragma unroll
+        for (int r = 0; r < N; ++r, at += stride) out[r] = read(at);
+    } else {
+#pragma unroll
+        for (int r = 0; r < N; ++r, at += stride) out[r] = from + r >= 0 && from + r < height ? read(at) : 0.f;
+    }
+}
+
+// A slope and the derivative of weight * |d|, which is 0 where d is 0 (or no number).
+DEVICE float with_l1(float slope, float weight, float d) {
+    const float toward = as_float(as_bits(weight) ^ (as_bits(d) & 0x80000000u));
+    return fabsf(d) > 0.f ? slope + toward : slope;
 }
 
 // ---- the weight of a pixel -----------------------------------------------------------------------------------------
@@ -127,163 +159,165 @@ DEVICE float joined(float sum, float value) {
     return sum + fabsf(value);
 #elif NORM == 2
     return fmaf(value, value, sum);
-#else
-    return greater(fabsf(value), sum);
+#else  // a NaN wins: the greater of two is one
+    return fabsf(value) <= sum ? sum : fabsf(value) + 0.f * sum;
 #endif
 }
 
-// The response of a pixel. Differences are taken in an order that is exactly zero on a constant image. With the norm
-// "infinity" a NaN would lose every comparison, so it is carried along in `poison`.
-DEVICE float response(const Task& k, const Value* view, int row, int column) {
-    const int up = reflected(row - 1, k.height) * k.of_target.row, down = reflected(row + 1, k.height) * k.of_target.row;
-    const int left = reflected(column - 1, k.width) * k.of_target.column;
-    const int right = reflected(column + 1, k.width) * k.of_target.column;
-    const int here = row * k.of_target.row, middle = column * k.of_target.column;
-    float strength = 0.f, poison = 0.f;
+// The responses of RUN pixels of a column, from `row` on; `before` and `after` it are the columns beside it, in values.
+// Differences are taken in an order that is exactly zero on a constant image.
+DEVICE void responses(const Task& k, const Value* at, int row, int before, int after, float (&e)[RUN]) {
+#pragma unroll
+    for (int r = 0; r < RUN; ++r) e[r] = 0.f;
 #pragma unroll 1
-    for (int channel = 0; channel < k.channels; ++channel, view += k.of_target.channel) {
-        const float north = read(view + up + middle), south = read(view + down + middle);
-        const float west = read(view + here + left), east = read(view + here + right);
-        float value;
-#if STENCIL == 1
-        value = fmaf(-4.f, read(view + here + middle), (north + south) + (west + east));
-#elif STENCIL == 2
-        value = (read(view + up + left) + read(view + down + right)) + (read(view + up + right) + read(view + down + left));
-        value = fmaf(-8.f, read(view + here + middle), ((north + south) + (west + east)) + value);
-#else
-        float other = k.middle * (south - north);
-        value = k.middle * (east - west);
-        if (k.side != 0.f) {
-            const float first = read(view + up + left), second = read(view + up + right);
-            const float third = read(view + down + left), fourth = read(view + down + right);
-            value = fmaf(k.side, (second - first) + (fourth - third), value);
-            other = fmaf(k.side, (third - first) + (fourth - second), other);
-        }
-        strength = joined(strength, other);
-        poison += 0.f * other;
+    for (int channel = 0; channel < k.channels; ++channel, at += k.of_target.channel) {
+        auto line = [&](int r) {  // of rows that are not needed, one that is there
+            const int wanted = row + r < k.height ? row + r : k.height;
+            return at + reflected(wanted, k.height) * k.of_target.row;
+        };
+        const Value* here = line(0);
+        float north = read(line(-1)), middle = read(here);
+#if STENCIL > 1
+        float north_west = read(line(-1) + before), north_east = read(line(-1) + after);
+        float west = read(here + before), east = read(here + after);
 #endif
-        strength = joined(strength, value);
-        poison += 0.f * value;
+#pragma unroll
+        for (int r = 0; r < RUN; ++r) {
+            const Value* below = line(r + 1);
+            const float south = read(below);
+#if STENCIL == 1
+            e[r] = joined(e[r], fmaf(-4.f, middle, (north + south) + (read(here + before) + read(here + after))));
+#else
+            const float south_west = read(below + before), south_east = read(below + after);
+#if STENCIL == 2
+            const float corners = (north_west + south_east) + (north_east + south_west);
+            e[r] = joined(e[r], fmaf(-8.f, middle, ((north + south) + (west + east)) + corners));
+#else
+            float down = k.middle * (south - north), across = k.middle * (east - west);
+            if (k.side != 0.f) {
+                across = fmaf(k.side, (north_east - north_west) + (south_east - south_west), across);
+                down = fmaf(k.side, (south_west - north_west) + (south_east - north_east), down);
+            }
+            e[r] = joined(joined(e[r], down), across);
+#endif
+            north_west = west; west = south_west; north_east = east; east = south_east;
+#endif
+            north = middle; middle = south; here = below;
+        }
     }
 #if NORM == 2
-    strength = sqrtf(strength);
+#pragma unroll
+    for (int r = 0; r < RUN; ++r) e[r] = root(e[r]);
 #endif
-    return strength + poison;
 }
-#endif
 
-DEVICE float curve(int which, float x) {
-    if (which == 1) return x;
-    if (which == 2) return x * x;
-    if (which == 3) return sqrtf(x);
-    if (which == 4) return x * x * fmaf(-2.f, x, 3.f);
-    // 1/2 - sin(asin(1 - 2x) / 3); the sine of an angle of at most 30 degrees is a short polynomial.
-    const float angle = asinf(fmaf(-2.f, x, 1.f)) * (1.f / 3.f), square = angle * angle;
-    const float sine = angle * fmaf(square, fmaf(square, fmaf(square, fmaf(square, 1.f / 362880.f, -1.f / 5040.f),
-                                                               1.f / 120.f), -1.f / 6.f), 1.f);
-    const float y = 0.5f - sine;
-    return y < 0.f ? 0.f : (y > 1.f ? 1.f : y);
+DEVICE void responses(const Task& k, const Value* target, int row, int column, float (&e)[RUN]) {
+    const int stride = k.of_target.column;
+    const int before = (reflected(column - 1, k.width) - column) * stride;
+    const int after = (reflected(column + 1, k.width) - column) * stride;
+    if (before == -1 && after == 1) responses(k, target + column, row, -1, 1, e);  // neighbours by constant offsets
+    else responses(k, target + column * stride, row, before, after, e);
 }
+#endif
 
 // What the weights of one view share.
 struct Weights {
-    const float* map;
-    const float* mask;
-    const Value* target;
-    const float* response;
+    int rows;  // of the views before it
     float low, scale;
+    float one;  // 1, or not a number where the range is none: then no weight is one
 };
 
-DEVICE Weights weights_of(const Task& k, long long view) {
+DEVICE Weights weights_of(const Task& k, int view) {
     Weights w;
-    w.map = k.map ? k.map + view * k.map_view : 0;
-    w.mask = k.mask ? k.mask + view * k.mask_view : 0;
-    w.target = plane_of(k.target, k.of_target, view, 0);
-    w.response = k.response ? k.response + view * k.height * k.width : 0;
+    w.rows = view * k.height;
     w.low = w.scale = 0.f;
     if (k.range) {
         const float span = k.range[2 * view + 1];
         w.low = k.range[2 * view];
         w.scale = span == 0.f ? 0.f : 1.f / (span + k.eps);  // a NaN is not equal to 0
     }
+    w.one = 1.f + 0.f * w.scale;
     return w;
 }
 
-DEVICE float weight_of(const Task& k, const Weights& w, float response) {
-    float x = (response - w.low) * w.scale;
-    x = x < 0.f ? 0.f : (x > 1.f ? 1.f : x);  // rounding; a NaN stays
-    return fmaf(k.beta, curve(k.curve, x), 1.f);
+// Turns responses into weights.
+template <int N>
+DEVICE void weigh(const Task& k, const Weights& w, float (&x)[N]) {
+#pragma unroll
+    for (int r = 0; r < N; ++r) x[r] = saturated((x[r] - w.low) * w.scale);
+    if (k.curve == 3) {
+#pragma unroll
+        for (int r = 0; r < N; ++r) x[r] = root(x[r]);
+    } else if (k.curve == 2) {
+#pragma unroll
+        for (int r = 0; r < N; ++r) x[r] *= x[r];
+    } else if (k.curve == 4) {
+#pragma unroll
+        for (int r = 0; r < N; ++r) x[r] = x[r] * x[r] * fmaf(-2.f, x[r], 3.f);
+    } else if (k.curve == 5) {
+        // 1/2 - sin(asin(1 - 2x) / 3); the sine of an angle of at most 30 degrees is a short polynomial.
+#pragma unroll
+        for (int r = 0; r < N; ++r) {
+            const float angle = asinf(fmaf(-2.f, x[r], 1.f)) * (1.f / 3.f), square = angle * angle;
+            const float high = fmaf(square, fmaf(square, 1.f / 362880.f, -1.f / 5040.f), 1.f / 120.f);
+            x[r] = saturated(0.5f - angle * fmaf(square, fmaf(square, high, -1.f / 6.f), 1.f));
+        }
+    }
+#pragma unroll
+    for (int r = 0; r < N; ++r) x[r] = fmaf(k.beta, x[r], w.one);
 }
 
-// The weight of a pixel of the pixelwise passes; `at` is row * width + column.
-DEVICE float weight_at(const Task& k, const Weights& w, int row, int column, int at) {
-#if STENCIL
-    float weight = weight_of(k, w, response(k, w.target, row, column));
-#else
-    float weight = w.response ? weight_of(k, w, w.response[at]) : 1.f;
-#endif
-    if (w.map) weight *= w.map[at];
-    return w.mask ? weight * w.mask[at] : weight;
-}
-
-DEVICE float l1_step(const Task& k, float values) {
-    const float least = 1.1754944e-38f;
-    return k.l1_share / values / (k.covered ? greater(*k.covered, least) : 1.f);
+// The weights of N pixels of a column, from a row on, 0 outside the image. Responses are in `x` already, or in memory.
+template <int N>
+DEVICE void weights_at(const Task& k, const Weights& w, int row, int column, bool responded, float (&x)[N]) {
+    auto read_map = [&](const float* map, int above, float (&out)[N]) {
+        const float* at = map + ((long long)anew(above + row) * k.width + column);
+        read_rows(at, k.width, row, k.height, out);
+    };
+    if (!responded && k.response) {
+        read_map(k.response, w.rows, x);
+        responded = true;
+    }
+    if (responded) {
+        weigh(k, w, x);
+    } else {
+#pragma unroll
+        for (int r = 0; r < N; ++r) x[r] = 1.f;
+    }
+    if (k.map) {
+        float factor[N];
+        read_map(k.map, k.map_view ? w.rows : 0, factor);
+#pragma unroll
+        for (int r = 0; r < N; ++r) x[r] *= factor[r];
+    }
 }
 
 // ---- sums ----------------------------------------------------------------------------------------------------------
 
-// Adds two values of each thread in an order that never changes and writes the block's sums.
-template <class Lane, class Lanes, class First, class Second>
-DEVICE void write_sums(const Task& k, Lanes& lanes, float* scratch, First first, Second second) {
-    phase(lanes, [&](Lane& lane, int t) { scratch[t] = first(lane); scratch[THREADS + t] = second(lane); });
+// Adds a value of each thread in an order that never changes, and hands the sum to the first.
+template <class Lane, class Lanes, class Number, class Write>
+DEVICE void add_up(Lanes& lanes, Number (&scratch)[THREADS], Write write_result) {
     for (int n = THREADS / 2; n > 0; n >>= 1)
-        phase(lanes, [&](Lane&, int t) {
-            if (t < n) { scratch[t] += scratch[t + n]; scratch[THREADS + t] += scratch[THREADS + t + n]; }
-        });
-    phase(lanes, [&](Lane&, int t) {
-        if (t == 0) { k.partial[BLOCK] = scratch[0]; k.partial[BLOCKS + BLOCK] = scratch[THREADS]; }
-    });
+        phase(lanes, [&](Lane&, int t) { if (t < n) scratch[t] += scratch[t + n]; });
+    phase(lanes, [&](Lane&, int t) { if (t == 0) write_result(scratch[0]); });
 }
 
 #if STENCIL == 0
-struct Sums { double l1, ssim; };
+struct Sum { double of_blocks; };
 
 // One block: the loss from all blocks' sums.
 KERNEL(legs_finish, 1) {
-    SHARED double l1[THREADS];
-    SHARED double ssim[THREADS];
-    LANES(Sums, lanes);
-    phase(lanes, [&](Sums& lane, int t) {
-        lane.l1 = lane.ssim = 0.;
-        for (long long i = t; i < k.count; i += THREADS) { lane.l1 += k.partial[i]; lane.ssim += k.partial[k.count + i]; }
-        l1[t] = lane.l1;
-        ssim[t] = lane.ssim;
+    SHARED double scratch[THREADS];
+    LANES(Sum, lanes);
+    phase(lanes, [&](Sum& lane, int t) {
+        lane.of_blocks = 0.;
+        for (long long i = t; i < k.count; i += THREADS) lane.of_blocks += k.partial[i];
+        scratch[t] = lane.of_blocks;
     });
-    for (int n = THREADS / 2; n > 0; n >>= 1)
-        phase(lanes, [&](Sums&, int t) { if (t < n) { l1[t] += l1[t + n]; ssim[t] += ssim[t + n]; } });
-    phase(lanes, [&](Sums&, int t) {
-        if (t == 0) {
-            const double values = (double)k.views * k.channels * k.height * k.width;
-            const double covered = k.covered ? greater(*k.covered, 1.1754944e-38f) : 1.f;
-            k.result[0] = (float)(k.l1_share * (l1[0] / values / covered) + k.ssim_share * (ssim[0] / values) + k.constant);
-        }
-    });
+    add_up<Sum>(lanes, scratch, [&](double sum) { k.result[0] = (float)(sum + k.constant); });
 }
 
 struct Nothing {};
-
-// The weight of each pixel, once for all channels, for the streaming pass: there each channel has a block of its own. The
-// response is overwritten, where there is one.
-KERNEL(legs_weights, 1) {
-    LANES(Nothing, lanes);
-    const int view = (int)(BLOCK / k.chunks), chunk = (int)(BLOCK % k.chunks), pixels = k.height * k.width;
-    phase(lanes, [&](Nothing&, int t) {
-        const Weights weights = weights_of(k, view);
-        for (long long p = (long long)chunk * THREADS + t; p < pixels; p += (long long)k.chunks * THREADS)
-            k.result[(long long)view * pixels + p] = weight_at(k, weights, 0, 0, (int)p);
-    });
-}
 
 // The gradient times the step that arrives in backward, read here, rounded once to the images' type.
 KERNEL(legs_scale, 1) {
@@ -297,14 +331,26 @@ KERNEL(legs_scale, 1) {
 }
 #endif
 
-// ---- the range of a view's response --------------------------------------------------------------------------------
+// ---- the pixelwise passes: a thread has RUN rows of a column -------------------------------------------------------
+
+struct Run { long long view; int row, column, rows; };
+
+DEVICE Run run_of(const Task& k, int t) {
+    const int tiles = (k.width + THREADS - 1) / THREADS, chunk = (int)(BLOCK % k.chunks);
+    Run run;
+    run.view = BLOCK / k.chunks;
+    run.row = chunk / tiles * RUN;
+    run.column = chunk % tiles * THREADS + t;
+    run.rows = run.column >= k.width ? 0 : (run.row + RUN < k.height ? RUN : k.height - run.row);
+    return run;
+}
 
 #if STENCIL
 struct Extremes { float low, high, poison; };
 
 DEVICE void join(Extremes& a, float low, float high, float poison) {
-    a.low = low < a.low ? low : a.low;
-    a.high = greater(high, a.high);
+    a.low = fminf(low, a.low);
+    a.high = fmaxf(high, a.high);
     a.poison += poison;
 }
 
@@ -323,18 +369,22 @@ DEVICE void over_threads(Lanes& lanes, float* scratch, Body write_result) {
     phase(lanes, [&](Extremes& lane, int t) { if (t == 0) write_result(lane); });
 }
 
+// The range of a view's response, and where it is wanted the response.
 KERNEL(legs_range, 1) {
     SHARED float scratch[3 * THREADS];
     LANES(Extremes, lanes);
-    const int view = (int)(BLOCK / k.chunks), chunk = (int)(BLOCK % k.chunks), pixels = k.height * k.width;
     phase(lanes, [&](Extremes& lane, int t) {
         lane.low = INFINITE; lane.high = 0.f; lane.poison = 0.f;
-        const Value* target = plane_of(k.target, k.of_target, view, 0);
-        for (long long p = (long long)chunk * THREADS + t; p < pixels; p += (long long)k.chunks * THREADS) {
-            const int row = (int)p / k.width;
-            const float e = response(k, target, row, (int)p - row * k.width);
-            if (k.response) k.response[(long long)view * pixels + p] = e;
-            join(lane, e, e, 0.f * e);
+        const Run run = run_of(k, t);
+        if (!run.rows) return;
+        float e[RUN];
+        responses(k, plane_of(k.target, k.of_target, run.view, 0), run.row, run.column, e);
+        float* to = k.response + (k.response ? (run.view * k.height + run.row) * k.width + run.column : 0);
+#pragma unroll
+        for (int r = 0; r < RUN; ++r) {
+            if (r >= run.rows) break;
+            if (k.response) to[r * k.width] = e[r];
+            join(lane, e[r], e[r], 0.f * e[r]);
         }
     });
     over_threads(lanes, scratch, [&](const Extremes& all) {
@@ -358,36 +408,43 @@ KERNEL(legs_range_finish, 1) {
 }
 #endif
 
-// ---- the weighted L1 alone -----------------------------------------------------------------------------------------
+struct One { float loss; };
 
-struct One { float absolute; };
-
+// The weighted L1 alone.
 template <bool WANTED>
 DEVICE void l1(const Task& k) {
-    SHARED float scratch[2 * THREADS];
+    SHARED float scratch[THREADS];
     LANES(One, lanes);
-    const int view = (int)(BLOCK / k.chunks), chunk = (int)(BLOCK % k.chunks), pixels = k.height * k.width;
     phase(lanes, [&](One& lane, int t) {
-        lane.absolute = 0.f;
-        const Weights weights = weights_of(k, view);
-        const float step = l1_step(k, (float)k.views * k.channels * k.height * k.width);
-        for (long long p = (long long)chunk * THREADS + t; p < pixels; p += (long long)k.chunks * THREADS) {
-            const int row = (int)p / k.width, column = (int)p - row * k.width;
-            const float w = weight_at(k, weights, row, column, (int)p);
-            for (int channel = 0; channel < k.channels; ++channel) {
-                const float u = read(plane_of(k.prediction, k.of_prediction, view, channel)
-                                     + row * k.of_prediction.row + column * k.of_prediction.column);
-                const float v = read(plane_of(k.target, k.of_target, view, channel)
-                                     + row * k.of_target.row + column * k.of_target.column);
-                const float d = u - v;
-                lane.absolute = fmaf(w, fabsf(d), lane.absolute);
-                if (WANTED)
-                    k.gradient[view * k.of_gradient.view + channel * k.of_gradient.channel
-                               + row * k.of_gradient.row + column * k.of_gradient.column] = step * w * sign(d);
+        lane.loss = 0.f;
+        const Run run = run_of(k, t);
+        if (!run.rows) return;
+        const Weights weights = weights_of(k, (int)run.view);
+        float w[RUN];
+#if STENCIL
+        responses(k, plane_of(k.target, k.of_target, run.view, 0), run.row, run.column, w);
+#endif
+        weights_at(k, weights, run.row, run.column, STENCIL != 0, w);
+#pragma unroll 1
+        for (int channel = 0; channel < k.channels; ++channel) {
+            const Value* x = plane_of(k.prediction, k.of_prediction, run.view, channel)
+                             + run.row * k.of_prediction.row + run.column * k.of_prediction.column;
+            const Value* y = plane_of(k.target, k.of_target, run.view, channel)
+                             + run.row * k.of_target.row + run.column * k.of_target.column;
+            float* to = k.gradient + (WANTED ? run.view * k.of_gradient.view + channel * k.of_gradient.channel
+                                               + run.row * k.of_gradient.row + run.column * k.of_gradient.column : 0);
+#pragma unroll
+            for (int r = 0; r < RUN; ++r) {
+                if (r >= run.rows) break;
+                const float d = read(x + r * k.of_prediction.row) - read(y + r * k.of_target.row);
+                const float weight = k.l1_step * w[r];
+                lane.loss = fmaf(weight, fabsf(d), lane.loss);
+                if (WANTED) to[r * k.of_gradient.row] = with_l1(0.f, weight, d);
             }
         }
     });
-    write_sums<One>(k, lanes, scratch, [](const One& lane) { return lane.absolute; }, [](const One&) { return 0.f; });
+    phase(lanes, [&](One& lane, int t) { scratch[t] = lane.loss; });
+    add_up<One>(lanes, scratch, [&](float sum) { k.partial[BLOCK] = sum; });
 }
 
 KERNEL(legs_l1_gradient, 1) { l1<true>(k); }
@@ -395,73 +452,147 @@ KERNEL(legs_l1_value, 1) { l1<false>(k); }
 
 // ---- SSIM, with or without the weighted L1 -------------------------------------------------------------------------
 
+#if STENCIL == 0
 struct __align__(16) Quad { float a, b, c, d; };
 
-// A transposed FIR: the shift is in the destination of the multiply-add. Returns the blurred value of five rows ago.
+// A vertical blur, times SCALE, as a transposed FIR: the shift is in the destination of the multiply-add. Returns the
+// blurred value of five rows ago.
+template <int SCALE>
 DEVICE float push(float (&s)[10], float x) {
-    const float out = fmaf(G0, x, s[0]);
-    s[0] = fmaf(G1, x, s[1]); s[1] = fmaf(G2, x, s[2]); s[2] = fmaf(G3, x, s[3]); s[3] = fmaf(G4, x, s[4]);
-    s[4] = fmaf(G5, x, s[5]); s[5] = fmaf(G4, x, s[6]); s[6] = fmaf(G3, x, s[7]); s[7] = fmaf(G2, x, s[8]);
-    s[8] = fmaf(G1, x, s[9]); s[9] = G0 * x;
+    const float z = SCALE;
+    const float out = fmaf(z * G0, x, s[0]);
+    s[0] = fmaf(z * G1, x, s[1]); s[1] = fmaf(z * G2, x, s[2]); s[2] = fmaf(z * G3, x, s[3]);
+    s[3] = fmaf(z * G4, x, s[4]); s[4] = fmaf(z * G5, x, s[5]); s[5] = fmaf(z * G4, x, s[6]);
+    s[6] = fmaf(z * G3, x, s[7]); s[7] = fmaf(z * G2, x, s[8]); s[8] = fmaf(z * G1, x, s[9]);
+    s[9] = z * G0 * x;
     return out;
 }
 
-// Four neighbouring values of a blurred row from 14 of 16 inputs.
-DEVICE Quad across(const float (&v)[16]) {
-    float o[4];
-#pragma unroll
-    for (int j = 0; j < 4; ++j)
-        o[j] = fmaf(G5, v[j + 5], fmaf(G4, v[j + 4] + v[j + 6], fmaf(G3, v[j + 3] + v[j + 7],
-               fmaf(G2, v[j + 2] + v[j + 8], fmaf(G1, v[j + 1] + v[j + 9], G0 * (v[j] + v[j + 10]))))));
-    return Quad{o[0], o[1], o[2], o[3]};
-}
-
-DEVICE void load_row(const float* from, float (&v)[16]) {
+// A horizontal blur, plus a constant: four neighbouring values from 14 of 16.
+DEVICE void across(const float* from, float plus, float (&out)[4]) {
+    float v[16];
 #pragma unroll
     for (int j = 0; j < 4; ++j) {
         const Quad q = *reinterpret_cast<const Quad*>(from + 4 * j);
         v[4 * j] = q.a; v[4 * j + 1] = q.b; v[4 * j + 2] = q.c; v[4 * j + 3] = q.d;
     }
+#pragma unroll
+    for (int j = 0; j < 4; ++j)
+        out[j] = fmaf(G5, v[j + 5], fmaf(G4, v[j + 4] + v[j + 6], fmaf(G3, v[j + 3] + v[j + 7],
+                 fmaf(G2, v[j + 2] + v[j + 8], fmaf(G1, v[j + 1] + v[j + 9], fmaf(G0, v[j] + v[j + 10], plus))))));
 }
+
+DEVICE void put(float* to, const float (&v)[4]) { *reinterpret_cast<Quad*>(to) = Quad{v[0], v[1], v[2], v[3]}; }
 
 struct Stream {
     float moments[4][10], slopes[3][10];  // rows on their way through the vertical blurs
     float u[ROWS], v[ROWS];               // the next rows
-    float absolute, similar;
+    int x, y;                             // where in their planes the rows after them are
+    float* column;                        // in shared memory: of the vertical blurs
+    float* group;                         // of the horizontal ones
+    float loss;
 };
 
+// Shared memory has a row of each of these, ROWS times: moments (column c at c + 3), slopes (at c - 2), blurred slopes (at c - 7).
+#define MOMENT(j) ((j) * ROWS * PITCH)
+#define SLOPE(j) ((4 + (j)) * ROWS * PITCH)
+#define BLURRED(j) ((7 + (j)) * ROWS * PITCH)
+
+// A block has a strip of a tile, some rows a step. A thread has a column in the vertical blurs, and four columns of one row
+// in the horizontal ones: rows go through moments (vertical, horizontal), SSIM and its slopes, slopes (horizontal,
+// vertical), so that only what a horizontal blur reads, and what it returns, goes through shared memory.
 template <bool L1, bool WANTED>
 DEVICE void stream(const Task& k) {
-    const int halo = WANTED ? 2 * REACH : REACH, core = THREADS - 2 * halo;
-    SHARED float raw[3 * ROWS * PITCH];        // prediction and target, then the three slopes
-    SHARED float blurred[4 * ROWS * THREADS];  // after the horizontal pass
+    const int halo = WANTED ? 2 * REACH : REACH + 1, core = THREADS - 2 * halo;
+    SHARED float memory[(WANTED ? 10 : 4) * ROWS * PITCH];
     LANES(Stream, lanes);
 
     // The channels of a tile are neighbours in time, so that what they share is in the cache.
     const int tiles = (k.width + core - 1) / core, strips = (k.height + k.strip - 1) / k.strip;
-    long long rest = BLOCK;
-    const int channel = (int)(rest % k.channels); rest /= k.channels;
-    const int left = (int)(rest % tiles) * core - halo; rest /= tiles;
-    const int first = (int)(rest % strips) * k.strip;
-    const long long view = rest / strips;
+    unsigned rest = (unsigned)BLOCK;
+    const int channel = rest % (unsigned)k.channels; rest /= (unsigned)k.channels;
+    const int left = (int)(rest % (unsigned)tiles) * core - halo; rest /= (unsigned)tiles;
+    const int first = (int)(rest % (unsigned)strips) * k.strip;
+    const long long view = rest / (unsigned)strips;
     const int last = first + k.strip < k.height ? first + k.strip : k.height;
-    const Value* xs = plane_of(k.prediction, k.of_prediction, view, channel);
-    const Value* ys = plane_of(k.target, k.of_target, view, channel);
-    const float* map = L1 && k.map ? k.map + view * k.map_view : 0;
-    float* slopes = k.gradient + (WANTED ? view * k.of_gradient.view + channel * k.of_gradient.channel : 0);
-    const float values = (float)k.views * k.channels * k.height * k.width;
-    const float l1_scale = L1 ? l1_step(k, values) : 0.f, ssim_scale = k.ssim_share / values;
+    // The rows that go in; from the step of `needed` on SSIM is computed.
+    const int start = first - (WANTED ? 2 * REACH : 2 * ROWS), end = last + (WANTED ? 2 * REACH : REACH);
+    const int needed = first + (WANTED ? 0 : REACH);
+    auto plane = [&](const void* images, const Layout& of, int size) {
+        return (const char*)images + whole((view * of.view + channel * of.channel) * size);
+    };
+    const Value* xs = (const Value*)plane(k.prediction, k.of_prediction, sizeof(Value));
+    const Value* ys = (const Value*)plane(k.target, k.of_target, sizeof(Value));
+    float* gradient = WANTED ? (float*)plane(k.gradient, k.of_gradient, sizeof(float)) : 0;
+    const Weights weights = weights_of(k, (int)view);
 
-    auto fetch = [&](Stream& lane, int t, int base) {
-        const int column = left + t;
-        const bool inside = column >= 0 && column < k.width;
+    auto inside = [&](int t) { return left + t >= 0 && left + t < k.width; };
+    auto owned = [&](int t) { return t >= halo && t < halo + core && left + t < k.width; };
+    auto group_of = [&](Stream& lane, int t) {  // with the weights in its registers a thread has none left for it
+        return L1 && WANTED ? memory + t / GROUPS * PITCH + t % GROUPS * 4 : lane.group;
+    };
+    auto fetch = [&](Stream& lane, int t, int row) {
+        if (!inside(t)) return;
+        const Value *x = xs + lane.x, *y = ys + lane.y;
+        read_rows(x, k.of_prediction.row, row, k.height, lane.u);
+        read_rows(y, k.of_target.row, row, k.height, lane.v);
+        lane.x += ROWS * k.of_prediction.row;
+        lane.y += ROWS * k.of_target.row;
+    };
+    auto push_moments = [&](Stream& lane, int t, int row) {
+        if (!inside(t)) return;
+        float* to = lane.column + 3;
 #pragma unroll
-        for (int r = 0; r < ROWS; ++r) {
-            const int row = base + r;
-            const bool ok = inside && row >= 0 && row < k.height && row < last + halo;
-            lane.u[r] = ok ? read(xs + row * k.of_prediction.row + column * k.of_prediction.column) : 0.f;
-            lane.v[r] = ok ? read(ys + row * k.of_target.row + column * k.of_target.column) : 0.f;
+        for (int r = 0; r < ROWS; ++r, to += PITCH) {
+            const float u = lane.u[r], v = lane.v[r];
+            to[MOMENT(0)] = push<1>(lane.moments[0], u);
+            to[MOMENT(1)] = push<1>(lane.moments[1], v);
+            to[MOMENT(2)] = push<1>(lane.moments[2], fmaf(u, u, v * v));
+            to[MOMENT(3)] = push<1>(lane.moments[3], u * v);
         }
+        if (L1 && !WANTED && row >= first && owned(t)) {
+#pragma unroll 1  // it keeps the weight's registers out of the blur's way
+            for (int r = row; r < row + ROWS && r < last; ++r) {
+                float w[1];
+                weights_at(k, weights, r, left + t, false, w);
+                const float d = read(xs + (r * k.of_prediction.row + (left + t) * k.of_prediction.column))
+                                - read(ys + (r * k.of_target.row + (left + t) * k.of_target.column));
+                lane.loss = fmaf(k.l1_step * w[0], fabsf(d), lane.loss);
+            }
+        }
+    };
+    auto push_slopes = [&](Stream& lane, int t, int row) {  // row: the first whose gradient is complete then
+        if (!owned(t)) return;
+        float u[ROWS], v[ROWS], w[ROWS], slope[ROWS];
+        const Value* x = xs + (lane.x - (2 * ROWS + 2 * REACH) * k.of_prediction.row);
+        const Value* y = ys + (lane.y - (2 * ROWS + 2 * REACH) * k.of_target.row);
+        read_rows(x, k.of_prediction.row, row, k.height, u);
+        read_rows(y, k.of_target.row, row, k.height, v);
+        if (L1) weights_at(k, weights, row, left + t, false, w);
+        const float* from = lane.column - 7;
+#pragma unroll
+        for (int r = 0; r < ROWS; ++r, from += PITCH) {
+            slope[r] = push<1>(lane.slopes[0], from[BLURRED(0)]);
+            slope[r] = fmaf(u[r], push<-2>(lane.slopes[1], from[BLURRED(1)]), slope[r]);
+            slope[r] = fmaf(v[r], push<1>(lane.slopes[2], from[BLURRED(2)]), slope[r]);
+        }
+        float* to = gradient + (row * k.of_gradient.row + (left + t) * k.of_gradient.column);
+        auto finish = [&](int rows) {
+#pragma unroll
+            for (int r = 0; r < ROWS; ++r) {
+                if (r >= rows) break;
+                if (L1) {
+                    const float d = u[r] - v[r];
+                    w[r] *= k.l1_step;
+                    lane.loss = fmaf(w[r], fabsf(d), lane.loss);
+                    slope[r] = with_l1(slope[r], w[r], d);
+                }
+                *to = slope[r];
+                to += k.of_gradient.row;
+            }
+        };
+        if (row >= first && row + ROWS <= last) finish(ROWS);
+        else if (row >= first) finish(last - row);
     };
 
     phase(lanes, [&](Stream& lane, int t) {
@@ -470,114 +601,89 @@ DEVICE void stream(const Task& k) {
             lane.moments[0][j] = lane.moments[1][j] = lane.moments[2][j] = lane.moments[3][j] = 0.f;
             lane.slopes[0][j] = lane.slopes[1][j] = lane.slopes[2][j] = 0.f;
         }
-        lane.absolute = lane.similar = 0.f;
-        for (int j = t; j < 3 * ROWS * PITCH; j += THREADS) raw[j] = 0.f;  // the margins stay zero
-        fetch(lane, t, first - halo);
+        lane.loss = 0.f;
+        const int column = left + t;
+        lane.x = start * k.of_prediction.row + column * k.of_prediction.column;
+        lane.y = start * k.of_target.row + column * k.of_target.column;
+        lane.column = memory + t;
+        lane.group = memory + t / GROUPS * PITCH + t % GROUPS * 4;
+        // What lies outside the image is never written, and stays zero.
+        for (int j = t; j < (WANTED ? 7 : 4) * ROWS * PITCH; j += THREADS) memory[j] = 0.f;
+        fetch(lane, t, start);
     });
-    for (int base = first - halo; base < last + halo; base += ROWS) {
+    // Of the rows from `base` on moments go in; SSIM of those of REACH rows before comes out, and the gradient of 2 * REACH.
+    for (int base = start;; base += ROWS) {
+        const bool light = base + ROWS <= needed;
         phase(lanes, [&](Stream& lane, int t) {
-#pragma unroll
-            for (int r = 0; r < ROWS; ++r) {
-                raw[r * PITCH + REACH + t] = lane.u[r];
-                raw[(ROWS + r) * PITCH + REACH + t] = lane.v[r];
-            }
+            t = anew(t);
+            if (WANTED && base > first) push_slopes(lane, t, base - ROWS - 2 * REACH);
+            if (base < end) push_moments(lane, t, base);
+            if (light) fetch(lane, t, base + ROWS);
         });
-        phase(lanes, [&](Stream& lane, int t) {  // the horizontal blur: a warp a row, four columns a thread
-            fetch(lane, t, base + ROWS);         // on its way meanwhile
-            const int at = (t & 31) * 4, line = t >> 5;
-            float u[16], v[16];
-            load_row(raw + line * PITCH + at, u);
-            load_row(raw + (ROWS + line) * PITCH + at, v);
-            float* to = blurred + line * THREADS + at;
-            *reinterpret_cast<Quad*>(to) = across(u);
-            *reinterpret_cast<Quad*>(to + ROWS * THREADS) = across(v);
+        if (base >= end) break;
+        if (light) continue;
+        phase(lanes, [&](Stream& lane, int t) {
+            t = anew(t);
+            float* group = group_of(lane, t);
+            if (!WANTED) fetch(lane, t, base + ROWS);
+            const int row = base + t / GROUPS - REACH, at = t % GROUPS * 4, column = left + 2 + at;
+            if (column + 3 < 0 || column >= k.width) return;
+            float m1[4] = {}, m2[4] = {}, squares[4], product[4] = {};
+            if (row >= 0 && row < k.height) {
+                across(group + MOMENT(0), 0.f, m1);
+                across(group + MOMENT(1), 0.f, m2);
+                across(group + MOMENT(2), K1 + K2, squares);
+                across(group + MOMENT(3), 0.5f * (K1 + K2), product);
 #pragma unroll
-            for (int j = 0; j < 14; ++j) { const float a = u[j], b = v[j]; u[j] = fmaf(a, a, b * b); v[j] = a * b; }
-            *reinterpret_cast<Quad*>(to + 2 * ROWS * THREADS) = across(u);
-            *reinterpret_cast<Quad*>(to + 3 * ROWS * THREADS) = across(v);
-        });
-        phase(lanes, [&](Stream& lane, int t) {  // the vertical blur, and SSIM of row base + r - 5
-            const int column = left + t;
-            const bool inside = column >= 0 && column < k.width;
-            const bool mine = t >= halo && t < halo + core && column < k.width;
-#pragma unroll MOMENT_ROWS
-            for (int r = 0; r < ROWS; ++r) {
-                const float* from = blurred + r * THREADS + t;
-                const float m1 = push(lane.moments[0], from[0]), m2 = push(lane.moments[1], from[ROWS * THREADS]);
-                const float squares = push(lane.moments[2], from[2 * ROWS * THREADS]);
-                const float product = push(lane.moments[3], from[3 * ROWS * THREADS]);
-                const int row = base + r - REACH;
-                const float m12 = m1 * m2, mm = fmaf(m1, m1, m2 * m2);
-                const float a1 = fmaf(2.f, m12, 0.0001f), a2 = fmaf(2.f, product - m12, 0.0009f);
-                const float d1 = mm + 0.0001f, d2 = (squares - mm) + 0.0009f;
-                const float inverse = reciprocal(d1 * d2), a1_inverse = a1 * inverse, similarity = a2 * a1_inverse;
-                if (mine && row >= first && row < last) lane.similar += similarity;
-                if (WANTED) {
-                    const bool ok = inside && row >= 0 && row < k.height;
-                    const float mixed = fmaf(m2, a2 - a1, m1 * similarity * (d1 - d2));
-                    raw[r * PITCH + REACH + t] = ok ? 2.f * inverse * mixed : 0.f;
-                    raw[(ROWS + r) * PITCH + REACH + t] = ok ? -2.f * similarity * (d1 * inverse) : 0.f;
-                    raw[(2 * ROWS + r) * PITCH + REACH + t] = ok ? 2.f * a1_inverse : 0.f;
+                for (int j = 0; j < 4; ++j) {
+                    // SSIM is (2 a1 * 2 a2) / (d1 * d2); with the scale all is the gradient's own.
+                    const float d1 = fmaf(m1[j], m1[j], fmaf(m2[j], m2[j], K1)), d2 = squares[j] - d1;
+                    const float a1 = fmaf(m1[j], m2[j], 0.5f * K1), a2 = product[j] - a1;
+                    const float inverse = reciprocal(d1 * d2), scaled = k.ssim_step * inverse;
+                    const float third = a1 * scaled, similarity = a2 * third;
+                    const float part = similarity * inverse, second = d1 * part;
+                    const float toward = fmaf(a2, scaled, -third), away = fmaf(-part, d2, second);
+                    m1[j] = fmaf(m1[j], away, fmaf(m1[j], away, m2[j] * toward));
+                    m2[j] = second;
+                    product[j] = third;
+                    squares[j] = similarity;
                 }
+                if (column < 0 || column + 3 >= k.width) {
+#pragma unroll
+                    for (int j = 0; j < 4; ++j)
+                        if (column + j < 0 || column + j >= k.width) m1[j] = m2[j] = product[j] = squares[j] = 0.f;
+                }
+                if (row >= first && row < last && at + 2 >= halo && at + 2 < halo + core)
+                    lane.loss += (squares[0] + squares[1]) + (squares[2] + squares[3]);
             }
-            if (L1 && !WANTED) {  // a loop of its own keeps the weight's registers out of the blur's way
-#pragma unroll 1
-                for (int r = 0; r < ROWS; ++r) {
-                    const int row = base + r - REACH;
-                    if (!(mine && row >= first && row < last)) continue;
-                    const float d = read(xs + row * k.of_prediction.row + column * k.of_prediction.column)
-                                    - read(ys + row * k.of_target.row + column * k.of_target.column);
-                    lane.absolute = fmaf(map ? map[row * k.width + column] : 1.f, fabsf(d), lane.absolute);
-                }
+            if (WANTED) {
+                put(group + SLOPE(0), m1);
+                put(group + SLOPE(1), m2);
+                put(group + SLOPE(2), product);
             }
         });
         if (!WANTED) continue;
-        phase(lanes, [&](Stream&, int t) {
-            const int at = (t & 31) * 4, line = t >> 5;
+        phase(lanes, [&](Stream& lane, int t) {
+            t = anew(t);
+            float* group = group_of(lane, t);
+            fetch(lane, t, base + ROWS);  // on its way meanwhile
+            const int at = t % GROUPS * 4, column = left + 7 + at;
+            if (column + 3 < 0 || column >= k.width || at + 16 > THREADS) return;
 #pragma unroll
             for (int j = 0; j < 3; ++j) {
-                float v[16];
-                load_row(raw + (j * ROWS + line) * PITCH + at, v);
-                *reinterpret_cast<Quad*>(blurred + (j * ROWS + line) * THREADS + at) = across(v);
-            }
-        });
-        phase(lanes, [&](Stream& lane, int t) {  // the vertical blur of the slopes, and the gradient of row base + r - 10
-            const int column = left + t;
-            const bool mine = t >= halo && t < halo + core && column < k.width;
-            int row = base - halo, at = row * k.width + column;
-            int x_at = row * k.of_prediction.row + column * k.of_prediction.column;
-            int y_at = row * k.of_target.row + column * k.of_target.column;
-            int slope_at = row * k.of_gradient.row + column * k.of_gradient.column;
-#pragma unroll SLOPE_ROWS
-            for (int r = 0; r < ROWS; ++r) {
-                const float* from = blurred + r * THREADS + t;
-                const float s1 = push(lane.slopes[0], from[0]), s2 = push(lane.slopes[1], from[ROWS * THREADS]);
-                const float s3 = push(lane.slopes[2], from[2 * ROWS * THREADS]);
-                if (mine && row >= first && row < last) {
-                    const float u = read(xs + x_at), v = read(ys + y_at);
-                    float slope = ssim_scale * fmaf(v, s3, fmaf(u, s2, s1));
-                    if (L1) {
-                        const float w = map ? map[at] : 1.f, d = u - v;
-                        lane.absolute = fmaf(w, fabsf(d), lane.absolute);
-                        slope = fmaf(l1_scale * w, sign(d), slope);
-                    }
-                    slopes[slope_at] = slope;
-                }
-                ++row;
-                at += k.width;
-                x_at += k.of_prediction.row;
-                y_at += k.of_target.row;
-                slope_at += k.of_gradient.row;
+                float out[4];
+                across(group + SLOPE(j), 0.f, out);
+                put(group + BLURRED(j), out);
             }
         });
     }
-    write_sums<Stream>(k, lanes, raw, [](const Stream& lane) { return lane.absolute; },
-                       [](const Stream& lane) { return lane.similar; });
+    SHARED float scratch[THREADS];
+    phase(lanes, [&](Stream& lane, int t) { scratch[t] = lane.loss; });
+    add_up<Stream>(lanes, scratch, [&](float sum) { k.partial[BLOCK] = sum; });
 }
 
-#if STENCIL == 0
-KERNEL(legs_loss_gradient, 4) { stream<true, true>(k); }
-KERNEL(legs_loss_value, 4) { stream<true, false>(k); }
-KERNEL(legs_ssim_gradient, 4) { stream<false, true>(k); }
-KERNEL(legs_ssim_value, 4) { stream<false, false>(k); }
+KERNEL(legs_loss_gradient, 2) { stream<true, true>(k); }
+KERNEL(legs_loss_value, 2) { stream<true, false>(k); }
+KERNEL(legs_ssim_gradient, 2) { stream<false, true>(k); }
+KERNEL(legs_ssim_value, 2) { stream<false, false>(k); }
 #endif

@@ -37,7 +37,7 @@ class Variant(NamedTuple):
     def kernels(self) -> List[str]:
         """Return the names of the kernels in its module."""
         terms = ["l1"] if self.stencil else ["l1", "loss", "ssim"]
-        others = ["range", "range_finish"] if self.stencil else ["finish", "scale", "weights"]
+        others = ["range", "range_finish"] if self.stencil else ["finish", "scale"]
         losses = [f"{term}_{kind}" for term in terms for kind in ("value", "gradient")]
         return [f"legs_{name}" for name in (*others, *losses)]
 

@@ -21,6 +21,7 @@ _RELAXED = 2  # a mode of stream capture
 
 _POINTER, _INT, _UNSIGNED = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint
 _OUT = ctypes.POINTER(ctypes.c_void_p)
+_One = _POINTER * 1
 _ARGUMENTS: Dict[str, List[Any]] = {
     "cuDevicePrimaryCtxRetain": [_OUT, _INT],
     "cuCtxGetCurrent": [_OUT],
@@ -77,6 +78,7 @@ class CudaDriver:
         for name, arguments in _ARGUMENTS.items():
             getattr(library, name).argtypes = arguments
         self._library, self._runtime = library, runtime
+        self._get_current, self._launch = library.cuCtxGetCurrent, library.cuLaunchKernel
         torch.empty(1, device=device)  # torch makes the context before it is asked for
         index = runtime.current_device() if device.index is None else device.index
         self._index = index
@@ -118,10 +120,28 @@ class CudaDriver:
 
     def launch(self, function: int, blocks: int, threads: int, task: ctypes.Structure) -> None:
         """Launch a kernel on torch's current stream; its one argument is copied at once."""
-        arguments = (ctypes.c_void_p * 1)(ctypes.addressof(task))
-        stream = self._stream(self._index)
+        # Without _current where the context is there already: a generator takes some microseconds.
+        arguments = (
+            function,
+            blocks,
+            1,
+            1,
+            threads,
+            1,
+            1,
+            0,
+            self._stream(self._index),
+            _One(ctypes.addressof(task)),
+            None,
+        )
+        now = _POINTER()
+        if self._get_current(ctypes.byref(now)) == 0 and now.value == self._context:
+            code = self._launch(*arguments)
+            if code != 0:
+                self._raise("cuLaunchKernel", code)
+            return
         with self._current():
-            self._call("cuLaunchKernel", function, blocks, 1, 1, threads, 1, 1, 0, stream, arguments, None)
+            self._call("cuLaunchKernel", *arguments)
 
     def capturing(self) -> bool:
         """Return whether the current stream is being captured: nothing is loaded then."""
@@ -153,8 +173,10 @@ class CudaDriver:
 
     def _call(self, name: str, *arguments: Any) -> None:
         code = getattr(self._library, name)(*arguments)
-        if code == 0:
-            return
+        if code != 0:
+            self._raise(name, code)
+
+    def _raise(self, name: str, code: int) -> None:
         text = ctypes.c_char_p()
         self._library.cuGetErrorString(code, ctypes.byref(text))
         reason = f"{(text.value or b'unknown error').decode()} ({code})"

@@ -248,9 +248,11 @@ class _Device:
                 held.append(response)
         factors = [values for values in (weights.map, _mask_of(weights)) if values is not None]
         if factors:
-            for values in factors:
-                if values.numel() not in (height * width, views * height * width):
-                    raise ValueError(f"weights {list(values.shape)} do not fit images {list(y.shape)}")
+            wrong = [
+                list(each.shape) for each in factors if each.numel() not in (height * width, views * height * width)
+            ]
+            if wrong:
+                raise ValueError(f"weights {wrong[0]} do not fit images {list(y.shape)}")
             planes = [values.detach().to(torch.float32).reshape(-1, height, width) for values in factors]
             product = (planes[0] if len(planes) == 1 else planes[0] * planes[1]).contiguous()
             task.map, task.map_view = product.data_ptr(), product.shape[0] > 1
@@ -343,10 +345,8 @@ def _batch(images: Tensor) -> Tensor:
 
 def _mask_of(weights: Weights) -> Optional[Tensor]:
     """Return the mask, divided by its mean where the L1 is to be."""
-    if weights.mask is None or not weights.renormalise:
-        return weights.mask
-    mask = weights.mask.to(torch.float32)
-    return mask / mask.mean().clamp_min(torch.finfo(torch.float32).tiny)
+    mask = None if weights.mask is None else weights.mask.float()
+    return mask / mask.mean().clamp_min(1.1754944e-38) if mask is not None and weights.renormalise else mask
 
 
 def _task_of(images: Tensor, spec: Optional[WeightSpec]) -> Task:

@@ -78,7 +78,6 @@ class CudaDriver:
         for name, arguments in _ARGUMENTS.items():
             getattr(library, name).argtypes = arguments
         self._library, self._runtime = library, runtime
-        self._get_current, self._launch = library.cuCtxGetCurrent, library.cuLaunchKernel
         torch.empty(1, device=device)  # torch makes the context before it is asked for
         index = runtime.current_device() if device.index is None else device.index
         self._index = index
@@ -120,28 +119,15 @@ class CudaDriver:
 
     def launch(self, function: int, blocks: int, threads: int, task: ctypes.Structure) -> None:
         """Launch a kernel on torch's current stream; its one argument is copied at once."""
-        # Without _current where the context is there already: a generator takes some microseconds.
-        arguments = (
-            function,
-            blocks,
-            1,
-            1,
-            threads,
-            1,
-            1,
-            0,
-            self._stream(self._index),
-            _One(ctypes.addressof(task)),
-            None,
-        )
+        arguments, stream = _One(ctypes.addressof(task)), self._stream(self._index)
+        given = (function, blocks, 1, 1, threads, 1, 1, 0, stream, arguments, None)
         now = _POINTER()
-        if self._get_current(ctypes.byref(now)) == 0 and now.value == self._context:
-            code = self._launch(*arguments)
-            if code != 0:
-                self._raise("cuLaunchKernel", code)
-            return
-        with self._current():
-            self._call("cuLaunchKernel", *arguments)
+        self._call("cuCtxGetCurrent", ctypes.byref(now))
+        if now.value == self._context:  # as a rule; a generator would take some microseconds
+            self._call("cuLaunchKernel", *given)
+        else:
+            with self._current():
+                self._call("cuLaunchKernel", *given)
 
     def capturing(self) -> bool:
         """Return whether the current stream is being captured: nothing is loaded then."""
@@ -173,10 +159,8 @@ class CudaDriver:
 
     def _call(self, name: str, *arguments: Any) -> None:
         code = getattr(self._library, name)(*arguments)
-        if code != 0:
-            self._raise(name, code)
-
-    def _raise(self, name: str, code: int) -> None:
+        if code == 0:
+            return
         text = ctypes.c_char_p()
         self._library.cuGetErrorString(code, ctypes.byref(text))
         reason = f"{(text.value or b'unknown error').decode()} ({code})"

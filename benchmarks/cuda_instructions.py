@@ -30,7 +30,7 @@ SIZE = (1080, 1920)
 
 
 class Way(NamedTuple):
-    """What a way through a loop must do: loads, square roots, accesses of shared memory (None: the most there are)."""
+    """The work of a way through a loop: loads, square roots, accesses of shared memory (None: the most there are)."""
 
     loads: int
     roots: int = 0
@@ -38,7 +38,7 @@ class Way(NamedTuple):
 
 
 class Budget(NamedTuple):
-    """What 32 values of RGB may take, and the aim: a change that needs more says why, here."""
+    """The instructions that 32 values of RGB may take, and the aim: a change that needs more says why, here."""
 
     kernel: str
     step: Way

@@ -511,7 +511,7 @@ def test_two_comparisons_at_once(tiny_scene, tmp_path):
 
 
 class Model:
-    """What pycolmap would have found, of a size."""
+    """A stand-in for what pycolmap would have found, of a size."""
 
     images, points3D = {}, {}
 

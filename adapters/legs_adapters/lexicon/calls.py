@@ -169,7 +169,7 @@ def _of_images(call: CallReading) -> Optional[Meaning]:
 
 
 def _returned(call: CallReading) -> Optional[Meaning]:
-    """What the called function returns; of ``Renderer(settings)(**means)``, what ``Renderer`` makes."""
+    """Return what the called function returns, and of ``Renderer(settings)(**means)`` what ``Renderer`` makes."""
     if isinstance(call.node.func, cst.Call):
         return call.ask(call.node.func)
     for reference in call.program.resolve(call.function, call.node.func):

@@ -24,6 +24,7 @@ from legs_adapters.code.syntax import (
     walk_expressions,
     words,
 )
+from legs_adapters.lexicon.words import SIDES
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.terms.findings import Findings, Left, Problem, Site
 from legs_adapters.terms.form import Form
@@ -36,7 +37,6 @@ __all__ = ["with_masks"]
 
 _MASKED = f"{PACKAGE}.masked"
 _MOST = 100  # expressions that a rendering is followed through
-_SIDES = {"width", "height"}
 _ALL = (0, math.inf)
 _LEAVES = (cst.Return, cst.Continue, cst.Break, cst.Raise)
 
@@ -231,7 +231,7 @@ class _Finder:
             for part, index in _places(node):
                 meaning = self.analysis.meanings.meaning(where, part)
                 is_picture = meaning.kind in ("image", None) and meaning.role in ("render", "both")
-                if part is not rendering and not (is_picture and not _SIDES & set(words(path_of(part) or ""))):
+                if part is not rendering and not (is_picture and not SIDES & set(words(path_of(part) or ""))):
                     continue
                 carriers.append(_Read(where, part, index))
                 for made in where.flow.reaching(part) if len(work) < _MOST else ():

@@ -168,7 +168,7 @@ class L1Functions:
         return [node.value] if node.attr.value in SIZES else []
 
     def _in_subscript(self, body: _Body, node: cst.Subscript) -> Optional[List[cst.CSTNode]]:
-        """What is compared is in a dictionary: the parameters are no pictures themselves."""
+        """Return nothing to follow, or None of an entry of a dictionary: its parameter is no picture itself."""
         is_entry = isinstance(node.value, cst.Name) and isinstance(key_of(node), str)
         return None if is_entry and node.value.value in body.pairs[0] else []  # type: ignore[attr-defined]
 

@@ -26,15 +26,13 @@ def folder_of(root: Path, path: str) -> Iterator[Tuple[Optional[int], str]]:
     *folders, name = path.split("/")
     options = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
     try:
-        folder = os.open(str(root), options)
-        try:
+        with contextlib.ExitStack() as opened:  # each is closed once, wherever Ctrl-C comes
+            folder = os.open(str(root), options)
+            opened.callback(os.close, folder)
             for part in folders:
-                inner = os.open(part, options | os.O_NOFOLLOW, dir_fd=folder)
-                os.close(folder)
-                folder = inner
+                folder = os.open(part, options | os.O_NOFOLLOW, dir_fd=folder)
+                opened.callback(os.close, folder)
             yield folder, name
-        finally:
-            os.close(folder)
     except OSError as error:
         error.filename = str(root / path)
         raise

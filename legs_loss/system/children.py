@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Any, Callable
 
 from legs_loss.system.ctrl_c import kept_from_children
@@ -15,8 +17,9 @@ class Child:
 
     def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
         context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
-        self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=target, args=(theirs, *arguments), daemon=True)
+        ours, theirs = context.Pipe()
+        self.connection: Connection = ours
+        self.process: BaseProcess = context.Process(target=target, args=(theirs, *arguments), daemon=True)
         with kept_from_children():
             self.process.start()
         theirs.close()

@@ -90,7 +90,7 @@ class Part:
     """
 
     def __init__(self, lines: Lines, text: bytes, shift: int = 0) -> None:
-        self.text = _FORM_FEED.sub(lambda found: b"#" * len(found.group()), text)
+        self.text: bytes = _FORM_FEED.sub(lambda found: b"#" * len(found.group()), text)
         self.tree: cst.Module = cst.parse_module(self.text.decode("utf-8"))
         self.shift = shift
         self._lines = lines

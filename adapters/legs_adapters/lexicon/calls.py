@@ -6,7 +6,7 @@ torch's operations do, then what a name says, then what the arguments are, then 
 
 from __future__ import annotations
 
-from typing import Callable, List, Optional, Tuple
+from typing import Callable, Dict, List, Optional, Tuple
 
 import libcst as cst
 
@@ -58,6 +58,8 @@ class CallReading:
         self.meaning_of = meaning_of
         self.role_of_holder = role_of_holder
         self.name: str = call_name(node)
+        self.positional: List[cst.BaseExpression]
+        self.keywords: Dict[str, cst.BaseExpression]
         self.positional, self.keywords, _ = arguments(node)
         self.values: List[cst.BaseExpression] = [*self.positional, *self.keywords.values()]
         base = node.func.value if isinstance(node.func, cst.Attribute) else None

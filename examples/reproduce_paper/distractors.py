@@ -21,14 +21,21 @@ from pathlib import Path
 from typing import Any, Dict, List, Sequence, Tuple
 
 import numpy as np
-from codebases.profile import find_profile
-from codebases.training import Checkout, copy_checkout, gaussians_in, read_picture
 from PIL import Image, ImageFilter
 
 from legs_loss.experiments.statistics import pooled_difference
 from legs_loss.reference.training.dataset import load_view, split_views
 from legs_loss.reference.training.metrics import mean_scores, score
 from legs_loss.scenes import read_scene
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the repository
+from examples.reproduce_paper.codebases.profile import find_profile
+from examples.reproduce_paper.codebases.training import (
+    Checkout,
+    copy_checkout,
+    gaussians_in,
+    read_picture,
+)
 
 ARMS = ("plain", "masked", "clean")
 PART = 0.6  # of the square root of the photograph's area: the side of the patch, which covers a quarter of it

@@ -381,13 +381,13 @@ class Checkout:
             return None
 
 
-def plan_of(folder: str) -> Plan:
-    """Return the report of ``legs-patch --check --json``, with the exit code."""
+def plan_of(folder: str, *options: str) -> Plan:
+    """Return the report of ``legs-patch --check --json`` with these options, and the exit code."""
     from legs_adapters.cli import main as legs_patch
 
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = legs_patch(["--check", "--json", folder])
+        code = legs_patch(["--check", "--json", *options, folder])
     try:
         found = json.loads(out.getvalue())
         found.pop("root", None)

@@ -4,11 +4,12 @@
     python -m benchmarks.corpus CHECKOUTS plans.json            # after it: plan, and print what differs
     python -m benchmarks.corpus CHECKOUTS plans.json --sites    # only what is edited counts, no word of a report
     python -m benchmarks.corpus CHECKOUTS plans.json --ablate   # each part switched off: what it decides, where
+    python -m benchmarks.corpus CHECKOUTS masks.json --masks    # plan with legs-patch --masks, save, and print counts
 
 A plan is the report of `legs-patch --check --json`: call sites, what was left and why, problems.
 Nothing is written to a checkout. Each is planned in a process of its own, which is killed at the limit.
 --ablate compares with plans.json, too, as the plans that were judged; it needs os.fork.
-Exit codes: 0 nothing differs, saved, or a table; 1 a plan differs; 2 bad usage.
+Exit codes: 0 nothing differs, saved, a table or counts; 1 a plan differs; 2 bad usage.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     args = parse(argv)
     folders = sorted(path for path in args.checkouts.iterdir() if path.is_dir())
     started = time.perf_counter()
-    plans, seconds = answers(_ablated if args.ablate else _planned, folders, args.jobs, args.limit)
+    work = _ablated if args.ablate else _masked if args.masks else _planned
+    plans, seconds = answers(work, folders, args.jobs, args.limit)
     slowest = sorted(seconds, key=lambda name: -seconds[name])[:3]
     print(
         f"{len(plans)} plans in {time.perf_counter() - started:.0f} s; slowest: "
@@ -47,8 +49,10 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     if args.ablate:
         print(ablation.table(args.before, plans))
         return 0
-    if args.save:
+    if args.save or args.masks:
         args.plans.write_text(json.dumps(plans, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        if args.masks:
+            print(masks_in(plans))
         return 0
     different = compare(args.before, plans, args.sites)
     print(f"{len(args.before)} before, {len(plans)} after, {different} differ")
@@ -65,6 +69,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     what.add_argument("--save", action="store_true", help="write PLANS instead of comparing with it")
     what.add_argument("--sites", action="store_true", help="compare call sites and the lines of problems only")
     what.add_argument("--ablate", action="store_true", help="print what each part of the patcher decides")
+    what.add_argument("--masks", action="store_true", help="plan with --masks, write PLANS, and print what is masked")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="default: %(default)s")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="a checkout; default: %(default)s")
     args = parser.parse_args(argv)
@@ -74,7 +79,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         parser.error("--jobs and --limit must be greater than 0")
     if args.ablate and not hasattr(os, "fork"):
         parser.error("--ablate needs os.fork, which this system lacks")
-    if not args.save:
+    if not (args.save or args.masks):
         args.before = read_plans(parser, args.plans)
     return args
 
@@ -134,8 +139,26 @@ def _planned(folder: str, _: float) -> Plan:
     return ablation.plan_of(folder)
 
 
+def _masked(folder: str, _: float) -> Plan:
+    return ablation.plan_of(folder, "--masks")
+
+
 def _ablated(folder: str, limit: float) -> Plan:
     return ablation.Checkout(folder, 0.9 * limit).ablate()
+
+
+def masks_in(plans: Dict[str, Plan]) -> str:
+    """Count what `legs-patch --masks` does: terms, lines, and the checkouts in which no line is left to the user."""
+    sites = [site for found in plans.values() for site in found.get("sites", ())]
+    lines = sum(site.get("term") == "mask" for site in sites)
+    by_hand = [
+        sum(problem["reason"].startswith("not masked") for problem in found.get("problems", ()))
+        for found in plans.values()
+    ]
+    return (
+        f"terms weighted: {len(sites) - lines}; lines that mask them: {lines} written, {sum(by_hand)} left to the "
+        f"user; checkouts in which all are written: {by_hand.count(0)} of {len(plans)}"
+    )
 
 
 def compare(before: Dict[str, Plan], after: Dict[str, Plan], sites: bool = False) -> int:

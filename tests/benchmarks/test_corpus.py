@@ -100,6 +100,32 @@ def test_words_count_only_without_sites(trees: Path, capsys: pytest.CaptureFixtu
     ]
 
 
+UNNAMED = """from gaussian_renderer import render
+from utils.loss_utils import l1_loss
+
+
+def training(scene, gaussians, background):
+    for viewpoint_cam in scene.getTrainCameras():
+        package = render(viewpoint_cam, gaussians, background)
+        gt_image = viewpoint_cam.original_image.cuda()
+        loss = l1_loss(package["render"], gt_image) + package["render"].mean()
+        loss.backward()
+        gaussians.optimizer.step()
+"""
+
+
+def test_masks_are_counted(trees: Path, tmp_path: Path) -> None:
+    checkout(trees / "unnamed", {"train.py": UNNAMED, "utils/loss_utils.py": LOSS})
+    done = run(trees, tmp_path / "masks.json", "--masks", "--jobs", 2)
+    assert (done.returncode, done.stdout) == (
+        0,
+        "terms weighted: 2; lines that mask them: 1 written, 1 left to the user; "
+        "checkouts in which all are written: 2 of 3\n",
+    )
+    sites = json.loads((tmp_path / "masks.json").read_text())["splats"]["sites"]
+    assert [site.get("term") for site in sites] == [None, "mask"]
+
+
 def test_another_order_is_a_difference(capsys: pytest.CaptureFixture[str]) -> None:
     assert corpus.compare({"a": {"left": [1, 2]}}, {"a": {"left": [2, 1]}}) == 1
     assert capsys.readouterr().out.splitlines() == ["a", "  left: the same elements in another order"]

@@ -38,7 +38,7 @@ def prove_unweighted(views: Sequence[TrainingView], config: TrainConfig) -> Dict
         if weight is not None and not bool((weight == 1).all()):
             raise LegsError(
                 f"the baseline is weighted: {view.name} has a weight map of mean {float(weight.mean()):.3f}: "
-                "differences from it would be meaningless"
+                "differences from it would be meaningless. Is it of --weights? Move the store away; masks may stay"
             )
         # Any rendering will do: the photograph with noise has errors of all sizes.
         rendering = (view.image + 0.2 * torch.randn(view.image.shape, generator=generator)).clamp(0, 1).requires_grad_()

@@ -191,10 +191,10 @@ class Comparison:
             "base": replace(self.base, densify_grad_threshold=self.threshold).as_dict(),
         }
         path = self.out / "comparison.json"
-        with alone_in(self.out, make=True):
-            write_or_check(path, dict(settings, baseline=None), SETTINGS, ("path", "baseline"))
         # Each time: a resumed comparison may run with newer code.
         self.proof: Dict[str, Any] = prove_unweighted(self.data.train, self.base)
+        with alone_in(self.out, make=True):
+            write_or_check(path, dict(settings, baseline=self.proof), SETTINGS, ("path", "baseline"))
         write_json(path, dict(read_json(path, SETTINGS), baseline=self.proof))
 
 

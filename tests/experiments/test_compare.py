@@ -90,6 +90,23 @@ def test_masks_of_the_scenes_store_hold_for_every_arm(tiny_scene: Path, tmp_path
     assert rows[1]["metrics"]["mean_weight"] == pytest.approx(float(sum(maps)) / len(maps), rel=1e-3)
 
 
+def test_weights_of_ones_own_in_the_store_are_refused_before_anything_is_written(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(str(tiny_scene), str(tmp_path / "scene"))
+    (tmp_path / "scene/importance").mkdir()
+    trained = read_scene(tmp_path / "scene").views[1].name
+    Image.new("L", (64, 48), 255).save(str(tmp_path / "scene/importance" / f"{PurePosixPath(trained).stem}.png"))
+    precompute(read_scene(tmp_path / "scene"), resolution=2, maps=OwnMaps(weights="importance", scale=3.0))
+    with pytest.raises(
+        LegsError, match=rf"{trained} has a weight map of mean 3\.000: .* --weights\? Move the store away"
+    ):
+        Comparison(tmp_path / "scene", BASE, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    shutil.rmtree(str(tmp_path / "scene/legs_weights"))
+    assert Comparison(tmp_path / "scene", BASE, tmp_path / "out").proof["views"] == 10
+
+
 def test_an_interrupted_row_goes_on(tiny_scene: Path, tmp_path: Path) -> None:
     whole = Comparison(tiny_scene, BASE, tmp_path / "whole").train_one(parse_arm("legs:shuffled"), 0)
     out = tmp_path / "out"

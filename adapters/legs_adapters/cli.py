@@ -162,7 +162,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     safety.add_argument(
         "--force",
         action="store_true",
-        help="patch despite uncommitted changes in git; with --undo: restore the patched lines of files that were "
+        help="patch files with uncommitted changes too; with --undo: restore the patched lines of files that were "
         "edited since, and keep the edits",
     )
     safety.add_argument(

@@ -148,15 +148,14 @@ def write(plan: Plan, force: bool = False) -> List[str]:
     """Write a plan; return the paths that were written.
 
     Raises:
-        LegsError: the git tree has changes that are not the patch's own, and not ``force``; another user patched this
-            checkout; or a file cannot be written. Nothing is written then.
+        LegsError: a file of it has uncommitted changes that are not the patch's own, and not ``force``; another user
+            patched this checkout; or a file cannot be written. Nothing is written then.
     """
     root = plan.root
     if not plan.after and plan.settings is None:
         return []
     with locked(root, f"legs-patch {root}"):
         journal = Journal.read(root)
-        changed = [] if force else [name for name in changed_files(root) if not _is_patched(root, name, journal)]
         changes = plan.changes()
         if SETTINGS_FILE in changes:
             current, data = changes[SETTINGS_FILE]
@@ -170,21 +169,14 @@ def write(plan: Plan, force: bool = False) -> List[str]:
                 f"{root / JOURNAL} is not yours: this checkout was patched by someone else, or on another machine; "
                 f"nothing was changed. Undo that patch first: see legs-patch --undo {root}"
             )
+        own = {path: plan.source(path) for path in plan.after if not journal.is_as_written(path, plan.source(path))}
+        changed = [] if force else changed_files(root, own)
         if changed:
             shown = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
-            raise LegsError(f"the git tree has uncommitted changes ({shown}): commit them, or use --force")
+            raise LegsError(f"uncommitted changes in what would be patched ({shown}): commit them, or use --force")
         for path, data in plan.after.items():
             edits = tuple((edit.start, edit.end, edit.after.decode("utf-8")) for edit in sorted(plan.edits[path]))
             journal.files.setdefault(path, []).append(Layer(plan.source(path), edits, digest(data)))
         # The journal is written first, so that --undo works whatever happens next.
         replace_files(root, {JOURNAL: (journal.data, journal.dump(root)), **changes})
     return list(changes)
-
-
-def _is_patched(root: Path, path: str, journal: Journal) -> bool:
-    """Return whether a file is as an earlier patch wrote it."""
-    try:
-        data = read_file(root, path)
-    except LegsError:
-        return False
-    return data is not None and journal.is_as_written(path, data)

@@ -9,7 +9,7 @@ import subprocess
 import pytest
 from legs_adapters.cli import main
 
-from tests.patcher.support import PATCHED, SITE, checkout, files, legs_patch, snapshot, without_marks
+from tests.patcher.support import PATCHED, SITE, checkout, files, legs_patch, run_git, snapshot, without_marks
 from tests.support import ROOT
 
 
@@ -89,16 +89,39 @@ class TestCommandLine:
         assert config.store == root / "maps"
         assert find_config(root / "train.py", environ={"LEGS_BETA": "7"}, argv=[]).spec.beta == 7.0
 
-    def test_a_dirty_tree_is_refused_and_a_dry_run_is_not(self, tmp_path, run):
+    def test_uncommitted_changes_are_refused_and_a_dry_run_is_not(self, tmp_path, run):
         root = checkout(tmp_path, files("inria"), git=True)
-        (root / "scene" / "cameras.py").write_text("# mine\n" + files("inria")["scene/cameras.py"])
+        (root / "train.py").write_text("# mine\n" + files("inria")["train.py"])
         before = snapshot(root)
         refused = run(root)
         assert refused.returncode == 2
-        assert "uncommitted changes (scene/cameras.py)" in refused.stderr
+        assert "uncommitted changes in what would be patched (train.py): commit them, or use --force" in refused.stderr
         assert snapshot(root) == before
         assert run("--diff", root).returncode == 0
         assert run("--force", root).returncode == 0
+
+    @pytest.mark.parametrize("format", ["sha1", "sha256"])
+    @pytest.mark.parametrize("folder", ["", "code/[a]"])
+    @pytest.mark.parametrize("attributes", ["", "*.py text eol=crlf\n"])
+    def test_what_is_as_it_was_committed_is_patched(self, format, folder, attributes, tmp_path, run):
+        """Changes of other files do not stop a patch, nor do the line ends that git writes; changes of its own do."""
+        texts = {f"{folder}/{name}".lstrip("/"): text for name, text in files("inria").items()}
+        checkout(tmp_path, {**texts, ".gitattributes": attributes})
+        try:
+            run_git(tmp_path, "init", "-q", f"--object-format={format}")
+        except subprocess.CalledProcessError:
+            pytest.skip("git knows one format of objects")
+        for arguments in (["add", "."], ["commit", "-q", "-m", "start"]):
+            run_git(tmp_path, *arguments)
+        root = tmp_path / folder
+        (root / "train.py").unlink()
+        run_git(tmp_path, "checkout", "-q", "--", ".")
+        assert (b"\r\n" in (root / "train.py").read_bytes()) == bool(attributes)
+        (root / "scene" / "cameras.py").write_text("# mine\n" + files("inria")["scene/cameras.py"])
+        assert run(root).returncode == 0
+        assert run("--undo", root).returncode == 0
+        (root / "train.py").write_bytes(b"# mine\n" + (root / "train.py").read_bytes())
+        assert "(train.py): commit them" in run(root).stderr
 
     def test_what_cannot_be_decided_is_quoted_and_stops_it_only_if_strict(self, tmp_path, run):
         root = checkout(tmp_path, files("unknown_image_pair_error"))

@@ -18,8 +18,7 @@ from legs_adapters.code.syntax import (
     dotted,
     every_parameter,
     key_of,
-    names_where_false,
-    names_where_true,
+    names_where,
     path_of,
     walk_expressions,
 )
@@ -47,7 +46,7 @@ class Flow:
         imports: its import statements.
         contexts: by a node's id, the loops and the context managers around it (``with torch.no_grad():``), the
             innermost last.
-        conditions: by a call's id, the names that must be true where it runs: ``if tracking:``.
+        conditions: by a call's id, the names that must be true where it runs, ``if tracking:``, the innermost last.
         steps: how many it took: nodes that were visited, and definitions that were copied, four a step.
     """
 
@@ -61,13 +60,13 @@ class Flow:
         self._most = most
         self.definitions: Dict[str, List[Definition]] = {}
         self.contexts: Dict[int, Tuple[cst.CSTNode, ...]] = {}
-        self.conditions: Dict[int, Tuple[str, ...]] = {}
+        self.conditions: Dict[int, Tuple[cst.Name | cst.Attribute, ...]] = {}
         self._reaching: Dict[int, Set[Definition]] = {}
         self._visited: Dict[int, Tuple[cst.CSTNode, int]] = {}  # with the number of definitions made before
         self._made: Dict[Tuple[int, str, str], Definition] = {}
         self._holders: Set[str] = set()  # places of which a part is defined: ``x`` and ``x.y`` of ``x.y['z']``
         self._around: Tuple[cst.CSTNode, ...] = ()
-        self._true: Tuple[str, ...] = ()
+        self._true: Tuple[cst.Name | cst.Attribute, ...] = ()
         self._loop_ends: Dict[int, Env] = {}  # by a loop's id: what its end hands back to its start
         self._exits: List[List[Env]] = []  # of the loops around: where a break or a continue leaves the body
         env = Env()
@@ -221,9 +220,9 @@ class Flow:
     def _visit_If(self, node: cst.If, env: Env) -> None:
         self._visit(node.test, env)
         outside, branch = self._true, self._copy(env)
-        self._true = outside + names_where_true(node.test)
+        self._true = outside + names_where(node.test, True)
         self._visit(node.body, branch)
-        self._true = outside + names_where_false(node.test)
+        self._true = outside + names_where(node.test, False)
         if node.orelse is not None:
             self._visit(node.orelse, env)
         self._true = outside

@@ -20,8 +20,7 @@ __all__ = [
     "dotted",
     "every_parameter",
     "key_of",
-    "names_where_false",
-    "names_where_true",
+    "names_where",
     "one_line",
     "path_of",
     "root_of",
@@ -187,19 +186,13 @@ def _squeezed(node: cst.CSTNode) -> str:
     return re.sub(r"\s+|#[^\n]*", "", code(bare))
 
 
-def names_where_true(test: cst.BaseExpression) -> Tuple[str, ...]:
-    """Return the names that are true where a test is true: for ``tracking and x > 0``: tracking."""
-    if isinstance(test, cst.BooleanOperation) and isinstance(test.operator, cst.And):
-        return names_where_true(test.left) + names_where_true(test.right)
-    name = dotted(test)
-    return () if name is None else (name.split(".")[-1],)
-
-
-def names_where_false(test: cst.BaseExpression) -> Tuple[str, ...]:
-    """Return the names that are true where a test is false: for ``not tracking``: tracking."""
+def names_where(test: cst.BaseExpression, holds: bool) -> Tuple[cst.Name | cst.Attribute, ...]:
+    """Return the names that are true where a test holds, or does not: ``tracking and x > 0``, ``not tracking``."""
     if isinstance(test, cst.UnaryOperation) and isinstance(test.operator, cst.Not):
-        return names_where_true(test.expression)
-    return ()
+        return names_where(test.expression, not holds)
+    if holds and isinstance(test, cst.BooleanOperation) and isinstance(test.operator, cst.And):
+        return names_where(test.left, True) + names_where(test.right, True)
+    return (test,) if holds and isinstance(test, (cst.Name, cst.Attribute)) else ()
 
 
 def every_parameter(parameters: cst.Parameters) -> Iterator[cst.Param]:

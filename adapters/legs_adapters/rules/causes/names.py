@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import AbstractSet, List
 
-import libcst as cst
-
-from legs_adapters.code.syntax import call_name, walk_all, words
+from legs_adapters.code.syntax import call_name, root_of, words
 from legs_adapters.lexicon.words import (
     EMBEDDING,
     EVALUATING,
@@ -36,7 +34,8 @@ class Tracking(Rule):
 
     def evidence(self, term: CallContext) -> List[Decider]:
         named = [decider for name, decider in term.names_around if _is_of_tracking(name)]
-        return (named or [(term.function, part) for part in _condition(term)])[:1]
+        tests = reversed(term.function.flow.conditions.get(id(term.call), ()))
+        return [*named, *((term.function, part) for part in tests if _is_of_tracking(root_of(part)))][:1]
 
     def evidence_of_call(self, call: CallContext) -> List[Decider]:
         return self.evidence(call)
@@ -94,16 +93,6 @@ NAMES = (
     OtherName("mesh", "other", MESH, "A name is of a mesh: no Gaussians are drawn.", "train_texture"),
     OtherName("robust", "huber", ROBUST, "A name is of a robust loss: a weight would move its threshold.", "huber"),
 )
-
-
-def _condition(term: CallContext) -> List[cst.CSTNode]:
-    """Return the names about tracking in the conditions around a call; the call itself where there are none."""
-    named = [name for name in term.function.flow.conditions.get(id(term.call), ()) if _is_of_tracking(name)]
-    branches = [part for part in walk_all(term.function.body) if named and isinstance(part, (cst.If, cst.IfExp))]
-    around = [branch for branch in branches if any(part is term.call for part in walk_all(branch))]
-    tests = [branch.test for branch in sorted(around, key=lambda branch: len(list(walk_all(branch))))]
-    parts = [part for test in tests for part in walk_all(test) if isinstance(part, cst.Name) and part.value in named]
-    return [*parts, term.call] if named else []
 
 
 def _is_of_tracking(name: str) -> bool:

@@ -46,7 +46,7 @@ _OFF = {
     "reader": {
         "masks: rows": {"rules.verdict:is_rows": False},
         "error maps": {"rules.verdict:reads_of": ([], [])},
-        "uses of a body": {"rules.verdict:uses_of": [], "rules.verdict:unsettled": None},
+        "uses of a body": {"rules.verdict:uses_of": []},
         "doubts": {"rules.verdict:Verdicts.doubt": None},
         "purposes": {"rules.purpose:Purposes.purpose": None},
     },

@@ -96,7 +96,7 @@ def plan(
     files = read_files(root, exclude)
     edits: Dict[str, List[Edit]] = {}
     with _deep_recursion():
-        findings = find(files.readable, by_hand, files.unread, ssim, masks)
+        findings = find(files.readable, by_hand, ssim, masks)
         for name in _files_to_edit(findings):
             why = why_not_compiled(findings.program.sources[name].data)
             if why:

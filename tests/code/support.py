@@ -12,7 +12,7 @@ from legs_adapters.tensors.modules import TORCH
 def program(files):
     """Return the program of {path: text}, or of one text as main.py."""
     files = {"main.py": files} if isinstance(files, str) else files
-    return Program([Source(path, text.encode(), text) for path, text in files.items()], None, TORCH)
+    return Program([Source(path, text.encode(), text) for path, text in files.items()], TORCH)
 
 
 def scopes(made):

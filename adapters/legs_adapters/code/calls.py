@@ -1,28 +1,19 @@
-"""The calls of a function in a checkout: those by its name, those that are certain, and whether others are possible."""
+"""The calls of a function in a checkout: those by its name, and those that are certain."""
 
 from __future__ import annotations
 
-import re
 from itertools import islice
-from typing import Iterator, List, NamedTuple, Optional, Tuple
+from typing import Iterator, List, Optional, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program, Reference
-from legs_adapters.code.syntax import call_name, root_of
+from legs_adapters.code.syntax import call_name
 
-__all__ = ["Calls", "callees", "calls_of", "given_to", "handed", "likely_calls", "sure_calls"]
+__all__ = ["callees", "given_to", "handed", "likely_calls", "sure_calls"]
 
-_METHODS = {"staticmethod", "classmethod"}  # decorators that do not pass the function on
 _Call = Tuple[Function, cst.Call]  # with the function that it stands in
-
-
-class Calls(NamedTuple):
-    """The calls of a function, each with its caller; and the place of a further possible call, None without one."""
-
-    known: List[_Call]
-    lost: Optional[str] = None
 
 
 def _named(program: Program, function: Function, most: Optional[int] = None) -> Iterator[_Call]:
@@ -71,35 +62,3 @@ def handed(program: Program, function: Function, node: cst.Name) -> List[Referen
     given = [(caller, value) for caller, value in given_to(program, function, node.value) if value is not None]
     found = [reference for caller, value in given for reference in program.resolve(caller, value)]
     return [reference for reference in dict.fromkeys(found) if reference.kind == "instance"]
-
-
-def calls_of(program: Program, function: Function) -> Calls:
-    """Return the calls of a function.
-
-    A further call is possible where it is a value, renamed in an import, in quotes or in a file that is not read. A
-    ``forward`` and a decorated function may be called under any name.
-    """
-    known, name = list(likely_calls(program, function)), re.escape(function.name)
-    if function.runs_by_instance or set(function.decorators) - _METHODS:
-        return Calls(known, f"{function.module.path}:{function.line}")
-    for scope in program.mentioning(function.name):
-        called = {id(call.func) for call in scope.flow.calls}
-        mentions: List[cst.CSTNode] = [
-            node
-            for node in scope.flow.places
-            if root_of(node) == function.name and id(node) not in called and function in _resolved(program, scope, node)
-        ]
-        mentions += [alias for node in scope.flow.imports for alias in _renamed(node, function.name)]
-        if mentions:
-            return Calls(known, f"{scope.module.path}:{scope.place(mentions[0]).line}")
-    quoted, unread = re.compile(rf"[\"']{name}[\"']"), re.compile(rf"\b{name}\b")
-    texts = [(path, source.text, quoted) for path, source in program.sources.items() if path not in program.unreadable]
-    texts += [(path, program.sources[path].text, unread) for path in program.unreadable]
-    texts += [(path, text, unread) for path, text in program.unread.items()]
-    return Calls(known, next((path for path, text, mention in sorted(texts) if mention.search(text)), None))
-
-
-def _renamed(node: cst.CSTNode, name: str) -> List[cst.ImportAlias]:
-    """Return ``from losses import photometric as loss`` of an import of a name."""
-    names = node.names if isinstance(node, cst.ImportFrom) and not isinstance(node.names, cst.ImportStar) else ()
-    return [alias for alias in names if alias.asname is not None and alias.evaluated_name == name]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import PurePosixPath
-from typing import Dict, Iterable, Iterator, List, Mapping, Optional, Tuple
+from typing import Dict, Iterable, Iterator, List, Optional, Tuple
 
 import libcst as cst
 
@@ -21,11 +21,9 @@ class Checkout:
 
     Args:
         sources: the readable files.
-        unread: by path, the text of ignored and unreadable files, which is only searched for names.
     """
 
-    def __init__(self, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> None:
-        self.unread: Mapping[str, str] = unread or {}
+    def __init__(self, sources: Iterable[Source]) -> None:
         self.sources: Dict[str, Source] = {source.path: source for source in sources}
         self._budget = Budget()
         self._unreadable: Dict[str, Unreadable] = {}

@@ -5,7 +5,7 @@ What Python decides at run time (a method of an unknown object) is looked up by 
 
 from __future__ import annotations
 
-from typing import Dict, FrozenSet, Iterable, Iterator, List, Mapping, NamedTuple, Optional, Tuple
+from typing import Dict, FrozenSet, Iterable, Iterator, List, NamedTuple, Optional, Tuple
 
 import libcst as cst
 
@@ -54,17 +54,11 @@ class Program(Checkout):
 
     Args:
         sources: the readable files.
-        unread: by path, the text of ignored and unreadable files, which is only searched for names.
         conventions: of the libraries that it uses.
     """
 
-    def __init__(
-        self,
-        sources: Iterable[Source],
-        unread: Optional[Mapping[str, str]] = None,
-        conventions: Optional[Conventions] = None,
-    ) -> None:
-        super().__init__(sources, unread)
+    def __init__(self, sources: Iterable[Source], conventions: Optional[Conventions] = None) -> None:
+        super().__init__(sources)
         self._conventions = conventions or Conventions()
         self._wrapping = tuple("." + name for name in self._conventions.wrapping)
         self._common = _COMMON | self._conventions.common

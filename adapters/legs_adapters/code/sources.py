@@ -18,7 +18,6 @@ from legs_loss.system import read_regular
 
 __all__ = ["BOM", "Files", "Source", "Unreadable", "check_root", "decode", "read_files", "read_source"]
 
-_MAX_UNREAD_BYTES = 64 << 20  # bytes in total; files over it are not searched for names
 BOM = b"\xef\xbb\xbf"
 
 
@@ -56,12 +55,10 @@ class Files(NamedTuple):
     Attributes:
         readable: those that are analysed.
         unreadable: those that cannot be read.
-        unread: by path, the text of excluded and unparsable files, which may mention functions that are patched.
     """
 
     readable: List[Source]
     unreadable: List[Unreadable]
-    unread: Dict[str, str]
 
 
 def check_root(path: str | os.PathLike[str]) -> Path:
@@ -83,17 +80,11 @@ def check_root(path: str | os.PathLike[str]) -> Path:
 def read_files(root: Path, exclude: Sequence[str]) -> Files:
     """Read the Python files of a checkout, except for excluded ones."""
     own = list(walk(root, exclude))
-    excluded = sorted(set(walk(root)) - set(own)) if exclude else []
     over = largest_over({path: size for path, size in _sizes(root, own).items() if size <= MAX_FILE_BYTES}, MAX_BYTES)
     why = f"too large: all files have more than {MAX_BYTES >> 20} MiB together; leave others out by --exclude"
     read = [Unreadable(path, why) if path in over else read_source(root, path) for path in own]
     unreadable = [source for source in read if isinstance(source, Unreadable)]
-    sizes = _sizes(root, [*excluded, *(source.path for source in unreadable)])
-    unread: Dict[str, str] = {}
-    for path in sorted(set(sizes) - largest_over(sizes, _MAX_UNREAD_BYTES)):
-        with contextlib.suppress(OSError):
-            unread[path] = read_regular(root / path, sizes[path]).decode("utf-8", "replace")
-    return Files([source for source in read if isinstance(source, Source)], unreadable, unread)
+    return Files([source for source in read if isinstance(source, Source)], unreadable)
 
 
 def _sizes(root: Path, paths: Sequence[str]) -> Dict[str, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Iterable, Mapping, Optional, Pattern
+from typing import Iterable, Optional, Pattern
 
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
@@ -53,6 +53,6 @@ class Analysis:
         self.ssims: SsimCalls = SsimCalls(self.program)
 
     @classmethod
-    def of_files(cls, sources: Iterable[Source], unread: Optional[Mapping[str, str]] = None) -> Analysis:
-        """Analyse the L1 terms of these files; ``unread`` are the texts of ignored files."""
-        return cls(Program(sources, unread, TORCH))
+    def of_files(cls, sources: Iterable[Source]) -> Analysis:
+        """Analyse the L1 terms of these files."""
+        return cls(Program(sources, TORCH))

@@ -7,7 +7,7 @@ the syntax tree; a term that cannot be decided becomes a problem that needs a ma
 from __future__ import annotations
 
 import re
-from typing import Iterable, Iterator, List, Mapping, Optional, Sequence, Tuple, Union
+from typing import Iterable, Iterator, List, Sequence, Tuple, Union
 
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
@@ -36,7 +36,6 @@ _MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|\bunweighted\(")
 def find(
     sources: Iterable[Source],
     by_hand: Sequence[Tuple[str, int]] = (),
-    unread: Optional[Mapping[str, str]] = None,
     ssim: bool = False,
     masks: bool = False,
 ) -> Findings:
@@ -45,11 +44,10 @@ def find(
     Args:
         sources: its files.
         by_hand: (path, line) of the L1 terms that the user named as sites; nothing else is a site then.
-        unread: by path, the text of files that are ignored or cannot be read.
         ssim: find the SSIM terms, too.
         masks: find where their renderings are masked, too.
     """
-    analysis = Analysis.of_files(sources, unread)
+    analysis = Analysis.of_files(sources)
     found = _Finder(analysis, by_hand).run()
     found = with_ssims(found, by_hand) if ssim else found
     return with_masks(found, analysis) if masks else found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Optional, Sequence
+from typing import Optional
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
@@ -13,7 +13,7 @@ from legs_adapters.lexicon.words import PERCEPTUAL
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import RULES, first
 from legs_adapters.rules.rule import Term
-from legs_adapters.rules.uses import Use, unsettled, uses_of
+from legs_adapters.rules.uses import Use, uses_of
 from legs_adapters.terms.error_maps import is_measured, reads_of
 from legs_adapters.terms.findings import Evidence, Kept, Left, Problem, Site
 from legs_adapters.terms.form import Form
@@ -44,9 +44,10 @@ class Verdicts:
         others = [use for use in uses if use.other is not None]
         if others and len(others) == len(uses):
             return Left.at(function, place, others[0].other or "")
-        lost = unsettled(self.analysis, function, uses) if others else None
-        if lost is not None:  # one body cannot serve both
-            return self._of_two_uses(term, place, uses, lost)
+        unknown = [use for use in uses if not use.is_known]
+        if unknown and len(unknown) < len(uses):  # one body serves both
+            call, where = one_line(unknown[0].call), unknown[0].where
+            return self.problem(term, place, f"nothing shows that {call} at {where} is the loss, as other calls are")
         loss, others_read = reads_of(self.analysis.training, function, form)
         if others_read and not loss:
             return Left.at(function, place, Evidence("untrained", "untrained", term.here))
@@ -113,17 +114,6 @@ class Verdicts:
 
     def _has_rows(self, term: Term) -> bool:
         return any(is_rows(self.analysis.meanings, term.function, side) for side in (term.pair.first, term.pair.second))
-
-    def _of_two_uses(self, term: Term, place: Place, uses: Sequence[Use], lost: str) -> Problem:
-        use = next(use for use in uses if use.other is not None)
-        assert use.other is not None
-        why = f"{term.function.name} is also called for {use.other.reason} at {use.where}"
-        why += f"; the purpose of the call at {lost} is unknown" if lost != use.where else ""
-        problem = self.problem(term, place, why)
-        calls = [use.where for use in uses if use.other is None]
-        shown = ", ".join(calls[:3]) + (f" and {len(calls) - 3} more" if len(calls) > 3 else "")
-        copy = f", in a copy of {_called(term.function)} for {shown}" if calls else ""
-        return problem._replace(advice=problem.advice + copy)
 
     def _why_photograph(self, term: Term) -> str:
         """Return what shows that a side is the photograph."""

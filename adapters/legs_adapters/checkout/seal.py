@@ -12,11 +12,11 @@ import hashlib
 import hmac
 import os
 import secrets
-import tempfile
 from pathlib import Path
 from typing import Optional
 
-from legs_loss.system import read_regular
+from legs_loss import LegsError
+from legs_loss.system import FileLock, read_regular, write_whole
 
 __all__ = ["is_sealed", "seal"]
 
@@ -31,76 +31,40 @@ def seal(content: bytes, root: Path) -> Optional[str]:
         content: what is sealed.
         root: the checkout. A state folder inside of it is not used: others may have written it.
     """
-    folder = _folder(root)
-    key = None if folder is None else _read(folder) or _make(folder)
-    return None if key is None else _seal(key, content)
+    folder = _folder()
+    if folder is not None and root != folder and root not in folder.parents:
+        with contextlib.suppress(OSError, LegsError):
+            if not os.path.lexists(str(folder / KEY)):
+                _make_key(folder)
+            key = read_regular(folder / KEY, 1 << 10)
+            if len(key) == _BYTES:
+                return hmac.new(key, content, hashlib.sha256).hexdigest()
+    return None
 
 
 def is_sealed(content: bytes, claimed: object, root: Path) -> bool:
     """Return whether a journal's seal was made by this user, with the key that is still there."""
-    folder = _folder(root)
-    key = None if folder is None else _read(folder)
-    return key is not None and isinstance(claimed, str) and hmac.compare_digest(
-        _seal(key, content).encode(), claimed.encode("utf-8", "replace")
-    )  # fmt: skip
+    own = seal(content, root)
+    return own is not None and hmac.compare_digest(own.encode(), str(claimed).encode("utf-8", "replace"))
 
 
-def _seal(key: bytes, content: bytes) -> str:
-    return hmac.new(key, content, hashlib.sha256).hexdigest()
-
-
-def _folder(root: Path) -> Optional[Path]:
+def _folder() -> Optional[Path]:
     base = os.environ.get("XDG_STATE_HOME", "")
     if not os.path.isabs(base):
         base = os.environ.get("LOCALAPPDATA", "") if os.name == "nt" else os.path.expanduser("~/.local/state")
-    if not os.path.isabs(base):
-        return None
-    folder = Path(os.path.realpath(os.path.join(base, "legs-loss")))
-    return None if root == folder or root in folder.parents else folder
+    return Path(os.path.realpath(os.path.join(base, "legs-loss"))) if os.path.isabs(base) else None
 
 
-def _read(folder: Path) -> Optional[bytes]:
-    try:
-        key = read_regular(folder / KEY, 1 << 10)
-    except OSError:
-        return None
-    return key if len(key) == _BYTES else None
-
-
-def _make(folder: Path) -> Optional[bytes]:
+def _make_key(folder: Path) -> None:
     """Make the key; concurrent processes all get the first one's."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        handle, name = tempfile.mkstemp(dir=str(folder))
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(secrets.token_bytes(_BYTES))
-                file.flush()
-                os.fsync(file.fileno())
-            _as_owner_of(folder.parent, folder, Path(name))
-            with contextlib.suppress(FileExistsError):
-                _publish(name, str(folder / KEY))
-        finally:
-            with contextlib.suppress(OSError):
-                os.unlink(name)
-    except OSError:
-        return None
-    return _read(folder)
-
-
-def _publish(name: str, key: str) -> None:
-    try:
-        os.link(name, key)  # unlike a rename, never over a key that is there
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links
-        if not os.path.exists(key):
-            os.rename(name, key)
-
-
-def _as_owner_of(parent: Path, *paths: Path) -> None:
-    """Give files to the owner of a folder: under sudo, what root creates in a home folder must stay readable."""
-    if getattr(os, "geteuid", lambda: -1)() == 0:
-        owner = os.stat(str(parent))
-        for path in paths:
-            os.chown(str(path), owner.st_uid, owner.st_gid)
+    key = folder / KEY
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with FileLock(folder / "journal.lock", wait=10.0, remove=True):
+        if os.path.lexists(str(key)):
+            return
+        write_whole(key, secrets.token_bytes(_BYTES))
+        os.chmod(str(key), 0o600)
+        if hasattr(os, "geteuid") and os.geteuid() == 0:  # under sudo, what root creates in a home folder must stay readable
+            owner = os.stat(str(folder.parent))
+            for path in (folder, key):
+                os.chown(str(path), owner.st_uid, owner.st_gid)

@@ -12,14 +12,13 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Callable, Optional, Sequence, Tuple
+from typing import TYPE_CHECKING, Any, Callable, Dict, Mapping, Optional, Sequence, Tuple
 
 from legs_loss import OPERATORS, LegsError, __version__
 from legs_loss.cli import Parser
 from legs_loss.system import never_fail_to_print, say, say_error
 
 if TYPE_CHECKING:
-    from legs_adapters.code.sources import Unreadable
     from legs_adapters.plan import Plan
     from legs_adapters.terms.findings import Problem
 
@@ -114,144 +113,127 @@ class _Explain(argparse.Action):
         parser.exit()
 
 
+_MODES = {
+    "--diff": "show what would change as a unified diff; write nothing",
+    "--check": "exit with 1 if something would change; write nothing",
+    "--verify": "patch, then train copies on the CPU with and without the patch for a few dozen steps, and compare",
+}
+_UNDO = {"--undo": "undo the patch, byte for byte; with --diff: show what would change"}
+_GROUPS = {
+    "the loss, written to legs.toml": {
+        "--preset NAME": "3dgs, eggs, legs-l, legs or legs-robust; default: legs",
+        "--beta X": "weight of the strongest response, minus 1",
+        "--curve NAME": "C1 to C5",
+        "--operator NAME": f"one of {', '.join(OPERATORS)}",
+        "--store DIR": "weight maps that legs precompute wrote",
+    },
+    "advanced: which terms": {
+        "--strict": "patch nothing where a term cannot be decided",
+        "--site FILE:LINE": "patch this term, and no other; repeatable",
+        "--exclude GLOB": "files or folders to ignore; repeatable",
+        "--ssim": "also rewrite the training step's SSIM to legs_loss.ssim, which is faster, where it is that of 3DGS",
+        "--masks": "also write the line that hides masked pixels from every other term of the step",
+        "--explain RULE": "explain a rule, or list the rules, and exit",
+    },
+    "advanced: safety and scripts": {
+        "--force": "patch files with uncommitted changes, too; with --undo: restore the patched lines of files that "
+        "were edited since, and keep the edits",
+        "--trust NAME": "with --undo: accept a journal that you did not write on this machine; the error message gives "
+        "its NAME",
+        "--json": "report as JSON",
+    },
+    "advanced: with --verify": {
+        "--script FILE": "the training script; default: the file of the term",
+        "--iterations N": "steps to compare; default: 40",
+        "--arguments TEXT": "the script's arguments, with {scene}, {output}, {iterations}, {port} filled in; default: "
+        "those of Inria's train.py that the script declares",
+    },
+}
+_KINDS: Dict[str, Dict[str, Any]] = {  # of those that are more than a text or a switch
+    "--beta": {"type": float},
+    "--site": {"action": "append", "default": []},
+    "--exclude": {"action": "append", "default": []},
+    "--explain": {"action": _Explain, "nargs": "?"},
+    "--iterations": {"type": int, "default": 40},
+}
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``legs-patch`` and ``legs patch``: what most use first, the advanced ones last."""
     parser.epilog = EXIT_CODES
     parser.add_argument("folder", metavar="FOLDER", help="the checkout")
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument("--diff", action="store_true", help="show what would change as a unified diff; write nothing")
-    what.add_argument("--check", action="store_true", help="exit with 1 if something would change; write nothing")
-    what.add_argument(
-        "--verify",
-        action="store_true",
-        help="patch, then verify it on the CPU: train copies with and without the patch for a few dozen steps, and "
-        "compare",
-    )
-    parser.add_argument(
-        "--undo", action="store_true", help="undo the patch, byte for byte; with --diff: show what would change"
-    )
-    settings = parser.add_argument_group("the loss, written to legs.toml")
-    settings.add_argument("--preset", metavar="NAME", help="3dgs, eggs, legs-l, legs or legs-robust; default: legs")
-    settings.add_argument("--beta", type=float, metavar="X", help="weight of the strongest response, minus 1")
-    settings.add_argument("--curve", metavar="NAME", help="C1 to C5")
-    settings.add_argument("--operator", metavar="NAME", help=f"one of {', '.join(OPERATORS)}")
-    settings.add_argument("--store", metavar="DIR", help="weight maps that legs precompute wrote")
-    terms = parser.add_argument_group("advanced: which terms")
-    terms.add_argument("--strict", action="store_true", help="patch nothing where a term cannot be decided")
-    terms.add_argument(
-        "--site", action="append", default=[], metavar="FILE:LINE", help="patch this term, and no other; repeatable"
-    )
-    terms.add_argument(
-        "--exclude", action="append", default=[], metavar="GLOB", help="files or folders to ignore; repeatable"
-    )
-    terms.add_argument(
-        "--ssim",
-        action="store_true",
-        help="also rewrite the training step's SSIM to legs_loss.ssim, which is faster, where the checkout's own is "
-        "provably the SSIM of 3DGS",
-    )
-    terms.add_argument(
-        "--masks",
-        action="store_true",
-        help="also write the line that hides masked pixels from every other term of the step",
-    )
-    terms.add_argument(
-        "--explain", action=_Explain, nargs="?", metavar="RULE", help="explain a rule, or list the rules, and exit"
-    )
-    safety = parser.add_argument_group("advanced: safety and scripts")
-    safety.add_argument(
-        "--force",
-        action="store_true",
-        help="patch files with uncommitted changes too; with --undo: restore the patched lines of files that were "
-        "edited since, and keep the edits",
-    )
-    safety.add_argument(
-        "--trust",
-        metavar="NAME",
-        help="with --undo: accept a journal that you did not write on this machine; the error message gives its NAME",
-    )
-    safety.add_argument("--json", action="store_true", help="report as JSON")
-    proof = parser.add_argument_group("advanced: with --verify")
-    proof.add_argument("--script", metavar="FILE", help="the training script; default: the file of the term")
-    proof.add_argument("--iterations", type=int, default=40, metavar="N", help="steps to compare; default: 40")
-    proof.add_argument(
-        "--arguments",
-        metavar="TEXT",
-        help="the script's arguments, with {scene}, {output}, {iterations}, {port} filled in; default: those of "
-        "Inria's train.py that the script declares",
-    )
+    _declare(parser.add_mutually_exclusive_group(), _MODES)
+    _declare(parser, _UNDO)
+    for title, options in _GROUPS.items():
+        _declare(parser.add_argument_group(title), options)
+
+
+def _declare(group: argparse._ActionsContainer, options: Mapping[str, str]) -> None:
+    """Declare options with their help: one with a word behind it takes a value, one without is a switch."""
+    for words, text in options.items():
+        name, _, value = words.partition(" ")
+        kind: Dict[str, Any] = {"metavar": value} if value else {"action": "store_true"}
+        group.add_argument(name, help=text, **{**kind, **_KINDS.get(name, {})})
 
 
 def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.code.sources import check_root
     from legs_adapters.plan import plan, write
-    from legs_adapters.report import as_diff, as_table
+    from legs_adapters.report import as_diff
     from legs_adapters.settings import SETTINGS_FILE, settings_text
     from legs_adapters.terms.instead import said_instead
 
     root = check_root(args.folder)
     settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
     text = settings_text(root, settings)
-    writes = bool(settings) or not (root / SETTINGS_FILE).exists()  # else the user's, or an earlier run's, stays
     found = plan(root, args.exclude, [_site(root, text) for text in args.site], ssim=args.ssim, masks=args.masks)
     problems, is_decided = found.findings.problems, bool(found.findings.sites or found.findings.patched)
-    if is_decided and writes:
-        found = found._replace(settings=text)
     if not is_decided or (problems and args.strict):
         _show(args, found)
         if not problems:
             raise LegsError(
                 f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
-                + _not_read(found.findings.unreadable)
-                + _not_searched(root, args.exclude),
+                + _elsewhere(root, args.exclude, found),
                 *said_instead(found.findings.program.sources.values()),
             )
-        _advise(problems)
+        _quote(problems, "error")
         say("legs-patch: nothing was changed: --site FILE:LINE takes your word, --exclude leaves files out", sys.stderr)
         return 2
-    for doubt in found.findings.doubts:
-        where = f"{doubt.path}:{doubt.line}"
-        say(f"legs-patch: warning: a possible loss was not weighted: {where}: {doubt.reason}", sys.stderr)
-        say(f"    {doubt.text}", sys.stderr)
-        say(f"  if it is the loss between rendering and photograph, edit it by hand: {doubt.advice}", sys.stderr)
+    if settings or not (root / SETTINGS_FILE).exists():  # else the user's, or an earlier run's, stays
+        found = found._replace(settings=text)
+    _quote(found.findings.doubts, "warning: a possible loss was not weighted")
     wrote = [] if args.diff or args.check else write(found, args.force)
-    if args.diff and not args.json:  # the diff alone on the standard output: git apply takes it
-        say(as_table(found), sys.stderr, end="", lines=True)
+    _show(args, found, wrote)
+    if args.diff and not args.json:
         print(as_diff(found.changes(), _is_coloured()), end="")
-    else:
-        _show(args, found, wrote)
-    if args.check and not args.json:
+    elif args.check and not args.json:
         say("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
     elif wrote and not args.json:
         say(f"\nwrote {', '.join(wrote)}; undo it with: legs-patch --undo {shlex.quote(args.folder)}", lines=True)
-    elif not (args.diff or args.json):
+    elif not args.json:
         say("\nnothing to do: it is patched", lines=True)
-    return _advise(problems) or (1 if args.check and found.after else 0)
+    _quote(problems, "error")
+    return 1 if problems or (args.check and found.after) else 0
 
 
 def _show(args: argparse.Namespace, found: Plan, wrote: Sequence[str] = ()) -> None:
+    """Print the report; beside a diff to stderr: git apply takes the diff alone."""
     from legs_adapters.report import as_json, as_table
 
-    say(as_json(found, wrote) if args.json else as_table(found), end="", lines=True)
+    text = as_json(found, wrote) if args.json else as_table(found)
+    say(text, sys.stderr if args.diff and not args.json else None, end="", lines=True)
 
 
-def _not_read(files: Sequence[Unreadable]) -> str:
-    """Name the first of the files that may have the term and could not be read."""
-    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return f"; not read: {files[0].path}: {files[0].reason}{more}" if files else ""
+def _elsewhere(root: Path, exclude: Sequence[str], found: Plan) -> str:
+    """Name the first of the files that could not be read, and of the folders that are skipped and may be codebases."""
+    from legs_adapters.code.folders import PATCHABLE, first_of, folders_of
 
-
-def _not_searched(root: Path, exclude: Sequence[str]) -> str:
-    """Name the folders that may have the term and that legs-patch skips by default."""
-    from legs_adapters.terms.other_folders import not_entered
-
-    folders = not_entered(root, exclude)
-    if not folders:
-        return ""
-    shown = ", ".join(f"{folder.path} ({folder.why})" for folder in folders[:3])
-    more = f" and {len(folders) - 3} more" if len(folders) > 3 else ""
-    which = "that folder" if len(folders) == 1 else "the one that trains"
-    return f"; not searched: {shown}{more}: run legs-patch on {which}"
+    files = [f"{file.path}: {file.reason}" for file in found.findings.unreadable]
+    skipped = sorted(folder for _, inner in folders_of(root, exclude) for folder in inner if folder.why in PATCHABLE)
+    folders = [f"{folder.path} ({folder.why})" for folder in skipped]
+    return (f"; not read: {first_of(files, 1)}" if files else "") + (
+        f"; not searched: {first_of(folders, 3)}: run legs-patch on the one that trains" if folders else ""
+    )
 
 
 def _verify(args: argparse.Namespace, script: str) -> int:
@@ -292,14 +274,13 @@ def _journal(folder: str) -> bytes:
     return repr((found.st_ino, found.st_size, found.st_mtime_ns)).encode()
 
 
-def _advise(problems: Sequence[Problem]) -> int:
-    """Print the terms that need a manual edit to stderr; return the exit code."""
-    for problem in problems:
-        say(f"legs-patch: error: {problem.path}:{problem.line}: {problem.reason}", sys.stderr)
-        say(f"    {problem.text}", sys.stderr)
-        say(f"  if this is the loss between rendering and photograph, edit it by hand: {problem.advice}", sys.stderr)
+def _quote(terms: Sequence[Problem], what: str) -> None:
+    """Print terms that may need a manual edit to stderr."""
+    for term in terms:
+        say(f"legs-patch: {what}: {term.path}:{term.line}: {term.reason}", sys.stderr)
+        say(f"    {term.text}", sys.stderr)
+        say(f"  if this is the loss between rendering and photograph, edit it by hand: {term.advice}", sys.stderr)
         say("  (rendering first), and import legs_loss at the top", sys.stderr)
-    return 1 if problems else 0
 
 
 def _site(root: Path, text: str) -> Tuple[str, int]:

@@ -10,7 +10,7 @@ from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_adapters.checkout.git import changed_files
 from legs_adapters.checkout.replace import locked, read_file, replace_files
-from legs_adapters.code.folders import why_left_out
+from legs_adapters.code.folders import first_of, why_left_out
 from legs_adapters.code.sources import Unreadable, check_root, read_files
 from legs_adapters.edit import Edit, apply_edits, rewrite, why_not_compiled
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
@@ -172,8 +172,9 @@ def write(plan: Plan, force: bool = False) -> List[str]:
         own = {path: plan.source(path) for path in plan.after if not journal.is_as_written(path, plan.source(path))}
         changed = [] if force else changed_files(root, own)
         if changed:
-            shown = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
-            raise LegsError(f"uncommitted changes in what would be patched ({shown}): commit them, or use --force")
+            raise LegsError(
+                f"uncommitted changes in what would be patched ({first_of(changed, 5)}): commit them, or use --force"
+            )
         for path, data in plan.after.items():
             edits = tuple((edit.start, edit.end, edit.after.decode("utf-8")) for edit in sorted(plan.edits[path]))
             journal.files.setdefault(path, []).append(Layer(plan.source(path), edits, digest(data)))

@@ -8,6 +8,7 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_adapters.checkout.comparing import Comparison
 from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
+from legs_adapters.code.folders import first_of
 from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_loss import LegsError
@@ -50,7 +51,7 @@ def undo(path: str | os.PathLike[str], force: bool = False, trust: Optional[str]
         if journal.data is None:
             raise LegsError(f"{root}: nothing to undo: there is no {JOURNAL}")
         if not (journal.is_own or look or trust == journal.name):
-            covered = _first([*journal.files, *journal.created], 3)
+            covered = first_of([*journal.files, *journal.created], 3)
             raise LegsError(
                 f"{root / JOURNAL} was not written by your legs-patch on this machine (or by a version without seals, "
                 f"or its key is gone): nothing was changed. It covers {covered}, which git can restore. To use it "
@@ -83,7 +84,7 @@ def _undone(root: Path, journal: Journal, force: bool) -> Undone:
                 data, missing = _undo_edits(layer, data, comparison)
                 lost += missing
         if lost:
-            shown = _first([line[:200] for line in sorted(set(lost))], 20, "; ")
+            shown = first_of([line[:200] for line in sorted(set(lost))], 20, "; ")
             done.kept.append((name, f"these lines were edited since and are kept: {shown}"))
         if data != current:
             changes[name] = (current, data)
@@ -101,10 +102,6 @@ def _undone(root: Path, journal: Journal, force: bool) -> Undone:
         elif current is not None:
             done.kept.append((name, "it was edited since"))
     return done
-
-
-def _first(names: Sequence[str], most: int, between: str = ", ") -> str:
-    return between.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _undo_edits(layer: Layer, current: bytes, comparison: Comparison) -> Tuple[bytes, List[str]]:

@@ -225,22 +225,20 @@ class TestCommandLine:
         assert snapshot(root) == before
 
     def test_folders_that_are_not_entered_are_named_where_nothing_was_found(self, tmp_path, run):
-        vendored = {f"third_party/gaussian-splatting/{path}": text for path, text in files("inria").items()}
-        mentions = {path: "from losses import l1_loss\n" for path in ("extern/a/x.py", "tests/x.py", "venv/x.py")}
-        others = {"third_party/simple-knn/setup.py": "", "extern/deeper/third_party/b/x.py": "F.l1_loss\n"}
-        root = checkout(tmp_path, {"run.py": "import os\n", **vendored})
-        (root / "third_party" / "gaussian-splatting" / ".git").write_text("gitdir: elsewhere\n")
+        vendored = {f"inner/gaussian-splatting/{path}": text for path, text in files("inria").items()}
+        root = checkout(tmp_path, {"run.py": "import os\n", "venv/x.py": "", **vendored})
+        (root / "inner" / "gaussian-splatting" / ".git").write_text("gitdir: elsewhere\n")
         found = run(root)
         assert (found.returncode, found.stderr.count("\n")) == (2, 1)
-        named = "third_party/gaussian-splatting (a nested checkout)"
-        assert found.stderr.endswith(f"; not searched: {named}: run legs-patch on that folder\n")
-        assert "not searched" not in run(root, "--exclude", "third_party").stderr
-        checkout(root, {**mentions, **others})
+        named = "inner/gaussian-splatting (a nested checkout)"
+        assert found.stderr.endswith(f"; not searched: {named}: run legs-patch on the one that trains\n")
+        assert "not searched" not in run(root, "--exclude", "inner").stderr
+        checkout(root, {"submodules/a.py": "", "extern/a.py": "", "tests/a.py": ""})
         assert run(root).stderr.endswith(
-            f"; not searched: {named}, extern/a (third-party code), "
-            "extern/deeper/third_party/b (third-party code) and 1 more: run legs-patch on the one that trains\n"
+            f"; not searched: extern (third-party code), {named}, submodules (third-party code) and 1 more: "
+            "run legs-patch on the one that trains\n"
         )
-        assert run(root / "third_party" / "gaussian-splatting").returncode == 0
+        assert run(root / "inner" / "gaussian-splatting").returncode == 0
 
     @pytest.mark.parametrize(
         ("path", "message"),

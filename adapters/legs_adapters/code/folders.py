@@ -15,10 +15,10 @@ from legs_loss.system import read_regular
 __all__ = [
     "PATCHABLE",
     "SUBMODULE",
-    "TESTS",
     "VENDORED",
     "Skipped",
     "check_name",
+    "first_of",
     "folders_of",
     "foreign_folder",
     "walk",
@@ -26,19 +26,19 @@ __all__ = [
 ]
 
 VENDORED, SUBMODULE = "third-party code", "a submodule"
-TESTS, _CHECKOUT = "a folder of tests", "a nested checkout"
+_TESTS, _CHECKOUT = "a folder of tests", "a nested checkout"
 _FOREIGN = {
     name: why
     for why, names in (
         (VENDORED, "submodules third_party third-party thirdparty external externals extern SIBR_viewers"),
         ("a model that it only uses", "croco dust3r mast3r vggt"),
-        (TESTS, "tests test testing"),
+        (_TESTS, "tests test testing"),
         ("installed packages", "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs"),
         ("tool output", ".git .hg .svn __pycache__ .ipynb_checkpoints build dist .mypy_cache .pytest_cache"),
     )
     for name in names.split()
 }
-PATCHABLE = (VENDORED, TESTS, SUBMODULE, _CHECKOUT)
+PATCHABLE = (VENDORED, _TESTS, SUBMODULE, _CHECKOUT)
 _LARGEST = 1 << 20  # bytes of a .gitmodules
 _TEST_FILE = re.compile(r"^(test_.*|conftest)\.py$")
 
@@ -161,3 +161,8 @@ def _is_dot_git(part: str) -> bool:
     """
     seen = "".join(letter for letter in part if unicodedata.category(letter) != "Cf")
     return seen.split(":")[0].rstrip(". ").casefold() in (".git", "git~1")
+
+
+def first_of(names: Sequence[str], most: int, between: str = ", ") -> str:
+    """Return the first of some names, and how many more there are."""
+    return between.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

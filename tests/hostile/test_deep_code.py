@@ -105,7 +105,7 @@ def test_the_training_is_planned_beside_them(tmp_path):
 
 
 def test_files_that_are_too_much_together(tmp_path, monkeypatch, capsys):
-    """Bytes: the largest are left, whatever their names. Steps: the first that go over. Each is one line."""
+    """Bytes: an error. Steps: the first that go over, each is one line."""
     from legs_adapters.cli import main
     from legs_adapters.code import limits
     from legs_adapters.code import sources as read
@@ -123,7 +123,8 @@ def test_files_that_are_too_much_together(tmp_path, monkeypatch, capsys):
     assert not unread()
     with monkeypatch.context() as patch:
         patch.setattr(read, "MAX_BYTES", 5000)
-        assert sorted(unread()) == ["a.py", "z.py"]
+        assert main(["--check", str(root)]) == 2
+        assert " MiB: leave some out by --exclude" in capsys.readouterr().err
     with monkeypatch.context() as patch:
         patch.setattr(limits, "MAX_FILE_STEPS", 50_000)
         assert sorted(unread()) == ["a.py", "z.py"]

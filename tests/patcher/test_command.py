@@ -253,9 +253,9 @@ class TestCommandLine:
             ),
             ("a/extern/b/c/train.py", "a/extern/b is not searched (third-party code): run legs-patch"),
             ("my_env/train.py", "my_env is not searched (a virtual environment)\n"),
-            ("old/train.py", "excluded by --exclude"),
-            ("test_train.py", "tests are not searched"),
-            ("train.sh", "it is not a .py file"),
+            ("old/train.py", "it is not searched: excluded"),
+            ("test_train.py", "it is not searched: excluded, not a .py file, a test or a link\n"),
+            ("train.sh", "it is not searched"),
             ("broken.py", "does not parse (line 1)"),
         ],
     )

@@ -41,7 +41,7 @@ class Flow:
         definitions: every definition by place, in source order: what a nested function sees.
         calls: every call in the body, in source order, nested functions excepted.
         expressions: every call and binary operation.
-        reads, places: every name that is read, in source order; with the attributes.
+        reads: every name that is read, in source order.
         returns: the expressions that it returns or yields.
         imports: its import statements.
         contexts: by a node's id, the loops and the context managers around it (``with torch.no_grad():``), the
@@ -79,7 +79,6 @@ class Flow:
         self.calls: List[cst.Call] = by_class.get(cst.Call, [])
         self.expressions: List[cst.CSTNode] = [*self.calls, *by_class.get(cst.BinaryOperation, ())]
         self.reads: List[cst.Name] = by_class.get(cst.Name, [])
-        self.places: List[cst.Name | cst.Attribute] = [*self.reads, *by_class.get(cst.Attribute, ())]
         self.imports: List[cst.CSTNode] = [*by_class.get(cst.Import, ()), *by_class.get(cst.ImportFrom, ())]
         values = [node.value for node in [*by_class.get(cst.Return, ()), *by_class.get(cst.Yield, ())]]
         self.returns: List[cst.BaseExpression] = [v for v in values if isinstance(v, cst.BaseExpression)]

@@ -63,17 +63,13 @@ def walk(root: Path, exclude: Sequence[str] = ()) -> Iterator[str]:
 
 def why_left_out(root: Path, path: str, exclude: Sequence[str] = ()) -> Optional[str]:
     """Return why ``walk`` skips a file of the checkout; None where it yields it."""
-    if _excluded(path, exclude):
-        return "excluded by --exclude"
+    if path in walk(root, exclude):
+        return None
     foreign = foreign_folder(root, path)
-    if foreign is not None:
-        instead = ": run legs-patch on that folder" if foreign.why in PATCHABLE else ""
-        return f"{foreign.path} is not searched ({foreign.why}){instead}"
-    if not path.endswith(".py"):
-        return "it is not a .py file"
-    if _TEST_FILE.match(os.path.basename(path)):
-        return "tests are not searched"
-    return "links are not followed" if os.path.islink(str(root / path)) else None
+    if foreign is None:
+        return "it is not searched: excluded, not a .py file, a test or a link"
+    instead = ": run legs-patch on that folder" if foreign.why in PATCHABLE else ""
+    return f"{foreign.path} is not searched ({foreign.why}){instead}"
 
 
 def foreign_folder(root: Path, path: str) -> Optional[Skipped]:

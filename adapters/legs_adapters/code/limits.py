@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from typing import List, Mapping, Set
+from typing import List
 
-__all__ = ["MAX_BYTES", "MAX_FILE_BYTES", "Budget", "largest_over", "over_the_limits", "parsing_steps"]
+__all__ = ["MAX_BYTES", "MAX_FILE_BYTES", "Budget", "over_the_limits", "parsing_steps"]
 
 MAX_FILE_BYTES = 1 << 20
 MAX_BYTES = 32 << 20  # of all files
@@ -60,18 +60,6 @@ class Budget:
 def parsing_steps(text: str) -> int:
     """Return the steps of parsing a text: by words, signs and line ends, in strings and comments too."""
     return _TOKEN_STEPS * len(_PIECE.findall(text))
-
-
-def largest_over(sizes: Mapping[str, int], most: int) -> Set[str]:
-    """Return the largest files, without which the others have at most this total size."""
-    over: Set[str] = set()
-    total = sum(sizes.values())
-    for path in sorted(sizes, key=lambda path: (-sizes[path], path)):
-        if total <= most:
-            break
-        total -= sizes[path]
-        over.add(path)
-    return over
 
 
 def over_the_limits(text: str) -> str:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import io
 import os
 import tokenize
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Dict, List, NamedTuple, Sequence
+from typing import List, NamedTuple, Sequence
 
 from legs_adapters.code.folders import check_name, walk
-from legs_adapters.code.limits import MAX_BYTES, MAX_FILE_BYTES, largest_over
+from legs_adapters.code.limits import MAX_BYTES, MAX_FILE_BYTES
 from legs_loss import LegsError
 from legs_loss.system import read_regular
 
@@ -78,21 +77,22 @@ def check_root(path: str | os.PathLike[str]) -> Path:
 
 
 def read_files(root: Path, exclude: Sequence[str]) -> Files:
-    """Read the Python files of a checkout, except for excluded ones."""
-    own = list(walk(root, exclude))
-    over = largest_over({path: size for path, size in _sizes(root, own).items() if size <= MAX_FILE_BYTES}, MAX_BYTES)
-    why = f"too large: all files have more than {MAX_BYTES >> 20} MiB together; leave others out by --exclude"
-    read = [Unreadable(path, why) if path in over else read_source(root, path) for path in own]
-    unreadable = [source for source in read if isinstance(source, Unreadable)]
-    return Files([source for source in read if isinstance(source, Source)], unreadable)
+    """Read the Python files of a checkout, except for excluded ones.
 
-
-def _sizes(root: Path, paths: Sequence[str]) -> Dict[str, int]:
-    sizes = {}
-    for path in paths:
-        with contextlib.suppress(OSError):
-            sizes[path] = os.lstat(str(root / path)).st_size
-    return sizes
+    Raises:
+        LegsError: they are too large together.
+    """
+    files, size = Files([], []), 0
+    for path in walk(root, exclude):
+        source = read_source(root, path)
+        if isinstance(source, Unreadable):
+            files.unreadable.append(source)
+            continue
+        files.readable.append(source)
+        size += len(source.data)
+        if size > MAX_BYTES:
+            raise LegsError(f"its Python files have more than {MAX_BYTES >> 20} MiB: leave some out by --exclude")
+    return files
 
 
 def read_source(root: Path, path: str) -> Source | Unreadable:

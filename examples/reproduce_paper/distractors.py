@@ -5,6 +5,8 @@
 A textured patch moves over every third training view. Held-out views are as they were. `plain` trains on that, `masked`
 with the patches' masks by `legs-patch --masks`, `clean` on the photographs without patches: the upper bound. All three
 have the codebase's own loss (beta 0) and run in the same way, on the CPU. Given again, it goes on where it stopped.
+`--arms robust robust-clean` trains with a mask that the training makes by itself (robust.py), on the scenes of `plain`
+and `clean`.
 OUT/scores.json has a row a training; `--report FILE ...` prints the tables of such files.
 """
 
@@ -18,7 +20,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Dict, List, Sequence, Tuple
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 from PIL import Image, ImageFilter
@@ -38,6 +40,7 @@ from examples.reproduce_paper.codebases.training import (
 )
 
 ARMS = ("plain", "masked", "clean")
+SCENES = {**{arm: arm for arm in ARMS}, "robust": "plain", "robust-clean": "clean"}  # of all arms
 PART = 0.6  # of the square root of the photograph's area: the side of the patch, which covers a quarter of it
 MARGIN = 3  # pixels of a mask beyond its patch, at the training's size
 
@@ -51,6 +54,8 @@ def main() -> None:
     parser.add_argument("-r", "--resolution", type=int, default=200)
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--arms", nargs="+", choices=SCENES, default=ARMS)
+    parser.add_argument("--robust", type=json.loads, default={}, metavar="JSON", help="other settings than robust.py's")
     parser.add_argument("--report", action="store_true")
     args = parser.parse_args()
     if args.report:
@@ -62,30 +67,31 @@ def main() -> None:
         make_scenes(args.scene, out / "scenes.part", args.resolution)
         os.replace(out / "scenes.part", out / "scenes")
     profile = find_profile(args.upstream)
-    for arm in ARMS:
+    for arm in args.arms:
         copy = out / "checkouts" / arm
         if not copy.is_dir():
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy_checkout(args.upstream, copy)
-            if arm == "masked":
+            if arm not in ("plain", "clean"):
                 legs("patch", "--masks", str(copy))
     path = out / "scores.json"
     rows = json.loads(path.read_text()) if path.is_file() else []
     for seed in range(args.seeds):
-        for arm in ARMS:
+        for arm in args.arms:
             if any((row["arm"], row["seed"]) == (arm, seed) for row in rows):
                 continue
             checkout = Checkout(
                 out / "checkouts" / arm,
                 profile,
-                out / "scenes" / arm,
+                out / "scenes" / SCENES[arm],
                 None,
                 args.resolution,
                 args.iterations,
                 cpu=True,
             )
             row = dict(arm=arm, seed=seed, scene=args.scene.name, codebase=profile.name, iterations=args.iterations)
-            rows.append({**row, "metrics": train(checkout, seed, out / arm / f"seed-{seed}")})
+            robust = args.robust if arm.startswith("robust") else None
+            rows.append({**row, "metrics": train(checkout, seed, out / arm / f"seed-{seed}", robust)})
             path.write_text(json.dumps(rows, indent=1) + "\n")
             metrics = rows[-1]["metrics"]
             print(arm, seed, metrics["test"]["psnr"], metrics["gaussians"], metrics["counts"], flush=True)
@@ -136,12 +142,16 @@ def distract(photograph: Image.Image, at: float, resolution: int) -> Tuple[Image
     return with_patch, covered.filter(ImageFilter.MaxFilter(margin)).point(lambda value: 255 - value)
 
 
-def train(checkout: Checkout, seed: int, folder: Path) -> Dict[str, Any]:
-    """Train and draw by the codebase's own scripts; score against the photographs without patches."""
+def train(checkout: Checkout, seed: int, folder: Path, robust: Optional[Dict[str, Any]] = None) -> Dict[str, Any]:
+    """Train and draw by the codebase's own scripts; score against the photographs without patches.
+
+    With settings of a RobustMask the training leaves out what that does.
+    """
     output = folder / "output"
     shutil.rmtree(output, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
-    counts = run(checkout, checkout.commands(output, 1.0), seed, folder, "train")
+    words = [] if robust is None else ["--robust", json.dumps(robust)]
+    counts = run(checkout, checkout.commands(output, 1.0), seed, folder, "train", words)
     run(checkout, checkout.drawing(output, output), seed, folder, "render")
     clean = read_scene(checkout.scene.with_name("clean"))
     views: Dict[str, Dict[str, Any]] = {}
@@ -158,7 +168,14 @@ def train(checkout: Checkout, seed: int, folder: Path) -> Dict[str, Any]:
     }
 
 
-def run(checkout: Checkout, commands: Sequence[Sequence[str]], seed: int, folder: Path, step: str) -> Dict[str, Any]:
+def run(
+    checkout: Checkout,
+    commands: Sequence[Sequence[str]],
+    seed: int,
+    folder: Path,
+    step: str,
+    robust: Sequence[str] = (),
+) -> Dict[str, Any]:
     """Run a step's commands; return the last one's counts."""
     report = folder / f"{step}.json"
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
@@ -166,7 +183,7 @@ def run(checkout: Checkout, commands: Sequence[Sequence[str]], seed: int, folder
     if step == "train" and checkout.scene.name == "masked":
         environment.update(LEGS_MASKS="require")
     for words in commands:
-        launch = [str(Path(__file__).with_name("launch.py")), str(report), str(seed), "--cpu", "--ssim"]
+        launch = [str(Path(__file__).with_name("launch.py")), str(report), str(seed), *robust, "--cpu", "--ssim"]
         with open(folder / f"{step}.log", "ab") as log:
             subprocess.run(
                 [sys.executable, *launch, *words],

@@ -1,9 +1,10 @@
 """Run one script of a codebase with a given seed, and report what was weighted.
 
-    python launch.py REPORT SEED [--cpu] SCRIPT ...
+    python launch.py REPORT SEED [--robust JSON] [--cpu] SCRIPT ...
 
 3DGS and its forks set their seeds to 0 in their code. Here a multiple of SEED is added to every seed that is set,
 so that runs with the same SEED agree and others differ; 0 keeps the script's own. The report is written at the end.
+With --robust the masks of a patched script are those that a RobustMask of these settings makes.
 It ends when the comparison that started it does, however that was killed.
 """
 
@@ -70,6 +71,12 @@ def main(report: str, seed: str, *words: str) -> int:
 
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     move_seeds(int(seed))
+    if words[0] == "--robust":
+        import legs_loss
+        from examples.reproduce_paper.robust import RobustMask
+
+        legs_loss.masked = RobustMask(**json.loads(words[1]))
+        words = words[2:]
     started = time.perf_counter(), time.process_time()
     try:
         return legs(["run", *words])

@@ -90,6 +90,15 @@ class TestReading:
         replace_mask(scene, Image.fromarray(third()), exif=exif)
         np.testing.assert_array_equal(mask_of(scene), third() / 255)
 
+    def test_a_palette_is_read_as_its_gray_values_not_as_its_indices(self, scene):
+        image = Image.fromarray((third() == 0).astype(np.uint8), "P")  # index 0 is white, 1 black
+        image.putpalette([255, 255, 255, 0, 0, 0])
+        replace_mask(scene, image)
+        np.testing.assert_array_equal(mask_of(scene), third() / 255)
+        replace_mask(scene, image, transparency=0)  # nothing but the black is left
+        with pytest.raises(LegsError, match="all black"):
+            mask_of(scene)
+
     def test_gray_counts_in_part(self, scene):
         replace_mask(scene, Image.fromarray(np.full((8, 12), 51, np.uint8)))
         np.testing.assert_allclose(mask_of(scene), 0.2, atol=1e-4)
@@ -165,6 +174,24 @@ class TestRefused:
         Image.open(scene / "images/b.png").save(scene / "masks/b.png")
         self.refuse(scene, r"b\.png: in colour, and a map is gray")
 
+    def test_labels_in_a_palette(self, scene):
+        labels = Image.fromarray(third() // 255, "P")
+        labels.putpalette([0, 0, 0, 128, 0, 0])  # what segmentation programs write: black, dark red
+        labels.save(scene / "masks/b.png")
+        self.refuse(scene, r"b\.png: in colour, and a map is gray")
+
+    def test_of_another_depth(self, scene):
+        for pixels, message in ((third(np.int32, 70000), "more than 16 bits"), (third(np.float32, 1.0), "float")):
+            Image.fromarray(pixels).save(scene / "masks/b.tif")
+            self.refuse(scene, rf"b\.tif: .*{message}")
+
+    def test_drawn_on_a_photograph_that_exif_turns(self, scene):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        Image.open(scene / "images/b.png").convert("RGB").save(scene / "images/b.png", exif=exif)
+        Image.fromarray(third().T).save(scene / "masks/b.png")  # as a paint program shows it
+        self.refuse(scene, r"b\.png: 8x12 pixels do not have the ratio of sides of its photograph, 12x8")
+
     def test_of_no_photograph(self, scene):
         Image.fromarray(third()).save(scene / "masks/z.png")
         self.refuse(scene, r"z\.png is the map of no photograph; maps have the name")
@@ -203,6 +230,13 @@ class TestRefused:
         os.mkfifo(scene / "masks/b.png")
         self.refuse(scene, r"b\.png: .*not a regular file")
 
+    def test_folders_and_links_to_them(self, scene):
+        (scene / "masks/b.png").mkdir()
+        (scene / "masks/images").symlink_to(scene / "masks")  # links to folders are not followed: it has a.png, too
+        (scene / "masks/c.png").symlink_to(scene / "masks/a.png")  # links to files are
+        assert mask_of(scene, "images/b.png") is None
+        np.testing.assert_array_equal(mask_of(scene, "images/c.png"), third() / 255)
+
     def test_arrays_that_are_no_weights(self, scene):
         (scene / "mine").mkdir()
         for values, message in (
@@ -215,6 +249,9 @@ class TestRefused:
         ):
             np.save(scene / "mine/a.npy", values, allow_pickle=True)
             self.refuse(scene, rf"a\.npy: .*{message}", weights="mine")
+        np.save(scene / "mine/a.npy", np.ones((8, 12)))
+        (scene / "mine/a.npy").write_bytes((scene / "mine/a.npy").read_bytes()[:-8])
+        self.refuse(scene, r"a\.npy: no array that can be read", weights="mine")
         (scene / "mine/a.npy").write_bytes(b"\x93NUMPY\x01\x00\x10\x00{'descr': open(")
         self.refuse(scene, r"a\.npy: no array that can be read", weights="mine")
         self.refuse(scene, "weight_scale must be above 0", scale=float("nan"))

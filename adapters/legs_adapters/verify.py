@@ -31,7 +31,15 @@ __all__ = ["Run", "Verdict", "check_verifiable", "verify"]
 
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 96, 64, 800  # of the embedded scene
 SECONDS = 1800  # that a run may take
+NOT_COPIED = (".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs")
+MAX_COPIED = 64 << 20  # bytes of a file
 FIRST_STEP, LATER_STEPS = 1e-5, 1e-3  # relative differences of losses that rounding explains
+SETTINGS: Dict[str, Dict[str, str]] = {
+    "unpatched": {},
+    "patched": {},
+    "LEGS_OFF": {"LEGS_OFF": "1"},
+    "beta 0": {"LEGS_BETA": "0"},
+}
 # The arguments of a script like Inria's, where its source has these words. (Inria's options are named after attributes,
 # except those that train.py adds itself.)
 ARGUMENTS = (
@@ -50,23 +58,25 @@ class Run(NamedTuple):
         code: its exit code.
         losses: the value of every loss that was trained on, as float.hex has it.
         seconds: from each step to the next.
-        weighted, weighted_without_gradient, plain: calls of legs_loss.l1_loss.
+        weighted, plain: calls of legs_loss.l1_loss.
         stored, computed, remembered: where weight maps came from.
         error: the last lines of its stderr.
-        ssims: calls of legs_loss.ssim in training.
     """
 
     code: int
     losses: Sequence[str] = ()
     seconds: Sequence[float] = ()
     weighted: int = 0
-    weighted_without_gradient: int = 0
     plain: int = 0
     stored: int = 0
     computed: int = 0
     remembered: int = 0
     error: str = ""
-    ssims: int = 0
+
+    @property
+    def step(self) -> Optional[float]:
+        """The seconds that a step takes, by the median; None without two steps."""
+        return statistics.median(self.seconds) if self.seconds else None
 
 
 class Verdict(NamedTuple):
@@ -79,24 +89,19 @@ class Verdict(NamedTuple):
         """Return the report."""
         rows = []
         for name, run in self.runs.items():
-            step = f"{1000 * statistics.median(run.seconds):.0f} ms a step" if run.seconds else "no step"
+            step = "no step" if run.step is None else f"{1000 * run.step:.0f} ms a step"
             rows.append((name, f"{len(run.losses)} steps, {step}" + (f", exit code {run.code}" if run.code else "")))
-        if "patched" in self.runs:
-            patched, unpatched = self.runs["patched"], self.runs["unpatched"]
-            if patched.seconds and unpatched.seconds:
-                ratio = statistics.median(patched.seconds) / statistics.median(unpatched.seconds)
+        unpatched, patched = self.runs["unpatched"], self.runs.get("patched")
+        if patched is not None:
+            if patched.step and unpatched.step:
+                ratio = patched.step / unpatched.step
                 rows.append(("step", f"patched takes {ratio:.2f} times the unpatched one's time (medians)"))
-            without = f"{patched.weighted_without_gradient} in no-grad code"
-            rows.append(("l1_loss", f"{patched.weighted} calls weighted in training, {without}; {patched.plain} plain"))
-            rows += [("ssim", f"{patched.ssims} calls in training")] if patched.ssims else []
+            rows.append(("l1_loss", f"{patched.weighted} calls weighted, {patched.plain} plain"))
             computed = f"{patched.computed} computed; {patched.remembered} reused"
             rows.append(("maps", f"{patched.stored} from the store, {computed}"))
         rows += [("holds" if held else "FAILS", claim) for claim, held in self.claims.items()]
-        lines = [f"{name:<10} {what}" for name, what in rows]
-        for name, run in self.runs.items():
-            if run.code != 0 and run.error:
-                lines += [f"{name} ended with:", *(f"    {line}" for line in run.error.splitlines())]
-        return "\n".join(lines) + "\n"
+        rows += [(name, line) for name, run in self.runs.items() if run.code for line in run.error.splitlines()]
+        return "".join(f"{name:<10} {what}\n" for name, what in rows)
 
 
 def check_verifiable(folder: str | os.PathLike[str], script: Optional[str], arguments: Optional[str]) -> str:
@@ -147,17 +152,14 @@ def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str]
         with locked(root, f"legs-patch --verify {folder}"):
             for copy in (patched, unpatched):
                 shutil.copytree(str(root), str(copy), symlinks=True, ignore=_unneeded)
-            if not (root / JOURNAL).is_file():  # undone by another one, before this one had the lock
-                raise LegsError(f"{root} is not patched any more: nothing to verify")
+        if not (patched / JOURNAL).is_file():  # undone by another one, before this one had the lock
+            raise LegsError(f"{root} is not patched any more: nothing to verify")
         undo(unpatched, force=True)
-        for name, copy, settings in (
-            ("unpatched", unpatched, {}),
-            ("patched", patched, {}),
-            ("LEGS_OFF", patched, {"LEGS_OFF": "1"}),
-            ("beta 0", patched, {"LEGS_BETA": "0"}),
-        ):
-            if name == "beta 0" and not runs["patched"].ssims:
+        with_ssim = b"legs_loss.ssim" in (patched / JOURNAL).read_bytes()
+        for name, settings in SETTINGS.items():
+            if name == "beta 0" and not with_ssim:
                 continue
+            copy = unpatched if name == "unpatched" else patched
             given = _arguments(copy / script, arguments, iterations, scene=scene, output=Path(work) / f"output-{name}")
             runs[name] = _run(copy, [script, *given], iterations, Path(work) / f"{name}.json", settings)
             if not runs["unpatched"].losses:
@@ -166,20 +168,18 @@ def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str]
 
 
 def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
-    unpatched, patched, off = runs["unpatched"], runs["patched"], runs["LEGS_OFF"]
-    steps = len(unpatched.losses)
+    losses = {name: list(run.losses) for name, run in runs.items()}
+    unpatched, patched, off = losses["unpatched"], losses["patched"], losses["LEGS_OFF"]
     claims = {
         "all three trained": all(run.code == 0 and run.losses for run in runs.values()),
-        "as many steps each": steps == len(patched.losses) == len(off.losses),
-        "with LEGS_OFF=1 every loss is the unpatched one, bit for bit": steps > 0 and off.losses == unpatched.losses,
-        "with LEGS every loss is another": steps > 0
-        and all(first != second for first, second in zip(unpatched.losses, patched.losses)),
-        "every step was weighted": patched.weighted >= len(patched.losses) > 0,
-        "nothing was weighted in no-grad code": patched.weighted_without_gradient == 0,
-        "nothing was weighted with LEGS_OFF=1": off.weighted == 0,
+        "as many steps each": len(unpatched) == len(patched) == len(off),
+        "with LEGS_OFF=1 every loss is the unpatched one, bit for bit": off == unpatched,
+        "with LEGS every loss is another": all(one != other for one, other in zip(unpatched, patched)),
+        "every step was weighted": runs["patched"].weighted >= len(patched) > 0,
+        "nothing was weighted with LEGS_OFF=1": runs["LEGS_OFF"].weighted == 0,
     }
     if "beta 0" in runs:
-        equal = _are_close(unpatched.losses, runs["beta 0"].losses)
+        equal = _are_close(unpatched, losses["beta 0"])
         claims["with beta 0 every loss is the unpatched one, up to the rounding of the SSIM"] = equal
     return claims
 
@@ -225,14 +225,10 @@ def _arguments(script: Path, given: Optional[str], iterations: int, **places: Pa
 
 
 def _unneeded(folder: str, names: List[str]) -> List[str]:
-    """Return what is not copied: histories, caches, and anything large."""
-    left = {".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs"} & set(names)
-    for name in names:
-        path = os.path.join(folder, name)
-        special = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)  # pipes, sockets
-        if special or (os.path.isfile(path) and os.path.getsize(path) > 64 << 20):
-            left.add(name)
-    return sorted(left)
+    """Return what is not copied: histories, caches, pipes and sockets, and anything large."""
+    paths = {name: os.path.join(folder, name) for name in names if name not in NOT_COPIED}
+    files = {name for name, path in paths.items() if os.path.isfile(path) and os.path.getsize(path) <= MAX_COPIED}
+    return [name for name in names if name not in files and not os.path.isdir(paths.get(name, ""))]
 
 
 def _run(root: Path, words: Sequence[str], iterations: int, report: Path, settings: Dict[str, str]) -> Run:

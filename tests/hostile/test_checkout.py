@@ -84,7 +84,7 @@ def test_verify_copies_what_is_a_file(stranger, monkeypatch, capsys):
 
 
 def run_of_none():
-    return verifying.Run(0, ["0x1p+0"], [], 0, 0, 0, 0, 0, 0, "")
+    return verifying.Run(0, ["0x1p+0"])
 
 
 @pytest.mark.parametrize("number", range(3))

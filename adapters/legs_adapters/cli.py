@@ -186,6 +186,7 @@ def _patch(args: argparse.Namespace) -> int:
     root = check_root(args.folder)
     settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
     text = settings_text(root, settings)
+    writes = bool(settings) or not (root / SETTINGS_FILE).exists()  # else the user's, or an earlier run's, stays
     found = plan(root, args.exclude, [_site(root, text) for text in args.site], ssim=args.ssim, masks=args.masks)
     problems, is_decided = found.findings.problems, bool(found.findings.sites or found.findings.patched)
     if not is_decided or (problems and args.strict):
@@ -199,7 +200,7 @@ def _patch(args: argparse.Namespace) -> int:
         _quote(problems, "error")
         say("legs-patch: nothing was changed: --site FILE:LINE takes your word, --exclude leaves files out", sys.stderr)
         return 2
-    if settings or not (root / SETTINGS_FILE).exists():  # else the user's, or an earlier run's, stays
+    if writes:
         found = found._replace(settings=text)
     _quote(found.findings.doubts, "warning: a possible loss was not weighted")
     wrote = [] if args.diff or args.check else write(found, args.force)

@@ -24,7 +24,7 @@ from legs_loss import LegsError
 __all__ = ["JOURNAL", "Journal", "Layer", "digest"]
 
 JOURNAL = ".legs-patch.json"
-MAX_EDITS = 100_000
+MAX_EDITS, MAX_LAYERS = 100_000, 100  # of the journal, and patches of one file
 _VERSION = 1
 _NOTE = "What legs-patch changed here, and the bytes from before. legs-patch --undo needs it; do not edit it."
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -136,6 +136,8 @@ def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
     for name, layers in content.items():
         check_name(name)
         files[_only(name, name.endswith(".py"))] = []
+        if len(layers) > MAX_LAYERS:
+            raise ValueError(f"more than {MAX_LAYERS} patches of {name}")
         for layer in layers:
             files[name].append(_read_layer(layer, room))
             room -= len(files[name][-1].original)

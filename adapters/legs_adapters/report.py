@@ -6,7 +6,7 @@ import json
 import re
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
-from legs_adapters.checkout.comparing import Comparison
+from legs_adapters.checkout.comparing import unified_diff
 from legs_adapters.checkout.replace import Changes
 from legs_adapters.code.syntax import one_line
 from legs_adapters.plan import Plan
@@ -90,11 +90,10 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
 
 def as_diff(changes: Changes, colour: bool) -> str:
     """Return a unified diff of files' bytes before and after; None is no file."""
-    comparison = Comparison()
     shown: List[str] = []
     for path, (before, after) in changes.items():
         names = "/dev/null" if before is None else f"a/{path}", "/dev/null" if after is None else f"b/{path}"
-        for line in comparison.unified_diff(_lines(before), _lines(after), names):
+        for line in unified_diff(_lines(before), _lines(after), names):
             text = printable(line, lines=True).rstrip("\n")
             code = _COLOURS.get(text[:3], _COLOURS.get(text[:1]))
             shown.append(f"\033[{code}m{text}\033[0m\n" if colour and code is not None else f"{text}\n")

@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
-from legs_adapters.checkout.comparing import Comparison
+from legs_adapters.checkout.comparing import changed_lines
 from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
 from legs_adapters.code.folders import first_of
+from legs_adapters.code.limits import Budget
 from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_loss import LegsError
@@ -68,24 +69,24 @@ def _undone(root: Path, journal: Journal, force: bool) -> Undone:
     changes: Dict[str, Tuple[Optional[bytes], Optional[bytes]]] = {}
     done = Undone([], [], [], changes)
     edited: List[str] = []
-    comparison = Comparison()
+    budget = Budget()
     for name, layers in journal.files.items():
         current = read_file(root, name)
         if current is None:
             done.kept.append((name, "the file is gone"))
             continue
         data = current
-        lost: List[str] = []
         for layer in reversed(layers):
             if digest(data) == layer.after:
                 data = layer.original
             elif data not in (earlier.original for earlier in layers):  # else it is as before: git took it back
                 edited.append(name)
-                data, missing = _undo_edits(layer, data, comparison)
-                lost += missing
-        if lost:
-            shown = first_of([line[:200] for line in sorted(set(lost))], 20, "; ")
-            done.kept.append((name, f"these lines were edited since and are kept: {shown}"))
+                data, lost = _undo_edits(name, layer, data, budget)
+                if lost:
+                    data = current
+                    shown = first_of([line[:200] for line in sorted(set(lost))], 20, "; ")
+                    done.kept.append((name, f"these lines were edited since and are kept, with the others: {shown}"))
+                    break
         if data != current:
             changes[name] = (current, data)
             done.restored.append(name)
@@ -104,27 +105,31 @@ def _undone(root: Path, journal: Journal, force: bool) -> Undone:
     return done
 
 
-def _undo_edits(layer: Layer, current: bytes, comparison: Comparison) -> Tuple[bytes, List[str]]:
-    """Restore the patched lines of a file that was edited since.
+def _undo_edits(name: str, layer: Layer, current: bytes, budget: Budget) -> Tuple[bytes, List[str]]:
+    """Restore the patched lines of a file that was edited since, all of them or none.
 
     Returns:
-        The file with the patch's lines as they were and the edits as they are; and the patched lines that are no
-        longer there as the patch left them, which were left alone.
+        The file with the patch's lines as they were and the edits as they are; and the patched lines that are no longer
+        there as the patch left them: then the file is as it was.
     """
     before, after, lines = (data.splitlines(keepends=True) for data in (layer.original, layer.patched(), current))
+    parts = changed_lines(before, after)
+    over = budget.spend(name, len(parts) * (len(after) + len(lines))) or budget.why_none_left()
+    restored: List[bytes] = []
     lost: List[str] = []
-    where = {a + i: b + i for a, b, size in comparison.matching_lines(after, lines) for i in range(size)}
-    changes: List[Tuple[int, int, Sequence[bytes]]] = []
-    ended = 0, 0
-    for i2, j2, size in [*comparison.matching_lines(before, after), (len(before), len(after), 0)]:
-        (i1, j1), ended = ended, (i2 + size, j2 + size)
-        if (i1, j1) == (i2, j2):
-            continue
-        places = [where[j] for j in range(j1, j2) if j in where]
-        if j1 == j2 or len(places) < j2 - j1 or places[-1] - places[0] >= j2 - j1:
-            lost += [line.decode("utf-8", "replace").strip() for line in after[j1:j2]]
+    at = 0
+    for start, end, first, last in parts:
+        place = -1 if over else _place(after, first, last, lines)
+        if place < at:  # it is gone, or in another order
+            lost += [line.decode("utf-8", "replace").strip() for line in after[first:last]]
         else:
-            changes.append((places[0], places[-1] + 1, before[i1:i2]))
-    for start, end, restored in reversed(changes):
-        lines[start:end] = restored
-    return b"".join(lines), lost
+            restored += [*lines[at:place], *before[start:end]]
+            at = place + last - first
+    return (current, lost) if lost else (b"".join([*restored, *lines[at:]]), lost)
+
+
+def _place(after: Sequence[bytes], first: int, last: int, lines: Sequence[bytes]) -> int:
+    """Return where lines that were patched are now; -1 where they are not as often as the patch left them."""
+    part = after[first:last]
+    here, there = ([at for at in range(len(text)) if text[at : at + len(part)] == part] for text in (after, lines))
+    return there[here.index(first)] if part and len(here) == len(there) else -1

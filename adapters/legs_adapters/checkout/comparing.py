@@ -1,96 +1,57 @@
-"""Compare the lines of two texts in bounded time: some files make a plain diff take days."""
+"""Compare texts that differ in single lines, as a patch leaves them, in one pass: a plain diff may take days."""
 
 from __future__ import annotations
 
-import difflib
-import itertools
-import re
-from collections import Counter
-from typing import Any, List, Mapping, Sequence, Tuple, TypeVar
+from typing import List, Sequence, Tuple, TypeVar
 
-__all__ = ["Comparison"]
+__all__ = ["changed_lines", "unified_diff"]
 
-MAX_STEPS = 2_000_000  # lines, and pairs of equal lines, that are looked at in all files: some seconds
 _CONTEXT = 3  # lines around a change in a diff
-_HUNK = re.compile(r"@@ -(\d+)(.*) \+(\d+)(.*@@\n)", re.S)
+# How many lines to pass over in both texts where they differ, until two are the same again; the fewest first.
+_AHEAD = sorted(((i, j) for i in range(6) for j in range(6)), key=sum)[1:]
 _Line = TypeVar("_Line", str, bytes)
 
 
-class Comparison:
-    """Compares files of one checkout, in a bounded number of steps together."""
+def changed_lines(before: Sequence[_Line], after: Sequence[_Line]) -> List[Tuple[int, int, int, int]]:
+    """Return the parts that differ: the first line and the end in the text before, and in the text after.
 
-    def __init__(self) -> None:
-        self._left: int = MAX_STEPS
-
-    def matching_lines(self, before: Sequence[_Line], after: Sequence[_Line]) -> List[Tuple[int, int, int]]:
-        """Return the blocks of lines that two texts share, in order: where in each, and how many lines.
-
-        Everything between the first and the last difference counts as different where it is too long or too repetitive
-        to be compared.
-        """
-        try:
-            self.spend(len(before) + len(after))
-            head, tail = _ends(before, after)
-        except _TooLongError:
-            return []
-        blocks: List[Tuple[int, int, int]] = [(0, 0, head)]
-        try:
-            matcher = _Matcher(self, before[head : len(before) - tail], after[head : len(after) - tail])
-            blocks += [(head + block.a, head + block.b, block.size) for block in matcher.get_matching_blocks()]
-        except _TooLongError:
-            pass
-        return [block for block in [*blocks, (len(before) - tail, len(after) - tail, tail)] if block[2]]
-
-    def unified_diff(self, before: Sequence[str], after: Sequence[str], names: Tuple[str, str]) -> List[str]:
-        """Return the lines of a unified diff of two texts; a single hunk where comparing would take too long."""
-        head, tail = _ends(before, after)
-        start = max(head - _CONTEXT, 0)
-        removed, added = (lines[start : len(lines) - max(tail - _CONTEXT, 0)] for lines in (before, after))
-        try:
-            if removed and added:
-                _Matcher(self, removed, added).get_matching_blocks()
-        except _TooLongError:
-            where = f"@@ -{start + 1},{len(removed)} +{start + 1},{len(added)} @@\n"
-            changed = [f"-{line}" for line in removed] + [f"+{line}" for line in added]
-            return [f"--- {names[0]}\n", f"+++ {names[1]}\n", where, *changed]
-        diff = difflib.unified_diff(removed, added, *names, n=_CONTEXT, lineterm="\n")
-        return [
-            _HUNK.sub(lambda at: f"@@ -{int(at[1]) + start}{at[2]} +{int(at[3]) + start}{at[4]}", line)
-            if line.startswith("@@")
-            else line
-            for line in diff
-        ]
-
-    def spend(self, steps: int) -> None:
-        """Count steps; raise an error where there are none left."""
-        if steps > self._left:
-            raise _TooLongError
-        self._left -= steps
+    Texts that differ in more than single lines may have larger parts than they need.
+    """
+    changed: List[Tuple[int, int, int, int]] = []
+    i = j = 0
+    while i < len(before) or j < len(after):
+        if before[i : i + 1] == after[j : j + 1]:
+            i, j = i + 1, j + 1
+            continue
+        ahead = ((m, n) for m, n in _AHEAD if before[i + m : i + m + 2] == after[j + n : j + n + 2])
+        skipped, added = next(ahead, (1, 1))
+        end, last = min(i + skipped, len(before)), min(j + added, len(after))
+        if changed and changed[-1][1::2] == (i, j):
+            i, _, j, _ = changed.pop()
+        changed.append((i, end, j, last))
+        i, j = end, last
+    return changed
 
 
-class _TooLongError(Exception):
-    pass
+def unified_diff(before: Sequence[str], after: Sequence[str], names: Tuple[str, str]) -> List[str]:
+    """Return the lines of a unified diff of two texts."""
+    hunks: List[List[Tuple[int, int, int, int]]] = []
+    for change in changed_lines(before, after):
+        if not hunks or change[0] - hunks[-1][-1][1] > 2 * _CONTEXT:
+            hunks.append([])
+        hunks[-1].append(change)
+    shown = [f"--- {names[0]}\n", f"+++ {names[1]}\n"]
+    for hunk in hunks:
+        head, tail = min(_CONTEXT, hunk[0][0]), min(_CONTEXT, len(before) - hunk[-1][1])
+        at, end = hunk[0][0] - head, hunk[-1][1] + tail
+        shown.append(f"@@ -{_range(at, end)} +{_range(hunk[0][2] - head, hunk[-1][3] + tail)} @@\n")
+        for start, stop, first, last in [*hunk, (end, end, 0, 0)]:
+            shown += [f" {line}" for line in before[at:start]] + [f"-{line}" for line in before[start:stop]]
+            shown += [f"+{line}" for line in after[first:last]]
+            at = stop
+    return shown
 
 
-class _Matcher(difflib.SequenceMatcher):
-    """Match lines, and count the steps: difflib's are cubic in lines that are alike, or in another order."""
-
-    def __init__(self, comparison: Comparison, before: Sequence[_Line], after: Sequence[_Line]) -> None:
-        comparison.spend(len(before) + len(after))
-        counts: Mapping[Any, int] = Counter(after)
-        self._comparison: Comparison = comparison
-        self._steps: List[int] = [0, *itertools.accumulate(1 + counts[line] for line in before)]
-        super().__init__(None, before, after, autojunk=False)
-
-    def find_longest_match(self, alo: int = 0, ahi: Any = None, blo: int = 0, bhi: Any = None) -> Any:
-        """Find the longest block of equal lines in parts of both texts."""
-        self._comparison.spend(self._steps[ahi] - self._steps[alo])
-        return super().find_longest_match(alo, ahi, blo, bhi)
-
-
-def _ends(before: Sequence[_Line], after: Sequence[_Line]) -> Tuple[int, int]:
-    """Return how many lines two texts share at their starts, and how many more at their ends."""
-    shorter = min(len(before), len(after))
-    head = next((i for i in range(shorter) if before[i] != after[i]), shorter)
-    tail = next((i for i in range(shorter - head) if before[-1 - i] != after[-1 - i]), shorter - head)
-    return head, tail
+def _range(start: int, end: int) -> str:
+    """Return lines as a hunk's head has them: the first, from 1, and how many; of none it is the line before."""
+    return f"{start + 1}" if end - start == 1 else f"{start + (end > start)},{end - start}"

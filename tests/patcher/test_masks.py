@@ -130,6 +130,41 @@ def test_a_patched_run_masks_every_term_and_without_masks_nothing_changes(scene,
     assert snapshot(masked) == before
 
 
+GT = '        gt_image = viewpoint_cam.original_image.to("cpu")\n'
+CHANGE = """
+        if viewpoint_cam.image_name == "a":  # a sub-pixel shift, as mip-splatting's
+            grid = torch.nn.functional.affine_grid(torch.eye(2, 3)[None], (1, 3, 16, 20), align_corners=False)
+            grid = grid + (torch.rand(1, 16, 20, 2) - 0.5) / 16
+            gt_image = torch.nn.functional.grid_sample(gt_image[None], grid, align_corners=False)[0]
+        else:  # a random background
+            alpha = (gt_image.mean(0, keepdim=True) > 0.4).float()
+            gt_image = gt_image * alpha + torch.rand(3)[:, None, None] * (1.0 - alpha)
+"""
+
+
+def test_a_target_that_changes_from_step_to_step_is_said_and_masked_in_no_term(scene, tmp_path):
+    root = checkout(tmp_path / "gs", {**FILES, "train.py": SCRIPT.replace(GT, GT + CHANGE)})
+    assert legs_patch("--masks", root).returncode == 0
+    text = (root / "train.py").read_text()
+    assert text.index(LINE) > text.index(CHANGE)
+    precompute(scene)
+    rows, said = python("train.py", "-s", scene, cwd=root)
+    assert all(np.array(gradient).all() for _, gradient in rows)
+    assert said.count("NOT MASKED: ") == 1 and "augmented, shifted, resized or laid on another background" in said
+    assert said.splitlines()[-1].endswith(
+        "masks: 0 view(s) masked, 2 training image(s) were NOT FOUND in the store, so NOT MASKED"
+    )
+    done = subprocess.run(
+        [sys.executable, "train.py", "-s", str(scene)],
+        cwd=root,
+        env={**legs_environment(), "LEGS_MASKS": "require"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1 and not done.stdout and "LegsError: NOT MASKED" in done.stderr
+
+
 def test_in_memory(scene, tmp_path):
     precompute(scene)
     root = checkout(tmp_path / "gs", FILES)

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,6 +109,28 @@ class TestFusedLoss:
         for value, gradient in results[1:]:
             assert value == results[0][0]
             assert torch.equal(gradient, results[0][1])
+
+    @pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="only Linux says how long a thread ran")
+    def test_it_takes_as_many_threads_as_torch(self):
+        """Of each thread of a process the system counts the time on a processor, which is 0 where it took no part."""
+        code = (
+            "import torch\nfrom pathlib import Path\nfrom legs_loss import legs_loss, ssim, weighted_l1\n"
+            "def ran():\n"
+            "    tasks = Path('/proc/self/task').iterdir()\n"
+            "    return {task.name: int((task / 'schedstat').read_text().split()[0]) for task in tasks}\n"
+            "x, y = torch.rand(3, 260, 700, requires_grad=True), torch.rand(3, 260, 700)\n"
+            "losses = (lambda: legs_loss(x, y), lambda: weighted_l1(x, y, torch.ones(260, 700)), lambda: ssim(x, y))\n"
+            "for threads in (2, 1, 2):\n"
+            "    torch.set_num_threads(threads)\n"
+            "    for _ in range(2):  # the first makes the threads\n"
+            "        before = ran()\n"
+            "        [loss() for loss in losses]\n"
+            "    print(sum(time > before[name] for name, time in ran().items()))\n"
+        )
+        environment = dict(legs_environment(), NUMBA_NUM_THREADS="2", OMP_NUM_THREADS="2", LEGS_BACKEND="numba")
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.split() == ["2", "1", "2"]
 
     def test_non_contiguous_images_and_a_scaled_loss(self):
         target = torch.rand(20, 30, 3).movedim(-1, 0)

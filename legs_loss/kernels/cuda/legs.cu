@@ -224,7 +224,6 @@ DEVICE void responses(const Task& k, const Value* target, int row, int column, f
 struct Weights {
     int rows;  // of the views before it
     float low, scale;
-    float one;  // 1, or not a number where the range is none: then no weight is one
 };
 
 DEVICE Weights weights_of(const Task& k, int view) {
@@ -236,7 +235,6 @@ DEVICE Weights weights_of(const Task& k, int view) {
         w.low = k.range[2 * view];
         w.scale = span == 0.f ? 0.f : 1.f / (span + k.eps);  // a NaN is not equal to 0
     }
-    w.one = 1.f + 0.f * w.scale;
     return w;
 }
 
@@ -263,8 +261,9 @@ DEVICE void weigh(const Task& k, const Weights& w, float (&x)[N]) {
             x[r] = saturated(0.5f - angle * fmaf(square, fmaf(square, high, -1.f / 6.f), 1.f));
         }
     }
+    const float one = fmaf(0.f, w.scale, 1.f);  // not a number where the range is none: then no weight is one
 #pragma unroll
-    for (int r = 0; r < N; ++r) x[r] = fmaf(k.beta, x[r], w.one);
+    for (int r = 0; r < N; ++r) x[r] = fmaf(k.beta, x[r], one);
 }
 
 // The weights of N pixels of a column, from a row on, 0 outside the image. Responses are in `x` already, or in memory.
@@ -468,18 +467,23 @@ DEVICE float push(float (&s)[10], float x) {
     return out;
 }
 
-// A horizontal blur, plus a constant: four neighbouring values from 14 of 16.
+// A horizontal blur, plus a constant: four neighbouring values from 14 of 16. Four are read at a time, which takes few
+// registers, the outer ones first: small terms are added up before large ones.
 DEVICE void across(const float* from, float plus, float (&out)[4]) {
-    float v[16];
+    const float taps[11] = {G0, G1, G2, G3, G4, G5, G4, G3, G2, G1, G0};
 #pragma unroll
-    for (int j = 0; j < 4; ++j) {
-        const Quad q = *reinterpret_cast<const Quad*>(from + 4 * j);
-        v[4 * j] = q.a; v[4 * j + 1] = q.b; v[4 * j + 2] = q.c; v[4 * j + 3] = q.d;
+    for (int j = 0; j < 4; ++j) out[j] = plus;
+#pragma unroll
+    for (int m = 0; m < 4; ++m) {
+        const int first = 4 * (m % 2 ? 3 - m / 2 : m / 2);
+        const Quad q = *reinterpret_cast<const Quad*>(from + first);
+        const float v[4] = {q.a, q.b, q.c, q.d};
+#pragma unroll
+        for (int i = first; i < first + 4; ++i)
+#pragma unroll
+            for (int j = 0; j < 4; ++j)
+                if (i >= j && i - j < 11) out[j] = fmaf(taps[i - j], v[i - first], out[j]);
     }
-#pragma unroll
-    for (int j = 0; j < 4; ++j)
-        out[j] = fmaf(G5, v[j + 5], fmaf(G4, v[j + 4] + v[j + 6], fmaf(G3, v[j + 3] + v[j + 7],
-                 fmaf(G2, v[j + 2] + v[j + 8], fmaf(G1, v[j + 1] + v[j + 9], fmaf(G0, v[j] + v[j + 10], plus))))));
 }
 
 DEVICE void put(float* to, const float (&v)[4]) { *reinterpret_cast<Quad*>(to) = Quad{v[0], v[1], v[2], v[3]}; }
@@ -608,7 +612,8 @@ DEVICE void stream(const Task& k) {
         lane.column = memory + t;
         lane.group = memory + t / GROUPS * PITCH + t % GROUPS * 4;
         // What lies outside the image is never written, and stays zero.
-        for (int j = t; j < (WANTED ? 7 : 4) * ROWS * PITCH; j += THREADS) memory[j] = 0.f;
+        const float zeros[4] = {};
+        for (int j = 4 * t; j < (WANTED ? 7 : 4) * ROWS * PITCH; j += 4 * THREADS) put(memory + j, zeros);
         fetch(lane, t, start);
     });
     // Of the rows from `base` on moments go in; SSIM of those of REACH rows before comes out, and the gradient of 2 * REACH.

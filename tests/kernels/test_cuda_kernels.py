@@ -193,6 +193,56 @@ class TestLoss:
             backend.weighted_l1(*images((2, 3, 8, 8)), Weights(spec=LEGS, range=torch.zeros(1, 2)))
 
 
+class TestRounding:
+    """How near float32 comes to float64; the emulation's reciprocals and roots are off by one unit in the last place.
+
+    Of noise the value keeps 1e-7: the result's own rounding is 6e-8. With weights from the target 2e-7, since the span of
+    responses is one float32 that all weights share. Of smooth images no float32 can: variances and responses are
+    differences of near-equal numbers, so an error of 1e-7 in a mean is one of 1e-4 beside SSIM's second constant. There
+    torch's own float32 is the measure. With exact reciprocals and roots the errors are the same.
+    """
+
+    @staticmethod
+    def errors(backend, target):
+        """Yield of map, spec and SSIM how far value and gradient are off, and torch's own in float32."""
+        torch.manual_seed(3)
+        prediction = (0.8 * target + 0.1 * torch.rand(target.shape)).requires_grad_()
+        map_ = weight_map(target, LEGS, False)
+
+        def whole(images, exact):
+            return legs_loss(images, exact, weight=map_.to(images.dtype), padding="zeros", channels_last=False)
+
+        for own, reference in (
+            (lambda: backend.loss(prediction, target, Weights(map=map_), 0.2), whole),
+            (lambda: backend.loss(prediction, target, Weights(LEGS), 0.2), lambda x, y: legs_loss(x, y, LEGS)),
+            (lambda: backend.ssim(prediction, target), ssim),
+        ):
+            exact = prediction.detach().double().requires_grad_()
+            expected = reference(exact, target.double())
+            (gradient,) = torch.autograd.grad(expected, exact)
+            found = []
+            for loss in (own(), reference(prediction, target)):
+                (slope,) = torch.autograd.grad(loss, prediction)
+                found.append(abs(loss.item() / expected.item() - 1.0))
+                found.append(float((slope.double() - gradient).norm() / gradient.norm()))
+            yield found
+
+    @pytest.mark.parametrize("shape", [(3, 44, 45), (3, 137, 251), (2, 3, 200, 300)])
+    def test_of_noise_the_value_keeps_seven_digits(self, backend, monkeypatch, shape):
+        monkeypatch.setenv("LEGS_BACKEND", "torch")
+        torch.manual_seed(2)
+        bounds = ((1e-7, 1e-7), (2e-7, 2e-7), (1e-7, 1e-6))
+        for (value, gradient, _, _), most in zip(self.errors(backend, torch.rand(shape)), bounds):
+            assert value <= most[0] and gradient <= most[1]
+
+    def test_of_smooth_images_it_is_as_near_as_torch(self, backend, monkeypatch):
+        monkeypatch.setenv("LEGS_BACKEND", "torch")
+        rows, columns = torch.arange(137.0).reshape(-1, 1), torch.arange(251.0)
+        target = 0.5 + 0.4 * torch.sin(torch.arange(1.0, 4.0).reshape(3, 1, 1) * (0.03 * rows + 0.02 * columns))
+        for (value, gradient, _, of_torch), most in zip(self.errors(backend, target), (2e-6, 1e-5, 2e-6)):
+            assert value <= most and gradient <= of_torch
+
+
 class TestRange:
     @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
     @pytest.mark.parametrize("operator", STENCILS)

@@ -194,12 +194,12 @@ class TestLoss:
 
 
 class TestRounding:
-    """How near float32 comes to float64; the emulation's reciprocals and roots are off by one unit in the last place.
+    """The distance of float32 from float64; reciprocals and roots of the emulation are off by a unit in the last place.
 
-    Of noise the value keeps 1e-7: the result's own rounding is 6e-8. With weights from the target 2e-7, since the span of
-    responses is one float32 that all weights share. Of smooth images no float32 can: variances and responses are
-    differences of near-equal numbers, so an error of 1e-7 in a mean is one of 1e-4 beside SSIM's second constant. There
-    torch's own float32 is the measure. With exact reciprocals and roots the errors are the same.
+    Of noise the value keeps 1e-7: the result's own rounding is 6e-8. With weights from the target 2e-7, since the span
+    of responses is one float32 that all weights share. Of smooth images no float32 can: variances and responses are
+    differences of near-equal numbers, so an error of 1e-7 in a mean is one of 1e-4 beside SSIM's second constant.
+    There torch's own float32 is the measure. With exact reciprocals and roots the errors are the same.
     """
 
     @staticmethod

@@ -7,7 +7,7 @@ from typing import Iterator, List, Optional, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.module import Function
+from legs_adapters.code.module import Class, Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.syntax import call_name
 
@@ -24,7 +24,7 @@ def _named(program: Program, function: Function, most: Optional[int] = None) -> 
 
 
 def _resolved(program: Program, caller: Function, node: cst.CSTNode) -> List[object]:
-    return [reference.target for reference in program.resolve(caller, node) if not reference.guess]
+    return [reference.target for reference in program.resolve(caller, node)]
 
 
 def likely_calls(program: Program, function: Function) -> Iterator[_Call]:
@@ -54,11 +54,17 @@ def given_to(
     return ((caller, function.given(call, parameter)) for caller, call in _named(program, function))
 
 
-def handed(program: Program, function: Function, node: cst.Name) -> List[Reference]:
-    """Return the modules that callers pass for a parameter, ``model`` of ``train_epoch(model, loader)``."""
-    kinds = {definition.kind for definition in function.flow.reaching(node)}
-    if not function.name or kinds - {"store"} != {"parameter"}:
+def handed(program: Program, function: Function, node: cst.CSTNode) -> List[Reference]:
+    """Return what callers pass for the parameter that is called: ``model(batch)``, ``model.loss(batch)``."""
+    receiver = node.value if isinstance(node, cst.Attribute) else node
+    kinds = {definition.kind for definition in function.flow.reaching(receiver)}
+    if not function.name or not isinstance(receiver, cst.Name) or kinds - {"store"} != {"parameter"}:
         return []
-    given = [(caller, value) for caller, value in given_to(program, function, node.value) if value is not None]
+    given = [(caller, value) for caller, value in given_to(program, function, receiver.value) if value is not None]
     found = [reference for caller, value in given for reference in program.resolve(caller, value)]
-    return [reference for reference in dict.fromkeys(found) if reference.kind == "instance"]
+    instances = [reference for reference in dict.fromkeys(found) if reference.kind == "instance"]
+    if not isinstance(node, cst.Attribute):
+        return instances
+    return [
+        ref for one in instances if isinstance(one.target, Class) for ref in program.member(one.target, node.attr.value)
+    ]

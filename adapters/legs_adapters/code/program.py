@@ -1,6 +1,6 @@
 """Resolve names across a checkout: find the function, class, module or library that a name refers to.
 
-What Python decides at run time (a method of an unknown object) is looked up by its name: all candidates are returned.
+Where only the run time knows the class of an object, its methods are unknown.
 """
 
 from __future__ import annotations
@@ -13,25 +13,22 @@ from legs_adapters.code.checkout import Checkout, imported_name
 from legs_adapters.code.module import CALLED, Class, Function, Module
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source
-from legs_adapters.code.syntax import arguments, call_name, dotted, path_of, word_set
+from legs_adapters.code.syntax import arguments, call_name, dotted, path_of
 
 __all__ = ["Conventions", "Program", "Reference"]
 
 _MAX_DEPTH = 16  # how many names are followed, one to the next
-# Methods whose names are too common to resolve.
-_COMMON = word_set("__init__ get items keys values copy load save append update close write read format join split pop")
 
 
 class Reference(NamedTuple):
     """A function, class, module or library name that an expression refers to.
 
     ``kind``: "function", "class", "instance" (of a class), "module", "external" (a dotted name outside of the
-    checkout), "made by" (an object that a call of such a name returned), "lambda". ``guess``: found by its name alone.
+    checkout), "made by" (an object that a call of such a name returned), "lambda".
     """
 
     kind: str
     target: object
-    guess: bool = False
 
 
 class Conventions(NamedTuple):
@@ -41,12 +38,10 @@ class Conventions(NamedTuple):
         returning_self: methods that return the object itself, ``model.cuda()``.
         wrapping: functions that return their argument wrapped: ``DataParallel(model)``; dotted where the
             name alone is ambiguous.
-        common: names of methods that are too common to resolve.
     """
 
     returning_self: FrozenSet[str] = frozenset()
     wrapping: FrozenSet[str] = frozenset()
-    common: FrozenSet[str] = frozenset()
 
 
 class Program(Checkout):
@@ -61,7 +56,6 @@ class Program(Checkout):
         super().__init__(sources)
         self._conventions = conventions or Conventions()
         self._wrapping = tuple("." + name for name in self._conventions.wrapping)
-        self._common = _COMMON | self._conventions.common
         # by expression and depth; each may be asked from many places, and asks for many others
         self._resolved: Dict[Function, Dict[Tuple[int, int], Tuple[cst.CSTNode, List[Reference]]]] = {}
 
@@ -115,12 +109,21 @@ class Program(Checkout):
             return [Reference(kind, target)] if target is not None else []
         if kind == "import":
             return self._imported(where.module, definition, depth + 1)
+        declared = self._declared(where, definition.node, depth) if kind == "parameter" else []
         if kind in ("assign", "with", "parameter") and value is not None:
-            return self.resolve(where, value, depth + 1)
+            return declared + self.resolve(where, value, depth + 1)
         if kind == "element" and definition.index is not None and isinstance(value, cst.Call):
             made = self._wrapped(where, value, definition.index, depth)
             return made or self._returned(self.resolve(where, value.func, depth + 1), definition.index, depth)
-        return []
+        return declared
+
+    def _declared(self, where: Function, parameter: cst.CSTNode, depth: int) -> List[Reference]:
+        """Resolve ``metric: Metric``: an instance of the class, or of one that derives from it."""
+        note = parameter.annotation.annotation if isinstance(parameter, cst.Param) and parameter.annotation else None
+        named = (
+            self.resolve(where.parent or where, note, depth + 1) if isinstance(note, (cst.Name, cst.Attribute)) else []
+        )
+        return [Reference("declared", ref.target) for ref in named if ref.kind == "class"]
 
     # -- calls
 
@@ -150,13 +153,13 @@ class Program(Checkout):
     def _returned(self, made: List[Reference], index: Optional[int], depth: int) -> List[Reference]:
         """Resolve what functions return, or one of a tuple: ``render = get_renderer(kind)``, ``net = get_model()``."""
         found: List[Reference] = []
-        for callee in [ref.target for ref in made if isinstance(ref.target, Function) and not ref.guess]:
+        for callee in [ref.target for ref in made if isinstance(ref.target, Function)]:
             for value in callee.flow.returns:
                 if index is None:
                     found += self.resolve(callee, value, depth + 1)
                 elif isinstance(value, cst.Tuple) and index < len(value.elements):
                     found += self.resolve(callee, value.elements[index].value, depth + 1)
-        return [r for r in found if r.kind in ("function", "lambda", "instance") and not r.guess]
+        return [r for r in found if r.kind in ("function", "lambda", "instance")]
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> List[Reference]:
         """Resolve ``LOSSES[kind]`` to all values of a dictionary, which may be imported."""
@@ -226,13 +229,10 @@ class Program(Checkout):
                     references.append(Reference("module", inner))
             elif isinstance(base.target, Class):
                 references += self.member(base.target, name, depth)
+                references += self._overrides(base.target, name) if base.kind == "declared" else []
             elif base.kind == "external":
                 references.append(Reference("external", f"{base.target}.{name}"))
-        if references or name in self._common:
-            return references
-        methods = self.methods_named(name)
-        known = methods if function.module.spend(len(methods)) else []
-        return [Reference("function", method, True) for method in known]
+        return references
 
     # -- classes
 
@@ -270,7 +270,7 @@ class Program(Checkout):
 
     def _overrides(self, owner: Class, name: str) -> List[Reference]:
         """Resolve ``self.step()`` in a base class: the methods of classes that derive from it."""
-        methods = self.methods_named(name) if name not in self._common and not name.startswith("__") else []
+        methods = self.methods_named(name) if not name.startswith("__") else []
         derived = [method for method in methods if method.owner is not None and method.owner is not owner]
         return [Reference("function", each) for each in derived if each.owner and owner in self.lineage(each.owner)]
 

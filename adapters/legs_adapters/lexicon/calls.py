@@ -178,7 +178,7 @@ def _returned(call: CallReading) -> Optional[Meaning]:
         target = reference.target
         if set(words(getattr(target, "name", str(target)))) & RENDERERS:
             return Meaning("image", "render")
-        if reference.kind == "function" and isinstance(target, Function) and not reference.guess:
+        if reference.kind == "function" and isinstance(target, Function):
             found = [call.meaning_of(target, value) for value in target.flow.returns]
             if found and UNKNOWN not in found:
                 return mix(found)

@@ -10,7 +10,7 @@ from typing import Dict, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import given_to, likely_calls
+from legs_adapters.code.calls import callees, given_to, likely_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import call_name, dotted, walk_all, words, words_in
@@ -87,8 +87,9 @@ class Purposes:
         read = read or _reads_gradients(function)
         for later in sorted(function.flow.calls, key=lambda each: function.place(each).start):
             if function.place(later).start > at:
-                resolved = [r.target for r in self.program.resolve(function, later.func)]
-                called = [each for each in resolved if isinstance(each, Function)]
+                called = callees(self.program, function, later)
+                if not called and isinstance(later.func, cst.Attribute):
+                    called = self.program.methods_named(call_name(later))  # one of them may run, for all that is known
                 if may_step([later]) or any(map(has_step, called)):
                     return True
                 read = read or any(map(_reads_gradients, called))

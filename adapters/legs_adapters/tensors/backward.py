@@ -120,9 +120,7 @@ class Training:
         if name == "dict" and key in keywords:
             self._push(function, keywords[str(key)])
             return
-        references = self.program.resolve(function, node.func)
-        if not references and isinstance(node.func, cst.Name):
-            references = handed(self.program, function, node.func)
+        references = self.program.resolve(function, node.func) or handed(self.program, function, node.func)
         for reference in references:
             if isinstance(reference.target, cst.Lambda):
                 self._push(function, reference.target.body)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from legs_adapters.code.program import Conventions
-from legs_adapters.tensors.operations import EVERYDAY, MODULE_SELF, MODULE_WRAPS
+from legs_adapters.tensors.operations import MODULE_SELF, MODULE_WRAPS
 
 __all__ = ["TORCH"]
 
-TORCH = Conventions(returning_self=MODULE_SELF, wrapping=MODULE_WRAPS, common=EVERYDAY)
+TORCH = Conventions(returning_self=MODULE_SELF, wrapping=MODULE_WRAPS)

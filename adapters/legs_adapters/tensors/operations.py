@@ -42,13 +42,6 @@ MODULES = word_set("F TF einops functional nn np numpy torch")  # as torch and i
 MODULE_SELF = word_set("cpu cuda double eval float half requires_grad_ to train")  # a module's methods that return it
 # These return a module wrapped; Lightning's fabric.setup, accelerate's prepare.
 MODULE_WRAPS = word_set("DDP DataParallel DistributedDataParallel compile convert_sync_batchnorm fabric.setup prepare")
-# Methods of tensors, modules and optimisers: the name alone is ambiguous.
-EVERYDAY = word_set(
-    """
-    clamp clone cpu cuda detach eval forward item mean permute reshape size squeeze step sum to train unsqueeze view
-    zero_grad
-    """
-)
 TRANSPARENT = word_set("autocast classmethod compile jaxtyped script staticmethod typechecked")  # decorators
 HOLDERS = word_set("ModuleDict OrderedDict dict functools.partial nn.ModuleDict partial torch.nn.ModuleDict")
 HOOKS = word_set("get_loss_dict get_train_loss_dict training_step")  # a framework trains on what they return

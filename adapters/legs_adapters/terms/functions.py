@@ -148,7 +148,7 @@ class L1Functions:
             return None
         if is_difference(node) and body.is_pair(node.left, node.right):
             calls = [part for part in walk_expressions(node.left) if isinstance(part, cst.Call)]
-            made = [r for call in calls for r in self.program.resolve(body.function, call.func) if not r.guess]
+            made = [r for call in calls for r in self.program.resolve(body.function, call.func)]
             return None if any(r.kind == "function" for r in made) else [node]  # edges(a) - edges(b)
         return [node] if isinstance(node.operator, cst.Multiply) and constant(node.right, 1) == 0 else []
 

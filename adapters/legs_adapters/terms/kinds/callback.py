@@ -83,6 +83,6 @@ class Callbacks:
             is_called = "." in made.place or holder.parent is None or made.place in reads
             if made.kind == "assign" and isinstance(made.value, (cst.Name, cst.Attribute)) and is_called:
                 references = self._program.resolve(holder, made.value)
-                if [r.target for r in references] == [function] and not references[0].guess:
+                if [r.target for r in references] == [function]:
                     found.append(made.value)
         return found

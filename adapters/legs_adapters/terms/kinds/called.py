@@ -38,7 +38,7 @@ class Called(Form):
             return None  # patched before
         if PERCEPTUAL & set(words(code(call.func))):
             return None  # lpips_model.forward(image, gt)
-        if (not references or any(r.guess for r in references)) and not is_l1_name(call_name(call)):
+        if not references and not is_l1_name(call_name(call)):
             return None  # a method of an object of unknown class: its name alone proves nothing
         shapes = {functions.shape_of_reference(reference, call) for reference in references} or {"own"}
         names = {p for r in references if isinstance(r.target, Function) for p in r.target.parameters[:2]}

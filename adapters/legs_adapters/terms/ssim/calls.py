@@ -28,7 +28,7 @@ class SsimCalls:
         """Return the function of a call, where it is 3DGS's SSIM and the further arguments are its defaults."""
         assert form.callee is not None
         references = self.program.resolve(function, form.callee)
-        target = references[0].target if len(references) == 1 and not references[0].guess else None
+        target = references[0].target if len(references) == 1 else None
         if not isinstance(target, Function) or not self.is_ssim(target):
             return None
         return target if all(_is_default(arg, form.call, target) for arg in form.extras) else None

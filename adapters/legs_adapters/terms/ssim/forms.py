@@ -119,7 +119,7 @@ class _Writer:
                 raise _NoForm
             return f"<{self._functions.index(called)}>"
         references = self._program.resolve(self._function, node)
-        if len(references) == 1 and references[0].kind == "external" and not references[0].guess:
+        if len(references) == 1 and references[0].kind == "external":
             return f"<{references[0].target}>"
         if references or not hasattr(builtins, place) or self._program.lookup(self._function, node) is not None:
             raise _NoForm
@@ -128,5 +128,5 @@ class _Writer:
     def _called(self, node: cst.CSTNode) -> Optional[Function]:
         """Return the one function of the checkout that a name refers to."""
         references = self._program.resolve(self._function, node)
-        target = references[0].target if len(references) == 1 and not references[0].guess else None
+        target = references[0].target if len(references) == 1 else None
         return target if isinstance(target, Function) else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import sys
 from pathlib import Path
@@ -56,9 +57,14 @@ class Plan(NamedTuple):
 
 
 @contextlib.contextmanager
-def _deep_recursion() -> Iterator[None]:
-    """Raise the recursion limit for expressions of some thousand parts; report longer ones as a LegsError."""
-    before = sys.getrecursionlimit()
+def _large_trees() -> Iterator[None]:
+    """Make room for expressions of some thousand parts and for files of some thousand functions.
+
+    Raises:
+        LegsError: a longer expression.
+    """
+    before, collected = sys.getrecursionlimit(), gc.get_threshold()
+    gc.set_threshold(100_000, *collected[1:])  # syntax trees live to the end: looking at them again finds no garbage
     # Before Python 3.11 a Python call takes some of the process's stack.
     sys.setrecursionlimit(max(before, 20_000 if sys.version_info >= (3, 11) else 6_000))
     try:
@@ -69,6 +75,7 @@ def _deep_recursion() -> Iterator[None]:
         ) from None
     finally:
         sys.setrecursionlimit(before)
+        gc.set_threshold(*collected)
 
 
 def plan(
@@ -95,7 +102,7 @@ def plan(
     root = check_root(path)
     files = read_files(root, exclude)
     edits: Dict[str, List[Edit]] = {}
-    with _deep_recursion():
+    with _large_trees():
         findings = find(files.readable, by_hand, ssim, masks)
         for name in _files_to_edit(findings):
             why = why_not_compiled(findings.program.sources[name].data)

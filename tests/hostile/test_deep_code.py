@@ -43,7 +43,7 @@ CASES = {
     "5 MB of literal": ("x = [" + "1.25, " * 900_000 + "]", "larger than 1 MiB"),
     "900 kB of literal": ("x = [" + "1.25, " * 150_000 + "]", STEPS),
     "130,000 statements": ("a\n" * 130_000, STEPS),
-    "2,000 terms": ("def f(a, b):\n" + "    x = l1_loss(a, b)\n" * 2000, STEPS),
+    "8,000 small functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(8000)), STEPS),
     "3,000 trained terms": (
         "def f(a, b):\n" + "    l1 = l1_loss(render(a)['render'], b.original_image); l1.backward()\n" * 3000,
         STEPS,

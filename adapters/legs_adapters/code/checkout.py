@@ -63,10 +63,6 @@ class Checkout:
             if module is not None:
                 yield module
 
-    def has_word(self, path: str, word: str) -> bool:
-        """Return whether a word stands in a file."""
-        return path in self._by_word.get(word, ())
-
     def mentioning(self, name: str, called: bool = False) -> List[Function]:
         """Return the functions and top levels whose text mentions a name, or calls it."""
         if (name, called) not in self._mentions:

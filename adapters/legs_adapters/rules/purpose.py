@@ -87,13 +87,12 @@ class Purposes:
         read = read or _reads_gradients(function)
         for later in sorted(function.flow.calls, key=lambda each: function.place(each).start):
             if function.place(later).start > at:
-                called = callees(self.program, function, later)
-                if not called and isinstance(later.func, cst.Attribute):
-                    called = self.program.methods_named(call_name(later))  # one of them may run, for all that is known
+                name, called = call_name(later), callees(self.program, function, later)
+                called = called or (self.program.methods_named(name) if name else [])  # one of them may run
                 if may_step([later]) or any(map(has_step, called)):
                     return True
                 read = read or any(map(_reads_gradients, called))
-                if call_name(later) == "zero_grad":
+                if name == "zero_grad":
                     return not read
         if may_step(function.flow.calls):
             return True  # of the loop's next round

@@ -17,7 +17,7 @@ _PATCHED = (f"{PACKAGE}.l1_loss", f"{PACKAGE}.unweighted")
 
 def patched_nodes(program: Program, function: Function, names: Sequence[str] = _PATCHED) -> List[cst.CSTNode]:
     """Return the calls and assigned values in a function that refer to these names of legs_loss."""
-    if not program.has_word(function.module.path, PACKAGE):
+    if not program.mentioning(PACKAGE):
         return []
     nodes: List[cst.CSTNode] = [call.func for call in function.flow.calls]
     named = [d.value for d in function.flow.every_definition if d.kind == "assign"]

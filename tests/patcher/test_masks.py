@@ -197,7 +197,7 @@ def test_a_line_that_has_to_be_written_by_hand(tmp_path):
     root = checkout(tmp_path, {**FILES, "train.py": text})
     done = legs_patch("--masks", root)
     assert done.returncode == 1 and "wrote train.py" in done.stdout
-    assert "not masked: the photograph has no name" in done.stderr
+    assert "not masked: the images have no names here" in done.stderr
     assert 'image = legs_loss.masked(image, gt_image.to("cpu")) before every term' in done.stderr
     strict = legs_patch("--masks", "--strict", checkout(tmp_path / "strict", {**FILES, "train.py": text}))
     assert strict.returncode == 2 and "nothing was changed" in strict.stderr

@@ -132,7 +132,6 @@ RAYS = re.compile(
     re.I,
 )
 RAY_BUNDLES = word_set("ray_bundle ray_samples")
-SIDES = word_set("width height")  # of a picture
 OF_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
 STRUCTURAL = re.compile("ssim", re.I)
 SPEAKS_OF_L1 = re.compile(r"[lL]1|\babs(olute)?\s*\(")

@@ -35,15 +35,7 @@ def with_ssims(found: Findings, by_hand: Sequence[Tuple[str, int]]) -> Findings:
     sites = [entry for entry in entries if isinstance(entry, Site)]
     left = [entry for entry in entries if isinstance(entry, Left) and entry.reason != "patched"]
     patched = [entry for entry in entries if isinstance(entry, Left) and entry.reason == "patched"]
-    return found._replace(
-        sites=sorted([*found.sites, *sites], key=_where),
-        left=sorted([*found.left, *left], key=_where),
-        patched=sorted([*found.patched, *patched], key=_where),
-    )
-
-
-def _where(entry: _Entry) -> Tuple[str, int]:
-    return entry.path, entry.line
+    return found.with_more(sites=sites, left=left, patched=patched)
 
 
 def _entries(analysis: Analysis, found: Findings, by_hand: Sequence[Tuple[str, int]]) -> Iterator[_Entry]:
@@ -78,6 +70,4 @@ def _verdict(
         if evidence is None or not (is_own and evidence.rule == "ssim-unproven"):
             yield Left.at(function, place, evidence or "not chosen")
     elif proven is not None:
-        stands = (function.module.path, place.line, place.column, place.last_line)
-        why = f"{proven.module.path}:{proven.line} is the SSIM of 3DGS"
-        yield Site(*stands, form, False, "", why, function)
+        yield Site.at(function, form, f"{proven.module.path}:{proven.line} is the SSIM of 3DGS")

@@ -56,11 +56,9 @@ class Verdicts:
             if not alone or not function.flow.unchanged(form.first, form.second):
                 return self.problem(term, place, f"{one_line(form.node)} has other uses than the loss")
             form = Reread(loss[0], form.call, form.first, form.second)
-            place = function.place(form.node)
-        stands = (function.module.path, place.line, place.column, place.last_line)
-        flipped, why = term.target is term.pair.first, self._why_photograph(term)
-        kept = tuple(_kept(function, use) for use in others)
-        return Site(*stands, form, flipped, term.pair.selection, why, function, kept)
+        is_swapped = term.target is term.pair.first
+        site = Site.at(function, form, self._why_photograph(term), is_swapped, term.pair.selection)
+        return site._replace(kept=tuple(_kept(function, use) for use in others))
 
     def decide_callback(self, holder: Function, callback: Callback) -> Site | Left:
         """Return the verdict on an L1 function that is passed by name, from the arguments of its call."""
@@ -75,9 +73,7 @@ class Verdicts:
     @staticmethod
     def callable(function: Function, form: Form) -> Site:
         """Return a function that is passed by name as a site."""
-        place = function.place(form.node)
-        stands = (function.module.path, place.line, place.column, place.line)
-        return Site(*stands, form, False, "", "passed by name", function)
+        return Site.at(function, form, "passed by name")
 
     def doubt(self, function: Function, form: Form, place: Place, left: Left) -> Optional[Problem]:
         """Return the warning of a skipped term that may be the loss, if nothing else is found; None of any other."""

@@ -63,6 +63,13 @@ class Site(NamedTuple):
     scope: Function
     kept: Tuple[Kept, ...] = ()
 
+    @classmethod
+    def at(cls, function: Function, form: Form, why: str, swapped: bool = False, selection: str = "") -> Site:
+        """Return a form in a function as a site."""
+        place = function.place(form.node)
+        stands = (function.module.path, place.line, place.column, place.last_line)
+        return cls(*stands, form, swapped, selection, why, function)
+
     @property
     def function(self) -> str:
         """The name of the function that it stands in."""
@@ -165,6 +172,13 @@ class Findings(NamedTuple):
     patched: List[Left]
     unreadable: List[Unreadable]
     program: Program
+
+    def with_more(self, **more: Sequence[Any]) -> Findings:
+        """Return findings with further ones, ``sites=...``, each kind in the order of the files."""
+        merged: Dict[str, Any] = {}
+        for kind, entries in more.items():
+            merged[kind] = sorted([*getattr(self, kind), *entries], key=lambda entry: (entry.path, entry.line))
+        return self._replace(**merged)
 
     def without(self, paths: Iterable[str]) -> None:
         """Remove what was found in files that were then given up."""

@@ -7,16 +7,17 @@ scoring and every other L1 are not changed. Writes legs.toml to FOLDER, and a jo
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Callable, Dict, Mapping, Optional, Sequence, Tuple
+from typing import TYPE_CHECKING, Any, Dict, Mapping, Optional, Sequence, Tuple
 
 from legs_loss import OPERATORS, LegsError, __version__
-from legs_loss.cli import Parser
-from legs_loss.system import never_fail_to_print, say, say_error
+from legs_loss.cli import Parser, exit_code
+from legs_loss.system import never_fail_to_print, say
 
 if TYPE_CHECKING:
     from legs_adapters.plan import Plan
@@ -38,12 +39,18 @@ EXIT_CODES = (
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
     args = argparse.Namespace(folder="", undo=False)
-    return _exit_code(args, lambda: _run(_parser().parse_args(argv, args)))
+    return exit_code("legs-patch", lambda: _run(_parser().parse_args(argv, args)), lambda: _so_far(args))
 
 
 def run(args: argparse.Namespace) -> int:
     """Patch, undo or verify, as the arguments say, and return the exit code."""
-    return _exit_code(args, lambda: _run(args))
+    return exit_code("legs-patch", lambda: _run(args), lambda: _so_far(args))
+
+
+def check_libcst() -> None:
+    """Raise a LegsError that says how to install LibCST where it is missing."""
+    if importlib.util.find_spec("libcst") is None:
+        raise LegsError("LibCST is missing: pip install 'legs-loss[patch]'")
 
 
 def _parser() -> Parser:
@@ -60,6 +67,7 @@ def _run(args: argparse.Namespace) -> int:
         raise LegsError("--undo can be combined with --diff, --force and --trust only")
     if args.trust is not None and not args.undo:
         raise LegsError("--trust requires --undo")
+    check_libcst()
     args.before = _journal(args.folder)
     if args.undo:
         return _undo(args)
@@ -71,41 +79,20 @@ def _run(args: argparse.Namespace) -> int:
     return _patch(args) or _verify(args, script)
 
 
-def _exit_code(args: argparse.Namespace, work: Callable[[], int]) -> int:
-    """Return the exit code of ``work``, which runs with these arguments; an error is a line on stderr."""
-    try:
-        return work()
-    except LegsError as error:
-        say_error("legs-patch", error)
-    except KeyboardInterrupt:
-        say(f"legs-patch: interrupted; {_so_far(args)}", sys.stderr)
-        return 130
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 0
-    except OSError as error:  # a full disk under --verify, a folder that went away
-        where = f"{error.filename}: " if error.filename is not None else ""
-        say(f"legs-patch: error: {where}{error.strerror or str(error)[:500]}; {_so_far(args)}", sys.stderr)
-    except ModuleNotFoundError as error:
-        if error.name != "libcst":
-            raise
-        say("legs-patch: error: LibCST is missing: pip install 'legs-loss[patch]'", sys.stderr)
-    return 2
-
-
 def _so_far(args: argparse.Namespace) -> str:
     """Return what was done so far, from the journal: a command writes all files and the journal, or nothing."""
     if _journal(args.folder) == getattr(args, "before", _journal(args.folder)):
-        return "nothing was changed"
+        return "; nothing was changed"
     if args.undo:
-        return "the patch was already undone"
-    return f"the patch was already written; undo it with: legs-patch --undo {args.folder}"
+        return "; the patch was already undone"
+    return f"; the patch was already written; undo it with: legs-patch --undo {args.folder}"
 
 
 class _Explain(argparse.Action):
     """Print the explanation of a rule, or without a name the list of rules, and exit; FOLDER is not required."""
 
     def __call__(self, parser: argparse.ArgumentParser, *given: object) -> None:
+        check_libcst()
         from legs_adapters.rules.document import explain, listed
 
         rule = given[1]
@@ -206,7 +193,7 @@ def _patch(args: argparse.Namespace) -> int:
     wrote = [] if args.diff or args.check else write(found, args.force)
     _show(args, found, wrote)
     if args.diff and not args.json:
-        print(as_diff(found.changes(), _is_coloured()), end="")
+        say(as_diff(found.changes()), end="", lines=True)
     elif args.check and not args.json:
         say("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
     elif wrote and not args.json:
@@ -257,7 +244,7 @@ def _undo(args: argparse.Namespace) -> int:
         say(json.dumps({"restored": done.restored, "removed": done.removed, "kept": done.kept}, indent=2), lines=True)
         return 0
     if args.diff:
-        print(as_diff(done.changes, _is_coloured()), end="")
+        say(as_diff(done.changes), end="", lines=True)
     else:
         for line in [f"restored {name}" for name in done.restored] + [f"removed {name}" for name in done.removed]:
             say(line)
@@ -293,10 +280,6 @@ def _site(root: Path, text: str) -> Tuple[str, int]:
         if full.is_file() and root in full.parents:
             return full.relative_to(root).as_posix(), int(line)
     raise LegsError(f"--site {text}: there is no such file in {root}")
-
-
-def _is_coloured() -> bool:
-    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import argparse
 import os
 from typing import Sequence
 
+from legs_adapters.cli import check_libcst
 from legs_loss import LegsError
 
 HELP = "run a training script with the LEGS loss, without changing its files"
@@ -32,23 +33,17 @@ def run(args: argparse.Namespace) -> int:
         LegsError: an option of ours stands behind the script, which does not know it.
     """
     _refuse_ours(args.script, args.arguments)
-    try:
-        from legs_adapters.runner import run_script
-    except ModuleNotFoundError as error:
-        if error.name != "libcst":
-            raise
-        raise LegsError("legs run needs LibCST: pip install 'legs-loss[patch]'") from None
+    check_libcst()
+    from legs_adapters.runner import run_script
+
     return run_script(args.script, args.arguments, args.cpu, args.ssim, args.masks)
 
 
 def _refuse_ours(script: str, arguments: Sequence[str]) -> None:
     """Raise for `legs run train.py --cpu`: what stands behind the script is the script's own."""
-    ours = [word for word in arguments if word in ("--cpu", "--ssim", "--masks")]
-    if ours and os.path.isfile(script):
-        with open(script, encoding="utf-8", errors="replace") as file:
-            text = file.read()
-        for option in ours:
-            if option[2:] not in text:
-                raise LegsError(
-                    f"{option} stands behind {script}, which does not know it: legs run {option} {script} ..."
-                )
+    for option in ("--cpu", "--ssim", "--masks"):
+        if option in arguments and os.path.isfile(script):
+            with open(script, "rb") as file:
+                if option[2:].encode() not in file.read():
+                    behind = f"{option} stands behind {script}, which does not know it"
+                    raise LegsError(f"{behind}: legs run {option} {script} ...")

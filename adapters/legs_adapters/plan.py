@@ -133,12 +133,8 @@ def _check_named(root: Path, findings: Findings, name: str, line: int, exclude: 
         for problem in findings.problems
         if (problem.path, problem.line) == (name, line)
     ]
-    found = next((reason for reason in reasons if reason is not None), None)
-    raise LegsError(
-        f"{name}:{line}: {found}"
-        if found is not None
-        else f"there is no difference, absolute value or call of two images at {name}:{line}"
-    )
+    why = next(filter(None, reasons), "there is no difference, absolute value or call of two images")
+    raise LegsError(f"{name}:{line}: {why}")
 
 
 def _files_to_edit(findings: Findings) -> List[str]:

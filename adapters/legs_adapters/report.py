@@ -17,8 +17,6 @@ from legs_loss.system import printable
 
 __all__ = ["as_diff", "as_json", "as_table"]
 
-_COLOURS = {"+++": 1, "---": 1, "+": 32, "-": 31, "@": 36}  # by how a line begins: bold, green, red, cyan
-
 
 def as_table(plan: Plan) -> str:
     """Return one line for every L1 term: its place, the verdict, and the reason."""
@@ -50,20 +48,19 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
     """Return all of it for a script; see docs/patching.md for the fields."""
     found = plan.findings
 
-    def line(entry: Any, **more: object) -> Dict[str, object]:
-        return {"file": entry.path, "line": entry.line, "code": entry.text, **more}
+    def line(entry: Any, code: Optional[str] = None, **more: object) -> Dict[str, object]:
+        return {"file": entry.path, "line": entry.line, "code": entry.text if code is None else code, **more}
 
     content: Dict[str, object] = {
         "root": str(plan.root),
         "sites": [
-            {
-                "file": site.path,
-                "line": site.line,
-                "column": site.column,
-                "function": site.function,
-                "code": one_line(site.form.node),
+            line(
+                site,
+                one_line(site.form.node),
+                column=site.column,
+                function=site.function,
                 **({} if site.form.weighs else {"term": site.form.term}),
-            }
+            )
             for site in found.sites
         ],
         "plain": [
@@ -88,17 +85,13 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
     return json.dumps(content, indent=2) + "\n"
 
 
-def as_diff(changes: Changes, colour: bool) -> str:
+def as_diff(changes: Changes) -> str:
     """Return a unified diff of files' bytes before and after; None is no file."""
     shown: List[str] = []
     for path, (before, after) in changes.items():
         names = "/dev/null" if before is None else f"a/{path}", "/dev/null" if after is None else f"b/{path}"
         for line in unified_diff(_lines(before), _lines(after), names):
-            text = printable(line, lines=True).rstrip("\n")
-            code = _COLOURS.get(text[:3], _COLOURS.get(text[:1]))
-            shown.append(f"\033[{code}m{text}\033[0m\n" if colour and code is not None else f"{text}\n")
-            if not line.endswith("\n"):
-                shown.append("\\ No newline at end of file\n")
+            shown.append(line if line.endswith("\n") else f"{line}\n\\ No newline at end of file\n")
     return "".join(shown)
 
 

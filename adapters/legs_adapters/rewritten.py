@@ -35,7 +35,7 @@ def install(sources: Dict[str, bytes]) -> None:
             return
         spawn.old_main_modules.append(sys.modules["__main__"])
         module = main_module("__mp_main__", path)
-        exec(Loader("__mp_main__", path, sources.get(os.path.realpath(path))).code(), module.__dict__)
+        exec(Loader("__mp_main__", path, sources.get(os.path.realpath(path))).get_code("__mp_main__"), module.__dict__)
         sys.modules["__main__"] = sys.modules["__mp_main__"] = module
 
     spawn._fixup_main_from_path = import_main
@@ -64,11 +64,7 @@ class Loader(importlib.machinery.SourceFileLoader):
             return self._data
         return super().get_data(os.fspath(path))
 
-    def get_code(self, fullname: str) -> Optional[CodeType]:
-        """Return the compiled source."""
-        return self.code()
-
-    def code(self) -> CodeType:
+    def get_code(self, fullname: str) -> CodeType:
         """Compile the source, and let tracebacks quote it."""
         data = self.get_data(self.path)
         if self._data is not None:

@@ -104,33 +104,28 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
     """
     file = _as_python_names(name)
     install(sources)
-    refusals: Tuple[Type[BaseException], ...] = ()
+    passed_on: Tuple[Type[BaseException], ...] = (SystemExit,)
     if cpu_root is not None:
         from legs_adapters.shims import MissingShim, start
 
         start(cpu_root)
-        refusals = (MissingShim,)
+        passed_on += (MissingShim,)
     sys.argv[:] = [name, *arguments]
     sys.path[0] = os.path.dirname(os.path.realpath(name))
     main = main_module("__main__", file)
     sys.modules["__main__"] = main
     try:
-        code = Loader("__main__", file, sources.get(os.path.realpath(name))).code()
+        code = Loader("__main__", file, sources.get(os.path.realpath(name))).get_code("__main__")
     except SyntaxError as error:
         sys.excepthook(type(error), error.with_traceback(None), None)
         return 1
     try:
         exec(code, main.__dict__)
-    except SystemExit:
-        raise
-    except KeyboardInterrupt as error:
-        _show(error)
-        return _interrupted()
-    except refusals:
+    except passed_on:
         raise
     except BaseException as error:
         _show(error)
-        return 1
+        return _interrupted() if isinstance(error, KeyboardInterrupt) else 1
     return 0
 
 

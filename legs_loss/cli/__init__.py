@@ -16,7 +16,7 @@ from legs_loss.cli.shared.parser import Parser
 from legs_loss.errors import LegsError
 from legs_loss.system import never_fail_to_print, plugins, say, say_error
 
-__all__ = ["Parser", "main"]
+__all__ = ["Parser", "exit_code", "main"]
 
 COMMANDS = (
     "scene",
@@ -39,29 +39,42 @@ EXIT_CODES = "exit codes: 0 done; 1 done, but some items failed; 2 bad input or 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs`` with these arguments (default: the process's own) and return its exit code."""
     never_fail_to_print()
+    return exit_code("legs", lambda: _run(argv))
+
+
+def _run(argv: Optional[Sequence[str]]) -> int:
+    parser = _parser()
+    args = parser.parse_args(argv)
+    if args.command is None:  # not an error: a user asks what there is
+        say(parser.format_help(), lines=True)
+        return 0
+    return args.run(args)
+
+
+def exit_code(command: str, work: Callable[[], int], so_far: Callable[[], str] = str) -> int:
+    """Return the exit code of a command's work; an error is a line on stderr.
+
+    Args:
+        command: its name.
+        work: all of it, which returns its exit code.
+        so_far: returns what an interrupted one has done, to be said behind that it was.
+    """
     try:
-        parser = _parser()
-        args = parser.parse_args(argv)
-        if args.command is None:  # not an error: a user asks what there is
-            say(parser.format_help(), lines=True)
-            return 0
-        return args.run(args)
+        return work()
     except LegsError as error:
-        say_error("legs", error)
-        return 2
+        say_error(command, error)
     except KeyboardInterrupt:
-        say("legs: interrupted", sys.stderr)
+        say(f"{command}: interrupted{so_far()}", sys.stderr)
         return 130
     except MemoryError as error:
-        say(f"legs: error: not enough memory{f' ({error})' if str(error) else ''}", sys.stderr)
-        return 2
+        say(f"{command}: error: not enough memory{f' ({error})' if str(error) else ''}", sys.stderr)
     except BrokenPipeError:  # `legs ... | head`: the reader left, which is no error of ours
         sys.stderr.close()
         return 0
     except OSError as error:  # a full disk, a folder that went away
         where = f"{error.filename}: " if error.filename is not None else ""
-        say(f"legs: error: {where}{error.strerror or error}", sys.stderr)
-        return 2
+        say(f"{command}: error: {where}{error.strerror or str(error)[:500]}{so_far()}", sys.stderr)
+    return 2
 
 
 def _parser() -> argparse.ArgumentParser:

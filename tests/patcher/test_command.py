@@ -161,7 +161,7 @@ class TestCommandLine:
         assert told.returncode == 2
         assert "write there: torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))" in told.stderr
         assert (
-            "no difference, absolute value or call of two images at train.py:1"
+            "train.py:1: there is no difference, absolute value or call of two images"
             in run("--site", "train.py:1", root).stderr
         )
 
@@ -209,7 +209,7 @@ class TestCommandLine:
         assert "l1_test += legs_loss.l1_loss(image, gt_image" in (root / "train.py").read_text()
         missing = run("--site", "train.py:3", root)
         assert missing.returncode == 2
-        assert "there is no difference, absolute value or call of two images at train.py:3" in missing.stderr
+        assert "train.py:3: there is no difference, absolute value or call of two images" in missing.stderr
 
     def test_a_function_that_is_settled_at_run_time_is_weighted_by_hand(self, tmp_path, run):
         texts = files("loss_from_eval_or_getattr_error")

@@ -72,7 +72,8 @@ def replace_files(root: Path, changes: Changes) -> None:
                     done.append(path)
             except BaseException:
                 for path in reversed(done):
-                    _restore(root, path, changes[path][0])
+                    before = changes[path][0]
+                    _put(root, path, None if before is None else _stage(root, path, before))
                 raise
     except OSError as error:
         raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
@@ -126,10 +127,6 @@ def _put(root: Path, path: str, staged: Optional[str]) -> None:
             return
         with folder_of(root, staged) as (source, new):
             os.replace(new, name, src_dir_fd=source, dst_dir_fd=folder)
-
-
-def _restore(root: Path, path: str, data: Optional[bytes]) -> None:
-    _put(root, path, None if data is None else _stage(root, path, data))
 
 
 def _sweep(root: Path) -> None:

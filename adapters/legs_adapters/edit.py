@@ -20,7 +20,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Module
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import dotted
+from legs_adapters.code.syntax import code, dotted
 from legs_adapters.terms.findings import Kept, Site
 from legs_adapters.terms.text import Edit, Text, on_one_line
 from legs_adapters.terms.writing import PACKAGE, Writing
@@ -29,6 +29,8 @@ from legs_loss import LegsError
 __all__ = ["PACKAGE", "Edit", "apply_edits", "rewrite", "why_not_compiled"]
 
 _STRINGS = (cst.SimpleString, cst.ConcatenatedString)
+_FUTURE = re.compile(r"from\s+__future__")
+_TORCH = re.compile(r"from\s+torch\b|import\s+(.*,\s*)?torch\b")
 
 
 def apply_edits(data: bytes, edits: Sequence[Edit]) -> bytes:
@@ -98,7 +100,7 @@ def _import(text: Text, package: str, in_place: bool) -> Edit:
         on_first = in_place and isinstance(body[0] if body else None, cst.SimpleStatementLine)
         return text.replace(at, at, f"{line}; " if on_first else line + newline)
     if in_place:
-        if _is_import(anchor.body[0]) and not _is_future(anchor.body[0]):
+        if _rank(anchor.body[0]):
             at = text.span(anchor.body[0])[0]
             return text.replace(at, at, f"{line}; ")
         at = text.span(anchor.body[-1])[1]
@@ -122,10 +124,9 @@ def _anchor(body: Sequence[cst.CSTNode]) -> Optional[cst.SimpleStatementLine]:
                 break
             continue
         first = statement.body[0]
-        if _is_import(first):
-            found.append((0 if _is_future(first) else 2 if "torch" in _roots(first) else 1, statement))
-        elif i == 0 and isinstance(first, cst.Expr) and isinstance(first.value, _STRINGS):
-            found.append((0, statement))
+        is_doc = i == 0 and isinstance(first, cst.Expr) and isinstance(first.value, _STRINGS)
+        if is_doc or isinstance(first, (cst.Import, cst.ImportFrom)):
+            found.append((_rank(first), statement))
     best = max((rank for rank, _ in found), default=0)
     return next((statement for rank, statement in reversed(found) if rank == best), None)
 
@@ -143,16 +144,7 @@ def _package_name(module: Module) -> Tuple[str, bool]:
     return PACKAGE, imported
 
 
-def _is_import(node: cst.CSTNode) -> bool:
-    return isinstance(node, (cst.Import, cst.ImportFrom))
-
-
-def _is_future(node: cst.CSTNode) -> bool:
-    return isinstance(node, cst.ImportFrom) and node.module is not None and dotted(node.module) == "__future__"
-
-
-def _roots(node: cst.CSTNode) -> List[str]:
-    """Return the packages that a statement imports from."""
-    if isinstance(node, cst.ImportFrom):
-        return [] if node.relative or node.module is None else [(dotted(node.module) or "").split(".")[0]]
-    return [(dotted(alias.name) or "").split(".")[0] for alias in node.names] if isinstance(node, cst.Import) else []
+def _rank(node: cst.CSTNode) -> int:
+    """Return how well a statement goes before our import: 2 is an import of torch, 1 any other, 0 none."""
+    text = code(node) if isinstance(node, (cst.Import, cst.ImportFrom)) else ""
+    return 0 if not text or _FUTURE.match(text) else 2 if _TORCH.match(text) else 1

@@ -77,7 +77,8 @@ class Journal(NamedTuple):
             content = json.loads(data.decode("utf-8"))
             if content["version"] != _VERSION:
                 raise ValueError("written by another version of legs-patch: undo with that version")
-            is_own = is_sealed(_canonical(content), content.pop("seal", None), root)
+            claimed = content.pop("seal", None)
+            is_own = is_sealed(_canonical(content), claimed, root)
             files = _read_files(content["files"])
             created = {_only(name, name == SETTINGS_FILE): _checksum(at) for name, at in content["created"].items()}
         except (LegsError, ValueError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
@@ -99,9 +100,7 @@ class Journal(NamedTuple):
             for path, layers in sorted(self.files.items())
         }
         content: Dict[str, Any] = {"note": _NOTE, "version": _VERSION, "files": files, "created": self.created}
-        sealed = seal(_canonical(content), root)
-        if sealed is not None:
-            content["seal"] = sealed
+        content["seal"] = seal(_canonical(content), root)
         data = (json.dumps(content, indent=1) + "\n").encode("utf-8")
         if len(data) > MAX_FILE_BYTES:
             raise LegsError(
@@ -126,8 +125,7 @@ def digest(data: bytes) -> str:
 
 
 def _canonical(content: Dict[str, Any]) -> bytes:
-    unsealed = {key: value for key, value in content.items() if key != "seal"}
-    return json.dumps(unsealed, sort_keys=True, separators=(",", ":")).encode("ascii")
+    return json.dumps(content, sort_keys=True, separators=(",", ":")).encode("ascii")
 
 
 def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:

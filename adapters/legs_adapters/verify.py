@@ -8,6 +8,7 @@ process of its own, see :mod:`legs_adapters.watched`.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shlex
 import shutil
@@ -34,12 +35,6 @@ SECONDS = 1800  # that a run may take
 NOT_COPIED = (".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs")
 MAX_COPIED = 64 << 20  # bytes of a file
 FIRST_STEP, LATER_STEPS = 1e-5, 1e-3  # relative differences of losses that rounding explains
-SETTINGS: Dict[str, Dict[str, str]] = {
-    "unpatched": {},
-    "patched": {},
-    "LEGS_OFF": {"LEGS_OFF": "1"},
-    "beta 0": {"LEGS_BETA": "0"},
-}
 # The arguments of a script like Inria's, where its source has these words. (Inria's options are named after attributes,
 # except those that train.py adds itself.)
 ARGUMENTS = (
@@ -155,10 +150,10 @@ def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str]
         if not (patched / JOURNAL).is_file():  # undone by another one, before this one had the lock
             raise LegsError(f"{root} is not patched any more: nothing to verify")
         undo(unpatched, force=True)
-        with_ssim = b"legs_loss.ssim" in (patched / JOURNAL).read_bytes()
-        for name, settings in SETTINGS.items():
-            if name == "beta 0" and not with_ssim:
-                continue
+        variables: Dict[str, Dict[str, str]] = {"unpatched": {}, "patched": {}, "LEGS_OFF": {"LEGS_OFF": "1"}}
+        if b"legs_loss.ssim" in (patched / JOURNAL).read_bytes():
+            variables["beta 0"] = {"LEGS_BETA": "0"}
+        for name, settings in variables.items():
             copy = unpatched if name == "unpatched" else patched
             given = _arguments(copy / script, arguments, iterations, scene=scene, output=Path(work) / f"output-{name}")
             runs[name] = _run(copy, [script, *given], iterations, Path(work) / f"{name}.json", settings)
@@ -186,10 +181,10 @@ def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
 
 def _are_close(losses: Sequence[str], others: Sequence[str]) -> bool:
     """Return whether the losses of two trainings agree: the first to rounding, which the later steps carry on."""
-    pairs = [(float.fromhex(one), float.fromhex(other)) for one, other in zip(losses, others)]
-    bounds = [FIRST_STEP, *[LATER_STEPS] * len(pairs)]
-    return 0 < len(pairs) == len(losses) == len(others) and all(
-        abs(one - other) <= bound * abs(one) for (one, other), bound in zip(pairs, bounds)
+    bounds = [FIRST_STEP, *[LATER_STEPS] * len(losses)]
+    return len(losses) == len(others) and all(
+        math.isclose(float.fromhex(one), float.fromhex(other), rel_tol=bound)
+        for one, other, bound in zip(losses, others, bounds)
     )
 
 

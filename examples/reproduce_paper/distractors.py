@@ -207,27 +207,36 @@ def legs(*words: str) -> None:
 
 
 def report(paths: Sequence[Path]) -> None:
-    """Print a table: each arm's held-out PSNR and Gaussians, and differences with 95% intervals over seeds, views."""
+    """Print tables: each arm's held-out PSNR and Gaussians, and differences with 95% intervals over seeds, views."""
     rows = [row for path in paths for row in json.loads(path.read_text())]
-    print("|codebase|capture|plain|masked|clean|masked - plain|masked - clean|plain - clean|Gaussians|")
-    print("|---|---|---:|---:|---:|---:|---:|---:|---:|")
+    table(rows, ARMS, (("masked", "plain"), ("masked", "clean"), ("plain", "clean")))
+    robust = {(row["codebase"], row["scene"]) for row in rows if row["arm"] == "robust"}
+    if robust:
+        print()
+        some = [row for row in rows if (row["codebase"], row["scene"]) in robust]
+        table(some, ("robust", "robust-clean"), (("robust", "plain"), ("masked", "plain"), ("robust-clean", "clean")))
+
+
+def table(rows: List[Dict[str, Any]], arms: Sequence[str], pairs: Sequence[Tuple[str, str]]) -> None:
+    """Print a table of these arms and differences."""
+    print("|".join(["", "codebase", "capture", *arms, *map(" - ".join, pairs), "Gaussians", ""]))
+    print(f"|---|---|{'---:|' * (len(arms) + len(pairs) + 1)}")
     for name in sorted({row["codebase"] for row in rows}):
         of_name = [row for row in rows if row["codebase"] == name]
         captures = [
             [row for row in of_name if row["scene"] == scene] for scene in sorted({r["scene"] for r in of_name})
         ]
         for capture in captures:
-            arms = [[row["metrics"] for row in capture if row["arm"] == arm] for arm in ARMS]
-            psnr = [np.array([metrics["test"]["psnr"] for metrics in arm]) for arm in arms]
+            metrics = [[row["metrics"] for row in capture if row["arm"] == arm] for arm in arms]
+            psnr = [np.array([one["test"]["psnr"] for one in arm]) for arm in metrics]
             cells = [f"{values.mean():.2f} ± {values.std(ddof=1):.2f}" for values in psnr]
-            numbers = ", ".join(f"{np.mean([metrics['gaussians'] for metrics in arm]):,.0f}" for arm in arms)
-            print(f"|{'|'.join([name, capture[0]['scene'], *cells, *differences([capture]), numbers])}|")
-        print(f"|{'|'.join([name, 'all', '', '', '', *differences(captures), ''])}|")
+            numbers = ", ".join(f"{np.mean([one['gaussians'] for one in arm]):,.0f}" for arm in metrics)
+            print("|".join(["", name, capture[0]["scene"], *cells, *differences([capture], pairs), numbers, ""]))
+        print("|".join(["", name, "all", *([""] * len(arms)), *differences(captures, pairs), "", ""]))
 
 
-def differences(captures: Sequence[List[Dict[str, Any]]]) -> List[str]:
+def differences(captures: Sequence[List[Dict[str, Any]]], pairs: Sequence[Tuple[str, str]]) -> List[str]:
     """Return by how much arms differ in held-out PSNR, in dB with the intervals."""
-    pairs = (("masked", "plain"), ("masked", "clean"), ("plain", "clean"))
     found = [pooled_difference(captures, *pair) for pair in pairs]
     return [f"{one.mean:+.2f} [{one.low:+.2f}, {one.high:+.2f}]" if one else "" for one in found]
 

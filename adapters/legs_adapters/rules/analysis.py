@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Iterable, Optional, Pattern
+from typing import Iterable
 
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
@@ -25,7 +25,6 @@ class Analysis:
 
     Args:
         program: the program.
-        speaks: a pattern of texts that contain a term; default: the words of an L1.
 
     Attributes:
         program: its files, linked by names.
@@ -39,10 +38,9 @@ class Analysis:
         splats: which of its functions are about Gaussian splatting.
     """
 
-    def __init__(self, program: Program, speaks: Optional[Pattern[str]] = None) -> None:
+    def __init__(self, program: Program) -> None:
         self.program = program
-        texts = [source.text for source in program.sources.values()]
-        self.prospects: Prospects = Prospects(texts, speaks) if speaks is not None else Prospects(texts)
+        self.prospects: Prospects = Prospects(source.text for source in program.sources.values())
         self.training: Training = Training(self.program, self.prospects.may_lead)
         self.meanings: Meanings = Meanings(self.program, self.training)
         self.origins: Meanings = Meanings(self.program, self.training, by_name=False)

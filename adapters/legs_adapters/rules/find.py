@@ -49,7 +49,7 @@ def find(
     """
     analysis = Analysis.of_files(sources)
     found = _Finder(analysis, by_hand).run()
-    found = with_ssims(found, by_hand) if ssim else found
+    found = with_ssims(found, analysis, by_hand) if ssim else found
     return with_masks(found, analysis) if masks else found
 
 

@@ -24,7 +24,7 @@ ORDER: Tuple[Rule, ...] = (
     other.NotSplats(),
 )
 # With legs-patch --ssim: nothing is weighted, so neither the images nor what the step trains matter.
-SSIM: Tuple[Rule, ...] = (*untrained.UNTRAINED, ssim.UnprovenSsim())
+SSIM: Tuple[Rule, ...] = (ssim.UnprovenSsim(),)
 RULES = {rule.id: rule for rule in (*ORDER, *SSIM)}
 
 

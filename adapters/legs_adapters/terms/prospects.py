@@ -1,4 +1,4 @@
-"""Find by words which text can lead to an L1, or to an SSIM: the others are not parsed.
+"""Find by words which text can lead to an L1: the others are not parsed.
 
 A text can lead to one if it mentions one, or a name that does: of a function, of a class whose ``forward`` does, or of
 a variable that holds one (``self.criterion = nn.L1Loss()``). False positives are possible, false negatives are not;
@@ -8,7 +8,7 @@ the search costs a hundredth of parsing.
 from __future__ import annotations
 
 import re
-from typing import Dict, Iterable, Iterator, List, Pattern, Set, Tuple
+from typing import Dict, Iterable, Iterator, List, Set, Tuple
 
 from legs_adapters.code.module import CALLED
 from legs_adapters.lexicon.words import SPEAKS_OF_L1
@@ -35,17 +35,15 @@ class Prospects:
 
     Args:
         texts: its files.
-        speaks: a pattern of texts that contain one; default: the words of an L1.
     """
 
-    def __init__(self, texts: Iterable[str], speaks: Pattern[str] = SPEAKS_OF_L1) -> None:
-        self._speaks = speaks
+    def __init__(self, texts: Iterable[str]) -> None:
         said = [(name, text) for whole in texts for name, text in _said(whole)]
         known = {name for name, _ in said}
         speakers: Dict[str, List[str]] = {}
         self._names: Set[str] = set()
         for name, text in said:
-            if speaks.search(text):
+            if SPEAKS_OF_L1.search(text):
                 self._names.add(name)
             else:
                 for word in known.intersection(_WORD.findall(text)):
@@ -61,7 +59,7 @@ class Prospects:
     def may_lead(self, text: str) -> bool:
         """Return whether a text can lead to an L1."""
         if text not in self._answers:
-            self._answers[text] = bool(self._speaks.search(text)) or not self._names.isdisjoint(_WORD.findall(text))
+            self._answers[text] = bool(SPEAKS_OF_L1.search(text)) or not self._names.isdisjoint(_WORD.findall(text))
         return self._answers[text]
 
 

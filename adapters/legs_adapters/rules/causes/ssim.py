@@ -15,8 +15,11 @@ class UnprovenSsim(Rule):
 
     id = "ssim-unproven"
     reason = "unproven SSIM"
-    VALID = ["loss = 1.0 - ssim(image, gt)", "loss = 1.0 - ssim(image, gt, window_size=11)"]
-    INVALID = ["loss = 1.0 - ssim(image, gt, window_size=7)", "loss = 1.0 - fused_ssim(image[None], gt[None])"]
+    VALID = ["loss = l1_loss(image, gt) - ssim(image, gt)", "loss = l1_loss(image, gt) - ssim(image, gt, 11)"]
+    INVALID = [
+        "loss = l1_loss(image, gt) - ssim(image, gt, window_size=7)",
+        "loss = l1_loss(image, gt) - fused_ssim(image[None], gt[None])",
+    ]
 
     def evidence(self, term: Term) -> List[Decider]:
         return [] if term.analysis.ssims.proven(term.function, term.form) is not None else term.here

@@ -19,9 +19,6 @@ __all__ = ["CALLED", "Class", "Function", "Module", "blocks_of", "index_by_word"
 CALLED = ("forward", "__call__")  # what calling an instance runs: a torch module's own, and Python's
 
 _T = TypeVar("_T")
-_PRINT_STATEMENT = re.compile(
-    r"^\s*(print\s+[\"'\w]|exec\s+[\"']|raise\s+\w+\s*,)|^\s*except\s+[\w.]+\s*,\s*\w+\s*:", re.M
-)
 _WORD = re.compile(r"(\w+)(?:\s*(\())?")  # a word, and whether it is called
 _DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
@@ -77,7 +74,7 @@ class Function:
                     self._body = header.body
                     self._inner = self.module.collect(self._body, self)
                 except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
-                    self.module.failure = _failure(self.module.path, self.module.text, error)
+                    self.module.failure = _failure(self.module.path, error)
         return self._body
 
     @property
@@ -111,7 +108,7 @@ class Function:
             try:
                 self._flow = Flow(self.body, parameters, self.module.budget.left(self.module.path))
             except RecursionError as error:
-                self.module.failure = _failure(self.module.path, self.module.text, error)
+                self.module.failure = _failure(self.module.path, error)
             if self._flow is None or not self.module.spend(self._flow.steps):
                 self._flow = Flow(cst.Module(body=[]), parameters)
         return self._flow
@@ -285,13 +282,12 @@ def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadabl
     try:
         return Module(source.path, source.text, budget)
     except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
-        return _failure(source.path, source.text, error)
+        return _failure(source.path, error)
 
 
-def _failure(path: str, text: str, error: Exception) -> Unreadable:
+def _failure(path: str, error: Exception) -> Unreadable:
     if isinstance(error, cst.ParserSyntaxError):
-        python2 = _PRINT_STATEMENT.search(text) is not None
-        return Unreadable(path, "Python 2" if python2 else f"does not parse (line {getattr(error, 'raw_line', 0)})")
+        return Unreadable(path, f"does not parse (line {error.raw_line})")
     if isinstance(error, RecursionError):
         return Unreadable(path, "is nested too deeply")
     return Unreadable(path, f"cannot be parsed: {type(error).__name__}")

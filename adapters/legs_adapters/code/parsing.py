@@ -130,12 +130,7 @@ def outline_part(lines: Lines) -> Tuple[Part, List[Optional[Cut]]]:
         assert body is not None
         indent, statements, end = body.groups()
         outline[cut.start : cut.end] = indent + b"0#".ljust(len(statements), b"x")[: len(statements)] + end
-    try:
-        return Part(lines, bytes(outline)), cuts
-    except cst.ParserSyntaxError:
-        if not any(cuts):
-            raise
-        return Part(lines, lines.data), []
+    return Part(lines, bytes(outline)), cuts
 
 
 def body_part(lines: Lines, cut: Cut) -> Part:

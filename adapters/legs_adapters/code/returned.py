@@ -9,29 +9,24 @@ import libcst as cst
 from legs_adapters.code.calls import callees
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, constant, every_parameter
+from legs_adapters.code.syntax import constant
 
 __all__ = [
     "called_makers",
     "default_key",
     "formatted_key",
     "forward_maker",
-    "known_arguments",
     "passed_on",
     "returned",
     "stored",
     "written",
 ]
 
-_MISSING = object()
 _Entry = Tuple[Function, cst.CSTNode]  # a value, and the function that it stands in
 
 
-def returned(function: Function, known: Dict[str, object]) -> Optional[cst.CSTNode]:
-    """Return what straight-line code returns, its local names filled in; None where that is not one expression.
-
-    ``known`` are values of parameters, which decide the branches that test them.
-    """
+def returned(function: Function) -> Optional[cst.CSTNode]:
+    """Return what straight-line code returns, its local names filled in; None where that is not one expression."""
     names: Dict[str, cst.BaseExpression] = {}
     work: List[cst.CSTNode] = list(function.body.body)
     while work:
@@ -39,30 +34,12 @@ def returned(function: Function, known: Dict[str, object]) -> Optional[cst.CSTNo
         if isinstance(statement, cst.SimpleStatementLine):
             work[:0] = statement.body
         elif isinstance(statement, cst.Return):
-            value = _filled(statement.value, names) if statement.value is not None else None
-            while isinstance(value, cst.IfExp) and _truth(value.test, known) is not None:
-                value = value.body if _truth(value.test, known) else value.orelse
-            return value
+            return _filled(statement.value, names) if statement.value is not None else None
         elif isinstance(statement, cst.Assign) and isinstance(statement.targets[0].target, cst.Name):
             names[statement.targets[0].target.value] = _filled(statement.value, names)
-        elif isinstance(statement, cst.If) and _truth(statement.test, known) is not None:
-            branch = statement.body if _truth(statement.test, known) else statement.orelse
-            inside = branch.body if isinstance(branch, cst.Else) else branch
-            work[:0] = inside.body if isinstance(inside, cst.BaseSuite) else list(filter(None, [inside]))
         elif not isinstance(statement, (cst.Assert, cst.Pass)) and not _is_text(statement):
             return None
     return None
-
-
-def known_arguments(function: Function, call: Optional[cst.Call]) -> Dict[str, object]:
-    """Return the parameters whose values a call fixes: literals, and defaults of missing arguments."""
-    assert isinstance(function.node, cst.FunctionDef)
-    if call is None or arguments(call)[2]:
-        return {}
-    defaults = {each.name.value: each.default for each in every_parameter(function.node.params)}
-    given = {name: function.given(call, name) or default for name, default in defaults.items()}
-    values = {name: constant(value, _MISSING) for name, value in given.items()}
-    return {name: value for name, value in values.items() if value is not _MISSING}
 
 
 def _is_text(statement: cst.CSTNode) -> bool:
@@ -85,23 +62,6 @@ def _filled(node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> c
     filled = node.visit(Fill()) if names else node
     assert isinstance(filled, cst.BaseExpression)
     return filled
-
-
-def _truth(node: cst.BaseExpression, known: Dict[str, object]) -> Optional[bool]:
-    """Return whether a test of a parameter is true: ``mask is None``, ``not mask``; None where it is unknown."""
-    if isinstance(node, cst.Name) and node.value in known:
-        return bool(known[node.value])
-    if isinstance(node, cst.UnaryOperation) and isinstance(node.operator, cst.Not):
-        inner = _truth(node.expression, known)
-        return None if inner is None else not inner
-    if isinstance(node, cst.Comparison) and len(node.comparisons) == 1 and isinstance(node.left, cst.Name):
-        operator, right = node.comparisons[0].operator, constant(node.comparisons[0].comparator, _MISSING)
-        if node.left.value in known and right is not _MISSING:
-            if isinstance(operator, (cst.Is, cst.Equal)):
-                return known[node.left.value] == right
-            if isinstance(operator, (cst.IsNot, cst.NotEqual)):
-                return known[node.left.value] != right
-    return None
 
 
 def passed_on(function: Function, node: cst.CSTNode) -> Optional[str]:

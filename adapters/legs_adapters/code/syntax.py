@@ -6,7 +6,7 @@ import ast
 import dataclasses
 import functools
 import re
-from typing import Any, Dict, FrozenSet, Iterable, Iterator, List, Optional, Set, Tuple
+from typing import Any, Dict, FrozenSet, Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
 
@@ -25,7 +25,6 @@ __all__ = [
     "path_of",
     "root_of",
     "same",
-    "walk_all",
     "walk_expressions",
     "word_set",
     "words",
@@ -204,19 +203,10 @@ def every_parameter(parameters: cst.Parameters) -> Iterator[cst.Param]:
             yield extra
 
 
-def walk_all(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
-    """Yield a node and every node under it, in no particular order."""
-    stack = [node]
-    while stack:
-        part = stack.pop()
-        yield part
-        stack.extend(children(part))
-
-
-def words_in(nodes: Iterable[cst.CSTNode]) -> Set[str]:
-    """Return the words of those nodes that are names or strings."""
+def words_in(*nodes: cst.CSTNode) -> Set[str]:
+    """Return the words of the names and strings in expressions."""
     found: Set[str] = set()
-    for node in nodes:
+    for node in (part for each in nodes for part in walk_expressions(each)):
         if isinstance(node, cst.Name):
             found.update(words(node.value))
         elif isinstance(node, cst.SimpleString) and isinstance(constant(node), str):

@@ -124,8 +124,8 @@ def _selected(call: CallReading) -> Optional[Meaning]:
 
 
 def _statistic(call: CallReading) -> Optional[Meaning]:
-    spoken = set(words(call.name))
-    is_statistic = spoken & STATISTICS and not spoken & MATCHED and call.values
+    tokens = set(words(call.name))
+    is_statistic = tokens & STATISTICS and not tokens & MATCHED and call.values
     return Meaning("feature", call.ask(call.values[0]).role) if is_statistic else None
 
 

@@ -29,16 +29,16 @@ _L1_NAME = re.compile(
 
 def kind_of_words(name: str) -> Optional[str]:
     """Return the kind of image in a name; the most specific of several."""
-    spoken = words(name)
-    said = [word for word in spoken if not word.isdigit() and word not in HELD_IN | WHICH]
-    if said and said[-1] in LAID_OVER:
+    tokens = words(name)
+    own = [word for word in tokens if not word.isdigit() and word not in HELD_IN | WHICH]
+    if own and own[-1] in LAID_OVER:
         return "mask"  # applied to an image, it gives an image
-    kinds = {KIND_OF[word] for word in spoken if word in KIND_OF}
+    kinds = {KIND_OF[word] for word in tokens if word in KIND_OF}
     if "image" in kinds:  # sky_rgb, render_sh
-        if spoken[-1] in PICTURES:
-            spoken = tuple(word for word in spoken if word not in OF_ONE)  # offset_image, not image_offset
-        kinds = {KIND_OF[word] for word in spoken if word in KIND_OF and word not in OF_PICTURES}
-        if "base" in spoken or "precomp" in spoken:  # rendered_base_color; colors_precomp, a colour for each Gaussian
+        if tokens[-1] in PICTURES:
+            tokens = tuple(word for word in tokens if word not in OF_ONE)  # offset_image, not image_offset
+        kinds = {KIND_OF[word] for word in tokens if word in KIND_OF and word not in OF_PICTURES}
+        if "base" in tokens or "precomp" in tokens:  # rendered_base_color; colors_precomp, a colour for each Gaussian
             return "parameter"
     return min(kinds, key=KINDS.index) if kinds else None
 

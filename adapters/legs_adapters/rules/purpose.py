@@ -13,10 +13,10 @@ import libcst as cst
 from legs_adapters.code.calls import callees, given_to, likely_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import call_name, dotted, walk_all, words, words_in
+from legs_adapters.code.syntax import call_name, dotted, walk_expressions, words, words_in
 from legs_adapters.lexicon.words import EMBEDDING, MODELS, PLUMBING, POSES
 from legs_adapters.tensors.backward import Training
-from legs_adapters.tensors.steps import gradients_read, has_step, is_backward, is_step, may_step
+from legs_adapters.tensors.steps import has_step, is_backward, is_step, may_step, reads_gradients
 from legs_adapters.terms.findings import Decider
 
 __all__ = ["Purpose", "Purposes"]
@@ -61,7 +61,7 @@ class Purposes:
         may_train = self._may_train(function, own, 0, False)
         inner: List[cst.Call] = []  # the backward passes of the innermost loop that has one
         for scope in [*function.flow.loops_around(node), function.body]:
-            inside = {id(part) for part in walk_all(scope)}
+            inside = {id(part) for part in walk_expressions(scope)}
             steps = [call for call in function.flow.calls if id(call) in inside and is_step(call)]
             within = [call for call in passes if id(call) in inside]
             if inner and len(within) > len(inner) and not may_train:
@@ -84,14 +84,14 @@ class Purposes:
         None does where gradients are read and then reset, or where the script, or a function that reads them, ends.
         """
         at = function.place(call).start
-        read = read or _reads_gradients(function)
+        read = read or reads_gradients(function)
         for later in sorted(function.flow.calls, key=lambda each: function.place(each).start):
             if function.place(later).start > at:
                 name, called = call_name(later), callees(self.program, function, later)
                 called = called or (self.program.methods_named(name) if name else [])  # one of them may run
                 if may_step([later]) or any(map(has_step, called)):
                     return True
-                read = read or any(map(_reads_gradients, called))
+                read = read or any(map(reads_gradients, called))
                 if name == "zero_grad":
                     return not read
         if may_step(function.flow.calls):
@@ -106,7 +106,7 @@ class Purposes:
         assert isinstance(step.func, cst.Attribute)
         optimiser = step.func.value
         name = set(words(optimiser.attr.value)) if isinstance(optimiser, cst.Attribute) else set()
-        found = name if name & POSES else words_in(walk_all(optimiser))  # gaussians.optimizer_cam moves cameras
+        found = name if name & POSES else words_in(optimiser)  # gaussians.optimizer_cam moves cameras
         definitions = self.program.lookup(function, optimiser)
         owner = self.program.owner_of(function)
         if not definitions and owner is not None and isinstance(optimiser, cst.Attribute):
@@ -115,14 +115,10 @@ class Purposes:
             made = definition.value
             if definition.kind == "parameter":
                 given = [value for _, value in given_to(self.program, where, definition.place) if value is not None]
-                found |= words_in(part for value in given for part in walk_all(value))
+                found |= words_in(*given)
             if isinstance(made, cst.Call) and _OPTIMISER.search(call_name(made)) and made.args:
-                found |= words_in(part for value in _listed(where, made.args[0].value) for part in walk_all(value))
+                found |= words_in(*_listed(where, made.args[0].value))
         return found - PLUMBING
-
-
-def _reads_gradients(function: Function) -> bool:
-    return "grad" in function.text and bool(gradients_read(list(walk_all(function.body))))
 
 
 def _listed(function: Function, node: cst.CSTNode) -> List[cst.CSTNode]:

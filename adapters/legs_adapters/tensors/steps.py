@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Iterable, List
+from typing import Iterable
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import call_name, walk_all, words, words_in
+from legs_adapters.code.syntax import call_name, walk_expressions, words, words_in
 from legs_adapters.tensors.operations import BACKWARD, OPTIMISERS, SCHEDULES, STEPS
 
 __all__ = [
-    "gradients_read",
     "has_step",
     "is_backward",
     "is_step",
     "may_step",
+    "reads_gradients",
 ]
 
 
@@ -40,7 +40,7 @@ def may_step(calls: Iterable[cst.Call]) -> bool:
 
 
 def _is_of_schedule(call: cst.Call) -> bool:
-    return isinstance(call.func, cst.Attribute) and bool(words_in(walk_all(call.func.value)) & SCHEDULES)
+    return isinstance(call.func, cst.Attribute) and bool(words_in(call.func.value) & SCHEDULES)
 
 
 def has_step(function: Function) -> bool:
@@ -48,8 +48,9 @@ def has_step(function: Function) -> bool:
     return "step" in function.text and any(map(is_step, function.flow.calls))
 
 
-def gradients_read(parts: List[cst.CSTNode]) -> List[cst.Attribute]:
-    """Return the gradients that are read, ``xyz.grad``; not those that are only compared, assigned or reset."""
+def reads_gradients(function: Function) -> bool:
+    """Return whether a function reads gradients, ``xyz.grad``; not where they are only compared, assigned or reset."""
+    parts = list(walk_expressions(function.body)) if "grad" in function.text else []
     others = [part for part in parts if isinstance(part, (cst.Comparison, cst.AssignTarget))]
-    unread = {id(each) for part in others for each in walk_all(part)}
-    return [p for p in parts if isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in unread]
+    unread = {id(each) for part in others for each in walk_expressions(part)}
+    return any(isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in unread for p in parts)

@@ -9,7 +9,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program, Reference
-from legs_adapters.code.returned import known_arguments, returned
+from legs_adapters.code.returned import returned
 from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, walk_expressions
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
@@ -83,7 +83,7 @@ class L1Functions:
             return None
         if set(function.decorators) - TRANSPARENT:
             return "own"  # the decorator may change what is returned: a mean, a weight
-        value = returned(function, known_arguments(function, call))
+        value = returned(function)
         shape = self._shape_of(function, value, depth) if isinstance(value, cst.Call) else None
         return shape or ("own" if SPEAKS_OF_LOSS.search(function.name) or function.runs_by_instance else None)
 

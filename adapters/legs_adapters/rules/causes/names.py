@@ -56,8 +56,8 @@ class EvaluationName(Rule):
         return [header(term.function)] if shows and not _trains_its_own(term) else []
 
     def evidence_of_call(self, call: CallContext) -> List[Decider]:
-        spoken = set(words(call.function.name))
-        return [header(call.function)] if spoken & EVALUATING and "train" not in spoken else []
+        tokens = set(words(call.function.name))
+        return [header(call.function)] if tokens & EVALUATING and "train" not in tokens else []
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether the function is named as a loss: only some of its callers may evaluate."""
@@ -82,7 +82,7 @@ class OtherName(Rule):
         return [decider for name, decider in names if self.words & set(words(name))][:1]
 
     def may_be_loss(self, term: Term) -> bool:
-        """Return whether the name may mean something else: it is told where no other term was found."""
+        """Return whether the name may mean something else: it is reported where no other term was found."""
         return True
 
 
@@ -97,8 +97,8 @@ NAMES = (
 
 def _is_of_tracking(name: str) -> bool:
     """Return whether a name is about optimising poses: for tracking, or to align a test view."""
-    spoken = set(words(name))
-    return {"test", "pose"} <= spoken or bool(spoken & TRACKING and not spoken & MAPPING)
+    tokens = set(words(name))
+    return {"test", "pose"} <= tokens or bool(tokens & TRACKING and not tokens & MAPPING)
 
 
 def _trains_its_own(term: Term) -> bool:

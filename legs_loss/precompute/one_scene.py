@@ -24,7 +24,6 @@ from legs_loss.system import held_back
 __all__ = ["Report", "precompute"]
 
 _COMMIT_SECONDS = 1.0
-_COMPILES = "the first time on a machine it compiles for 10 to 40 s"
 
 
 @dataclass
@@ -99,9 +98,7 @@ def precompute(
         due = time.monotonic()  # the first at once, so that there is a store
         with closing(results):
             try:
-                bar = tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress, postfix=_COMPILES)
-                for result in bar:
-                    bar.postfix = None
+                for result in tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress):
                     if result.unwritable is not None:
                         raise LegsError(f"cannot write to {out}: {result.unwritable}")
                     if result.problem is not None:

@@ -4,6 +4,10 @@
 
 The libcuda of the tests (compiled by g++) takes each call and returns; the images are of the CPU and tiny, so what is
 timed is autograd, the packing of arguments and the calls. On a GPU torch's own allocations cost a little more.
+
+The measure is the least that SSIM alone can take in Python: an autograd.Function that allocates a map and two slopes
+and launches a kernel, takes the map's mean, and in backward allocates a gradient and launches another. Exit status 1
+where one of ours is above the goal.
 """
 
 from __future__ import annotations
@@ -20,11 +24,34 @@ from typing import Any, Callable, Dict
 import torch
 
 from legs_loss.kernels.contract import Weights
+from legs_loss.kernels.cuda.backend import THREADS, CudaBackend, Task
+from legs_loss.kernels.cuda.driver import CudaDriver
+from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules
+from legs_loss.kernels.cuda.nvrtc import Compiler
 from legs_loss.spec import PRESETS
-from tests.cuda_emulation import COMPILER, emulated, libraries
+from tests.cuda_emulation import COMPILER, Runtime, libraries
 
 STEPS = 200
 GOAL = 60.0  # microseconds
+
+
+class Thin(torch.autograd.Function):
+    """A wrapper that checks nothing and packs nothing anew: one launch each way."""
+
+    @staticmethod
+    def forward(ctx: Any, prediction: torch.Tensor, target: torch.Tensor, launch: Callable[[], None]) -> torch.Tensor:
+        similarity, first, second = (torch.empty_like(prediction) for _ in range(3))
+        launch()
+        ctx.save_for_backward(prediction, target, first, second)
+        ctx.launch = launch
+        return similarity
+
+    @staticmethod
+    def backward(ctx: Any, *arrived: torch.Tensor) -> Any:
+        prediction = ctx.saved_tensors[0]
+        gradient = torch.empty_like(prediction)
+        ctx.launch()
+        return gradient, None, None
 
 
 def main() -> int:
@@ -36,17 +63,26 @@ def main() -> int:
         print("needs g++", file=sys.stderr)
         return 2
     torch.set_num_threads(1)
-    backend, spec = emulated(), PRESETS["legs"]
+    driver = CudaDriver(torch.device("cpu"), libraries().cuda, Runtime())  # as on a GPU, where no test looks on
+    modules = Modules(driver, Compiler(libraries().nvrtc), BinaryCache(libraries().cache))
+    backend, spec = CudaBackend(lambda device: modules), PRESETS["legs"]
     target = torch.rand(1, 3, 8, 8)
     prediction = (0.9 * target).requires_grad_()
     kept, stored = backend.response_range(target, spec), torch.rand(1, 1, 8, 8)
-    steps: Dict[str, Callable[[], Any]] = {
+    task, kernel = Task(), (modules.function("legs_finish", PLAIN), 1, THREADS)
+    ours: Dict[str, Callable[[], Any]] = {
         "the whole loss, weights from the target": lambda: backend.loss(prediction, target, Weights(spec), 0.2),
         "the whole loss, stored map": lambda: backend.loss(prediction, target, Weights(map=stored), 0.2),
         "L1, remembered range": lambda: backend.weighted_l1(prediction, target, Weights(spec, kept)),
         "SSIM": lambda: backend.ssim(prediction, target),
+    }
+    steps = {
+        **ours,
+        "a thin wrapper of SSIM": lambda: Thin.apply(prediction, target, lambda: driver.launch(task, kernel)).mean(),
         "torch's own |a - b|.mean()": lambda: (prediction - target).abs().mean(),
     }
+    result = torch.empty(())
+    task.result = result.data_ptr()
     for step in steps.values():
         step().backward()
     library, context = libraries().cuda, ctypes.c_void_p()
@@ -58,12 +94,12 @@ def main() -> int:
         for name, step in steps.items():
             found[name].append(microseconds(step, prediction))
     for name, values in found.items():
-        print(
-            f"{name:<42} {statistics.median(values):6.0f} us  ({min(values):.0f} to {max(values):.0f}; goal {GOAL:.0f})"
-        )
+        print(f"{name:<42} {statistics.median(values):6.0f} us  ({min(values):.0f} to {max(values):.0f})")
     if args.json:
         Path(args.json).write_text(json.dumps({"us": found}) + "\n", encoding="utf-8")
-    return 0
+    above = [name for name in ours if statistics.median(found[name]) > GOAL]
+    print(f"above the goal of {GOAL:.0f} us: {', '.join(above) or 'none'}")
+    return 1 if above else 0
 
 
 def microseconds(step: Callable[[], Any], prediction: torch.Tensor) -> float:

@@ -109,10 +109,9 @@ class RecordingDriver(CudaDriver):
     def function(self, module: int, name: str) -> Any:
         return name, super().function(module, name)
 
-    def launch(self, function: Any, blocks: int, threads: int, task: Any) -> None:
-        name, own = function
-        self.launches.append((name, blocks))
-        super().launch(own, blocks, threads, task)
+    def launch(self, task: Any, *kernels: Any) -> None:
+        self.launches += [(name, blocks) for (name, _), blocks, _ in kernels]
+        super().launch(task, *[(own, blocks, threads) for (_, own), blocks, threads in kernels])
 
 
 class EmulatedDriver(RecordingDriver):
@@ -122,9 +121,9 @@ class EmulatedDriver(RecordingDriver):
         self.cuda = libraries().cuda
         super().__init__(torch.device("cpu"), self.cuda, Runtime(multiprocessors))
 
-    def launch(self, function: Any, blocks: int, threads: int, task: Any) -> None:
+    def launch(self, task: Any, *kernels: Any) -> None:
         self.cuda.test_reverse(int(self.backwards))
-        super().launch(function, blocks, threads, task)
+        super().launch(task, *kernels)
 
 
 def emulated(driver: Optional[CudaDriver] = None, flags: Sequence[str] = ()) -> CudaBackend:

@@ -36,8 +36,8 @@ class FakeDriver:
     def function(self, module, name):
         return name
 
-    def launch(self, function, blocks, threads, task):
-        self.launches.append(function)
+    def launch(self, task, *kernels):
+        self.launches += [name for name, _, _ in kernels]
 
     def capturing(self):
         return self.captures

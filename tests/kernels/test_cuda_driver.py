@@ -57,7 +57,7 @@ def sums(modules, values):
     """Launch legs_finish on partial sums of two blocks; return the loss."""
     partial, result = torch.tensor(values), torch.zeros(())
     task = Task(partial=partial.data_ptr(), result=result.data_ptr(), count=2)
-    modules.driver.launch(modules.function("legs_finish", PLAIN), 1, THREADS, task)
+    modules.driver.launch(task, (modules.function("legs_finish", PLAIN), 1, THREADS))
     return result.item()
 
 
@@ -85,12 +85,12 @@ class TestLaunch:
         assert [sums(each, [2.0, 2.0]) for each in built] == [4.0, 4.0]
         foreign = built[0].function("legs_finish", PLAIN)
         with pytest.raises(DriverError, match=r"cuLaunchKernel failed: .*\(400\)"):
-            built[1].driver.launch(foreign, 1, THREADS, Task())
+            built[1].driver.launch(Task(), (foreign, 1, THREADS))
 
     @pytest.mark.parametrize(("blocks", "threads", "code"), [(2**31, THREADS, 1), (0, THREADS, 1), (1, 128, 701)])
     def test_what_the_hardware_refuses_is_an_error(self, modules, blocks, threads, code):
         with pytest.raises(DriverError, match=rf"cuLaunchKernel failed: .*\({code}\)"):
-            modules.driver.launch(modules.function("legs_finish", PLAIN), blocks, threads, Task())
+            modules.driver.launch(Task(), (modules.function("legs_finish", PLAIN), blocks, threads))
 
 
 class TestLoading:

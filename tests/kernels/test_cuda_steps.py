@@ -47,7 +47,7 @@ class TestLaunch:
     def test_a_gradient_of_overlapping_windows_is_addressable(self, parts, monkeypatch):
         """As dense as memory is it would have rows of 2^24 values, and the last of them beyond 31 bits."""
         tasks = []
-        monkeypatch.setattr(parts[0], "launch", lambda function, blocks, threads, task: tasks.append((function, task)))
+        monkeypatch.setattr(parts[0], "launch", lambda task, *kernels: tasks.append((kernels[0][0], task)))
         windows = torch.empty(1 << 17, device="meta").as_strided((1, 65536, 256, 256), (0, 1, 2, 512))
         backend = CudaBackend(lambda _: parts[2])
         backend.ssim(windows.requires_grad_(), torch.empty(windows.shape, device="meta"))

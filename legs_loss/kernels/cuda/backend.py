@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from typing import Any, Callable, Dict, FrozenSet, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, FrozenSet, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
@@ -107,7 +107,7 @@ class CudaBackend(Backend):
 
     def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
         """Return each view's least response and the span."""
-        return self._of(target).response_range(_batch(target.detach()), spec)[0]
+        return self._of(target).response_range(_batch(target.detach()), spec)
 
     def loss(self, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
         """Return the whole loss."""
@@ -131,21 +131,25 @@ class CudaBackend(Backend):
         return device
 
 
+_Launch = Tuple[Any, int, int]  # a kernel, its blocks and threads
+
+
 class _Plan(NamedTuple):
-    """A launch that is prepared: all but the addresses.
+    """The launches of an operation, prepared: all but the addresses.
 
     Attributes:
-        own, finish: the kernels.
-        blocks: of the first of them.
-        task: its argument.
+        task: their argument; its count is of the sums that ``kernels`` add up.
+        kernels: the operation, and what adds up its blocks.
+        ranging: those that make responses and range, where the weights come from the target.
+        ranged: the blocks of these.
         copies: whether prediction and target must be made contiguous first: strides that the kernels cannot address.
         gradient: the gradient's strides, or None where none is wanted.
     """
 
-    own: Any
-    finish: Any
-    blocks: int
     task: Task
+    kernels: Tuple[_Launch, ...]
+    ranging: Tuple[_Launch, ...]
+    ranged: int
     copies: Tuple[bool, bool]
     gradient: Optional[Tuple[int, ...]]
 
@@ -165,99 +169,91 @@ class _Device:
         """
         if prediction.dtype != target.dtype:
             prediction, target = prediction.float(), target.float()
-        prediction, target = _batch(prediction), _batch(target)
         dtype = prediction.dtype
 
         def compute(wanted: bool, x: Tensor, constants: Sequence[Optional[Tensor]]) -> Tuple[Tensor, Optional[Tensor]]:
             y, map_, mask, found = constants
             assert y is not None
             given = Weights(weights.spec, found, map_, mask, weights.renormalise)
-            return self._loss_and_gradient(x, y.detach(), given, shares, wanted)
+            loss, gradient = self._loss_and_gradient(_batch(x), _batch(y.detach()), given, shares, wanted)
+            return loss, gradient[0] if gradient is not None and x.dim() == 3 else gradient
 
         def scale(gradient: Tensor, step: Tensor) -> Tensor:
             return self._scaled(gradient, step, dtype)
 
         return differentiable(prediction, (target, weights.map, weights.mask, weights.range), compute, scale)
 
-    def response_range(self, y: Tensor, spec: WeightSpec, kept: bool = False) -> Tuple[Tensor, Optional[Tensor]]:
-        """Return the least response of each view of [B, C, H, W], and the greatest less the least: float32 [B, 2].
-
-        With ``kept`` the response of every pixel, too: float32 [B, H, W].
-        """
+    def response_range(self, y: Tensor, spec: WeightSpec) -> Tensor:
+        """Return the least response of each view of [B, C, H, W], and the greatest less the least: float32 [B, 2]."""
         key = (y.shape, y.stride(), y.dtype, spec)
-        plan = self._plans.get(key)
-        if plan is None:
-            plan = self._keep(key, self._plan_of_range(y, spec))
+        plan = self._plans.get(key) or self._keep(key, self._plan_of(y, y, spec, None, False))
         y = y.contiguous() if plan.copies[1] else y
         task = Task.from_buffer_copy(plan.task)
-        partial = torch.empty(3 * task.count, dtype=torch.float32, device=y.device)
-        result = torch.empty((y.shape[0], 2), dtype=torch.float32, device=y.device)
+        result = y.new_empty((y.shape[0], 2), dtype=torch.float32)
+        partial = y.new_empty(3 * plan.ranged, dtype=torch.float32)
         task.target, task.partial, task.result = y.data_ptr(), partial.data_ptr(), result.data_ptr()
-        response = None
-        if kept:
-            views, _, height, width = y.shape
-            response = torch.empty((views, height, width), dtype=torch.float32, device=y.device)
-            task.response = response.data_ptr()
-        self._launch(plan.own, plan.blocks, THREADS, task)
-        self._launch(plan.finish, y.shape[0], THREADS, task)
-        return result, response
+        task.count = plan.ranged
+        self._launch(task, *plan.ranging)
+        return result
 
     def _loss_and_gradient(
         self, x: Tensor, y: Tensor, weights: Weights, shares: Shares, wanted: bool
     ) -> Tuple[Tensor, Optional[Tensor]]:
         spec = weights.spec if shares.l1 else None
         key = (x.shape, x.stride(), y.stride(), x.dtype, wanted, shares, spec)
-        plan = self._plans.get(key)
-        if plan is None:
-            plan = self._keep(key, self._plan_of_loss(x, y, spec, shares, wanted))
+        plan = self._plans.get(key) or self._keep(key, self._plan_of(x, y, spec, shares, wanted))
         x, y = (images.contiguous() if copied else images for images, copied in zip((x, y), plan.copies))
         task = Task.from_buffer_copy(plan.task)
-        # These must live until the launch; the allocator keeps the order of one stream.
-        held = self._add_weights(task, y, weights, spec, streams=shares.ssim != 0.0) if shares.l1 else []
+        task.prediction, task.target = x.data_ptr(), y.data_ptr()
+        # What is held must live until the last launch; the allocator keeps the order of one stream.
+        held = [self._add_map(task, y, weights), self._add_range(task, y, weights, plan, shares)] if shares.l1 else []
         gradient = None
         if plan.gradient is not None:
             gradient = torch.empty_strided(x.shape, plan.gradient, dtype=torch.float32, device=x.device)
             task.gradient = gradient.data_ptr()
-        partial = torch.empty(plan.blocks, dtype=torch.float32, device=x.device)
-        loss = torch.empty((), dtype=torch.float32, device=x.device)
-        task.prediction, task.target = x.data_ptr(), y.data_ptr()
+        partial = x.new_empty(plan.task.count, dtype=torch.float32)
+        loss = x.new_empty((), dtype=torch.float32)
         task.partial, task.result = partial.data_ptr(), loss.data_ptr()
-        self._launch(plan.own, plan.blocks, THREADS, task)
-        self._launch(plan.finish, 1, THREADS, task)
+        self._launch(task, *plan.kernels)
         del held
         return loss, gradient
 
-    def _add_weights(
-        self, task: Task, y: Tensor, weights: Weights, spec: Optional[WeightSpec], streams: bool
-    ) -> List[Tensor]:
-        """Set a task's weights, of the streaming pass with the responses; return the memory they are in."""
-        held, response = [], None
+    def _add_range(self, task: Task, y: Tensor, weights: Weights, plan: _Plan, shares: Shares) -> Sequence[Tensor]:
+        """Set the range of a task's weights, for the streaming pass the responses, too; return their memory."""
+        if not plan.ranging:
+            return ()
         views, _, height, width = y.shape
-        if spec is not None:
-            found = weights.range
-            if found is None or streams:
-                made, response = self.response_range(y, spec, streams)
-                found = made if found is None else found
-            found = found.to(device=y.device, dtype=torch.float32).contiguous()
-            if found.shape != (views, 2):
-                raise ValueError(f"a range {list(found.shape)} does not fit images {list(y.shape)}")
-            task.range = found.data_ptr()
-            held.append(found)
-            if response is not None:
-                task.response = response.data_ptr()
-                held.append(response)
+        given, made = weights.range, None
+        if given is not None:
+            if given.shape != (views, 2):
+                raise ValueError(f"a range {list(given.shape)} does not fit images {list(y.shape)}")
+            given = given.to(device=y.device, dtype=torch.float32).contiguous()
+        if given is None or shares.ssim:  # one piece of memory: the range, sums of blocks, responses
+            start = 2 * views + 3 * plan.ranged
+            made = y.new_empty(start + (views * height * width if shares.ssim else 0), dtype=torch.float32)
+            base = made.data_ptr()
+            task.range, task.result, task.partial = base, base, base + 8 * views
+            task.response = base + 4 * start if shares.ssim else None
+            count, task.count = task.count, plan.ranged
+            self._launch(task, *plan.ranging)
+            task.count = count
+        if given is not None:
+            task.range = given.data_ptr()
+        return [values for values in (given, made) if values is not None]
+
+    def _add_map(self, task: Task, y: Tensor, weights: Weights) -> Optional[Tensor]:
+        """Set the factors of a task's weights that are given for each pixel; return their memory."""
         factors = [values for values in (weights.map, _mask_of(weights)) if values is not None]
-        if factors:
-            wrong = [
-                list(each.shape) for each in factors if each.numel() not in (height * width, views * height * width)
-            ]
-            if wrong:
-                raise ValueError(f"weights {wrong[0]} do not fit images {list(y.shape)}")
-            planes = [values.detach().to(torch.float32).reshape(-1, height, width) for values in factors]
-            product = (planes[0] if len(planes) == 1 else planes[0] * planes[1]).contiguous()
-            task.map, task.map_view = product.data_ptr(), product.shape[0] > 1
-            held.append(product)
-        return held
+        if not factors:
+            return None
+        views, _, height, width = y.shape
+        wrong = [list(each.shape) for each in factors if each.numel() not in (height * width, views * height * width)]
+        if wrong:
+            raise ValueError(f"weights {wrong[0]} do not fit images {list(y.shape)}")
+        planes = [values.detach().to(torch.float32).reshape(-1, height, width) for values in factors]
+        product = (planes[0] if len(planes) == 1 else planes[0] * planes[1]).contiguous()
+        task.map, task.map_view = product.data_ptr(), product.shape[0] > 1
+        return product
 
     def _scaled(self, gradient: Tensor, step: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the gradient times the incoming gradient of backward, rounded once, in the prediction's type."""
@@ -266,7 +262,7 @@ class _Device:
         count = gradient.numel()
         task = Task(gradient=gradient.data_ptr(), scaled=scaled.data_ptr(), step=step.data_ptr(), count=count)
         blocks = max(1, min(-(-count // (4 * THREADS)), 16 * self._modules.driver.multiprocessors))
-        self._launch(self._modules.function("legs_scale", variant_of(dtype, None)), blocks, THREADS, task)
+        self._launch(task, (self._modules.function("legs_scale", variant_of(dtype, None)), blocks, THREADS))
         return scaled
 
     def _keep(self, key: Any, plan: _Plan) -> _Plan:
@@ -275,39 +271,40 @@ class _Device:
         self._plans[key] = plan
         return plan
 
-    def _plan_of_loss(self, x: Tensor, y: Tensor, spec: Optional[WeightSpec], shares: Shares, wanted: bool) -> _Plan:
+    def _plan_of(
+        self, x: Tensor, y: Tensor, spec: Optional[WeightSpec], shares: Optional[Shares], wanted: bool
+    ) -> _Plan:
+        """Return the plan of a loss, or without shares of the range alone."""
         modules, plain, weighted = self._modules, variant_of(x.dtype, None), variant_of(x.dtype, spec)
         modules.load(weighted, plain, PLAIN)  # backward's too, which a capture may contain alone
         copies = (not _is_addressable(x), not _is_addressable(y))
         task = _task_of(x, spec)
         task.of_prediction = _layout_of(x.contiguous() if copies[0] else x)
         task.of_target = _layout_of(y.contiguous() if copies[1] else y)
-        task.l1_step, task.ssim_step = shares.l1 / x.numel(), 4.0 * shares.ssim / x.numel()
-        task.constant = shares.constant
-        term = "l1" if shares.ssim == 0.0 else ("loss" if shares.l1 else "ssim")
-        task.strip, blocks = strip_of(x, modules.driver.multiprocessors, wanted)
-        if term == "l1":
-            task.chunks = chunks_of(x)
-            blocks = task.chunks * task.views
-        task.count = blocks
+        task.chunks = chunks_of(x)
+        ranged = task.count = task.chunks * task.views
+
+        def launch(name: str, variant: Variant, blocks: int) -> _Launch:
+            return modules.function(f"legs_{name}", variant), blocks, THREADS
+
+        kernels: Tuple[_Launch, ...] = ()
+        ranging = kernels
+        if spec is not None:
+            ranging = launch("range", weighted, ranged), launch("range_finish", weighted, task.views)
+        if shares is not None:
+            task.l1_step, task.ssim_step = shares.l1 / x.numel(), 4.0 * shares.ssim / x.numel()
+            task.constant = shares.constant
+            term = "l1" if shares.ssim == 0.0 else ("loss" if shares.l1 else "ssim")
+            if term != "l1":
+                task.strip, task.count = strip_of(x, modules.driver.multiprocessors, wanted)
+            own = launch(f"{term}_{'gradient' if wanted else 'value'}", weighted if term == "l1" else plain, task.count)
+            kernels = own, launch("finish", PLAIN, 1)
         strides = None
         if wanted:  # dense, where x may be windows that overlap
             dense = torch.empty_like(x, dtype=torch.float32)
             dense = dense if _is_addressable(dense) else dense.contiguous()
             task.of_gradient, strides = _layout_of(dense), dense.stride()
-        variant = weighted if term == "l1" else plain
-        own = modules.function(f"legs_{term}_{'gradient' if wanted else 'value'}", variant)
-        return _Plan(own, modules.function("legs_finish", PLAIN), blocks, task, copies, strides)
-
-    def _plan_of_range(self, y: Tensor, spec: WeightSpec) -> _Plan:
-        modules, variant = self._modules, variant_of(y.dtype, spec)
-        copied = not _is_addressable(y)
-        task = _task_of(y, spec)
-        task.of_target = _layout_of(y.contiguous() if copied else y)
-        task.chunks = chunks_of(y)
-        task.count = y.shape[0] * task.chunks
-        own, finish = (modules.function(name, variant) for name in ("legs_range", "legs_range_finish"))
-        return _Plan(own, finish, task.count, task, (False, copied), None)
+        return _Plan(task, kernels, ranging, ranged, copies, strides)
 
 
 def variant_of(dtype: torch.dtype, spec: Optional[WeightSpec]) -> Variant:

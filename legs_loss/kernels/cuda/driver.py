@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from contextlib import contextmanager
-from typing import Any, Dict, Iterator, List, Optional
+from typing import Any, Dict, Iterator, List, Optional, Tuple
 
 import torch
 
@@ -77,7 +77,7 @@ class CudaDriver:
         library = load_library() if library is None else library
         for name, arguments in _ARGUMENTS.items():
             getattr(library, name).argtypes = arguments
-        self._library, self._runtime = library, runtime
+        self._library, self._runtime, self._launch_kernel = library, runtime, library.cuLaunchKernel
         torch.empty(1, device=device)  # torch makes the context before it is asked for
         index = runtime.current_device() if device.index is None else device.index
         self._index = index
@@ -117,17 +117,25 @@ class CudaDriver:
         assert function.value is not None
         return function.value
 
-    def launch(self, function: int, blocks: int, threads: int, task: ctypes.Structure) -> None:
-        """Launch a kernel on torch's current stream; its one argument is copied at once."""
-        arguments, stream = _One(ctypes.addressof(task)), self._stream(self._index)
-        given = (function, blocks, 1, 1, threads, 1, 1, 0, stream, arguments, None)
+    def launch(self, task: ctypes.Structure, *kernels: Tuple[int, int, int]) -> None:
+        """Launch kernels, each with its blocks and threads, in this order on torch's current stream.
+
+        Their one argument is copied at once.
+        """
         now = _POINTER()
         self._call("cuCtxGetCurrent", ctypes.byref(now))
         if now.value == self._context:  # as a rule; a generator would take some microseconds
-            self._call("cuLaunchKernel", *given)
+            self._launch_all(task, kernels)
         else:
             with self._current():
-                self._call("cuLaunchKernel", *given)
+                self._launch_all(task, kernels)
+
+    def _launch_all(self, task: ctypes.Structure, kernels: Tuple[Tuple[int, int, int], ...]) -> None:
+        arguments, stream = _One(ctypes.addressof(task)), self._stream(self._index)
+        for function, blocks, threads in kernels:
+            code = self._launch_kernel(function, blocks, 1, 1, threads, 1, 1, 0, stream, arguments, None)
+            if code:
+                self._fail("cuLaunchKernel", code)
 
     def capturing(self) -> bool:
         """Return whether the current stream is being captured: nothing is loaded then."""
@@ -159,8 +167,10 @@ class CudaDriver:
 
     def _call(self, name: str, *arguments: Any) -> None:
         code = getattr(self._library, name)(*arguments)
-        if code == 0:
-            return
+        if code:
+            self._fail(name, code)
+
+    def _fail(self, name: str, code: int) -> None:
         text = ctypes.c_char_p()
         self._library.cuGetErrorString(code, ctypes.byref(text))
         reason = f"{(text.value or b'unknown error').decode()} ({code})"

@@ -229,7 +229,7 @@ def table(rows: List[Dict[str, Any]], arms: Sequence[str], pairs: Sequence[Tuple
         for capture in captures:
             metrics = [[row["metrics"] for row in capture if row["arm"] == arm] for arm in arms]
             psnr = [np.array([one["test"]["psnr"] for one in arm]) for arm in metrics]
-            cells = [f"{values.mean():.2f} ± {values.std(ddof=1):.2f}" for values in psnr]
+            cells = [f"{v.mean():.2f}" + (f" ± {v.std(ddof=1):.2f}" if len(v) > 1 else "") for v in psnr]
             numbers = ", ".join(f"{np.mean([one['gaussians'] for one in arm]):,.0f}" for arm in metrics)
             print("|".join(["", name, capture[0]["scene"], *cells, *differences([capture], pairs), numbers, ""]))
         print("|".join(["", name, "all", *([""] * len(arms)), *differences(captures, pairs), "", ""]))

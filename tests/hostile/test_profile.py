@@ -36,7 +36,14 @@ PROFILES = {
 }
 
 
-@pytest.mark.parametrize("what", PROFILES, ids=lambda what: what.replace(" ", "_"))
+# These run a copy of the checkout as far as their command.
+RUN = ("a command after a semicolon", "a command in a command", "no script")
+CASES = [
+    pytest.param(what, id=what.replace(" ", "_"), marks=[pytest.mark.slow] if what in RUN else []) for what in PROFILES
+]
+
+
+@pytest.mark.parametrize("what", CASES)
 def test_a_stranger_s_profile(what, tiny_scene, tmp_path, capsys):
     text, line = PROFILES[what]
     place = tmp_path / "place"

@@ -79,7 +79,7 @@ MATCHED = word_set("match matching matched equalize equalized")  # histogram_mat
 LOADING = word_set("load read get open fetch")
 OF_DIFFUSION = word_set("guidance_scale negative_prompt num_inference_steps strength")  # arguments where it paints
 PERCEPTUAL = word_set("vgg perceptual lpips gram dists clip dino")
-MESH = word_set("mesh meshhead texture")  # of triangles: what they draw is no splat
+MESH = word_set("bake baked baking mesh meshhead texture")  # of triangles: what they draw is no splat
 ROBUST = word_set("huber tukey cauchy")  # a weight would move their thresholds
 
 # -- cameras, models and what optimisers move

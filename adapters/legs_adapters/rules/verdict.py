@@ -6,10 +6,10 @@ from typing import Optional
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
-from legs_adapters.code.syntax import one_line, words
+from legs_adapters.code.syntax import one_line, words, words_in
 from legs_adapters.lexicon.masks import is_rows
 from legs_adapters.lexicon.meaning import swapped
-from legs_adapters.lexicon.words import PERCEPTUAL
+from legs_adapters.lexicon.words import MESH, PERCEPTUAL, WARPED
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import RULES, first
 from legs_adapters.rules.rule import Term
@@ -81,11 +81,11 @@ class Verdicts:
         rule = RULES[left.evidence.rule] if left.evidence is not None else None
         if rule is None or not rule.may_be_loss(term) or is_measured(function, form) or same_root(form):
             return None
-        if any(PERCEPTUAL & set(words(name)) for name, _ in term.names_around):
-            return None
-        pictures = "image" in (term.pair.a.kind, term.pair.b.kind)
-        pictures = pictures or (function.runs_by_instance and is_role(form.first) and is_role(form.second))
-        if not pictures or (rule.needs_target and "target" not in (term.pair.a.role, term.pair.b.role)):
+        names = [*dict(term.names_around), *getattr(self.analysis.program.owner_of(function), "methods", ())]
+        other = (PERCEPTUAL | WARPED | MESH) & words_in(form.node).union(*map(words, names))
+        a, b = term.pair.a, term.pair.b
+        pictures = "image" in (a.kind, b.kind) or (function.runs_by_instance and all(map(is_role, term.sides)))
+        if other or not pictures or (rule.needs_target and "target" not in (a.role, b.role)):
             return None
         return self.problem(term, place, f"nothing shows that this is the loss ({left.reason})")
 

@@ -108,6 +108,7 @@ def training(args):
                 optimizer.step()
                 optimizer.zero_grad()
     report(args.out, rank, gaussians)
+    dist.destroy_process_group()  # else a thread of gloo's may end the process
 
 
 def report(out, rank, gaussians):

@@ -252,6 +252,7 @@ class TestOnesOwn:
         refused = run("--undo", root, ran=ran, XDG_STATE_HOME=str(place))
         assert refused.returncode == 2
         assert "or its key is gone" in refused.stderr
+        assert place.exists() == (state_home != "absent")  # to look at a seal makes no key
         name = re.search(r"--trust (\w{16}) ", refused.stderr).group(1)
         assert run("--undo", "--trust", name, root, ran=ran, XDG_STATE_HOME=str(place)).returncode == 0
         assert snapshot(root) == before

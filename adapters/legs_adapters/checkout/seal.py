@@ -24,17 +24,18 @@ KEY = "journal.key"
 _BYTES = 32
 
 
-def seal(content: bytes, root: Path) -> Optional[str]:
+def seal(content: bytes, root: Path, make: bool = True) -> Optional[str]:
     """Return the seal of a journal's content; None where no key can be read or made.
 
     Args:
         content: what is sealed.
         root: the checkout. A state folder inside of it is not used: others may have written it.
+        make: whether a key is made where there is none.
     """
     folder = _folder()
     if folder is not None and root != folder and root not in folder.parents:
         with contextlib.suppress(OSError, LegsError):
-            if not os.path.lexists(str(folder / KEY)):
+            if make and not os.path.lexists(str(folder / KEY)):
                 _make_key(folder)
             key = read_regular(folder / KEY, 1 << 10)
             if len(key) == _BYTES:
@@ -44,7 +45,7 @@ def seal(content: bytes, root: Path) -> Optional[str]:
 
 def is_sealed(content: bytes, claimed: object, root: Path) -> bool:
     """Return whether a journal's seal was made by this user, with the key that is still there."""
-    own = seal(content, root)
+    own = seal(content, root, make=False)
     return own is not None and hmac.compare_digest(own.encode(), str(claimed).encode("utf-8", "replace"))
 
 

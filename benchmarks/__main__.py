@@ -35,6 +35,7 @@ PARTS: Dict[str, List[str]] = {
     "drop-in-1": ["drop_in.py", "--threads", "1"],
     "drop-in-2": ["drop_in.py", "--threads", "2"],
     "memory": ["loss.py", "--parts", "memory"],
+    "threads-2": ["loss.py", "--parts", "threads", "--threads", "2", "--rounds", "25"],
     "growth": ["loss.py", "--parts", "growth", "--rounds", "3"],
     "precompute": ["precompute.py"],
     "precompute-r1": ["precompute.py", "--resolution", "1"],

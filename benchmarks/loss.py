@@ -2,6 +2,7 @@
 
     python benchmarks/loss.py --threads 1 --size 1297x840
     python benchmarks/loss.py --parts growth
+    python benchmarks/loss.py --parts threads --threads 2         # what they give, by the clock: a quiet machine
     python benchmarks/loss.py --device cuda --parts loss memory   # fused-ssim too, where it is installed
 
 The contenders take turns in every round, on the same eight pairs of images and the same threads; a ratio is taken
@@ -23,8 +24,9 @@ import os
 import statistics
 import subprocess
 import sys
+import time
 from pathlib import Path
-from typing import Any, Dict, Tuple
+from typing import Any, Dict, List, Tuple
 
 import torch
 from losses.contenders import losses, weightings
@@ -33,6 +35,7 @@ from losses.machine import machine, set_threads
 from losses.tables import TOO_LONG, at_bandwidth, side_by_side
 from losses.timing import timed
 
+THREADED = ("LEGS, weights in the kernel", "LEGS, stored map", "3DGS by the kernel")
 GROWTH = ((400, 266), (800, 533), (1297, 840), (1600, 1066), (3840, 2160), (7680, 4320))
 
 
@@ -47,7 +50,7 @@ def main() -> None:
         "size": f"{args.size[0]}x{args.size[1]}",
     }
     for part in args.parts:
-        result[part] = {"loss": loss, "weights": weights, "memory": memory, "growth": growth}[part](args)
+        result[part] = PARTS[part](args)
     if args.json:
         Path(args.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
@@ -56,6 +59,9 @@ def loss(args: argparse.Namespace) -> Any:
     print(f"\nforward and backward, {args.size[0]}x{args.size[1]} RGB, {where(args)}")
     contenders = losses(some_images(args.size, args.device))
     if args.only:
+        missing = [name for name in args.only if name not in contenders]
+        if missing:
+            sys.exit(f"loss.py: --only {missing[0]!r} is not here; these are: {', '.join(contenders)}")
         contenders = {name: contenders[name] for name in args.only}
     table = side_by_side(contenders, args.rounds, "LEGS, weights in the kernel", args.device)
     if args.device.type == "cuda":
@@ -115,6 +121,28 @@ def growth(args: argparse.Namespace) -> Any:
     return found
 
 
+def threads(args: argparse.Namespace) -> Any:
+    """Time our steps on one thread and on several in turns, all by the clock; print how many times faster they are."""
+    print(f"\nwhat {args.threads} threads give, forward and backward, {args.size[0]}x{args.size[1]} RGB")
+    found = {}
+    for name, step in losses(some_images(args.size, args.device)).items():
+        if name not in (args.only or THREADED):
+            continue
+        rounds: Dict[int, List[float]] = {1: [], args.threads: []}
+        for _ in range(args.rounds + 1):
+            for count, seconds in rounds.items():
+                set_threads(count)
+                before = time.perf_counter()
+                step()
+                seconds.append(time.perf_counter() - before)
+        one, several = (1e3 * statistics.median(seconds[1:]) for seconds in rounds.values())
+        gains = sorted(a / b for a, b in zip(rounds[1][1:], rounds[args.threads][1:]))
+        found[name] = {"ms": [one, several], "gain": [statistics.median(gains), gains[0], gains[-1]]}
+        spread = f"{statistics.median(gains):.2f} ({gains[0]:.2f} to {gains[-1]:.2f})"
+        print(f"{name:<34} {one:7.2f} ms   {several:7.2f} ms   {spread}", flush=True)
+    return found
+
+
 def peak_memory(name: str, size: Tuple[int, int], device: torch.device) -> int:
     """Return by how many bytes one step raises this process's peak (on Linux); a small one came first, to load all.
 
@@ -155,6 +183,9 @@ def parse() -> argparse.Namespace:
         parser.error("torch finds no CUDA GPU here")
     set_threads(args.threads)
     return args
+
+
+PARTS = {"loss": loss, "weights": weights, "memory": memory, "growth": growth, "threads": threads}
 
 
 if __name__ == "__main__":

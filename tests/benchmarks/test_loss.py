@@ -43,6 +43,18 @@ def test_the_contenders_are_timed_in_turns(tmp_path: Path) -> None:
         assert min(row["ms"]) > 0
 
 
+@pytest.mark.slow
+def test_one_thread_and_two_take_turns(tmp_path: Path) -> None:
+    file = tmp_path / "threads.json"
+    arguments = ["--size", "40x30", "--rounds", "3", "--parts", "threads", "--threads", "2", "--json", str(file)]
+    done = run(*arguments, "--only", NAMES[1], LEGS_BACKEND="numba")
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(file.read_text())["threads"].values()
+    one, two = row["ms"]
+    middle, least, greatest = row["gain"]
+    assert min(one, two) > 0 and 0 < least <= middle <= greatest
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_missing_gpu_is_said() -> None:
     done = run("--device", "cuda")

@@ -29,7 +29,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
 
 
 def on_page_content(content: str, page: Any, config: Any, **_: Any) -> str:
-    """Append the table of all codebases to its page, with a field that filters it."""
+    """Show names that docstrings refer to as code, and append to its page the table of codebases with a filter."""
+    content = re.sub(r":\w+:<code>~?(?:[\w.]+\.)?(\w+)</code>", r"<code>\1</code>", content)  # `:func:` is Sphinx's
     if page.file.src_uri != "compatibility.md":
         return content
     with Path(config["docs_dir"], "compatibility", "corpus.csv").open(encoding="utf-8", newline="") as file:

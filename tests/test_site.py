@@ -38,6 +38,7 @@ class TestSite:
         reference = (site / "api.html").read_text(encoding="utf-8")
         for name in ("l1_loss", "WeightSpec", "register_curve", "percentile"):
             assert name in reference
+        assert ":func:<code>" not in reference
         assert "data:image/png;base64" in (site / "decision.html").read_text(encoding="utf-8")
         start = (site / "index.html").read_text(encoding="utf-8")
         assert start.index("legs-patch") < start.index("legs run")
@@ -46,6 +47,7 @@ class TestSite:
         assert listed.partition('id="codebases"')[2].count("<tr>") == len(rows)
         for page in site.glob("**/*.html"):
             text = page.read_text(encoding="utf-8")
+            assert "<th></th>\n</tr>" not in text, f"{page}: a table without heads"
             for host in ("fonts.googleapis.com", "unpkg.com/mermaid"):
                 assert host not in text, page
 

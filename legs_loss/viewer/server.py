@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import sys
 import time
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, Dict, Tuple
 
@@ -80,7 +82,7 @@ def _start(host: str, port: int) -> Tuple[Any, str]:
             """Share nothing."""
 
     guard = Guard(host)
-    with guard.before_every_handshake():
+    with guard.before_every_handshake(), redirect_stdout(io.StringIO()):  # viser prints an address without the token
         server = Unshared(host=host, port=port, verbose=False)
     if not guard.on:
         server.stop()

@@ -205,7 +205,8 @@ class TestBrowser:
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         view = subprocess.Popen(command, env=legs_environment(), **pipes)
         try:
-            said = next(line for line in view.stdout if line.endswith("(Ctrl-C ends)\n"))
+            said = view.stdout.readline()
+            assert said.endswith("(Ctrl-C ends)\n")
             assert said.startswith("3dgs, legs: http://127.0.0.1:")
             page.goto(said.split()[2])
             for row in rows:

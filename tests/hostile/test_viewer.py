@@ -74,6 +74,16 @@ def types(connection):
     return found
 
 
+def test_no_address_is_printed_that_is_refused(tmp_path, capsys):
+    from legs_loss.viewer.server import serve
+
+    write_ply(tmp_path / "g.ply", some((255, 0, 0), 4))
+    server, address = serve(find_content(tmp_path / "g.ply"), port=free_port())
+    server.stop()
+    assert "token=" in address
+    assert "http" not in capsys.readouterr().out
+
+
 def test_the_printed_address_shows_the_splats(page):
     status, cookie, body = page.get(f"/?{page.query}")
     assert (status, body[:15].lower()) == (200, b"<!doctype html>")

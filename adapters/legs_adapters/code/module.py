@@ -153,7 +153,7 @@ class Function:
 
 
 class Class:
-    """A class: its methods, what its body assigns, and the values that methods store in its attributes."""
+    """A class: its methods, and the values that they store in its attributes."""
 
     def __init__(self, module: Module, node: cst.ClassDef, parent: Function) -> None:
         self.module = module
@@ -161,8 +161,6 @@ class Class:
         self.parent = parent
         self.name: str = node.name.value
         self.methods: Dict[str, Function] = {}
-        own = Flow(node.body).definitions
-        self.fields: Dict[str, Definition] = {name: made[-1] for name, made in own.items() if made[-1].kind == "assign"}
 
     def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
         """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""

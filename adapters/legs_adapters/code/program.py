@@ -113,8 +113,7 @@ class Program(Checkout):
         if kind in ("assign", "with", "parameter") and value is not None:
             return declared + self.resolve(where, value, depth + 1)
         if kind == "element" and definition.index is not None and isinstance(value, cst.Call):
-            made = self._wrapped(where, value, definition.index, depth)
-            return made or self._returned(self.resolve(where, value.func, depth + 1), definition.index, depth)
+            return self._wrapped(where, value, definition.index, depth)
         return declared
 
     def _declared(self, where: Function, parameter: cst.CSTNode, depth: int) -> List[Reference]:
@@ -141,7 +140,7 @@ class Program(Checkout):
         made = self.resolve(function, node.func, depth)
         instances = [Reference("instance", ref.target) for ref in made if ref.kind == "class"]
         instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
-        return instances + self._returned(made, None, depth)
+        return instances + self._returned(made, depth)
 
     def _wrapped(self, function: Function, node: cst.Call, index: int, depth: int) -> List[Reference]:
         """Resolve ``DataParallel(model)``, and ``model, optimizer = accelerator.prepare(model, optimizer)``."""
@@ -150,15 +149,12 @@ class Program(Checkout):
         found = self.resolve(function, given[index], depth + 1) if index < len(given) else []
         return [reference for reference in found if reference.kind == "instance"]
 
-    def _returned(self, made: List[Reference], index: Optional[int], depth: int) -> List[Reference]:
-        """Resolve what functions return, or one of a tuple: ``render = get_renderer(kind)``, ``net = get_model()``."""
-        found: List[Reference] = []
-        for callee in [ref.target for ref in made if isinstance(ref.target, Function)]:
-            for value in callee.flow.returns:
-                if index is None:
-                    found += self.resolve(callee, value, depth + 1)
-                elif isinstance(value, cst.Tuple) and index < len(value.elements):
-                    found += self.resolve(callee, value.elements[index].value, depth + 1)
+    def _returned(self, made: List[Reference], depth: int) -> List[Reference]:
+        """Resolve what functions return: ``render = get_renderer(kind)``."""
+        callees = [ref.target for ref in made if isinstance(ref.target, Function)]
+        found = [
+            ref for callee in callees for value in callee.flow.returns for ref in self.resolve(callee, value, depth + 1)
+        ]
         return [r for r in found if r.kind in ("function", "lambda", "instance")]
 
     def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> List[Reference]:
@@ -262,8 +258,6 @@ class Program(Checkout):
             if name in current.methods:
                 references.append(Reference("function", current.methods[name]))
                 break
-            if name in current.fields:
-                references += self.of_definition(current.parent, current.fields[name], depth)
             for method, definition in current.stores(name):
                 references += self.of_definition(method, definition, depth + 1)
         return _unique(references)

@@ -7,7 +7,7 @@ from typing import Callable, Dict, List, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import callees, given_to, handed
+from legs_adapters.code.calls import given_to, handed
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
@@ -144,8 +144,6 @@ class Training:
 
     def _place(self, function: Function, node: cst.CSTNode, key: object) -> None:
         definitions = self.program.lookup(function, node)
-        if isinstance(node, cst.Name) and (isinstance(key, str) or _begins_empty(definitions)):
-            self._fill(function, node, key)
         if not definitions and isinstance(node, cst.Subscript):
             inner = key_of(node)
             self._push(function, node.value, _ANY if inner is None else inner)
@@ -162,29 +160,9 @@ class Training:
     def _is_near(self, function: Function) -> bool:
         return self._matters(function.text)
 
-    def _fill(self, function: Function, node: cst.Name, key: object) -> None:
-        """Follow ``self.compute(image, output)``, which puts ``output["loss"]`` into the dictionary trained on."""
-        for call in function.flow.calls if function.module.spend(len(function.flow.calls)) else ():
-            if not any(isinstance(arg.value, cst.Name) and arg.value.value == node.value for arg in call.args):
-                continue
-            for callee in filter(self._is_near, callees(self.program, function, call)):
-                for parameter in callee.parameters:
-                    given, known = callee.given(call, parameter), callee.flow.definitions
-                    if isinstance(given, cst.Name) and given.value == node.value:
-                        stores = [d for d in known.get(parameter, []) if d.kind in ("store", "mutate")]
-                        stores += known.get(f"{parameter}[{key!r}]", [])
-                        if stores:
-                            self._record(function, call, callee)
-                        for definition in stores:
-                            self._definition(callee, definition, key)
-
     def _definition(self, function: Function, definition: Definition, key: object) -> None:
         value, kind = definition.value, definition.kind
-        if kind in ("function", "import", "class"):
-            for reference in self.program.of_definition(function, definition):
-                if isinstance(reference.target, Function):
-                    self._return(reference.target)
-        elif kind == "store":
+        if kind == "store":
             if definition.key in (None, key) or key is _ANY:
                 self._push(function, value)
         elif isinstance(definition.node, cst.AugAssign):
@@ -214,9 +192,3 @@ def _entries(node: cst.CSTNode, key: object) -> Sequence[cst.CSTNode]:
         found = [each.value for each in literal if constant(each.key) == key]
         return found if len(literal) == len(node.elements) else []
     return []
-
-
-def _begins_empty(definitions: Optional[List[Tuple[Function, Definition]]]) -> bool:
-    """Return whether a dictionary is empty where it is made, ``losses = {}``, and filled before it is returned."""
-    values = [definition.value for _, definition in definitions or () if definition.kind == "assign"]
-    return bool(values) and all(isinstance(value, cst.Dict) and not value.elements for value in values)

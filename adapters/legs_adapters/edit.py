@@ -52,24 +52,24 @@ def rewrite(
         program, path: the checkout, and the file.
         sites: its sites.
         kept: its calls that are not weighted.
-        in_place: put the import on an existing line, so that every line keeps its number.
+        in_place: add no import, so that every line keeps its number: the file is run in memory, with the name built in.
 
     Raises:
-        LegsError: the result would not compile (a bug of legs-patch; nothing is written then).
+        LegsError: the file has a legs_loss of its own; or the result would not compile (a bug of legs-patch).
     """
     source, module = program.sources[path], program.module(path)
     assert module is not None
-    package, is_imported = _package_name(module)
+    is_imported = _is_imported(module)
     edits: List[Edit] = []
     for site in sites:
-        writing = Writing(package, site.swapped, on_one_line(site.selection), in_place)
+        writing = Writing(site.swapped, on_one_line(site.selection), in_place)
         edits += site.form.edits(Text(source, site.scope), writing)
     for call in kept:
         text = Text(source, call.scope)
         start, end = text.span(call.call.func, True)
-        edits += [text.replace(start, start, f"{package}.unweighted("), text.replace(end, end, ")")]
-    if not is_imported:
-        edits.append(_import(Text(source, module.top), package, in_place))
+        edits += [text.replace(start, start, f"{PACKAGE}.unweighted("), text.replace(end, end, ")")]
+    if not (is_imported or in_place):
+        edits.append(_import(Text(source, module.top)))
     edits.sort()
     why = why_not_compiled(apply_edits(source.data, edits))
     if why:
@@ -88,23 +88,16 @@ def why_not_compiled(data: bytes) -> str:
     return ""
 
 
-def _import(text: Text, package: str, in_place: bool) -> Edit:
-    """Return the edit that imports the package under a name; ``in_place``: on an existing line."""
+def _import(text: Text) -> Edit:
+    """Return the edit that imports the package."""
     module, body = text.module, text.module.outline.tree.body
-    line = f"import {PACKAGE}" + ("" if package == PACKAGE else f" as {package}")
+    line = f"import {PACKAGE}"
     newline = module.outline.tree.default_newline
     anchor = _anchor(body)
     if anchor is None:
         first = [module.top.place(node).line for part in body[:1] for node in (part, *getattr(part, "decorators", ()))]
         at = module.lines.start(min(first)) if first else len(text.bytes)
-        on_first = in_place and isinstance(body[0] if body else None, cst.SimpleStatementLine)
-        return text.replace(at, at, f"{line}; " if on_first else line + newline)
-    if in_place:
-        if _rank(anchor.body[0]):
-            at = text.span(anchor.body[0])[0]
-            return text.replace(at, at, f"{line}; ")
-        at = text.span(anchor.body[-1])[1]
-        return text.replace(at, at, f"; {line}")
+        return text.replace(at, at, line + newline)
     at = module.lines.start(module.top.place(anchor).last_line + 1)
     ending = re.search(rb"(\r\n|\r|\n)?\Z", text.bytes[:at])
     assert ending is not None
@@ -131,17 +124,17 @@ def _anchor(body: Sequence[cst.CSTNode]) -> Optional[cst.SimpleStatementLine]:
     return next((statement for rank, statement in reversed(found) if rank == best), None)
 
 
-def _package_name(module: Module) -> Tuple[str, bool]:
-    """Return the name that legs_loss has, or will have, in a file; and whether the file imports it already."""
-    imported = False
-    for function in module.scopes(lambda text: PACKAGE in text):
-        for definition in function.flow.definitions.get(PACKAGE, []):
-            alias = definition.node
-            if isinstance(alias, cst.ImportAlias) and dotted(alias.name) == PACKAGE and alias.asname is None:
-                imported = imported or function is module.top
-            else:
-                return f"{PACKAGE}_", False  # the name is taken, by a variable say
-    return PACKAGE, imported
+def _is_imported(module: Module) -> bool:
+    """Return whether a file imports legs_loss at its top.
+
+    Raises:
+        LegsError: the name is another's, a variable's say.
+    """
+    scopes = list(module.scopes(lambda text: PACKAGE in text))
+    for node in [made.node for scope in scopes for made in scope.flow.definitions.get(PACKAGE, [])]:
+        if not isinstance(node, cst.ImportAlias) or (dotted(node.name) or "").split(".")[0] != PACKAGE:
+            raise LegsError(f"{module.path} has a {PACKAGE} of its own: rename it, or skip the file with --exclude")
+    return PACKAGE in module.top.flow.definitions
 
 
 def _rank(node: cst.CSTNode) -> int:

@@ -6,13 +6,13 @@ import libcst as cst
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import code
-from legs_adapters.tensors.modules import TORCH
+from legs_adapters.tensors.operations import MODULE_SELF, MODULE_WRAPS
 
 
 def program(files):
     """Return the program of {path: text}, or of one text as main.py."""
     files = {"main.py": files} if isinstance(files, str) else files
-    return Program([Source(path, text.encode(), text) for path, text in files.items()], TORCH)
+    return Program([Source(path, text.encode(), text) for path, text in files.items()], MODULE_SELF, MODULE_WRAPS)
 
 
 def scopes(made):

@@ -8,7 +8,7 @@ import pytest
 
 cst = pytest.importorskip("libcst")
 
-from legs_adapters.code.module import Module, parse  # noqa: E402
+from legs_adapters.code.module import Function, Module, parse  # noqa: E402
 from legs_adapters.code.sources import Source, Unreadable  # noqa: E402
 from legs_adapters.code.syntax import code, walk_expressions  # noqa: E402
 from legs_adapters.terms.prospects import Prospects  # noqa: E402
@@ -110,6 +110,10 @@ def test_every_node_of_a_real_file_stands_where_it_stands(path: Path) -> None:
     check(path.read_text(encoding="utf-8"))
 
 
+def named(module: Module, name: str) -> Function:
+    return next(function for function in module.scopes(bool) if function.name == name)
+
+
 def test_a_body_is_parsed_only_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     parsed = []
     real = cst.parse_module
@@ -120,14 +124,14 @@ def test_a_body_is_parsed_only_when_it_is_asked_for(monkeypatch: pytest.MonkeyPa
     if len(again.outline_text) < len(module.text):  # before Python 3.8 a file is parsed as a whole
         assert not any("return" in text for text in parsed)
         assert [f.name for f in again.scopes(lambda text: "c(" in text)] == ["g"]
-        next(again.named("f")).flow.calls.clear()
+        named(again, "f").flow.calls.clear()
         assert any("b(x" in text for text in parsed) and not any("c(1" in text for text in parsed)
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("def f(:\n    pass\n", "does not parse (line 2)"),
+        ("def f(:\n    pass\n", "does not parse (line 1)"),
         ("x = 1\n\n\ndef f():\n    return 1 2\n", "does not parse (line 5)"),
     ],
 )
@@ -151,6 +155,6 @@ def test_what_can_lead_to_an_l1_is_found_by_its_words(text: str) -> None:
     other = "def render(camera):\n    return camera.project(points)\n"
     prospects = Prospects([text + other])
     module = Module("file.py", text + other)
-    assert prospects.may_lead(next(module.named("training")).text)
+    assert prospects.may_lead(named(module, "training").text)
     if len(module.outline_text) < len(module.text):
-        assert not prospects.may_lead(next(module.named("render")).text)
+        assert not prospects.may_lead(named(module, "render").text)

@@ -195,7 +195,7 @@ class TestAsPythonRunsIt:
         texts["train.py"] = (
             "import inspect, losses\n"
             "from utils.loss_utils import l1_loss\n"
-            "print(inspect.getsource(losses.training).count('legs_loss.l1_loss(') , losses.legs_loss.__name__)\n"
+            "print(inspect.getsource(losses.training).count('legs_loss.l1_loss(') , legs_loss.__name__)\n"
         )
         root = checkout(tmp_path, texts)
         before = snapshot(root)
@@ -207,7 +207,7 @@ class TestAsPythonRunsIt:
 
     def test_calls_stay_plain_in_memory_too(self, tmp_path):
         texts = files("shared_loss_function_unweighted_call")
-        texts["run.py"] = "import inspect, slam\nprint(inspect.getsource(slam.tracking), slam.legs_loss.__name__)\n"
+        texts["run.py"] = "import inspect, slam\nprint(inspect.getsource(slam.tracking), legs_loss.__name__)\n"
         root = checkout(tmp_path, texts)
         before = snapshot(root)
         done = python("-m", "legs_loss", "run", "run.py", cwd=root)

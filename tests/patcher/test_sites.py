@@ -9,6 +9,7 @@ from legs_adapters.code.sources import decode
 from legs_adapters.plan import plan
 from legs_adapters.terms.functions import L1Functions
 
+from legs_loss import LegsError
 from tests.patcher.support import NAMES, checkout, expected, files, legs_patch, options
 
 MASKS = re.compile(r"\s*\w+ = legs_loss\.masked\(")
@@ -76,14 +77,21 @@ def test_in_place_every_line_keeps_its_number(name, tmp_path):
     assert sorted(here.after) == sorted(on_disk.after)
     for path, data in here.after.items():
         before = (root / path).read_bytes()
-        # nothing to put the import on: its own line; or, between two compound statements, the line of masks
-        if name not in ("legs_loss_name_taken_weighted", "masks_in_other_shapes_masked"):
+        if name != "masks_in_other_shapes_masked":  # between two compound statements a line of masks is its own
             assert data.count(b"\n") == before.count(b"\n")
         edits, others = (
             [edit for edit in made.edits[path] if not re.search(rb"import legs_loss|legs_loss.masked", edit.after)]
             for made in (here, on_disk)
         )
         assert edits == others
+
+
+@pytest.mark.parametrize("line", ["\n\ndef legs_loss(pose):\n    return pose\n", "import math as legs_loss\n"])
+def test_a_name_that_is_taken_is_one_error(line, tmp_path):
+    texts = files("inria")
+    texts["train.py"] += line
+    with pytest.raises(LegsError, match=r"train.py has a legs_loss of its own: rename it"):
+        plan(checkout(tmp_path, texts))
 
 
 def test_a_site_chosen_by_hand_is_the_only_one(tmp_path):

@@ -9,7 +9,7 @@ from typing import Dict, Iterable, Iterator, List, Optional, Tuple
 import libcst as cst
 
 from legs_adapters.code.limits import Budget
-from legs_adapters.code.module import Function, Module, index_by_word, parse
+from legs_adapters.code.module import Class, Function, Module, index_by_word, parse
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import dotted
 
@@ -75,8 +75,8 @@ class Checkout:
         """Return every method of this name in the checkout."""
         if name not in self._methods:
             modules = self.matching(re.compile(rf"\bdef[ \t]+{name}\b"), name)
-            found = [function for module in modules for function in module.named(name)]
-            self._methods[name] = [function for function in found if function.owner is not None]
+            owners = [each for module in modules for each in module.by_node.values() if isinstance(each, Class)]
+            self._methods[name] = [owner.methods[name] for owner in owners if name in owner.methods]
         return self._methods[name]
 
     # -- imports

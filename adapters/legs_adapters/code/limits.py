@@ -18,7 +18,6 @@ MAX_BYTES = 32 << 20  # of all files
 MAX_FILE_STEPS = 3_000_000
 MAX_STEPS = 40_000_000  # of all files
 MAX_BRACKETS = 150  # in one another; Python itself refuses 200
-MAX_BLOCKS = 100  # in one another; as Python
 MAX_PARTS = 2000  # of one expression: operators, calls, attributes, strings in a row; `elif` in a file
 MAX_LAMBDAS = 660  # in a file: LibCST's parser takes memory quadratic in lambdas in one another, 200 MB for 1,000
 
@@ -32,7 +31,6 @@ _TOKEN = re.compile(
     re.S,
 )
 _FIELD = re.compile(r"\{[^{}]*\}")
-_INDENTED = re.compile(r"^([ \t]*)[^\s#]", re.M)
 
 
 class Budget:
@@ -63,28 +61,14 @@ def parsing_steps(text: str) -> int:
 
 
 def over_the_limits(text: str) -> str:
-    """Return why a file is not parsed, or "": it is too long, or its blocks or an expression are too deep."""
+    """Return why a file is not parsed, or "": it is too long, or an expression is too deep. Python counts blocks."""
     if _TOKEN_STEPS * len(text) > MAX_FILE_STEPS and parsing_steps(text) > MAX_FILE_STEPS:
         return _WHY_OVER
     if text.count("elif") > MAX_PARTS:
         return f"more than {MAX_PARTS} elif"
-    if _are_blocks_deep(text):
-        return f"blocks are nested more than {MAX_BLOCKS} deep"
     if text.count("lambda") > MAX_LAMBDAS:
         return f"more than {MAX_LAMBDAS} lambdas"
     return _why_too_deep(text)
-
-
-def _are_blocks_deep(text: str) -> bool:
-    columns: List[int] = []  # of the blocks that a line is in
-    for found in _INDENTED.finditer(text):
-        column = len(found.group(1).expandtabs())
-        while columns and columns[-1] >= column:
-            columns.pop()
-        columns.append(column)
-        if len(columns) > MAX_BLOCKS:
-            return True
-    return False
 
 
 def _why_too_deep(text: str) -> str:

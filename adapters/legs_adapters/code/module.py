@@ -58,9 +58,6 @@ class Function:
         else:
             self.text = parent.text if parent is not None and parent.parent is not None else module.outline_text
 
-    def __repr__(self) -> str:
-        return f"<{self.module.path}:{self.name or 'top level'}>"
-
     @property
     def body(self) -> cst.BaseSuite | cst.Module:
         """Its statements, parsed on first use."""
@@ -226,14 +223,6 @@ class Module:
             self.failure = Unreadable(self.path, why)
         return self.failure is None
 
-    def named(self, name: str) -> Iterator[Function]:
-        """Yield the functions of this name."""
-        for function in self._functions:
-            if function.name == name:
-                yield function
-            if name in function.text:
-                yield from (inner for inner in _chosen(function.inner, bool) if inner.name == name)
-
     def scopes(self, matches: Callable[[str], object]) -> Iterator[Function]:
         """Yield the top level and the functions whose text matches."""
         return _chosen([self.top, *self._functions], matches)
@@ -279,13 +268,14 @@ def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadabl
         return Unreadable(source.path, over)
     try:
         return Module(source.path, source.text, budget)
-    except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
+    except (SyntaxError, cst.ParserSyntaxError, RecursionError, ValueError) as error:
         return _failure(source.path, error)
 
 
 def _failure(path: str, error: Exception) -> Unreadable:
-    if isinstance(error, cst.ParserSyntaxError):
-        return Unreadable(path, f"does not parse (line {error.raw_line})")
+    if isinstance(error, (SyntaxError, cst.ParserSyntaxError)):
+        line = error.lineno if isinstance(error, SyntaxError) else error.raw_line
+        return Unreadable(path, f"does not parse (line {line})")
     if isinstance(error, RecursionError):
         return Unreadable(path, "is nested too deeply")
     return Unreadable(path, f"cannot be parsed: {type(error).__name__}")

@@ -122,7 +122,7 @@ def outline_part(lines: Lines) -> Tuple[Part, List[Optional[Cut]]]:
         The outline, and for each of those functions, in source order, what was cut; empty where nothing was cut.
 
     Raises:
-        libcst.ParserSyntaxError, RecursionError, ValueError: it does not parse.
+        SyntaxError, libcst.ParserSyntaxError, RecursionError, ValueError: it does not parse.
     """
     outline, cuts = bytearray(lines.data), _cuts(lines)
     for cut in filter(None, cuts):
@@ -151,8 +151,8 @@ def _cuts(lines: Lines) -> List[Optional[Cut]]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             tree = ast.parse(lines.data)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return []  # Python 2, or newer than this Python: LibCST knows
+    except (ValueError, RecursionError, MemoryError):
+        return []  # deeper than Python's parser goes
     return [_cut(lines, node) for node in _functions(tree)]
 
 

@@ -5,7 +5,7 @@ Where only the run time knows the class of an object, its methods are unknown.
 
 from __future__ import annotations
 
-from typing import Dict, FrozenSet, Iterable, Iterator, List, NamedTuple, Optional, Tuple
+from typing import Dict, Iterable, Iterator, List, NamedTuple, Optional, Tuple
 
 import libcst as cst
 
@@ -15,7 +15,7 @@ from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import arguments, call_name, dotted, path_of
 
-__all__ = ["Conventions", "Program", "Reference"]
+__all__ = ["Program", "Reference"]
 
 _MAX_DEPTH = 16  # how many names are followed, one to the next
 
@@ -31,31 +31,22 @@ class Reference(NamedTuple):
     target: object
 
 
-class Conventions(NamedTuple):
-    """The conventions by which libraries pass objects on, which the checkout itself does not show.
-
-    Attributes:
-        returning_self: methods that return the object itself, ``model.cuda()``.
-        wrapping: functions that return their argument wrapped: ``DataParallel(model)``; dotted where the
-            name alone is ambiguous.
-    """
-
-    returning_self: FrozenSet[str] = frozenset()
-    wrapping: FrozenSet[str] = frozenset()
-
-
 class Program(Checkout):
     """The files of a checkout, linked by the names in them.
 
     Args:
         sources: the readable files.
-        conventions: of the libraries that it uses.
+        returning_self: methods of libraries that return the object itself, ``model.cuda()``.
+        wrapping: functions that return their argument wrapped: ``DataParallel(model)``; dotted where the
+            name alone is ambiguous.
     """
 
-    def __init__(self, sources: Iterable[Source], conventions: Optional[Conventions] = None) -> None:
+    def __init__(
+        self, sources: Iterable[Source], returning_self: Iterable[str] = (), wrapping: Iterable[str] = ()
+    ) -> None:
         super().__init__(sources)
-        self._conventions = conventions or Conventions()
-        self._wrapping = tuple("." + name for name in self._conventions.wrapping)
+        self._returning_self = frozenset(returning_self)
+        self._wrapping = tuple("." + name for name in wrapping)
         # by expression and depth; each may be asked from many places, and asks for many others
         self._resolved: Dict[Function, Dict[Tuple[int, int], Tuple[cst.CSTNode, List[Reference]]]] = {}
 
@@ -130,7 +121,7 @@ class Program(Checkout):
         name = call_name(node)
         if name == "partial" and node.args:
             return self.resolve(function, node.args[0].value, depth)
-        if name in self._conventions.returning_self and isinstance(node.func, cst.Attribute):
+        if name in self._returning_self and isinstance(node.func, cst.Attribute):
             moved = [r for r in self.resolve(function, node.func.value, depth) if r.kind in ("instance", "made by")]
             if moved:
                 return moved

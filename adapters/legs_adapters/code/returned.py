@@ -1,8 +1,8 @@
-"""Find what functions return: one expression, a parameter, the entries of a dictionary and their keys."""
+"""Find what functions return: one expression, or the entries of a dictionary under a key."""
 
 from __future__ import annotations
 
-from typing import Dict, Iterable, List, Optional, Set, Tuple
+from typing import Dict, Iterable, List, Optional, Tuple
 
 import libcst as cst
 
@@ -11,16 +11,7 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import constant
 
-__all__ = [
-    "called_makers",
-    "default_key",
-    "formatted_key",
-    "forward_maker",
-    "passed_on",
-    "returned",
-    "stored",
-    "written",
-]
+__all__ = ["called_makers", "default_key", "formatted_key", "returned", "written"]
 
 _Entry = Tuple[Function, cst.CSTNode]  # a value, and the function that it stands in
 
@@ -64,43 +55,10 @@ def _filled(node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> c
     return filled
 
 
-def passed_on(function: Function, node: cst.CSTNode) -> Optional[str]:
-    """Return the parameter that an expression is, or is an element of, on every path."""
-    found: Set[str] = set()
-    work: List[Optional[cst.CSTNode]] = [node]
-    for part in work:  # which grows
-        while isinstance(part, cst.Subscript):
-            part = part.value
-        definitions = function.flow.reaching(part) if isinstance(part, cst.Name) else ()
-        if not definitions:
-            return None
-        for definition in definitions:
-            value = definition.value
-            if definition.kind == "element" and isinstance(value, cst.Tuple):
-                index = len(value.elements) if definition.index is None else definition.index
-                value = value.elements[index].value if index < len(value.elements) else None
-            if definition.kind == "parameter":
-                found.add(definition.place)
-            elif definition.kind not in ("assign", "element") or value is None:
-                return None
-            elif value not in work:
-                work.append(value)
-    return found.pop() if len(found) == 1 else None
-
-
 def called_makers(program: Program, function: Function, package: cst.CSTNode) -> List[Function]:
     """Return the functions that ``package = render(...)`` calls, where that is the only definition of the package."""
     call = function.flow.value_of(package)
     return callees(program, function, call) if isinstance(call, cst.Call) else []
-
-
-def forward_maker(function: Function, package: cst.CSTNode) -> List[Function]:
-    """Return the ``forward`` of a method's class, where the package is a parameter of the method."""
-    forward = function.owner.methods.get("forward") if function.owner is not None else None
-    given = function.flow.reaching(package)
-    if forward is None or forward is function or not given or any(d.kind != "parameter" for d in given):
-        return []
-    return [forward]
 
 
 def written(makers: Iterable[Function], key: str) -> List[_Entry]:
@@ -117,18 +75,6 @@ def written(makers: Iterable[Function], key: str) -> List[_Entry]:
         if isinstance(value, cst.Dict)
         for element in value.elements
         if isinstance(element, cst.DictElement) and constant(element.key) == key
-    ]
-
-
-def stored(makers: Iterable[Function], key: str) -> List[_Entry]:
-    """Return the values that functions store under a key of their result: ``package["photo"] = image``."""
-    return [
-        (maker, definition.value)
-        for maker in makers
-        for each in maker.flow.returns
-        if isinstance(each, cst.Name)
-        for definition in maker.flow.definitions.get(f"{each.value}[{key!r}]", [])
-        if definition.value is not None
     ]
 
 

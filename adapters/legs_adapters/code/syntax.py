@@ -33,6 +33,7 @@ __all__ = [
 
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _EMPTY = cst.Module(body=[])
+_LITERALS = (cst.Name, cst.SimpleString, cst.Integer, cst.Float, cst.UnaryOperation, cst.Tuple, cst.List)
 _MISSING = object()
 _PUNCTUATION = re.compile(
     "whitespace|[lr]par|[lr]brac|leading_lines|trailing_whitespace|header|footer|comma|equal|semicolon"
@@ -69,24 +70,17 @@ def words(name: str) -> Tuple[str, ...]:
 
 def constant(node: Optional[cst.CSTNode], default: Any = None) -> Any:
     """Return the value of a literal (also a negative number, a tuple of literals), else ``default``."""
-    named = isinstance(node, cst.Name) and node.value in ("None", "True", "False")
-    if named or isinstance(node, (cst.SimpleString, cst.Integer, cst.Float)):
-        try:
-            return _literal(node.value)  # type: ignore[union-attr]
-        except (SyntaxError, ValueError):  # "\x", or of a newer Python
-            return default
-    if isinstance(node, cst.UnaryOperation) and isinstance(node.operator, cst.Minus):
-        value = constant(node.expression, _MISSING)
-        return -value if isinstance(value, (int, float)) else default
-    if isinstance(node, (cst.Tuple, cst.List)):
-        values = [constant(element.value, _MISSING) for element in node.elements]
-        return default if _MISSING in values else tuple(values)
-    return default
+    value = _literal(one_line(node)) if isinstance(node, _LITERALS) else _MISSING
+    return default if value is _MISSING else value
 
 
 @functools.lru_cache(maxsize=4096)
 def _literal(text: str) -> Any:
-    return ast.literal_eval(text)
+    try:
+        value = ast.literal_eval(text)
+    except (SyntaxError, ValueError, TypeError):  # a name, "\x", or of a newer Python
+        return _MISSING
+    return tuple(value) if isinstance(value, list) else value
 
 
 def key_of(node: cst.CSTNode) -> Any:

@@ -16,15 +16,7 @@ from legs_adapters.code.calls import callees, sure_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.returned import (
-    called_makers,
-    default_key,
-    formatted_key,
-    forward_maker,
-    passed_on,
-    stored,
-    written,
-)
+from legs_adapters.code.returned import default_key, formatted_key
 from legs_adapters.code.syntax import arguments, call_name, constant, key_of, root_of, same, words
 from legs_adapters.lexicon.calls import CallReading, meaning_of_call
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
@@ -150,21 +142,11 @@ class Meanings:
             return Meaning("depth", self.meaning(function, node.value).role)  # of RGB+D, render[0, ..., 3]
         if not isinstance(key, str):
             return self.meaning(function, node.value)
-        here = bool(function.flow.reaching(node))
-        local = self._flow(function, node) if here else self._entry(function, node.value, key)
+        local = self._flow(function, node) if function.flow.reaching(node) else UNKNOWN
         role = role_of_words(key) or local.role
         if role is None and not BACKGROUND & set(words(key)):
             role = self._role_of_holder(function, node.value)
         return Meaning(more_special(kind_of_words(key), local.kind), role)
-
-    def _entry(self, function: Function, node: cst.CSTNode, key: str) -> Meaning:
-        """Return the meaning of ``package["photo"]``, of a package that a function of the codebase returned.
-
-        A renderer's keys say what the entries are; the values inside a renderer are made of depths, too.
-        """
-        held = stored(called_makers(self.program, function, node), key)
-        held = held or written(forward_maker(function, node), key)
-        return mix(self.meaning(maker, value) for maker, value in held)
 
     def _role_of_holder(self, function: Function, node: cst.CSTNode) -> Optional[str]:
         """Return the role from the container: ``outputs["rgb"]`` is rendered, ``batch["rgb"]`` a target."""
@@ -241,11 +223,8 @@ class Meanings:
         for callee in callees(self.program, function, call):
             tuples = [value for value in callee.flow.returns if isinstance(value, cst.Tuple)]
             for element in (each.elements[index].value for each in tuples if index < len(each.elements)):
-                passed = passed_on(callee, element)
-                given = callee.given(call, passed) if passed is not None else None
-                where, what = (callee, element) if given is None else (function, given)
-                says_image = isinstance(what, cst.Name) and kind_of_words(what.value) == "image"
-                meaning = self.meaning(where, what)
+                says_image = isinstance(element, cst.Name) and kind_of_words(element.value) == "image"
+                meaning = self.meaning(callee, element)
                 found.append(meaning._replace(kind="image") if by_name and says_image else meaning)
         return mix(found)
 

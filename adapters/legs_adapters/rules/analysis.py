@@ -10,7 +10,7 @@ from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.rules.purpose import Purposes
 from legs_adapters.rules.splats import Splats
 from legs_adapters.tensors.backward import Training
-from legs_adapters.tensors.modules import TORCH
+from legs_adapters.tensors.operations import MODULE_SELF, MODULE_WRAPS
 from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.kinds.callback import Callbacks
@@ -53,4 +53,4 @@ class Analysis:
     @classmethod
     def of_files(cls, sources: Iterable[Source]) -> Analysis:
         """Analyse the L1 terms of these files."""
-        return cls(Program(sources, TORCH))
+        return cls(Program(sources, MODULE_SELF, MODULE_WRAPS))

@@ -18,7 +18,6 @@ from legs_adapters.tensors.steps import is_backward
 __all__ = ["Training"]
 
 _BACKWARD = re.compile(r"\b(manual_)?backward\s*\(")
-_HOOK = re.compile(rf"def\s+({'|'.join(sorted(HOOKS))})\s*\(")
 _ANY = object()
 
 
@@ -47,10 +46,8 @@ class Training:
             for function in module.scopes(_BACKWARD.search):
                 passes = [call for call in function.flow.calls if is_backward(call)]
                 self._begin(function, [value for call in passes for value in _trained_by(call)], bool(passes))
-        for module in program.matching(_HOOK):
-            for function in (f for name in sorted(HOOKS) for f in module.named(name)):
-                if function.owner is not None:
-                    self._begin(function, function.flow.returns, True)
+        for method in (method for name in sorted(HOOKS) for method in program.methods_named(name)):
+            self._begin(method, method.flow.returns, True)
         while self._work:
             function, node, key = self._work.pop()
             if function.module.spend(1):

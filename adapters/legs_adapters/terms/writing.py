@@ -20,13 +20,11 @@ class Writing(NamedTuple):
     """The settings of the weighted call at one call site.
 
     Attributes:
-        package: the name that legs_loss has in the file.
         swapped: whether the target is the first of the two sides.
         selection: the index by a mask that both images carry, with its brackets; empty without.
         in_place: whether every line has to keep its number.
     """
 
-    package: str = PACKAGE
     swapped: bool = False
     selection: str = ""
     in_place: bool = False
@@ -37,7 +35,7 @@ class Writing(NamedTuple):
 
     def call(self, prediction: str, target: str, as_map: bool = False, own: str = "") -> str:
         """Return the whole call of two images."""
-        return f"{self.package}.l1_loss({prediction}, {target}{self.settings(as_map, own)})"
+        return f"{PACKAGE}.l1_loss({prediction}, {target}{self.settings(as_map, own)})"
 
     def settings(self, as_map: bool = False, own: str = "") -> str:
         """Return the arguments after the two images, each with its comma.

@@ -13,7 +13,7 @@ from legs_adapters.tensors.operations import NUMBERS
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
-from legs_adapters.terms.writing import Writing
+from legs_adapters.terms.writing import PACKAGE, Writing
 
 __all__ = ["Absolute"]
 
@@ -53,7 +53,7 @@ class Absolute(Form):
         tail = writing.selection + (".mean()" if writing.selection and self.is_mean else "")
         before, after = residue(text.between(start, left[0])), residue(text.between(right[1], end))
         return [
-            text.replace(start, left[0], f"{writing.package}.l1_loss({before}"),
+            text.replace(start, left[0], f"{PACKAGE}.l1_loss({before}"),
             text.replace(left[0], left[1], sides[0]),
             text.replace(left[1], right[0], f",{middle}" if middle else ", "),
             text.replace(right[0], right[1], sides[1]),

@@ -14,7 +14,7 @@ from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.text import Edit, Text
-from legs_adapters.terms.writing import Writing
+from legs_adapters.terms.writing import PACKAGE, Writing
 
 __all__ = ["Callback", "Callbacks", "PassedByName"]
 
@@ -31,7 +31,7 @@ class PassedByName(Form):
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Write the weighted function in the name's place; what is not the plain mean is kept as ``own=``."""
         assert self.callee is not None
-        function = f"{writing.package}.l1_loss"
+        function = f"{PACKAGE}.l1_loss"
         if not self.is_mean:
             function = f"lambda input, target: {function}(input, target, own={code(self.callee)})"
         return [text.replace(*text.span(self.node, True), function)]

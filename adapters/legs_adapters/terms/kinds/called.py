@@ -14,7 +14,7 @@ from legs_adapters.lexicon.words import PERCEPTUAL
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
-from legs_adapters.terms.writing import Writing
+from legs_adapters.terms.writing import PACKAGE, Writing
 
 __all__ = ["Called"]
 
@@ -62,7 +62,7 @@ class Called(Form):
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the function, order the two images, and replace the further arguments by the settings."""
         first, second = self.call.args[:2]
-        edits = [text.replace(*text.span(self.call.func, True), f"{writing.package}.l1_loss")]
+        edits = [text.replace(*text.span(self.call.func, True), f"{PACKAGE}.l1_loss")]
         sides = writing.ordered(*(text.argument(arg.value, writing.selection) for arg in (first, second)))
         edits += [text.replace(*text.span(arg), side) for arg, side in zip((first, second), sides)]
         tail = ""

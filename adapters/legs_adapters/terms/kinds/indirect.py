@@ -12,7 +12,7 @@ from legs_adapters.code.syntax import code, one_line
 from legs_adapters.tensors.absolute import absolute_value, is_difference
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
-from legs_adapters.terms.writing import Writing
+from legs_adapters.terms.writing import PACKAGE, Writing
 
 __all__ = ["Indirect"]
 
@@ -47,7 +47,7 @@ class Indirect(Form):
         assert self.difference is not None
         _, target = writing.ordered(self.first, self.second)
         made = f"({code(self.difference.with_changes(lpar=[], rpar=[]))})"
-        return f"torch.abs({writing.package}.weight_map({one_line(target)}) * {' '.join(made.split())})"
+        return f"torch.abs({PACKAGE}.weight_map({one_line(target)}) * {' '.join(made.split())})"
 
 
 def _differences(function: Function, node: cst.CSTNode, depth: int) -> Iterator[cst.BinaryOperation]:

@@ -9,7 +9,7 @@ import libcst as cst
 
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.text import Edit, Text, on_one_line
-from legs_adapters.terms.writing import Writing
+from legs_adapters.terms.writing import PACKAGE, Writing
 
 __all__ = ["Masked"]
 
@@ -42,7 +42,7 @@ class Masked(Form):
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Write the line; where lines have to keep their numbers, before or after a statement beside it, if one can."""
         assert self.before is not None
-        line = self.line(text, writing.package)
+        line = self.line(text, PACKAGE)
         if writing.in_place and isinstance(self.before, cst.SimpleStatementLine):
             at = text.span(self.before)[0]
             return [text.replace(at, at, f"{line}; ")]

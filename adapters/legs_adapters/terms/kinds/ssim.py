@@ -13,7 +13,7 @@ from legs_adapters.lexicon.words import STRUCTURAL
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
-from legs_adapters.terms.writing import Writing
+from legs_adapters.terms.writing import PACKAGE, Writing
 
 __all__ = ["Ssim"]
 
@@ -49,7 +49,7 @@ class Ssim(Form):
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the function; the further arguments are the defaults of ``legs_loss.ssim``, and are dropped."""
-        edits = [text.replace(*text.span(self.call.func, True), f"{writing.package}.ssim")]
+        edits = [text.replace(*text.span(self.call.func, True), f"{PACKAGE}.ssim")]
         if self.extras:
             start, end = text.span(self.call.args[1])[1], text.span(self.call.args[-1])[1]
             edits.append(text.replace(start, end, residue(text.between(start, end))))

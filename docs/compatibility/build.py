@@ -66,6 +66,12 @@ def right_of(rows):
     return f"{right} of {len(rows)} ({rate(right, len(rows))})"
 
 
+def fair_of(rows, when):
+    """Return 'N of M (P%)': how many rows were right or an error on the very line, "first" or "now"."""
+    fair = sum(row[when] in ("right", "error") for row in rows)
+    return f"{fair} of {len(rows)} ({rate(fair, len(rows))})"
+
+
 def by_kind(rows):
     """Return the rows of each kind that has any."""
     kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in KINDS}
@@ -90,7 +96,7 @@ def round_table(blind):
     lines = ["| round | rules of | codebases | right |", "| --- | --- | --- | --- |"]
     recent = recent_from(blind)
     older = [row for row in blind if int(row["round"]) < recent]
-    rounds = [(f"1 to {recent - 1}", "commits 77fafa3 to 5b5f38e: [rounds.csv](compatibility/rounds.csv)", older)]
+    rounds = [(f"1 to {recent - 1}", "commits 77fafa3 to 748344f: [rounds.csv](compatibility/rounds.csv)", older)]
     for entry in read("rounds.csv"):
         if int(entry["round"]) >= recent:
             rounds.append((entry["round"], entry["rules"], [row for row in blind if row["round"] == entry["round"]]))
@@ -146,7 +152,10 @@ def figures():
         "last": right_of(latest),
         "last_wrong": sum(row["first"] == "wrong term" for row in latest),
         "last_alarms": sum(row["first"] == "false alarm" for row in latest),
-        "last_now": sum(row["now"] == "right" for row in latest),
+        "last_fair": fair_of(latest, "first"),
+        "last_now_fair": fair_of(latest, "now"),
+        "last_now_wrong": sum(row["now"] == "wrong term" for row in latest),
+        "last_now_alarms": sum(row["now"] == "false alarm" for row in latest),
         "last_kinds": ", ".join(f"{kind} {right_of(rows)}" for kind, rows in by_kind(latest).items()),
         "static": right_of([row for row in split if row["kind"] == "static"]),
         "rest": right_of([row for row in split if row["kind"] != "static"]),

@@ -169,8 +169,8 @@ class _Cameras:
         self.store = open_store(content.scene)
         self.masks = {entry.view: entry for entry in self.store.of_kind(MASK)} if self.store is not None else {}
         poses = [_pose(view) for view in self.views]
-        size = 0.08 * float(np.ptp([position for _, position in poses], axis=0).max()) if len(poses) > 1 else 0.2
-        self.handles = [self._add(server, view, *pose, size or 0.2) for view, pose in zip(self.views, poses)]
+        size = 0.03 * float(np.ptp([position for _, position in poses], axis=0).max()) if len(poses) > 1 else 0.1
+        self.handles = [self._add(server, view, *pose, size or 0.1) for view, pose in zip(self.views, poses)]
         self.what = server.gui.add_dropdown(
             "cameras", ["none", "outlines", "photograph", "weight map"], initial_value="none"
         )

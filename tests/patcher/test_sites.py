@@ -114,7 +114,26 @@ def test_a_vendored_network_that_is_not_about_splats_is_left(tmp_path):
     )
     found = plan(checkout(tmp_path, texts))
     assert [site.path for site in found.findings.sites] == ["train.py"]
-    assert ("depth_network/train.py", "other") in [(entry.path, entry.reason) for entry in found.findings.left]
+    assert ("depth_network/train.py", "unrelated") in [(entry.path, entry.reason) for entry in found.findings.left]
+
+
+def test_a_proven_photograph_is_told_from_one_that_only_its_name_shows(tmp_path):
+    texts = files("inria")
+    texts["step.py"] = (
+        "from gaussian_renderer import render\nfrom utils.loss_utils import l1_loss, ssim\n\n\n"
+        "def called(image, other):\n    return l1_loss(image, other) + 0.2 * (1 - ssim(image, other))\n\n\n"
+        "def handed(gaussians, cam, gt_image, pipe, background):\n"
+        "    image = render(cam, gaussians, pipe, background)['render']\n"
+        "    l1_loss(image, gt_image).backward()\n    gaussians.optimizer.step()\n\n\n"
+        "def step(gaussians, cam, pipe, background):\n"
+        "    image = render(cam, gaussians, pipe, background)['render']\n"
+        "    called(image, cam.original_image.cuda()).backward()\n    gaussians.optimizer.step()\n"
+    )
+    found = plan(checkout(tmp_path, texts))
+    assert {site.function: site.why for site in found.findings.sites if site.path == "step.py"} == {
+        "called": "other is the photograph",
+        "handed": "gt_image is a parameter, the photograph by its name",
+    }
 
 
 def test_a_value_with_very_many_ways_to_come_about_is_followed_once(tmp_path):

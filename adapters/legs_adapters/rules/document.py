@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import inspect
 from textwrap import dedent, indent
 from typing import List, NamedTuple
 
@@ -24,9 +23,8 @@ class Description(NamedTuple):
 
 def describe(rule: Rule) -> Description:
     """Return why a rule skips a term, and its snippets."""
-    why = rule.why or inspect.getdoc(rule) or ""
     snippets = ([dedent(text).strip() for text in texts] for texts in (rule.INVALID, rule.VALID))
-    return Description(" ".join(why.replace("``", "`").split()), *snippets)
+    return Description(rule.sentence(), *snippets)
 
 
 def explain(name: str) -> str:
@@ -44,16 +42,14 @@ def explain(name: str) -> str:
 
 
 def table() -> str:
-    """Return the table of reasons in docs/patching.md."""
-    reasons = dict.fromkeys(rule.reason for rule in RULES.values())
-    rows = [(reason, [f"`{rule.id}`" for rule in RULES.values() if rule.reason == reason]) for reason in reasons]
-    head = ["| reason | rules |", "| --- | --- |"]
-    return "\n".join([*head, *(f"| {reason} | {', '.join(rules)} |" for reason, rules in rows)]) + "\n"
+    """Return the table of rules in docs/patching.md."""
+    rows = [f"| `{rule.id}` | {rule.sentence()} | {rule.reason} |" for rule in RULES.values()]
+    return "\n".join(["| rule | why it skips a term | `reason` |", "| --- | --- | --- |", *rows, ""])
 
 
 def _explained(rule: Rule) -> str:
     why, left, weighted = describe(rule)
-    parts = [f"{rule.id}: skipped ({rule.reason})", f"  {why}"]
+    parts = [f"{rule.id}: skipped", f"  {why}"]
     for title, snippets in (("skipped", left), ("weighted", weighted)):
         parts += [f"\n  {title}:", "\n\n".join(indent(snippet, "    ") for snippet in snippets)]
     return "\n".join([*parts, ""])

@@ -6,6 +6,7 @@ skips, `VALID` terms that are weighted; all are tests. ``order.py`` lists the ru
 
 from __future__ import annotations
 
+import inspect
 from typing import TYPE_CHECKING, Callable, Iterator, List, Optional, Sequence, Tuple
 
 import libcst as cst
@@ -85,7 +86,7 @@ class Rule:
 
     Attributes:
         id: its name, for ``--explain`` and the report.
-        reason: the word in the report; several rules may share it.
+        reason: the word in the JSON report; several rules may share it.
         why: why a term is skipped, a sentence; default: the docstring.
         VALID, INVALID: code whose terms are weighted, and code with a term that the rule skips; the body of a training
             step, or functions.
@@ -100,6 +101,10 @@ class Rule:
     INVALID: List[str] = []
     needs_target = True
     is_doubted_beside_sites = True
+
+    def sentence(self) -> str:
+        """Return why a term is skipped."""
+        return " ".join((self.why or inspect.getdoc(self) or "").replace("``", "`").split())
 
     def evidence(self, term: Term) -> List[Decider]:
         """Return the evidence to skip a term; nothing where the rule does not apply."""

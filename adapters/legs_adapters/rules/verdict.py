@@ -87,7 +87,7 @@ class Verdicts:
         pictures = "image" in (a.kind, b.kind) or (function.runs_by_instance and all(map(is_role, term.sides)))
         if other or not pictures or (rule.needs_target and "target" not in (a.role, b.role)):
             return None
-        return self.problem(term, place, f"nothing shows that this is the loss ({left.reason})")
+        return self.problem(term, place, f"nothing shows that this is the loss: {rule.sentence()}")
 
     def problem(self, term: Term, place: Place, reason: str) -> Problem:
         """Return a term as a problem, with the advice for the manual edit."""
@@ -116,8 +116,8 @@ class Verdicts:
         name = one_line(term.target)
         if self.analysis.meanings.origin(term.function, term.target).role == "target":
             return f"{name} is the photograph"
-        is_parameter = term.function.is_parameter(term.target)
-        return f"{name} is a parameter" if is_parameter else f"{name} is the photograph by its name"
+        where = "a parameter, " if term.function.is_parameter(term.target) else ""
+        return f"{name} is {where}the photograph by its name"
 
 
 def _kept(function: Function, use: Use) -> Kept:

@@ -90,7 +90,7 @@ NAMES = (
     OtherName("warping", "synthetic", WARPED, "A name says that one view is warped into another.", "reprojection"),
     OtherName("perceptual", "features", PERCEPTUAL, "A name is of a perceptual loss: it compares features.", "vgg_l1"),
     OtherName("embedding-fit", "evaluation", EMBEDDING, "A name is of a fit of an embedding.", "optimize_embedding"),
-    OtherName("mesh", "other", MESH, "A name is of a mesh: no Gaussians are drawn.", "train_texture"),
+    OtherName("mesh", "mesh", MESH, "A name is of a mesh: no Gaussians are drawn.", "train_texture"),
     OtherName("robust", "huber", ROBUST, "A name is of a robust loss: a weight would move its threshold.", "huber"),
 )
 

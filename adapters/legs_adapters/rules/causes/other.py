@@ -22,7 +22,7 @@ class NotSplats(Rule):
     """The code around the term is not about Gaussian splatting in torch, or the sides are colours of rays."""
 
     id = "not-splats"
-    reason = "other"
+    reason = "unrelated"
     is_doubted_beside_sites = False
     INVALID = ["loss = l1_loss(image[ray_indexes], gt[ray_indexes])"]
 

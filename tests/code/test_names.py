@@ -35,7 +35,7 @@ KINDS = {
     "colors_precomp": "parameter",  # a colour for each Gaussian
     "image_no_sh": "image",
     "sky_rgb": "image",
-    "offset_image": "image",
+    "offset_image": "parameter",
     "image_offset": "parameter",
     "left_image": "image",
     "iteration": None,

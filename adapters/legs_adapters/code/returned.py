@@ -1,19 +1,15 @@
-"""Find what functions return: one expression, or the entries of a dictionary under a key."""
+"""Find what functions return as one expression, and the keys of the dictionaries that they return."""
 
 from __future__ import annotations
 
-from typing import Dict, Iterable, List, Optional, Tuple
+from typing import Dict, List, Optional
 
 import libcst as cst
 
-from legs_adapters.code.calls import callees
 from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import constant
 
-__all__ = ["called_makers", "default_key", "formatted_key", "returned", "written"]
-
-_Entry = Tuple[Function, cst.CSTNode]  # a value, and the function that it stands in
+__all__ = ["default_key", "formatted_key", "returned"]
 
 
 def returned(function: Function) -> Optional[cst.CSTNode]:
@@ -53,29 +49,6 @@ def _filled(node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> c
     filled = node.visit(Fill()) if names else node
     assert isinstance(filled, cst.BaseExpression)
     return filled
-
-
-def called_makers(program: Program, function: Function, package: cst.CSTNode) -> List[Function]:
-    """Return the functions that ``package = render(...)`` calls, where that is the only definition of the package."""
-    call = function.flow.value_of(package)
-    return callees(program, function, call) if isinstance(call, cst.Call) else []
-
-
-def written(makers: Iterable[Function], key: str) -> List[_Entry]:
-    """Return the values of a key in the dictionaries that functions return: ``{"photo": image}``."""
-    returned = [
-        (maker, value)
-        for maker in makers
-        for each in maker.flow.returns
-        for value in ([d.value for d in maker.flow.reaching(each)] if isinstance(each, cst.Name) else [each])
-    ]
-    return [
-        (maker, element.value)
-        for maker, value in returned
-        if isinstance(value, cst.Dict)
-        for element in value.elements
-        if isinstance(element, cst.DictElement) and constant(element.key) == key
-    ]
 
 
 def formatted_key(node: cst.Subscript) -> Optional[str]:

@@ -12,10 +12,10 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, call_name, constant, root_of, words
+from legs_adapters.code.syntax import arguments, call_name, constant, words
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
-from legs_adapters.lexicon.words import CAMERAS, GAUSSIANS, LOADING, MATCHED, OF_DIFFUSION, RENDERERS, STATISTICS
+from legs_adapters.lexicon.words import LOADING, MATCHED, OF_DIFFUSION, RENDERERS, STATISTICS
 from legs_adapters.tensors.operations import (
     ASKS,
     EXTREMES,
@@ -36,7 +36,6 @@ class CallReading:
     Args:
         program, function, node: the call, the function that it stands in, and the program.
         meaning_of: what an expression of a function depicts.
-        role_of_holder: the role of what an expression of this function holds.
 
     Attributes:
         name: the last name of the callee.
@@ -50,13 +49,11 @@ class CallReading:
         function: Function,
         node: cst.Call,
         meaning_of: Callable[[Function, cst.CSTNode], Meaning],
-        role_of_holder: Callable[[cst.CSTNode], Optional[str]],
     ) -> None:
         self.program = program
         self.function = function
         self.node = node
         self.meaning_of = meaning_of
-        self.role_of_holder = role_of_holder
         self.name: str = call_name(node)
         self.positional: List[cst.BaseExpression]
         self.keywords: Dict[str, cst.BaseExpression]
@@ -80,14 +77,6 @@ class CallReading:
 def meaning_of_call(call: CallReading) -> Meaning:
     """Return what a call depicts, from its name, its arguments and the definition of the function."""
     return next((known for known in (reading(call) for reading in _READINGS) if known is not None), UNKNOWN)
-
-
-def _entry(call: CallReading) -> Optional[Meaning]:
-    """``batch.get("image")``."""
-    key = constant(call.positional[0]) if call.name == "get" and call.positional else None
-    if not isinstance(key, str) or not isinstance(call.node.func, cst.Attribute):
-        return None
-    return Meaning(kind_of_words(key), role_of_words(key) or call.role_of_holder(call.node.func.value))
 
 
 def _painted(call: CallReading) -> Optional[Meaning]:
@@ -119,10 +108,6 @@ def _reduced(call: CallReading) -> Optional[Meaning]:
     return Meaning("parameter", None) if whole else None
 
 
-def _selected(call: CallReading) -> Optional[Meaning]:
-    return mix(map(call.ask, call.values[1:])) if call.name == "where" and len(call.values) == 3 else None
-
-
 def _statistic(call: CallReading) -> Optional[Meaning]:
     tokens = set(words(call.name))
     is_statistic = tokens & STATISTICS and not tokens & MATCHED and call.values
@@ -145,11 +130,8 @@ def _moved(call: CallReading) -> Optional[Meaning]:
 
 
 def _rendered(call: CallReading) -> Optional[Meaning]:
-    """Named as a renderer, or given Gaussians and a camera: ``imlsplat(gaussians, viewpoint_cam, background)``."""
     kind = kind_of_words(call.name)
-    names = [set(words(root_of(each))) for each in call.values if isinstance(each, (cst.Name, cst.Attribute))]
-    draws = kind is None and any(each & GAUSSIANS for each in names) and any(each & CAMERAS for each in names)
-    if not draws and not set(words(call.name)) & RENDERERS:
+    if not set(words(call.name)) & RENDERERS:
         return None
     return Meaning("image" if kind in (None, "parameter") else kind, "render")  # points_to_render(...)
 
@@ -159,7 +141,7 @@ def _named(call: CallReading) -> Optional[Meaning]:
     if kind not in (None, "image", "mask", "parameter"):
         return Meaning(kind, role)
     if kind == "image" and (role == "target" or set(words(call.name)) & LOADING):
-        holder = call.role_of_holder(call.owner) if call.owner is not None else None
+        holder = call.ask(call.owner).role if call.owner is not None else None
         return Meaning("image", role or holder or "target")
     return None
 
@@ -171,13 +153,9 @@ def _of_images(call: CallReading) -> Optional[Meaning]:
 
 
 def _returned(call: CallReading) -> Optional[Meaning]:
-    """Return what the called function returns, and of ``Renderer(settings)(**means)`` what ``Renderer`` makes."""
-    if isinstance(call.node.func, cst.Call):
-        return call.ask(call.node.func)
+    """Return what the called function returns."""
     for reference in call.program.resolve(call.function, call.node.func):
         target = reference.target
-        if set(words(getattr(target, "name", str(target)))) & RENDERERS:
-            return Meaning("image", "render")
         if reference.kind == "function" and isinstance(target, Function):
             found = [call.meaning_of(target, value) for value in target.flow.returns]
             if found and UNKNOWN not in found:
@@ -191,7 +169,7 @@ def _of_owner(call: CallReading) -> Optional[Meaning]:
 
 
 _READINGS: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
-    *(_entry, _painted, _number, _extreme, _reduced, _selected, _statistic, _filtered, _moved),
+    *(_painted, _number, _extreme, _reduced, _statistic, _filtered, _moved),
     *(_rendered, _named),
     *(_of_images, _returned, _of_owner),
 )

@@ -7,7 +7,6 @@ and the field's words in the names along it. A name with "depth" or "feature" ou
 
 from __future__ import annotations
 
-import functools
 from typing import Callable, Dict, List, Optional, Set, Tuple
 
 import libcst as cst
@@ -46,7 +45,6 @@ class Meanings:
         self._by_name = by_name
         self._known: Dict[_Question, Meaning] = {}
         self._here: Dict[_Question, Meaning] = {}
-        self._calls: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
         self._open: Set[_Question] = set()
         self._spent = 0
 
@@ -101,8 +99,7 @@ class Meanings:
         if isinstance(node, cst.Subscript):
             return self._subscript(function, node)
         if isinstance(node, cst.Call):
-            holder = functools.partial(self._role_of_holder, function)
-            return meaning_of_call(CallReading(self.program, function, node, self.meaning, holder))
+            return meaning_of_call(CallReading(self.program, function, node, self.meaning))
         if isinstance(node, cst.Comparison):
             return Meaning("mask", None)
         if isinstance(node, cst.BinaryOperation) and _is_of_neighbours(node):
@@ -128,8 +125,6 @@ class Meanings:
             owner = self.program.owner_of(function)
             stores = owner.stores(name) if owner is not None else []
             local = mix(self._definition(method, definition) for method, definition in stores[:6])
-        if kind is None and name in ("T", "data", "grad", "real"):
-            return self.meaning(function, node.value)
         role = role_of_words(name) or local.role or self._role_of_holder(function, node.value)
         return Meaning(more_special(kind, local.kind), role)
 
@@ -142,7 +137,7 @@ class Meanings:
             return Meaning("depth", self.meaning(function, node.value).role)  # of RGB+D, render[0, ..., 3]
         if not isinstance(key, str):
             return self.meaning(function, node.value)
-        local = self._flow(function, node) if function.flow.reaching(node) else UNKNOWN
+        local = self._flow(function, node)
         role = role_of_words(key) or local.role
         if role is None and not BACKGROUND & set(words(key)):
             role = self._role_of_holder(function, node.value)
@@ -208,8 +203,6 @@ class Meanings:
         given = arguments(value)[0]
         if call_name(value) == "zip" and index < len(given):
             return self.meaning(function, given[index])
-        if call_name(value) == "enumerate":
-            return self.meaning(function, given[0]) if index == 1 and given else UNKNOWN
         # A renderer that returns a tuple returns the image first; the rest have names of their own.
         meaning = self.meaning(function, value)
         if meaning.kind == "image" and index > 0:
@@ -232,19 +225,13 @@ class Meanings:
         """Return the meaning of a parameter: that of its arguments where training calls the function."""
         if definition.place not in function.parameters:
             return UNKNOWN
-        calls = self.training.sites.get(function) or self._calls_of(function)
+        calls = self.training.sites.get(function) or list(sure_calls(self.program, function))
         given = [(caller, function.given(call, definition.place)) for caller, call in calls[:12]]
         found = [self.meaning(caller, value) for caller, value in given if value is not None]
         meaning = mix([meaning for meaning in found if meaning.kind == "image"] or found)
         owner = function.owner.name if function.owner is not None else ""
         says_kind = LOSS & set(words(owner)) and kind_of_words(owner) in ("depth", "normal", "flow")
         return meaning._replace(kind=kind_of_words(owner)) if says_kind else meaning
-
-    def _calls_of(self, function: Function) -> List[Tuple[Function, cst.Call]]:
-        """Return the calls of a function outside of training."""
-        if function not in self._calls:
-            self._calls[function] = list(sure_calls(self.program, function))
-        return self._calls[function]
 
 
 def _parts(node: cst.CSTNode) -> List[cst.CSTNode]:

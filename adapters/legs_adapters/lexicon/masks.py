@@ -7,7 +7,6 @@ from typing import List, Optional
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.returned import called_makers, written
 from legs_adapters.code.syntax import arguments, call_name, constant, key_of, words
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.words import PICKING
@@ -46,11 +45,6 @@ def is_rows(meanings: Meanings, function: Function, node: Optional[cst.CSTNode],
     elif isinstance(node, cst.Subscript):
         if depth and not isinstance(key_of(node), str) and any(is_mask(meanings, function, e) for e in node.slice):
             return True  # with a name: where both carry it, the images themselves are written
-        key = key_of(node)
-        makers = called_makers(meanings.program, function, node.value) if isinstance(key, str) else []
-        entries = written(makers, str(key))
-        if entries:
-            return any(is_rows(meanings, maker, value, depth + 1) for maker, value in entries)
         parts = [node.value]
     elif isinstance(node, cst.Name):
         for made in function.flow.reaching(node):

@@ -11,9 +11,7 @@ from legs_adapters.lexicon.words import (
     KIND_OF,
     KINDS,
     LAID_OVER,
-    OF_ONE,
     OF_PICTURES,
-    PICTURES,
     RENDER,
     TARGET,
     WHICH,
@@ -35,11 +33,7 @@ def kind_of_words(name: str) -> Optional[str]:
         return "mask"  # applied to an image, it gives an image
     kinds = {KIND_OF[word] for word in tokens if word in KIND_OF}
     if "image" in kinds:  # sky_rgb, render_sh
-        if tokens[-1] in PICTURES:
-            tokens = tuple(word for word in tokens if word not in OF_ONE)  # offset_image, not image_offset
         kinds = {KIND_OF[word] for word in tokens if word in KIND_OF and word not in OF_PICTURES}
-        if "base" in tokens or "precomp" in tokens:  # rendered_base_color; colors_precomp, a colour for each Gaussian
-            return "parameter"
     return min(kinds, key=KINDS.index) if kinds else None
 
 

@@ -48,7 +48,7 @@ WORDS = {
         offset offsets grid grids plane planes pose poses deform deformation delta deltas residual means mean2d pts
         points point light lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds
         c2w w2c intrinsics extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints
-        vertex vertices verts bone bones smpl center centers knn kpt kpts keypoint keypoints mu std
+        vertex vertices verts bone bones smpl center centers knn kpt kpts keypoint keypoints mu std base precomp
     """,
     "image": """
         image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering
@@ -69,8 +69,6 @@ RENDER = RENDERERS | word_set(
 LAID_OVER = word_set("mask masks valid weight weights diff error errors")
 WHICH = word_set("first second third last left right front back")  # of several of a kind
 OF_PICTURES = word_set("sky sh shs prior time dx dy")  # a mask, for example, unless something shows that it is an image
-PICTURES = word_set("image images img imgs photo photos frame frames")
-OF_ONE = word_set("scale scales scaling scalings offset offsets center centers mean light lights")  # scaled or shifted
 HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
 BACKGROUND = word_set("bg bkgd background backgrounds")  # a colour to lay things over, whoever keeps it
 PICKING = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")

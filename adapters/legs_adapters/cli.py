@@ -168,7 +168,7 @@ def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.plan import plan, write
     from legs_adapters.report import as_diff
     from legs_adapters.settings import SETTINGS_FILE, settings_text
-    from legs_adapters.terms.instead import said_instead
+    from legs_adapters.terms.instead import trained_instead
 
     root = check_root(args.folder)
     settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
@@ -182,7 +182,7 @@ def _patch(args: argparse.Namespace) -> int:
             raise LegsError(
                 f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
                 + _elsewhere(root, args.exclude, found),
-                *said_instead(found.findings.program.sources.values()),
+                *trained_instead(found.findings.program.sources.values()),
             )
         _quote(problems, "error")
         say("legs-patch: nothing was changed: --site FILE:LINE takes your word, --exclude leaves files out", sys.stderr)

@@ -21,7 +21,7 @@ import libcst as cst
 from legs_adapters.code.module import Module
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import code, dotted
-from legs_adapters.terms.findings import Kept, Site
+from legs_adapters.terms.findings import Site, Use
 from legs_adapters.terms.text import Edit, Text, on_one_line
 from legs_adapters.terms.writing import PACKAGE, Writing
 from legs_loss import LegsError
@@ -44,14 +44,14 @@ def apply_edits(data: bytes, edits: Sequence[Edit]) -> bytes:
 
 
 def rewrite(
-    program: Program, path: str, sites: Sequence[Site], kept: Sequence[Kept] = (), in_place: bool = False
+    program: Program, path: str, sites: Sequence[Site], unweighted: Sequence[Use] = (), in_place: bool = False
 ) -> List[Edit]:
     """Return the edits that give one file the LEGS loss.
 
     Args:
         program, path: the checkout, and the file.
         sites: its sites.
-        kept: its calls that are not weighted.
+        unweighted: its calls that are not weighted.
         in_place: add no import, so that every line keeps its number: the file is run in memory, with the name built in.
 
     Raises:
@@ -64,9 +64,9 @@ def rewrite(
     for site in sites:
         writing = Writing(site.swapped, on_one_line(site.selection), in_place)
         edits += site.form.edits(Text(source, site.scope), writing)
-    for call in kept:
-        text = Text(source, call.scope)
-        start, end = text.span(call.call.func, True)
+    for use in unweighted:
+        text = Text(source, use.caller)
+        start, end = text.span(use.call.func, True)
         edits += [text.replace(start, start, f"{PACKAGE}.unweighted("), text.replace(end, end, ")")]
     if not (is_imported or in_place):
         edits.append(_import(Text(source, module.top)))

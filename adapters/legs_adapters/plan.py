@@ -110,9 +110,9 @@ def plan(
                 _give_up(findings, name, why)
         for name in _files_to_edit(findings):
             sites = [site for site in findings.sites if site.path == name]
-            kept = [call for call in findings.kept if call.path == name]
+            unweighted = [use for use, _ in findings.unweighted if use.caller.module.path == name]
             try:
-                edits[name] = rewrite(findings.program, name, sites, kept, in_place)
+                edits[name] = rewrite(findings.program, name, sites, unweighted, in_place)
             except RecursionError:
                 _give_up(findings, name, "is nested too deeply")
     findings.unreadable[:0] = files.unreadable
@@ -124,7 +124,7 @@ def plan(
 
 def _check_named(root: Path, findings: Findings, name: str, line: int, exclude: Sequence[str]) -> None:
     """Raise a LegsError that says why a site that was named by hand is none."""
-    is_site = any(site.path == name and site.named_by(line) for site in findings.sites)
+    is_site = any(site.path == name and site.line <= line <= site.last_line for site in findings.sites)
     if is_site or (name, line) in [(entry.path, entry.line) for entry in findings.patched]:
         return
     reasons = [why_left_out(root, name, exclude), *(one.reason for one in findings.unreadable if one.path == name)]
@@ -138,7 +138,7 @@ def _check_named(root: Path, findings: Findings, name: str, line: int, exclude: 
 
 
 def _files_to_edit(findings: Findings) -> List[str]:
-    return sorted({site.path for site in findings.sites} | {call.path for call in findings.kept})
+    return sorted({site.path for site in findings.sites} | {use.caller.module.path for use, _ in findings.unweighted})
 
 
 def _give_up(findings: Findings, name: str, why: str) -> None:

@@ -8,9 +8,8 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 from legs_adapters.checkout.comparing import unified_diff
 from legs_adapters.checkout.replace import Changes
-from legs_adapters.code.syntax import one_line
+from legs_adapters.code.syntax import call_name, one_line
 from legs_adapters.plan import Plan
-from legs_adapters.rules.document import describe
 from legs_adapters.rules.order import RULES
 from legs_adapters.terms.findings import Left
 from legs_loss.system import printable
@@ -22,9 +21,10 @@ def as_table(plan: Plan) -> str:
     """Return one line for every L1 term: its place, the verdict, and the reason."""
     found = plan.findings
     rows: List[Tuple[str, int, str, str]] = [(site.path, site.line, "patched", site.why) for site in found.sites]
-    for kept, site in found.kept.items():
-        why = f"{kept.reason}: {kept.function} is weighted at {site.path}:{site.line}, in this call it is not"
-        rows.append((kept.path, kept.line, "plain", why))
+    for use, site in found.unweighted:
+        path, line, _, reason, *_ = use.left
+        why = f"{reason}: {call_name(use.call)} is weighted at {site.path}:{site.line}, in this call it is not"
+        rows.append((path, line, "plain", why))
     rows += [(entry.path, entry.line, "already patched", "") for entry in found.patched]
     rows += [(entry.path, entry.line, "skipped", _why_left(entry)) for entry in found.left]
     rows += [(entry.path, entry.line, "ERROR", entry.reason) for entry in found.problems]
@@ -36,12 +36,12 @@ def as_table(plan: Plan) -> str:
 
 def _why_left(left: Left) -> str:
     """Return why a term is skipped: the sentence of its rule, and the first deciding line."""
-    if left.evidence is None:
+    if not left.rule:
         return left.reason
     path, line, text = left.because[0]
     here = f"line {line}" if path == left.path else f"{path}:{line}"
-    rule, text = left.evidence.rule, text if len(text) <= 60 else text[:57] + "..."
-    return f"{describe(RULES[rule]).why.rstrip('.')} (rule {rule}, {here}: {text})"
+    text = text if len(text) <= 60 else text[:57] + "..."
+    return f"{RULES[left.rule].sentence().rstrip('.')} (rule {left.rule}, {here}: {text})"
 
 
 def as_json(plan: Plan, wrote: Sequence[str]) -> str:
@@ -58,19 +58,20 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
                 site,
                 one_line(site.form.node),
                 column=site.column,
-                function=site.function,
+                function=site.scope.name,
                 **({} if site.form.weighs else {"term": site.form.term}),
             )
             for site in found.sites
         ],
         "plain": [
-            line(kept, reason=kept.reason, weighted_at=f"{site.path}:{site.line}") for kept, site in found.kept.items()
+            line(use.left, reason=use.left.reason, weighted_at=f"{site.path}:{site.line}")
+            for use, site in found.unweighted
         ],
         "left": [
             line(
                 left,
                 reason=left.reason,
-                rule=left.evidence.rule if left.evidence else None,
+                rule=left.rule or None,
                 because=[line(at) for at in left.because],
             )
             for left in found.left

@@ -79,8 +79,8 @@ def run_script(
     sources = {os.path.realpath(str(root / name)): data for name, data in found.after.items()}
     for site in found.findings.sites:
         _say(f"{site.path}:{site.line} {site.form.done} in this run")
-    for kept in found.findings.kept:
-        _say(f"{kept.path}:{kept.line} is not weighted in this run")
+    for use, _ in found.findings.unweighted:
+        _say(f"{use.left.path}:{use.left.line} is not weighted in this run")
     return execute(str(script), arguments, sources, root if cpu else None)
 
 

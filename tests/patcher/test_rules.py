@@ -9,11 +9,10 @@ from textwrap import indent
 
 import pytest
 from legs_adapters.plan import plan
-from legs_adapters.rules.document import describe, explain, table
+from legs_adapters.rules.document import explain, snippets, table
 from legs_adapters.rules.order import RULES
 from legs_adapters.rules.rule import Rule
 
-from legs_loss import LegsError
 from tests.patcher.support import checkout, files, legs_patch
 
 IMPORTS = """\
@@ -50,19 +49,19 @@ def planned(folder, example, ssim=False):
     return plan(checkout(folder, texts), ssim=ssim), first, first + example.count("\n")
 
 
-LEFT = [(rule, example) for rule in RULES.values() for example in describe(rule).left]
-WEIGHTED = [(rule, example) for rule in RULES.values() for example in describe(rule).weighted]
+LEFT = [(rule, example) for rule in RULES.values() for example in snippets(rule.INVALID)]
+WEIGHTED = [(rule, example) for rule in RULES.values() for example in snippets(rule.VALID)]
 
 
 @pytest.mark.parametrize(("rule", "example"), LEFT, ids=[rule.id for rule, _ in LEFT])
 def test_a_rule_leaves_its_invalid_code_and_names_the_line_that_decided(rule, example, tmp_path):
     found, first, last = planned(tmp_path, example, rule.id.startswith("ssim-"))
     left = [entry for entry in found.findings.left if entry.path == "train.py"]
-    assert rule.id in [entry.evidence.rule for entry in left]
+    assert rule.id in [entry.rule for entry in left]
     for entry in left:
-        assert entry.reason == RULES[entry.evidence.rule].reason
-        if entry.evidence.rule == rule.id:
-            lines = entry.evidence.lines
+        assert entry.reason == RULES[entry.rule].reason
+        if entry.rule == rule.id:
+            lines = entry.because
             assert lines
             for line in lines:
                 assert line.path == "train.py"
@@ -85,13 +84,13 @@ def test_every_rule_in_the_causes_has_a_place_in_the_order():
         return [leaf for each in kind.__subclasses__() for leaf in (leaves(each) or [each])]
 
     assert {type(rule) for rule in RULES.values()} == set(leaves(Rule))
-    assert all(rule.id and rule.reason and describe(rule).left and describe(rule).weighted for rule in RULES.values())
+    assert all(rule.id and rule.reason and rule.INVALID and rule.VALID for rule in RULES.values())
 
 
 def test_the_report_names_the_rule_and_the_line_that_decided(tmp_path):
     root = checkout(tmp_path, files("inria"))
     shown = legs_patch("--check", root).stdout
-    why = describe(RULES["evaluation"]).why.rstrip(".")
+    why = RULES["evaluation"].sentence().rstrip(".")
     assert f"train.py:32            skipped  {why} (rule evaluation, line 29: with torch.no_grad():)\n" in shown
     left = json.loads(legs_patch("--check", "--json", root).stdout)["left"]
     assert left[0]["rule"] == left[0]["reason"] == "evaluation"
@@ -112,7 +111,7 @@ def test_the_condition_that_decides_is_the_one_around_the_term(tmp_path):
     )
     found, first, _ = planned(tmp_path, example)
     [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
-    assert left.evidence.rule == "tracking"
+    assert left.rule == "tracking"
     assert [(line.line - first, line.text) for line in left.because] == [(6, "elif tracking:")]
 
 
@@ -130,7 +129,7 @@ def test_the_def_that_decides_is_found_below_its_decorators_and_namesakes(tmp_pa
     )
     found, first, _ = planned(tmp_path, example)
     [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
-    assert left.evidence.rule == "evaluation"
+    assert left.rule == "evaluation"
     assert [(line.line - first, line.text) for line in left.because] == [(5, "async  def evaluate(")]
 
 
@@ -138,7 +137,7 @@ def test_a_term_outside_of_functions_is_decided_by_its_own_line(tmp_path):
     example = "import torch\nfrom utils.loss_utils import l1_loss\n\nprint(l1_loss(image, gt_image))\n"
     found, _, _ = planned(tmp_path, example)
     [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
-    assert left.evidence.rule == "untrained"
+    assert left.rule == "untrained"
     assert [line.line for line in left.because] == [4]
 
 
@@ -151,7 +150,7 @@ def test_a_default_that_decides_is_shown_by_the_def_it_stands_in(tmp_path):
     )
     found, first, _ = planned(tmp_path, example)
     [left] = [entry for entry in found.findings.left if entry.path == "train.py"]
-    assert left.evidence.rule == "mask"
+    assert left.rule == "mask"
     assert [line.line for line in left.because] == [first]
 
 
@@ -159,7 +158,7 @@ def test_explain_prints_a_rule_or_all_of_a_reason_or_the_list():
     done = legs_patch("--explain", "robust")
     assert done.returncode == 0
     assert done.stdout.startswith("robust: skipped\n  A name is of a robust loss")
-    assert indent(describe(RULES["robust"]).left[0], "    ") in done.stdout
+    assert indent(snippets(RULES["robust"].INVALID)[0], "    ") in done.stdout
     assert [line.split(":")[0] for line in explain("regulariser").splitlines()[:1]] == ["parameter"]
     assert explain("tracking").count(": skipped") == 1
     listing = legs_patch("--explain")
@@ -170,9 +169,7 @@ def test_explain_prints_a_rule_or_all_of_a_reason_or_the_list():
 def test_explain_of_an_unknown_rule_is_one_line():
     done = legs_patch("--explain", "dept")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "legs-patch: error: there is no rule 'dept'; did you mean depth?\n"
-    with pytest.raises(LegsError, match="there is no rule 'xyzzy'; legs-patch --explain lists them"):
-        explain("xyzzy")
+    assert done.stderr == "legs-patch: error: there is no rule 'dept'; legs-patch --explain lists them\n"
 
 
 def test_the_table_of_reasons_in_the_documents_is_current():

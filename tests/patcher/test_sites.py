@@ -29,8 +29,8 @@ def test_every_term_gets_the_verdict_that_its_comment_asks_for(name, tmp_path):
     for site in (site for site in found.findings.sites if site.form.term != "mask"):
         becomes = "weighted" if site.form.weighs else "fused"
         verdicts[site.path, site.line] = becomes, changed_lines(found, site.path)[site.line - 1].strip()
-    for kept in found.findings.kept:
-        verdicts[kept.path, kept.line] = "plain", changed_lines(found, kept.path)[kept.line - 1].strip()
+    for use, _ in found.findings.unweighted:
+        verdicts[use.left.path, use.left.line] = "plain", changed_lines(found, use.left.path)[use.left.line - 1].strip()
     for entry in found.findings.left:
         verdicts.setdefault((entry.path, entry.line), ("left", entry.reason))
     for entry in found.findings.problems:

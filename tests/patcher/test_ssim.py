@@ -115,7 +115,7 @@ class TestPatch:
         found = plan(checkout(tmp_path, files("ssim_beside_l1_fused")))
         assert not [edit for edits in found.edits.values() for edit in edits if b"ssim" in edit.after]
         assert all(site.form.weighs for site in found.findings.sites)
-        assert not [left for left in found.findings.left if left.evidence.rule.startswith("ssim-")]
+        assert not [left for left in found.findings.left if left.rule.startswith("ssim-")]
 
     def test_the_l1_terms_are_what_they_are_without_it(self, tmp_path):
         root = checkout(tmp_path, files("ssim_beside_l1_fused"))

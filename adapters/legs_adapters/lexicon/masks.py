@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import List, Optional
+from typing import List, Optional, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.calls import callees
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import arguments, call_name, constant, key_of, words
+from legs_adapters.code.syntax import arguments, call_name, constant, key_of, walk_expressions, words
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.words import PICKING
 from legs_adapters.tensors.operations import JOINS, KEEPS_AXES
@@ -45,6 +46,8 @@ def is_rows(meanings: Meanings, function: Function, node: Optional[cst.CSTNode],
     elif isinstance(node, cst.Subscript):
         if depth and not isinstance(key_of(node), str) and any(is_mask(meanings, function, e) for e in node.slice):
             return True  # with a name: where both carry it, the images themselves are written
+        if any(is_rows(meanings, maker, value, depth + 1) for maker, value in _entries(meanings, function, node)):
+            return True
         parts = [node.value]
     elif isinstance(node, cst.Name):
         for made in function.flow.reaching(node):
@@ -58,6 +61,21 @@ def is_rows(meanings: Meanings, function: Function, node: Optional[cst.CSTNode],
         parts = [*arguments(node)[0][:1]] if call_name(node) in JOINS else []
         parts += [node.func.value] if call_name(node) in KEEPS_AXES else []
     return any(is_rows(meanings, function, part, depth + 1) for part in parts)
+
+
+def _entries(meanings: Meanings, function: Function, node: cst.Subscript) -> List[Tuple[Function, cst.CSTNode]]:
+    """Return the values that ``package = render_all(...)`` writes under the key of ``package["mouths"]``."""
+    key, call = key_of(node), function.flow.value_of(node.value)
+    if not isinstance(key, str) or not isinstance(call, cst.Call):
+        return []
+    elements = [
+        (maker, element)
+        for maker in callees(meanings.program, function, call)
+        for part in walk_expressions(maker.body)
+        if isinstance(part, cst.Dict)
+        for element in part.elements
+    ]
+    return [(m, e.value) for m, e in elements if isinstance(e, cst.DictElement) and constant(e.key) == key]
 
 
 def _flattens(node: cst.Call) -> bool:

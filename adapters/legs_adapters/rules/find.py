@@ -7,7 +7,7 @@ the syntax tree; a term that cannot be decided becomes a problem that needs a ma
 from __future__ import annotations
 
 import re
-from typing import Iterable, Iterator, List, Sequence, Tuple, Union
+from typing import Any, Dict, Iterable, Iterator, List, Sequence, Tuple, Union
 
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
@@ -86,14 +86,14 @@ class _Finder:
 
     def _trains_alone(self, left: Left) -> bool:
         """Return whether its file trains, and has no term that is weighted or reported as a problem."""
-        settled = {
-            entry.path for entries in (self.found.sites, self.found.patched, self.found.problems) for entry in entries
-        }
+        found = self.found
+        entries: List[Any] = [*found.sites, *found.patched, *found.problems]
+        is_settled = any(entry.path == left.path for entry in entries)
         trains = any(root.module.path == left.path for root in self.analysis.training.roots)
-        is_told = left.evidence is None or RULES[left.evidence.rule].is_doubted_beside_sites
-        return trains and is_told and left.path not in settled
+        return trains and RULES[left.rule].is_doubted_beside_sites and not is_settled
 
     def _module(self, module: Module) -> None:
+        found = self.found
         entries: List[_Entry] = []
         patched: List[Left] = []
         for function in module.scopes(lambda text: self.analysis.prospects.may_lead(text) or STRUCTURAL.search(text)):
@@ -102,14 +102,10 @@ class _Finder:
             entries += self._entries(function)
             nodes = patched_nodes(self.analysis.program, function)
             patched += [Left.at(function, function.place(node), "patched") for node in nodes]
+        lists: Dict[type, List[Any]] = {Site: found.sites, Problem: found.problems, Left: found.left}
         for _, entry in sorted(entries, key=lambda item: (item[0].line, item[0].column)):
-            if isinstance(entry, Site):
-                self.found.sites.append(entry)
-            elif isinstance(entry, Problem):
-                self.found.problems.append(entry)
-            else:
-                self.found.left.append(entry)
-        self.found.patched.extend(sorted(patched, key=lambda entry: entry.line))
+            lists[type(entry)].append(entry)
+        found.patched.extend(sorted(patched, key=lambda entry: entry.line))
 
     def _entries(self, function: Function) -> Iterator[_Entry]:
         """Yield the verdict on each L1 in a function, with its place."""

@@ -124,5 +124,5 @@ class Purposes:
 def _listed(function: Function, node: cst.CSTNode) -> List[cst.CSTNode]:
     """Return an argument of an optimiser, with what is appended to the list that it names."""
     parts = function.flow.definitions.get(node.value, []) if isinstance(node, cst.Name) else []
-    kept = [d.value for d in parts if d.kind == "mutate" or isinstance(d.value, cst.List)]
-    return [node, *(value for value in kept if value is not None)]
+    listed = [d.value for d in parts if d.kind == "mutate" or isinstance(d.value, cst.List)]
+    return [node, *(value for value in listed if value is not None)]

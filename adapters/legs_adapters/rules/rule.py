@@ -6,7 +6,6 @@ skips, `VALID` terms that are weighted; all are tests. ``order.py`` lists the ru
 
 from __future__ import annotations
 
-import inspect
 from typing import TYPE_CHECKING, Callable, Iterator, List, Optional, Sequence, Tuple
 
 import libcst as cst
@@ -87,7 +86,6 @@ class Rule:
     Attributes:
         id: its name, for ``--explain`` and the report.
         reason: the word in the JSON report; several rules may share it.
-        why: why a term is skipped, a sentence; default: the docstring.
         VALID, INVALID: code whose terms are weighted, and code with a term that the rule skips; the body of a training
             step, or functions.
         needs_target: warn of the term only if a side is known to be the photograph.
@@ -96,7 +94,6 @@ class Rule:
 
     id: str = ""
     reason: str = ""
-    why: str = ""
     VALID: List[str] = ["loss = l1_loss(image, gt)"]
     INVALID: List[str] = []
     needs_target = True
@@ -104,7 +101,7 @@ class Rule:
 
     def sentence(self) -> str:
         """Return why a term is skipped."""
-        return " ".join((self.why or inspect.getdoc(self) or "").replace("``", "`").split())
+        return " ".join((self.__doc__ or "").replace("``", "`").split())
 
     def evidence(self, term: Term) -> List[Decider]:
         """Return the evidence to skip a term; nothing where the rule does not apply."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Optional
+from typing import List
 
 import libcst as cst
 
@@ -12,29 +12,9 @@ from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import first
 from legs_adapters.rules.rule import CallContext
-from legs_adapters.terms.findings import Evidence
+from legs_adapters.terms.findings import Use
 
-__all__ = ["Use", "uses_of"]
-
-
-class Use(NamedTuple):
-    """A call of a function that compares images.
-
-    Attributes:
-        caller, call: the call, and the function that it stands in.
-        other: the evidence that it is not for the loss; None where it is.
-        is_known: whether its arguments show which.
-    """
-
-    caller: Function
-    call: cst.Call
-    other: Optional[Evidence]
-    is_known: bool
-
-    @property
-    def where(self) -> str:
-        """Its file and line."""
-        return f"{self.caller.module.path}:{self.caller.place(self.call).line}"
+__all__ = ["uses_of"]
 
 
 def uses_of(analysis: Analysis, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> List[Use]:

@@ -13,9 +13,9 @@ from legs_adapters.lexicon.words import MESH, PERCEPTUAL, WARPED
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import RULES, first
 from legs_adapters.rules.rule import Term
-from legs_adapters.rules.uses import Use, uses_of
+from legs_adapters.rules.uses import uses_of
 from legs_adapters.terms.error_maps import is_measured, reads_of
-from legs_adapters.terms.findings import Evidence, Kept, Left, Problem, Site
+from legs_adapters.terms.findings import Evidence, Left, Problem, Site
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import Callback
 from legs_adapters.terms.kinds.reread import Reread
@@ -46,8 +46,9 @@ class Verdicts:
             return Left.at(function, place, others[0].other or "")
         unknown = [use for use in uses if not use.is_known]
         if unknown and len(unknown) < len(uses):  # one body serves both
-            call, where = one_line(unknown[0].call), unknown[0].where
-            return self.problem(term, place, f"nothing shows that {call} at {where} is the loss, as other calls are")
+            call, where = one_line(unknown[0].call), unknown[0].left
+            why = f"nothing shows that {call} at {where.path}:{where.line} is the loss, as other calls are"
+            return self.problem(term, place, why)
         loss, others_read = reads_of(self.analysis.training, function, form)
         if others_read and not loss:
             return Left.at(function, place, Evidence("untrained", "untrained", term.here))
@@ -58,7 +59,7 @@ class Verdicts:
             form = Reread(loss[0], form.call, form.first, form.second)
         is_swapped = term.target is term.pair.first
         site = Site.at(function, form, self._why_photograph(term), is_swapped, term.pair.selection)
-        return site._replace(kept=tuple(_kept(function, use) for use in others))
+        return site._replace(unweighted=tuple(others))
 
     def decide_callback(self, holder: Function, callback: Callback) -> Site | Left:
         """Return the verdict on an L1 function that is passed by name, from the arguments of its call."""
@@ -78,7 +79,7 @@ class Verdicts:
     def doubt(self, function: Function, form: Form, place: Place, left: Left) -> Optional[Problem]:
         """Return the warning of a skipped term that may be the loss, if nothing else is found; None of any other."""
         term = Term(self.analysis, function, form)
-        rule = RULES[left.evidence.rule] if left.evidence is not None else None
+        rule = RULES.get(left.rule)
         if rule is None or not rule.may_be_loss(term) or is_measured(function, form) or same_root(form):
             return None
         names = [*dict(term.names_around), *getattr(self.analysis.program.owner_of(function), "methods", ())]
@@ -118,16 +119,3 @@ class Verdicts:
             return f"{name} is the photograph"
         where = "a parameter, " if term.function.is_parameter(term.target) else ""
         return f"{name} is {where}the photograph by its name"
-
-
-def _kept(function: Function, use: Use) -> Kept:
-    """Return a call that is not for the loss as one that is not weighted."""
-    assert use.other is not None
-    module, line = use.caller.module, use.caller.place(use.call).line
-    reason, text = use.other.reason, module.lines.text(line)
-    return Kept(module.path, line, text, reason, _called(function), use.call, use.caller)
-
-
-def _called(function: Function) -> str:
-    """Return the name that calls use: for a ``forward`` the name of its class."""
-    return function.owner.name if function.owner is not None and function.runs_by_instance else function.name

@@ -12,29 +12,82 @@ from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Unreadable
 from legs_adapters.terms.form import Form
 
-__all__ = ["Decider", "Evidence", "Findings", "Kept", "Left", "Line", "Problem", "Site"]
+__all__ = ["Decider", "Evidence", "Findings", "Left", "Line", "Problem", "Site", "Use"]
 
 Decider = Tuple[Function, cst.CSTNode]
 
 
-class Kept(NamedTuple):
-    """A call that is not weighted although the function it calls contains a site.
+class Line(NamedTuple):
+    """A line of a checkout: its place and its text."""
+
+    path: str
+    line: int
+    text: str
+
+
+class Evidence(NamedTuple):
+    """The rule that skips a term, its word for the report, and the nodes that decided, each with its function."""
+
+    rule: str
+    reason: str
+    deciders: Sequence[Decider]
+
+
+class Left(NamedTuple):
+    """A skipped L1.
 
     Attributes:
         path, line, text: its place, and the text of that line.
-        reason: its purpose, in one word.
-        function: the name of the called function.
-        call: all of it.
-        scope: the function that it stands in.
+        reason: why, in one word.
+        because: the lines that decided; its own where those cannot be placed.
+        rule: the id of the rule that skips it; empty where none did.
     """
 
     path: str
     line: int
     text: str
     reason: str
-    function: str
+    because: Tuple[Line, ...]
+    rule: str = ""
+
+    @classmethod
+    def at(cls, function: Function, place: Place, why: str | Evidence) -> Left:
+        """Return the term at a place as skipped: by a rule's evidence, or for another reason."""
+        here = Line(function.module.path, place.line, function.module.lines.text(place.line))
+        if isinstance(why, str):
+            return cls(*here, why, (here,))
+        return cls(*here, why.reason, tuple(_lines(why.deciders)) or (here,), why.rule)
+
+
+def _lines(deciders: Sequence[Decider]) -> Iterator[Line]:
+    for function, node in deciders:
+        if isinstance(node, cst.Module):
+            continue  # a whole file has no deciding line
+        try:
+            line = function.line if node is function.node else function.place(node).line
+        except (KeyError, ValueError):  # a node that the analysis made, or a file that LibCST writes differently
+            continue
+        yield Line(function.module.path, line, function.module.lines.text(line))
+
+
+class Use(NamedTuple):
+    """A call of a function that compares images.
+
+    Attributes:
+        caller, call: the call, and the function that it stands in.
+        other: the evidence that it is not for the loss; None where it is.
+        is_known: whether its arguments show which.
+    """
+
+    caller: Function
     call: cst.Call
-    scope: Function
+    other: Optional[Evidence]
+    is_known: bool
+
+    @property
+    def left(self) -> Left:
+        """The call as one that is not weighted."""
+        return Left.at(self.caller, self.caller.place(self.call), self.other or "")
 
 
 class Site(NamedTuple):
@@ -49,7 +102,7 @@ class Site(NamedTuple):
             difference of them is taken with; empty without.
         why: what is known of it, in words.
         scope: the function that it stands in.
-        kept: calls of that function that are not the loss.
+        unweighted: the calls of that function that are not for the loss.
     """
 
     path: str
@@ -61,7 +114,7 @@ class Site(NamedTuple):
     selection: str
     why: str
     scope: Function
-    kept: Tuple[Kept, ...] = ()
+    unweighted: Tuple[Use, ...] = ()
 
     @classmethod
     def at(cls, function: Function, form: Form, why: str, swapped: bool = False, selection: str = "") -> Site:
@@ -69,79 +122,6 @@ class Site(NamedTuple):
         place = function.place(form.node)
         stands = (function.module.path, place.line, place.column, place.last_line)
         return cls(*stands, form, swapped, selection, why, function)
-
-    @property
-    def function(self) -> str:
-        """The name of the function that it stands in."""
-        return self.scope.name
-
-    def named_by(self, line: int) -> bool:
-        """Return whether a line is one of its lines."""
-        return self.line <= line <= self.last_line
-
-
-class Line(NamedTuple):
-    """A line of a checkout: its place and its text."""
-
-    path: str
-    line: int
-    text: str
-
-
-class Evidence(NamedTuple):
-    """The rule that skips a term, and the nodes that decided.
-
-    Attributes:
-        rule: the rule's id.
-        reason: its word for the report.
-        deciders: the nodes that decided, each with the function that it stands in.
-    """
-
-    rule: str
-    reason: str
-    deciders: Sequence[Decider]
-
-    @property
-    def lines(self) -> List[Line]:
-        """The lines that decided; none in a file in which LibCST cannot place them."""
-        return [line for decider in self.deciders for line in _lines(*decider)]
-
-
-def _lines(function: Function, node: cst.CSTNode) -> Iterator[Line]:
-    if isinstance(node, cst.Module):
-        return  # a whole file has no deciding line
-    try:
-        line = function.line if node is function.node else function.place(node).line
-    except (KeyError, ValueError):  # a node that the analysis made, or a file that LibCST writes differently
-        return
-    yield Line(function.module.path, line, function.module.lines.text(line))
-
-
-class Left(NamedTuple):
-    """A skipped L1.
-
-    Attributes:
-        path, line, text: its place, and the text of that line.
-        reason: why, in one word.
-        evidence: the rule and what decided; None where no rule did.
-    """
-
-    path: str
-    line: int
-    text: str
-    reason: str
-    evidence: Optional[Evidence] = None
-
-    @classmethod
-    def at(cls, function: Function, place: Place, why: str | Evidence) -> Left:
-        """Return the term at a place as skipped: by a rule's evidence, or for another reason."""
-        reason, evidence = (why, None) if isinstance(why, str) else (why.reason, why)
-        return cls(function.module.path, place.line, function.module.lines.text(place.line), reason, evidence)
-
-    @property
-    def because(self) -> List[Line]:
-        """The lines that decided; its own where those cannot be placed."""
-        return (self.evidence.lines if self.evidence else []) or [Line(self.path, self.line, self.text)]
 
 
 class Problem(NamedTuple):
@@ -188,6 +168,6 @@ class Findings(NamedTuple):
             entries[:] = [entry for entry in entries if entry.path not in given_up]
 
     @property
-    def kept(self) -> Dict[Kept, Site]:
+    def unweighted(self) -> List[Tuple[Use, Site]]:
         """The calls that are not weighted, each with a site in the function that it calls."""
-        return {kept: site for site in self.sites for kept in site.kept}
+        return list({use.call: (use, site) for site in self.sites for use in site.unweighted}.values())

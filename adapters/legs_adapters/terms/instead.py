@@ -7,7 +7,7 @@ from typing import Iterable, Iterator
 
 from legs_adapters.code.sources import Source
 
-__all__ = ["said_instead"]
+__all__ = ["trained_instead"]
 
 _SQUARED = "the image loss is squared, not absolute"
 _OF_PICTURES = re.compile(r"rgb|im(g|age)|colou?r|delta", re.I)
@@ -27,7 +27,7 @@ _INSTEAD = (
 )
 
 
-def said_instead(sources: Iterable[Source]) -> Iterator[str]:
+def trained_instead(sources: Iterable[Source]) -> Iterator[str]:
     """Yield ``file:line: what`` for each row of the table that the files speak of, at its first line in code."""
     files = sorted(sources, key=lambda source: (source.path.count("/"), source.path))
     for pattern, what in _INSTEAD:

@@ -38,22 +38,19 @@ class Prospects:
     """
 
     def __init__(self, texts: Iterable[str]) -> None:
-        said = [(name, text) for whole in texts for name, text in _said(whole)]
-        known = {name for name, _ in said}
-        speakers: Dict[str, List[str]] = {}
+        definitions = [definition for text in texts for definition in _definitions(text)]
+        known = {name for name, _ in definitions}
+        speakers: Dict[str, List[str]] = {}  # by a word, the names whose definitions mention it
+        work = [name for name, text in definitions if SPEAKS_OF_L1.search(text)]
+        for name, text in definitions:
+            for word in known.intersection(_WORD.findall(text)):
+                speakers.setdefault(word, []).append(name)
         self._names: Set[str] = set()
-        for name, text in said:
-            if SPEAKS_OF_L1.search(text):
-                self._names.add(name)
-            else:
-                for word in known.intersection(_WORD.findall(text)):
-                    speakers.setdefault(word, []).append(name)
-        work = list(self._names)
         while work:
-            for name in speakers.get(work.pop(), ()):
-                if name not in self._names:
-                    self._names.add(name)
-                    work.append(name)
+            name = work.pop()
+            if name not in self._names:
+                self._names.add(name)
+                work += speakers.get(name, ())
         self._answers: Dict[str, bool] = {}
 
     def may_lead(self, text: str) -> bool:
@@ -63,7 +60,7 @@ class Prospects:
         return self._answers[text]
 
 
-def _said(text: str) -> Iterator[Tuple[str, str]]:
+def _definitions(text: str) -> Iterator[Tuple[str, str]]:
     """Yield names, each with the text of its definition."""
     classes: List[Tuple[int, str]] = []
     definitions = list(_DEFINITION.finditer(text))

@@ -15,7 +15,7 @@ __all__ = ["Edit", "Text", "flat", "names_for_two", "on_one_line", "residue"]
 
 _STRING = r"""("(?:\\.|[^"\\\r\n])*"|'(?:\\.|[^'\\\r\n])*')"""  # no comment begins inside
 _GAP = re.compile(_STRING + r"|(?:\s|\\(?=[\r\n])|#[^\r\n]*)+")
-_KEPT = re.compile(_STRING + r"|([ \t]*#[^\r\n]*|\\?(?:\r\n|\r|\n)[ \t]*)")
+_COMMENT_OR_BREAK = re.compile(_STRING + r"|([ \t]*#[^\r\n]*|\\?(?:\r\n|\r|\n)[ \t]*)")
 
 
 class Edit(NamedTuple):
@@ -86,4 +86,4 @@ def residue(text: str) -> str:
     """Return what is kept of a text that is removed: its comments and its line breaks."""
     if "\n" not in text and "\r" not in text:
         return ""
-    return "".join(kept for _, kept in _KEPT.findall(text))
+    return "".join(part for _, part in _COMMENT_OR_BREAK.findall(text))

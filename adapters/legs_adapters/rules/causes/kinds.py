@@ -34,7 +34,7 @@ class OtherKind(Rule):
         self.id: str = id
         self.kind: str = kind
         self.reason: str = reason or id
-        self.why: str = f"One side is {what}."
+        self.__doc__ = f"One side is {what}."
         self.INVALID: List[str] = [f"loss = l1_loss({invalid})"]
 
     def evidence(self, term: Term) -> List[Decider]:
@@ -81,7 +81,7 @@ def _is_named_picture(term: Term, side: cst.CSTNode, meaning: Meaning, beside: M
     """
     if meaning.kind not in LAID_OVER_PICTURES or beside.kind != "image":
         return False
-    spoken = words(side.value if isinstance(side, cst.Name) else str(key_of(side) or ""))
+    tokens = words(side.value if isinstance(side, cst.Name) else str(key_of(side) or ""))
     is_under_mask = bool(term.form.extras) and "masked" in words(call_name(term.form.call)) and meaning.kind == "mask"
-    is_picture = is_under_mask and any(kind_of_words(word) == "image" for word in spoken)
+    is_picture = is_under_mask and any(kind_of_words(word) == "image" for word in tokens)
     return is_picture or is_beside_ssim(term.function, *term.sides)

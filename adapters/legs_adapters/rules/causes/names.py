@@ -71,7 +71,7 @@ class OtherName(Rule):
         self.id: str = id
         self.reason: str = reason
         self.words: AbstractSet[str] = words
-        self.why: str = why
+        self.__doc__ = why
         self.INVALID: List[str] = [f"def {invalid}(cam, image):\n    l1_loss(image, cam.original_image).backward()"]
 
     def evidence(self, term: Term) -> List[Decider]:

@@ -83,12 +83,12 @@ def _is_called_by_framework(term: Term) -> bool:
     return any(f.name == "forward" and f.owner is not None and f not in training.sites for f in above)
 
 
-def _named(term: Term, spoken: AbstractSet[str]) -> List[Decider]:
+def _named(term: Term, tokens: AbstractSet[str]) -> List[Decider]:
     """Return the first of the term's function, its class, its callers and their files whose name has one of words."""
     names = list(term.names_around)
     for function in _above(term):
         names += [(name, header(function)) for name in (function.name, function.module.path.rsplit("/", 1)[-1])]
-    return [decider for name, decider in names if spoken & set(words(name))][:1]
+    return [decider for name, decider in names if tokens & set(words(name))][:1]
 
 
 def _above(term: Term) -> Iterator[Function]:

@@ -327,3 +327,50 @@ class TestCompletion:
         code, text = says(capsys, "--print-completion", "bash", main=command)
         assert code == 2
         assert "pip install 'legs-loss[completion]'" in text
+
+
+class TestWhatIsOffered:
+    @pytest.mark.parametrize(
+        ("arguments", "most", "advanced"),
+        [
+            (["patch"], 10, "advanced: which terms"),
+            (["train"], 10, "advanced: the training"),
+            (["compare"], 9, "advanced"),
+        ],
+    )
+    def test_the_basic_options_are_few_and_come_first(self, capsys, arguments, most, advanced):
+        pytest.importorskip("libcst")
+        with pytest.raises(SystemExit):
+            main([*arguments, "--help"])
+        basic, found, rest = capsys.readouterr().out.partition(f"\n{advanced}:\n")
+        options = re.findall(r"^  (?:-\w[^-]*)?--(\w+)", basic.partition("\noptions:")[2], re.M)
+        assert found
+        assert 4 <= len(options) <= most
+        assert len(re.findall(r"^  --", rest, re.M)) >= 3
+
+    def test_studies_of_our_own_pages_are_examples(self, capsys):
+        code, text = says(capsys, "compare", "--study", "noise")
+        assert code == 2 and "main" in text and "controls" in text
+        for option in ("--again", "--first_seed", "--upstream"):
+            assert says(capsys, "compare", option, "3")[0] == 2
+        for script in ("compare", "reproduce", "schedule", "distractors"):
+            assert (ROOT / "examples" / "reproduce_paper" / f"{script}.py").is_file()
+
+    def test_the_docs_need_nothing_of_the_package(self):
+        tomllib = pytest.importorskip("tomllib")
+        extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+        assert not [one for one in extras["docs"] if one.startswith(("legs-loss", "torch"))]
+        assert "[test]" not in (ROOT / "Makefile").read_text().partition("$(VENV)/.docs:")[2].partition("\n\n")[0]
+
+    @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+    def test_when_to_use_it_and_when_not(self, page):
+        lines = [line for line in (ROOT / page).read_text().splitlines() if line.startswith("- **")]
+        assert [line.split("**")[1] for line in lines[:3]] == ["Use it", "Do not use it", "Measure it"]
+        assert "contours" in lines[0] and "more Gaussians are acceptable" in lines[0]
+        assert "fixed" in lines[1]
+
+    def test_what_users_ask_is_answered(self):
+        answers = (ROOT / "docs" / "index.md").read_text().partition("## Questions\n")[2]
+        for question in ("blurry", "Floaters", "exposure", "Masks", "cap", "Noise", "slower", "Windows", "MPS"):
+            [answer] = re.findall(rf"^\*\*[^*]*{question}[^*]*\*\*(?:.+\n)+", answers, re.M)
+            assert 8 <= len(answer.split()) <= 90, question

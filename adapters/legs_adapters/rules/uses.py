@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List
+from typing import Iterator, List, Optional, Sequence, Tuple
 
 import libcst as cst
 
@@ -16,12 +16,15 @@ from legs_adapters.terms.findings import Use
 
 __all__ = ["uses_of"]
 
+_Call = Tuple[Function, cst.Call, List[Optional[cst.BaseExpression]]]
+_DEPTH = 3  # functions that hand on what they are given
+
 
 def uses_of(analysis: Analysis, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> List[Use]:
     """Classify the calls, in the training step, of a function that compares two of its parameters."""
     found: List[Use] = []
-    for caller, call in analysis.training.sites.get(function, []) if isinstance(target, cst.Name) else ():
-        sides = [function.given(call, side.value) for side in (prediction, target) if isinstance(side, cst.Name)]
+    names = [side.value for side in (prediction, target) if isinstance(side, cst.Name)]
+    for caller, call, sides in _calls(analysis, function, names) if isinstance(target, cst.Name) else ():
         if arguments(call)[2]:  # starred
             found.append(Use(caller, call, None, False))
         elif sides[-1] is not None:
@@ -31,3 +34,15 @@ def uses_of(analysis: Analysis, function: Function, prediction: cst.CSTNode, tar
             is_loss = is_loss and (len(given) == 1 or swapped(*given) is False)
             found.append(Use(caller, call, other, is_loss or other is not None))
     return sorted(found, key=lambda use: (use.caller.module.path, use.caller.place(use.call).line))
+
+
+def _calls(analysis: Analysis, function: Function, names: Sequence[str], depth: int = 0) -> Iterator[_Call]:
+    """Yield the calls that give a function these parameters, past callers that only hand on their own."""
+    sites = analysis.training.sites
+    for caller, call in sites.get(function, []):
+        sides = [function.given(call, name) for name in names]
+        own = [side.value for side in sides if isinstance(side, cst.Name) and caller.is_parameter(side)]
+        if len(own) == len(names) and caller in sites and depth < _DEPTH:
+            yield from _calls(analysis, caller, own, depth + 1)
+        else:
+            yield caller, call, sides

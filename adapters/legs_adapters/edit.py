@@ -14,13 +14,13 @@ from __future__ import annotations
 import re
 import sys
 import warnings
-from typing import List, Optional, Sequence, Tuple
+from typing import List, Optional, Sequence
 
 import libcst as cst
 
 from legs_adapters.code.module import Module
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import code, dotted
+from legs_adapters.code.syntax import dotted
 from legs_adapters.terms.findings import Site, Use
 from legs_adapters.terms.text import Edit, Text, on_one_line
 from legs_adapters.terms.writing import PACKAGE, Writing
@@ -29,8 +29,7 @@ from legs_loss import LegsError
 __all__ = ["PACKAGE", "Edit", "apply_edits", "rewrite", "why_not_compiled"]
 
 _STRINGS = (cst.SimpleString, cst.ConcatenatedString)
-_FUTURE = re.compile(r"from\s+__future__")
-_TORCH = re.compile(r"from\s+torch\b|import\s+(.*,\s*)?torch\b")
+_IMPORTS = (cst.Import, cst.ImportFrom)
 
 
 def apply_edits(data: bytes, edits: Sequence[Edit]) -> bytes:
@@ -106,22 +105,16 @@ def _import(text: Text) -> Edit:
 
 
 def _anchor(body: Sequence[cst.CSTNode]) -> Optional[cst.SimpleStatementLine]:
-    """Return the statement that the import goes after: the last ``import torch...`` at the top, or the last import.
-
-    Without imports it is the last ``from __future__``, or the docstring.
-    """
-    found: List[Tuple[int, cst.SimpleStatementLine]] = []  # the better the higher
-    for i, statement in enumerate(body):
-        if not isinstance(statement, cst.SimpleStatementLine):
-            if any(rank for rank, _ in found) and not isinstance(statement, (cst.If, cst.Try, cst.With)):
-                break
-            continue
-        first = statement.body[0]
-        is_doc = i == 0 and isinstance(first, cst.Expr) and isinstance(first.value, _STRINGS)
-        if is_doc or isinstance(first, (cst.Import, cst.ImportFrom)):
-            found.append((_rank(first), statement))
-    best = max((rank for rank, _ in found), default=0)
-    return next((statement for rank, statement in reversed(found) if rank == best), None)
+    """Return the statement that the import goes after: the last import above functions and classes, or a docstring."""
+    found: Optional[cst.SimpleStatementLine] = None
+    for statement in body:
+        if isinstance(statement, (cst.FunctionDef, cst.ClassDef)):
+            break
+        first = statement.body[0] if isinstance(statement, cst.SimpleStatementLine) else None
+        is_doc = statement is body[0] and isinstance(first, cst.Expr) and isinstance(first.value, _STRINGS)
+        if isinstance(statement, cst.SimpleStatementLine) and (is_doc or isinstance(first, _IMPORTS)):
+            found = statement
+    return found
 
 
 def _is_imported(module: Module) -> bool:
@@ -135,9 +128,3 @@ def _is_imported(module: Module) -> bool:
         if not isinstance(node, cst.ImportAlias) or (dotted(node.name) or "").split(".")[0] != PACKAGE:
             raise LegsError(f"{module.path} has a {PACKAGE} of its own: rename it, or skip the file with --exclude")
     return PACKAGE in module.top.flow.definitions
-
-
-def _rank(node: cst.CSTNode) -> int:
-    """Return how well a statement goes before our import: 2 is an import of torch, 1 any other, 0 none."""
-    text = code(node) if isinstance(node, (cst.Import, cst.ImportFrom)) else ""
-    return 0 if not text or _FUTURE.match(text) else 2 if _TORCH.match(text) else 1

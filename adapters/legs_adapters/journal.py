@@ -37,14 +37,6 @@ class Layer(NamedTuple):
     edits: Tuple[Tuple[int, int, str], ...]
     after: str
 
-    def patched(self) -> bytes:
-        """Return the bytes that the patch wrote."""
-        parts, at = [], 0
-        for start, end, text in self.edits:
-            parts += [self.original[at:start], text.encode("utf-8")]
-            at = end
-        return b"".join([*parts, self.original[at:]])
-
 
 class Journal(NamedTuple):
     """The patches of one checkout.

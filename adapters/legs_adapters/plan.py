@@ -100,10 +100,10 @@ def plan(
         LegsError: no such folder; a site named by hand is not there; an expression that is nested too deeply.
     """
     root = check_root(path)
-    files = read_files(root, exclude)
+    readable, unreadable = read_files(root, exclude)
     edits: Dict[str, List[Edit]] = {}
     with _large_trees():
-        findings = find(files.readable, by_hand, ssim, masks)
+        findings = find(readable, by_hand, ssim, masks)
         for name in _files_to_edit(findings):
             why = why_not_compiled(findings.program.sources[name].data)
             if why:
@@ -115,7 +115,7 @@ def plan(
                 edits[name] = rewrite(findings.program, name, sites, unweighted, in_place)
             except RecursionError:
                 _give_up(findings, name, "is nested too deeply")
-    findings.unreadable[:0] = files.unreadable
+    findings.unreadable[:0] = unreadable
     for name, line in by_hand:
         _check_named(root, findings, name, line, exclude)
     after = {name: apply_edits(findings.program.sources[name].data, made) for name, made in edits.items()}

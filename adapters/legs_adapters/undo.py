@@ -11,6 +11,7 @@ from legs_adapters.checkout.replace import Changes, locked, read_file, replace_f
 from legs_adapters.code.folders import first_of
 from legs_adapters.code.limits import Budget
 from legs_adapters.code.sources import check_root
+from legs_adapters.edit import Edit, apply_edits
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_loss import LegsError
 
@@ -112,7 +113,9 @@ def _undo_edits(name: str, layer: Layer, current: bytes, budget: Budget) -> Tupl
         The file with the patch's lines as they were and the edits as they are; and the patched lines that are no longer
         there as the patch left them: then the file is as it was.
     """
-    before, after, lines = (data.splitlines(keepends=True) for data in (layer.original, layer.patched(), current))
+    edits = [Edit(start, end, layer.original[start:end], text.encode("utf-8")) for start, end, text in layer.edits]
+    patched = apply_edits(layer.original, edits)
+    before, after, lines = (data.splitlines(keepends=True) for data in (layer.original, patched, current))
     parts = changed_lines(before, after)
     over = budget.spend(name, len(parts) * (len(after) + len(lines))) or budget.why_none_left()
     restored: List[bytes] = []

@@ -130,7 +130,7 @@ def test_a_proven_photograph_is_told_from_one_that_only_its_name_shows(tmp_path)
         "    called(image, cam.original_image.cuda()).backward()\n    gaussians.optimizer.step()\n"
     )
     found = plan(checkout(tmp_path, texts))
-    assert {site.function: site.why for site in found.findings.sites if site.path == "step.py"} == {
+    assert {site.scope.name: site.why for site in found.findings.sites if site.path == "step.py"} == {
         "called": "other is the photograph",
         "handed": "gt_image is a parameter, the photograph by its name",
     }

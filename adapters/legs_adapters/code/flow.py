@@ -207,7 +207,9 @@ class Flow:
 
     def _copy(self, env: Env) -> Env:
         self.steps += len(env) >> 2
-        return env.copied()
+        copied = Env(env)
+        copied.alive = env.alive
+        return copied
 
     def _inside(self, env: Env, body: cst.BaseSuite, *around: cst.CSTNode) -> None:
         """Visit the body of a loop or of a ``with``."""

@@ -6,7 +6,7 @@ import fnmatch
 import os
 import re
 import unicodedata
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_loss import LegsError
@@ -75,15 +75,11 @@ def why_left_out(root: Path, path: str, exclude: Sequence[str] = ()) -> Optional
 def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
     """Return the skipped folder that a file is in, below third_party the inner one; None without one."""
     submodules = _submodules(root)
-    parts = path.split("/")
-    for i in range(1, len(parts)):
-        folder = "/".join(parts[:i])
-        why = _why_foreign(root, folder, submodules)
-        if why == VENDORED and i + 1 < len(parts):
-            folder = "/".join(parts[: i + 1])
-            why = _why_foreign(root, folder, submodules) or why
-        if os.path.islink(str(root / folder)):
-            why = "a link"
+    folders = [folder.as_posix() for folder in reversed(PurePosixPath(path).parents)][1:]
+    for folder, inner in zip(folders, [*folders[1:], ""]):
+        why = "a link" if os.path.islink(str(root / folder)) else _why_foreign(root, folder, submodules)
+        if why == VENDORED and inner:
+            return Skipped(inner, _why_foreign(root, inner, submodules) or why)
         if why is not None:
             return Skipped(folder, why)
     return None

@@ -71,11 +71,12 @@ class Program(Checkout):
         if isinstance(node, cst.Call):
             return self._call(function, node, depth)
         if isinstance(node, cst.Subscript):
-            return self._subscript(function, node, depth)
+            return self.resolve(function, node.value, depth)  # one of a dictionary's values, LOSSES[kind]
+        if isinstance(node, cst.Dict):
+            values = [each.value for each in node.elements if isinstance(each, cst.DictElement)]
+            return [ref for value in values for ref in self.resolve(function, value, depth)]
         if isinstance(node, cst.IfExp):
             return self.resolve(function, node.body, depth) + self.resolve(function, node.orelse, depth)
-        if isinstance(node, cst.BooleanOperation):
-            return self.resolve(function, node.left, depth) + self.resolve(function, node.right, depth)
         return [Reference("lambda", node)] if isinstance(node, cst.Lambda) else []
 
     def lookup(self, function: Function, node: cst.CSTNode) -> Optional[List[Tuple[Function, Definition]]]:
@@ -147,22 +148,6 @@ class Program(Checkout):
             ref for callee in callees for value in callee.flow.returns for ref in self.resolve(callee, value, depth + 1)
         ]
         return [r for r in found if r.kind in ("function", "lambda", "instance")]
-
-    def _subscript(self, function: Function, node: cst.Subscript, depth: int) -> List[Reference]:
-        """Resolve ``LOSSES[kind]`` to all values of a dictionary, which may be imported."""
-        found: List[Reference] = []
-        for where, made in self.lookup(function, node.value) or ():
-            if made.kind == "import" and isinstance(made.value, cst.ImportFrom):
-                base = self.imported_from(where.module, made.value)
-                named = made.node.evaluated_name if isinstance(made.node, cst.ImportAlias) else ""
-                entries = [(base.top, each) for each in base.top.flow.definitions.get(named, [])] if base else []
-            else:
-                entries = [(where, made)]
-            for place, value in ((place, entry.value) for place, entry in entries if entry.kind == "assign"):
-                elements = value.elements if isinstance(value, cst.Dict) else ()
-                for element in (each for each in elements if isinstance(each, cst.DictElement)):
-                    found += self.resolve(place, element.value, depth)
-        return found
 
     # -- modules
 

@@ -44,12 +44,6 @@ class Env(Dict[str, FrozenSet[Definition]]):
 
     alive: bool = True
 
-    def copied(self) -> Env:
-        """Return a copy, for a branch."""
-        copied = Env(self)
-        copied.alive = self.alive
-        return copied
-
     def join(self, *ends: Env) -> None:
         """Continue with the definitions at the ends of several branches, of those that go on."""
         alive = [end for end in ends if end.alive]

@@ -8,16 +8,14 @@ import os
 import tokenize
 from dataclasses import dataclass
 from pathlib import Path
-from typing import List, NamedTuple, Sequence
+from typing import List, Sequence, Tuple
 
 from legs_adapters.code.folders import check_name, walk
 from legs_adapters.code.limits import MAX_BYTES, MAX_FILE_BYTES
 from legs_loss import LegsError
 from legs_loss.system import read_regular
 
-__all__ = ["BOM", "Files", "Source", "Unreadable", "check_root", "decode", "read_files", "read_source"]
-
-BOM = b"\xef\xbb\xbf"
+__all__ = ["Source", "Unreadable", "check_root", "decode", "read_files", "read_source"]
 
 
 @dataclass(frozen=True)
@@ -34,11 +32,6 @@ class Source:
     data: bytes
     text: str
 
-    @property
-    def bom(self) -> bytes:
-        """The byte order mark, if the file starts with one."""
-        return BOM if self.data.startswith(BOM) else b""
-
 
 @dataclass(frozen=True)
 class Unreadable:
@@ -46,18 +39,6 @@ class Unreadable:
 
     path: str
     reason: str
-
-
-class Files(NamedTuple):
-    """The Python files of a checkout.
-
-    Attributes:
-        readable: those that are analysed.
-        unreadable: those that cannot be read.
-    """
-
-    readable: List[Source]
-    unreadable: List[Unreadable]
 
 
 def check_root(path: str | os.PathLike[str]) -> Path:
@@ -76,23 +57,25 @@ def check_root(path: str | os.PathLike[str]) -> Path:
     return root
 
 
-def read_files(root: Path, exclude: Sequence[str]) -> Files:
-    """Read the Python files of a checkout, except for excluded ones.
+def read_files(root: Path, exclude: Sequence[str]) -> Tuple[List[Source], List[Unreadable]]:
+    """Read the Python files of a checkout, except for excluded ones; return them, and those that cannot be read.
 
     Raises:
         LegsError: they are too large together.
     """
-    files, size = Files([], []), 0
+    readable: List[Source] = []
+    unreadable: List[Unreadable] = []
+    size = 0
     for path in walk(root, exclude):
         source = read_source(root, path)
         if isinstance(source, Unreadable):
-            files.unreadable.append(source)
+            unreadable.append(source)
             continue
-        files.readable.append(source)
+        readable.append(source)
         size += len(source.data)
         if size > MAX_BYTES:
             raise LegsError(f"its Python files have more than {MAX_BYTES >> 20} MiB: leave some out by --exclude")
-    return files
+    return readable, unreadable
 
 
 def read_source(root: Path, path: str) -> Source | Unreadable:

@@ -107,15 +107,12 @@ class Training:
 
     def _call(self, function: Function, node: cst.Call, key: object) -> None:
         name, owner = call_name(node), node.func.value if isinstance(node.func, cst.Attribute) else None
-        positional, keywords, _ = arguments(node)
+        positional = arguments(node)[0]
         literal = constant(positional[0]) if positional else None
         if owner is not None and name in ENDS_GRADIENT | SIZES | BACKWARD:
             return
         if owner is not None and name == "get" and isinstance(literal, str):
             self._push(function, owner, literal)
-            return
-        if name == "dict" and key in keywords:
-            self._push(function, keywords[str(key)])
             return
         references = self.program.resolve(function, node.func) or handed(self.program, function, node.func)
         for reference in references:

@@ -7,7 +7,7 @@ from typing import Optional, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import attribute_chain, call_name, constant, walk_expressions
+from legs_adapters.code.syntax import attribute_chain, call_name, walk_expressions
 from legs_adapters.tensors.operations import ENDS_GRADIENT, NO_GRAD
 
 __all__ = ["detaches", "is_detached", "is_without_grad", "no_grad_around", "under_no_grad"]
@@ -46,9 +46,4 @@ def detaches(node: cst.CSTNode) -> bool:
 
 
 def _stops_gradients(node: cst.CSTNode) -> bool:
-    if isinstance(node, cst.Call) and call_name(node) in NO_GRAD:
-        if call_name(node) == "no_grad":
-            return True
-        value = constant(node.args[0].value) if node.args else True
-        return bool(value) if call_name(node) == "inference_mode" else value is False
-    return False
+    return isinstance(node, cst.Call) and call_name(node) in NO_GRAD

@@ -35,7 +35,7 @@ class Text:
         self.function = function
         self.module: Module = function.module
         self.bytes: bytes = self.module.lines.data
-        self._shift = len(source.bom)
+        self._shift = len(source.data) - len(self.bytes)  # a byte order mark
 
     def span(self, node: cst.CSTNode, brackets: bool = False) -> Tuple[int, int]:
         """Return where a node begins and ends, on request with the brackets around it."""

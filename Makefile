@@ -10,6 +10,7 @@ SIDE_BY_SIDE = -n auto --maxprocesses 4 --dist worksteal
 
 demo: $(VENV)/.demo
 	$(BIN)/legs demo
+	@echo "legs is installed in $(VENV): source $(BIN)/activate"
 
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -q -m "not slow" $(SIDE_BY_SIDE)

@@ -362,6 +362,13 @@ class TestWhatIsOffered:
         assert not [one for one in extras["docs"] if one.startswith(("legs-loss", "torch"))]
         assert "[test]" not in (ROOT / "Makefile").read_text().partition("$(VENV)/.docs:")[2].partition("\n\n")[0]
 
+    def test_the_demo_ends_with_how_to_look(self):
+        if shutil.which("make") is None:
+            pytest.skip("no make")
+        done = subprocess.run(["make", "-n", "demo", "VENV=here"], cwd=str(ROOT), capture_output=True, text=True)
+        *_, demo, told = done.stdout.splitlines()
+        assert demo == "here/bin/legs demo" and "source here/bin/activate" in told
+
     @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
     def test_when_to_use_it_and_when_not(self, page):
         lines = [line for line in (ROOT / page).read_text().splitlines() if line.startswith("- **")]

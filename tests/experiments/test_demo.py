@@ -55,7 +55,7 @@ def test_the_demo_on_a_users_scene(tiny_scene: Path, tmp_path: Path) -> None:
         for kind in ("rendering", "error", "weight"):
             assert size_of(out / "pictures" / f"{name}-{kind}.png") == (32, 24)
     assert str(out / "pictures" / "comparison.png") in done.stdout
-    assert f"Look at them in the browser: legs view {out} (pip install 'legs-loss[view]')\n" in done.stdout
+    assert f"in the browser: legs view {out} -s {tiny_scene} (pip install 'legs-loss[view]')\n" in done.stdout
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.reference.embedded import write_embedded_scene
     from legs_loss.reference.training.checkpoint import CHECKPOINT
     from legs_loss.reference.training.side_by_side import Arm, train_side_by_side
-    from legs_loss.reference.training.trainer import TrainConfig
+    from legs_loss.reference.training.trainer import TrainConfig, check_trainable
     from legs_loss.report.comparison import check_matplotlib
     from legs_loss.scenes import read_scene
     from legs_loss.spec import PRESETS
@@ -55,13 +55,12 @@ def run(args: argparse.Namespace) -> int:
         raise LegsError(f"--processes must be at least 1, got {args.processes}")
     out: Path = args.out
     check_writable(out)
+    root = out / "scene" if args.scene is None else Path(args.scene)
     if args.scene is None:
-        root = out / "scene"
         say(f"making the embedded scene in {root}")
         write_embedded_scene(root)
-    else:
-        root = Path(args.scene)
     scene = read_scene(root, args.images)
+    check_trainable(scene)
     resolution = args.resolution if args.resolution is not None else default_resolution(scene)
 
     store = out / "legs_weights"  # not in the scene folder, which is the user's

@@ -149,6 +149,15 @@ class TestResolution:
             assert message in text
         assert not (tmp_path / "run").exists()
 
+    @pytest.mark.parametrize("command", ["train", "compare", "demo"])
+    def test_photographs_without_cameras_are_met_before_anything_is_computed(self, capsys, scene, tmp_path, command):
+        pytest.importorskip("numba")
+        pytest.importorskip("matplotlib")
+        code, text = says(capsys, command, scene / "images", "--out", tmp_path / "run")
+        assert (code, text.count("\n")) == (2, 1)
+        assert "has no camera: training needs a scene with poses (COLMAP's sparse/0)" in text
+        assert not (tmp_path / "run").exists()
+
 
 class TestWhatIsNotThere:
     def test_info_of_a_scene_without_a_store(self, capsys, scene, tmp_path):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Set
+from typing import Dict, Set
 
 import pytest
+
+from legs_loss.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/**/*.md")})
@@ -35,6 +37,23 @@ def test_what_a_page_links_to_is_there(page: Path) -> None:
 def test_a_path_of_the_project_that_a_page_names_is_there(page: Path) -> None:
     named = {path for code in re.findall(r"`([^`\n]+)`", prose(page)) for path in re.findall(PATH, code)}
     assert [path for path in sorted(named) if not any(ROOT.glob(path.rstrip("/")))] == []
+
+
+def test_an_option_that_a_page_gives_to_a_command_is_one_of_it(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("libcst")
+    known: Dict[str, Set[str]] = {}
+    for page in PAGES:
+        for name, other, words in re.findall(
+            r"\blegs(?: ([a-z]+)|-(patch))\b([^`|#\n]*)", page.read_text(encoding="utf-8")
+        ):
+            command, words = name or other, words.partition(".py")[0] if name == "run" else words
+            given = set(re.findall(r"(?<!\S)--[a-z_]+", words)) - {"--version", "--print-completion"}
+            if given and command not in known:
+                with pytest.raises(SystemExit):
+                    main([command, "--help"])
+                known[command] = set(re.findall(r"--[a-z_]+", capsys.readouterr().out))
+            assert given <= known.get(command, set()), f"{page.name}: legs {command}{words}"
+    assert {"patch", "run", "precompute", "train", "compare"} <= set(known)
 
 
 def test_readme_fits_a_screen_or_two() -> None:

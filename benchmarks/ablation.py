@@ -166,7 +166,7 @@ def switch_off(kind: str, name: str) -> None:
     """Let a part behave as if it did not exist, from now on: fork first."""
     if kind == "rule":
         for rule in rules()[name]:
-            rule.evidence = rule.evidence_of_call = lambda *_: []
+            rule.evidence = lambda *_: []
     elif kind == "words":
         _replace(lists()[name], _without(name))
     elif name in _OFF.get(kind, ()):
@@ -260,8 +260,7 @@ def listen() -> Callable[[], Set[str]]:
     words: Dict[str, Set[str]] = {}
     for name, some in rules().items():
         for rule in some:
-            for asked in ("evidence", "evidence_of_call"):
-                _listen_to(rule, asked, noted.setdefault(f"rule: {name}", set()))
+            _listen_to(rule, "evidence", noted.setdefault(f"rule: {name}", set()))
     for form in kinds_of_form():
         _listen_to(form, "find", noted.setdefault(f"form: {form.__name__}", set()))
     for kind, table in _OFF.items():

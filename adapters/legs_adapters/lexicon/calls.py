@@ -27,7 +27,10 @@ from legs_adapters.tensors.operations import (
     REDUCES,
 )
 
-__all__ = ["CallReading", "meaning_of_call"]
+__all__ = ["CallReading", "MeaningOf", "meaning_of_call"]
+
+
+MeaningOf = Callable[[Function, cst.CSTNode], Meaning]  # of an expression of a function
 
 
 class CallReading:
@@ -43,13 +46,7 @@ class CallReading:
         owner: the object whose method is called; None for a function, of a module too.
     """
 
-    def __init__(
-        self,
-        program: Program,
-        function: Function,
-        node: cst.Call,
-        meaning_of: Callable[[Function, cst.CSTNode], Meaning],
-    ) -> None:
+    def __init__(self, program: Program, function: Function, node: cst.Call, meaning_of: MeaningOf) -> None:
         self.program = program
         self.function = function
         self.node = node

@@ -7,7 +7,7 @@ and the field's words in the names along it. A name with "depth" or "feature" ou
 
 from __future__ import annotations
 
-from typing import Callable, Dict, List, Optional, Set, Tuple
+from typing import Dict, List, Optional, Set, Tuple
 
 import libcst as cst
 
@@ -16,8 +16,8 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.returned import default_key, formatted_key
-from legs_adapters.code.syntax import arguments, call_name, constant, key_of, root_of, same, words
-from legs_adapters.lexicon.calls import CallReading, meaning_of_call
+from legs_adapters.code.syntax import arguments, call_name, constant, dotted, key_of, root_of, same, words
+from legs_adapters.lexicon.calls import CallReading, MeaningOf, meaning_of_call
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import BACKGROUND, DATA, LOSS, PARAMETERS, RENDERERS
@@ -50,7 +50,7 @@ class Meanings:
 
     def meaning(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Return the meaning of an expression."""
-        return self._answer(("expression", id(node)), function, node, self._of)
+        return self._answer(function, node, self._of)
 
     def origin(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Return the meaning from a name's definitions, without the name itself."""
@@ -60,16 +60,11 @@ class Meanings:
 
     def _flow(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Join the meanings of the definitions that reach this use."""
-        return self._answer(("definitions", id(node)), function, node, self._defined)
+        return self._answer(function, node, self._defined)
 
-    def _answer(
-        self,
-        question: _Question,
-        function: Function,
-        node: cst.CSTNode,
-        answer: Callable[[Function, cst.CSTNode], Meaning],
-    ) -> Meaning:
+    def _answer(self, function: Function, node: cst.CSTNode, answer: MeaningOf) -> Meaning:
         """Answer a question once; unknown where the answer depends on itself or exceeds the budget."""
+        question = answer.__name__, id(node)
         for known in (self._known, self._here):
             if question in known:
                 return known[question]
@@ -95,7 +90,7 @@ class Meanings:
         if isinstance(node, cst.Name):
             return self._name(function, node, self._flow(function, node))
         if isinstance(node, cst.Attribute):
-            return self._attribute(function, node)
+            return self._member(function, node, node.attr.value)
         if isinstance(node, cst.Subscript):
             return self._subscript(function, node)
         if isinstance(node, cst.Call):
@@ -118,16 +113,6 @@ class Meanings:
             return Meaning("mask", role)  # motion_masks, alpha = depth_sil[1]: to be laid over a rendering
         return Meaning(more_special(kind, flow.kind), role)
 
-    def _attribute(self, function: Function, node: cst.Attribute) -> Meaning:
-        name, kind = node.attr.value, kind_of_words(node.attr.value)
-        local = self._flow(function, node) if function.flow.reaching(node) else UNKNOWN
-        if local == UNKNOWN and isinstance(node.value, cst.Name) and node.value.value == "self":
-            owner = self.program.owner_of(function)
-            stores = owner.stores(name) if owner is not None else []
-            local = mix(self._definition(method, definition) for method, definition in stores[:6])
-        role = role_of_words(name) or local.role or self._role_of_holder(function, node.value)
-        return Meaning(more_special(kind, local.kind), role)
-
     def _subscript(self, function: Function, node: cst.Subscript) -> Meaning:
         key = key_of(node) or formatted_key(node) or default_key(function, node)
         if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in PARAMETERS:
@@ -135,13 +120,19 @@ class Meanings:
         last = node.slice[-1].slice
         if len(node.slice) > 1 and isinstance(last, cst.Index) and constant(last.value) == 3:
             return Meaning("depth", self.meaning(function, node.value).role)  # of RGB+D, render[0, ..., 3]
-        if not isinstance(key, str):
-            return self.meaning(function, node.value)
-        local = self._flow(function, node)
-        role = role_of_words(key) or local.role
-        if role is None and not BACKGROUND & set(words(key)):
+        return self._member(function, node, key) if isinstance(key, str) else self.meaning(function, node.value)
+
+    def _member(self, function: Function, node: cst.Attribute | cst.Subscript, name: str) -> Meaning:
+        """Return the meaning of an attribute or an entry: of its words, what is assigned to it, and who holds it."""
+        local = self._flow(function, node) if function.flow.reaching(node) else UNKNOWN
+        if local == UNKNOWN and isinstance(node, cst.Attribute) and dotted(node.value) == "self":
+            owner = self.program.owner_of(function)
+            stores = owner.stores(name) if owner is not None else []
+            local = mix(self._definition(method, definition) for method, definition in stores[:6])
+        role = role_of_words(name) or local.role
+        if role is None and not BACKGROUND & set(words(name)):
             role = self._role_of_holder(function, node.value)
-        return Meaning(more_special(kind_of_words(key), local.kind), role)
+        return Meaning(more_special(kind_of_words(name), local.kind), role)
 
     def _role_of_holder(self, function: Function, node: cst.CSTNode) -> Optional[str]:
         """Return the role from the container: ``outputs["rgb"]`` is rendered, ``batch["rgb"]`` a target."""

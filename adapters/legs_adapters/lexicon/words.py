@@ -29,9 +29,9 @@ WORDS = {
     """,
     # LangSplat, Feature 3DGS, Gaussian Grouping; polarised light, phasors of time-of-flight cameras
     "feature": """
-        feature features feat feats semantic semantics sem language lang clip dino dinov2 lseg sam embedding embeddings
-        latent latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors
-        classes obj objects wavelet wavelets haar fft rfft dct phasor phasors stokes
+        feature features feat feats semantic semantics sem language lang clip dino lseg sam embedding embeddings latent
+        latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors classes obj
+        objects wavelet wavelets haar fft rfft dct phasor phasors stokes
     """,
     # sds, inpaint, edit: GaussianDreamer, GaussianEditor; pseudo, unseen, virtual: codebases with few views
     "warp": f"""
@@ -44,11 +44,11 @@ WORDS = {
     """,
     # of Gaussians, cameras, light and materials (GS-IR, GaussianShader), bodies and faces (GaussianAvatar)
     "parameter": """
-        pointmap pointmaps scaling scalings scale scales xyz xyzs rotation rotations rot rots quat quats sh shs sh0 shn
-        offset offsets grid grids plane planes pose poses deform deformation delta deltas residual means mean2d pts
-        points point light lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds
-        c2w w2c intrinsics extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints
-        vertex vertices verts bone bones smpl center centers knn kpt kpts keypoint keypoints mu std base precomp
+        pointmap pointmaps scaling scalings scale scales xyz xyzs rotation rotations rot rots quat quats sh shs shn
+        offset offsets grid grids plane planes pose poses deform deformation delta deltas residual means pts points
+        point light lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds
+        intrinsics extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints vertex
+        vertices verts bone bones smpl center centers knn kpt kpts keypoint keypoints mu std base precomp
     """,
     "image": """
         image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering
@@ -63,7 +63,7 @@ RENDERERS = word_set("render rendering rasterize rasterization rasterizer render
 RENDER = RENDERERS | word_set(
     """
     renders rendered renderings pred preds predict predicted prediction predictions out output outputs rets comp synth
-    synthesized network student recon reconstructed reconstruction est estimated
+    network student recon reconstructed reconstruction est estimated
     """
 )
 LAID_OVER = word_set("mask masks valid weight weights diff error errors")
@@ -87,13 +87,13 @@ CAMERAS = _CAMERA | word_set("view views viewpoint viewpoints")
 DATA = CAMERAS | word_set(
     "data batch sample item items datum info infos keyframe frame dataset input inputs entry"
 )  # what holds photographs
-POSES = _CAMERA | word_set("pose poses c2w w2c extrinsic extrinsics camtoworld camtoworlds tracking se3")
+POSES = _CAMERA | word_set("pose poses extrinsic extrinsics camtoworld camtoworlds tracking")
 EMBEDDING = word_set("embedding embeddings")
 GAUSSIANS = word_set("gaussian gaussians gs splat splats")
 MODELS = GAUSSIANS | word_set(
     """
-    xyz means opacity opacities scaling scalings scales features sh0 shn model models net network mlp scene deform
-    anchor anchors primitives points parameters params variables
+    xyz means opacity opacities scaling scalings scales features shn model models net network mlp scene deform anchor
+    anchors primitives points parameters params variables
     """
 )
 PARAMETERS = word_set("params param parameters variables splats gauss_params")  # names of what holds a model's

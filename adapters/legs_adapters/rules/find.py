@@ -113,7 +113,8 @@ class _Finder:
         if self.by_hand:
             yield from self._of_named_lines(function)
         callbacks = self.analysis.callbacks.assigned_in(function)
-        found = [(callback.form, self.verdicts.decide_callback(function, callback)) for callback in callbacks]
+        found: List[Tuple[Form, Union[Site, Left]]]
+        found = [(form, self.verdicts.decide_callback(function, form)) for form in callbacks]
         for call in function.flow.calls if registered.MENTIONED.search(function.text) else ():
             forms = registered.forms_of(self.analysis.program, function, call)
             found += [(form, self.verdicts.callable(function, form)) for form in forms]

@@ -6,7 +6,7 @@ An L1 whose gradients update only poses is tracking; one whose gradients are onl
 from __future__ import annotations
 
 import re
-from typing import Dict, List, NamedTuple, Optional, Set, Tuple
+from typing import Dict, List, Optional, Set, Tuple
 
 import libcst as cst
 
@@ -17,24 +17,12 @@ from legs_adapters.code.syntax import call_name, dotted, walk_expressions, words
 from legs_adapters.lexicon.words import EMBEDDING, MODELS, PLUMBING, POSES
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.steps import has_step, is_backward, is_step, may_step, reads_gradients
-from legs_adapters.terms.findings import Decider
+from legs_adapters.terms.findings import Evidence
 
-__all__ = ["Purpose", "Purposes"]
+__all__ = ["Purposes"]
 
 _DEPTH = 3
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
-
-
-class Purpose(NamedTuple):
-    """The purpose of a backward pass that does not train the Gaussians.
-
-    Attributes:
-        word: the purpose: "tracking" or "scoring".
-        decider: the step of the optimiser, or the backward pass that no step follows.
-    """
-
-    word: str
-    decider: Decider
 
 
 class Purposes:
@@ -43,16 +31,16 @@ class Purposes:
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
-        self._known: Dict[Tuple[Function, Tuple[int, ...], int], Optional[Purpose]] = {}
+        self._known: Dict[Tuple[Function, Tuple[int, ...], int], Optional[Evidence]] = {}
 
-    def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Purpose]:
-        """Return the purpose of an expression that does not train, by the loops around it; None where it may."""
+    def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Evidence]:
+        """Return the evidence that the backward pass of an expression trains no Gaussians; None where it may."""
         known = function, tuple(map(id, function.flow.loops_around(node))), depth
         if known not in self._known:
             self._known[known] = self._purpose(function, node, depth)
         return self._known[known]
 
-    def _purpose(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[Purpose]:
+    def _purpose(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[Evidence]:
         passes = [call for call in function.flow.calls if is_backward(call)]
         if not passes:
             return self._of_callers(function, depth)
@@ -70,13 +58,13 @@ class Purposes:
             if steps and within:
                 moved = [self._moved(function, step) for step in steps]
                 is_other = all(some & (POSES | EMBEDDING) and not some & MODELS for some in moved)
-                return Purpose("tracking", (function, steps[0])) if is_other else None
-        return None if may_train else Purpose("scoring", (function, own))
+                return Evidence("pose-step", "tracking", [(function, steps[0])]) if is_other else None
+        return None if may_train else Evidence("no-step", "scoring", [(function, own)])
 
-    def _of_callers(self, function: Function, depth: int) -> Optional[Purpose]:
+    def _of_callers(self, function: Function, depth: int) -> Optional[Evidence]:
         sites = self.training.sites.get(function, []) if depth < _DEPTH else []
         purposes = [self.purpose(caller, call, depth + 1) for caller, call in sites]
-        return purposes[0] if len({purpose and purpose.word for purpose in purposes}) == 1 else None
+        return purposes[0] if len({purpose and purpose.rule for purpose in purposes}) == 1 else None
 
     def _may_train(self, function: Function, call: cst.Call, depth: int, read: bool) -> bool:
         """Return whether a step may follow a call, in its function or then in the callers.
@@ -117,12 +105,5 @@ class Purposes:
                 given = [value for _, value in given_to(self.program, where, definition.place) if value is not None]
                 found |= words_in(*given)
             if isinstance(made, cst.Call) and _OPTIMISER.search(call_name(made)) and made.args:
-                found |= words_in(*_listed(where, made.args[0].value))
+                found |= words_in(made.args[0].value)
         return found - PLUMBING
-
-
-def _listed(function: Function, node: cst.CSTNode) -> List[cst.CSTNode]:
-    """Return an argument of an optimiser, with what is appended to the list that it names."""
-    parts = function.flow.definitions.get(node.value, []) if isinstance(node, cst.Name) else []
-    listed = [d.value for d in parts if d.kind == "mutate" or isinstance(d.value, cst.List)]
-    return [node, *(value for value in listed if value is not None)]

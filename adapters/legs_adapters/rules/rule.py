@@ -1,4 +1,4 @@
-"""The base class of the rules that skip terms, and the terms and calls that they are given.
+"""The base class of the rules that skip terms, and the terms that they are given.
 
 A rule is a class in ``causes/``, or a row of one. Its docstring says why in one sentence, `INVALID` are terms that it
 skips, `VALID` terms that are weighted; all are tests. ``order.py`` lists the rules as they are asked.
@@ -12,7 +12,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import walk_expressions
-from legs_adapters.lexicon.meaning import Meaning, swapped
+from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.sides import Pair, pair_of
@@ -20,52 +20,26 @@ from legs_adapters.terms.sides import Pair, pair_of
 if TYPE_CHECKING:
     from legs_adapters.rules.analysis import Analysis
 
-__all__ = ["CallContext", "Rule", "Term", "header", "source_of"]
+__all__ = ["Rule", "Term", "header", "source_of"]
 
 _DEPTH = 3
 
 
-class CallContext:
-    """A call in a function, and the analyses of its program.
+class Term:
+    """A photometric term, and the analyses of its program.
 
     Attributes:
         analysis: those analyses.
-        function: the function that the call stands in.
-        call: the call.
-        given: what it passes to a function that compares two of its parameters: for the rendering, where that is known,
-            and for the photograph.
-        here: the call, or the term, as evidence.
-    """
-
-    def __init__(
-        self, analysis: Analysis, function: Function, call: cst.CSTNode, given: Sequence[Meaning] = ()
-    ) -> None:
-        self.analysis = analysis
-        self.function = function
-        self.call = call
-        self.given = given
-        self.here: List[Decider] = [(function, call)]
-
-    @property
-    def names_around(self) -> Iterator[Tuple[str, Decider]]:
-        """The names of the function and of its class, each with where it stands."""
-        yield self.function.name, header(self.function)
-        owner = self.analysis.program.owner_of(self.function)
-        if owner is not None:
-            yield owner.name, (owner.parent, owner.node.name)
-
-
-class Term(CallContext):
-    """A photometric term.
-
-    Attributes:
+        function: the function that it stands in.
         form: the expression.
+        here: the term, as evidence.
         pair: its two sides, and what they depict.
         target, prediction: the side that is the photograph, the second where neither name says so; and the other.
     """
 
     def __init__(self, analysis: Analysis, function: Function, form: Form) -> None:
-        super().__init__(analysis, function, form.call)
+        self.analysis = analysis
+        self.function = function
         self.form = form
         self.here: List[Decider] = [(function, form.node)]
         self.pair: Pair = pair_of(analysis.meanings, function, form)
@@ -78,6 +52,14 @@ class Term(CallContext):
     def sides(self) -> Sequence[cst.BaseExpression]:
         """Both sides as they are written."""
         return self.form.first, self.form.second
+
+    @property
+    def names_around(self) -> Iterator[Tuple[str, Decider]]:
+        """The names of the function and of its class, each with where it stands."""
+        yield self.function.name, header(self.function)
+        owner = self.analysis.program.owner_of(self.function)
+        if owner is not None:
+            yield owner.name, (owner.parent, owner.node.name)
 
 
 class Rule:
@@ -106,10 +88,6 @@ class Rule:
     def evidence(self, term: Term) -> List[Decider]:
         """Return the evidence to skip a term; nothing where the rule does not apply."""
         raise NotImplementedError
-
-    def evidence_of_call(self, call: CallContext) -> List[Decider]:
-        """Return the evidence that a call is not for the loss; nothing where the rule does not apply."""
-        return []
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether a term that this rule skipped needs a warning, if nothing else is found."""

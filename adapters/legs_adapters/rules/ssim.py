@@ -7,10 +7,9 @@ from typing import Iterator, List, Sequence, Tuple, Union
 from legs_adapters.code.module import Function
 from legs_adapters.lexicon.words import STRUCTURAL
 from legs_adapters.rules.analysis import Analysis
-from legs_adapters.rules.order import SSIM, first
-from legs_adapters.rules.rule import Term
+from legs_adapters.rules.causes.ssim import UnprovenSsim
 from legs_adapters.tensors.gradients import is_without_grad
-from legs_adapters.terms.findings import Findings, Left, Site
+from legs_adapters.terms.findings import Evidence, Findings, Left, Site
 from legs_adapters.terms.kinds.ssim import Ssim
 from legs_adapters.terms.patched import patched_nodes
 from legs_adapters.terms.writing import PACKAGE
@@ -47,13 +46,13 @@ def _in_function(
         form, place = Ssim.find(analysis.forms.functions, function, call), function.place(call)
         if form is None or any(at.start <= place.start < at.end for at in edited):
             continue
-        proven, evidence = analysis.ssims.proven(function, form), first(Term(analysis, function, form), SSIM)
+        proven = analysis.ssims.proven(function, form)
         named = [(function.module.path, line) for line in range(place.line, place.last_line + 1)]
-        if proven is None and evidence is not None:
-            yield Left.at(function, place, evidence)
+        if proven is None:
+            yield Left.at(function, place, Evidence(UnprovenSsim.id, UnprovenSsim.reason, [(function, form.node)]))
         elif by_hand and not set(named).intersection(by_hand):
             yield Left.at(function, place, "not chosen")
         elif is_without_grad(function, call):
             yield Left.at(function, place, "evaluation")
-        elif proven is not None:
+        else:
             yield Site.at(function, form, f"{proven.module.path}:{proven.line} is the SSIM of 3DGS")

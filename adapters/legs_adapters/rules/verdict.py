@@ -17,7 +17,7 @@ from legs_adapters.rules.uses import uses_of
 from legs_adapters.terms.error_maps import is_measured, reads_of
 from legs_adapters.terms.findings import Evidence, Left, Problem, Site
 from legs_adapters.terms.form import Form
-from legs_adapters.terms.kinds.callback import Callback
+from legs_adapters.terms.kinds.callback import PassedByName
 from legs_adapters.terms.kinds.reread import Reread
 from legs_adapters.terms.sides import is_role, same_root
 from legs_adapters.terms.writing import Writing
@@ -61,15 +61,15 @@ class Verdicts:
         site = Site.at(function, form, self._why_photograph(term), is_swapped, term.pair.selection)
         return site._replace(unweighted=tuple(others))
 
-    def decide_callback(self, holder: Function, callback: Callback) -> Site | Left:
+    def decide_callback(self, holder: Function, form: PassedByName) -> Site | Left:
         """Return the verdict on an L1 function that is passed by name, from the arguments of its call."""
-        term = Term(self.analysis, callback.caller, callback.form)
+        term = Term(self.analysis, form.caller or holder, form)
         evidence = first(term)
         if evidence is None and swapped(term.pair.a, term.pair.b) is not False:
             evidence = Evidence("unknown", "unknown", term.here)
         if evidence is not None:
-            return Left.at(holder, holder.place(callback.form.node), evidence)
-        return self.callable(holder, callback.form)
+            return Left.at(holder, holder.place(form.node), evidence)
+        return self.callable(holder, form)
 
     @staticmethod
     def callable(function: Function, form: Form) -> Site:

@@ -133,10 +133,7 @@ class L1Functions:
             if parts is None:
                 return False
             allowed.update(id(part) for each in parts for part in walk_expressions(each))
-        beside = [
-            each.value for value in function.flow.returns if isinstance(value, cst.Tuple) for each in value.elements
-        ]
-        if not all(depends(function, each, set(pairs[0])) for each in beside):
+        if any(isinstance(value, cst.Tuple) for value in function.flow.returns):
             return False  # return loss, mask
         compared = {name for pair in pairs for name in pair}
         names = [node for node in nodes if isinstance(node, cst.Name) and node.value in compared]
@@ -158,11 +155,6 @@ class L1Functions:
         if call_name(node) in ASKS | LIKE:
             return list(node.args)
         return list(node.args[:2]) if self._is_l1(body, node) else []
-
-    def _in_comparison(self, body: _Body, node: cst.Comparison) -> List[cst.CSTNode]:
-        """A mask that is made from the second, ``gt != 0``: it is handed over as it is."""
-        target = body.pairs[0][1]
-        return [part for part in walk_expressions(node) if isinstance(part, cst.Name) and part.value == target]
 
     def _in_attribute(self, body: _Body, node: cst.Attribute) -> List[cst.CSTNode]:
         return [node.value] if node.attr.value in SIZES else []
@@ -192,7 +184,6 @@ class L1Functions:
 _MAY_BE: Dict[type, Callable[..., Optional[Iterable[cst.CSTNode]]]] = {
     cst.BinaryOperation: L1Functions._in_operation,
     cst.Call: L1Functions._in_call,
-    cst.Comparison: L1Functions._in_comparison,
     cst.Attribute: L1Functions._in_attribute,
     cst.Subscript: L1Functions._in_subscript,
     cst.Assign: L1Functions._in_assignment,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import List
 
-from legs_adapters.rules.rule import CallContext, Rule, Term, source_of
+from legs_adapters.rules.rule import Rule, Term, source_of
 from legs_adapters.tensors.gradients import detaches
 from legs_adapters.terms.findings import Decider
 
@@ -26,9 +26,6 @@ class Distillation(Rule):
             analysis.origins.meaning(*target).role,
         )
         return [source_of(term.function, term.target) or term.here[0]] if rendered else []
-
-    def evidence_of_call(self, call: CallContext) -> List[Decider]:
-        return call.here if call.given[-1].role == "render" else []
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether no side is detached; a photograph needs no ``detach()``."""

@@ -10,7 +10,7 @@ from legs_adapters.code.syntax import call_name, key_of, words
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words
 from legs_adapters.lexicon.words import LAID_OVER_PICTURES
-from legs_adapters.rules.rule import CallContext, Rule, Term, source_of
+from legs_adapters.rules.rule import Rule, Term, source_of
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import is_beside_ssim
 
@@ -44,11 +44,6 @@ class OtherKind(Rule):
             if meaning.kind in _NAMES and not _is_named_picture(term, side, meaning, beside):
                 return self._shown(term, side) if meaning.kind == self.kind else []
         return []
-
-    def evidence_of_call(self, call: CallContext) -> List[Decider]:
-        """Return the call, where what it passes is of this kind."""
-        kinds = [meaning.kind for meaning in call.given if meaning.kind in _NAMES]
-        return call.here if kinds[:1] == [self.kind] else []
 
     def _shown(self, term: Term, side: cst.CSTNode) -> List[Decider]:
         shown = source_of(term.function, side, lambda text: kind_of_words(text) == self.kind)

@@ -19,7 +19,7 @@ from legs_adapters.lexicon.words import (
     TRACKING,
     WARPED,
 )
-from legs_adapters.rules.rule import CallContext, Rule, Term, header
+from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.tensors.steps import has_step
 from legs_adapters.terms.findings import Decider
 
@@ -32,13 +32,10 @@ class Tracking(Rule):
     id = reason = "tracking"
     INVALID = ["def track_camera(image, gt):\n    l1_loss(image, gt).backward()"]
 
-    def evidence(self, term: CallContext) -> List[Decider]:
+    def evidence(self, term: Term) -> List[Decider]:
         named = [decider for name, decider in term.names_around if _is_of_tracking(name)]
-        tests = reversed(term.function.flow.conditions.get(id(term.call), ()))
+        tests = reversed(term.function.flow.conditions.get(id(term.form.call), ()))
         return [*named, *((term.function, part) for part in tests if _is_of_tracking(root_of(part)))][:1]
-
-    def evidence_of_call(self, call: CallContext) -> List[Decider]:
-        return self.evidence(call)
 
 
 class EvaluationName(Rule):
@@ -54,10 +51,6 @@ class EvaluationName(Rule):
         shows = first in NOT_TRAINING and bool(others) and not LOSS & set(others) and not _is_of_training_step(term)
         shows = shows or bool(set(folders.split("/")) & EVALUATING) or words(file)[0] in EVALUATING
         return [header(term.function)] if shows and not _trains_its_own(term) else []
-
-    def evidence_of_call(self, call: CallContext) -> List[Decider]:
-        tokens = set(words(call.function.name))
-        return [header(call.function)] if tokens & EVALUATING and "train" not in tokens else []
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether the function is named as a loss: only some of its callers may evaluate."""

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List
-
-from legs_adapters.rules.rule import Rule, Term
-from legs_adapters.terms.findings import Decider
+from legs_adapters.rules.rule import Rule
 
 __all__ = ["UnprovenSsim"]
 
@@ -20,6 +17,3 @@ class UnprovenSsim(Rule):
         "loss = l1_loss(image, gt) - ssim(image, gt, window_size=7)",
         "loss = l1_loss(image, gt) - fused_ssim(image[None], gt[None])",
     ]
-
-    def evidence(self, term: Term) -> List[Decider]:
-        return [] if term.analysis.ssims.proven(term.function, term.form) is not None else term.here

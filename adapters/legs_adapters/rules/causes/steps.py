@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from typing import List
 
-from legs_adapters.rules.rule import CallContext, Rule, Term
+from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.terms.findings import Decider
 
 __all__ = ["NoStep", "PoseStep"]
 
 
 class _OtherStep(Rule):
-    """Skip a term, or a call, by the purpose of its backward pass: the rule's reason."""
+    """Skip a term by the purpose of its backward pass."""
 
-    def evidence(self, term: CallContext) -> List[Decider]:
+    def evidence(self, term: Term) -> List[Decider]:
         """Return the step, or the backward pass without one, that shows the purpose."""
-        purpose = term.analysis.purposes.purpose(term.function, term.call)
-        return [purpose.decider] if purpose is not None and purpose.word == self.reason else []
-
-    def evidence_of_call(self, call: CallContext) -> List[Decider]:
-        """Return the same of a call."""
-        return self.evidence(call)
+        purpose = term.analysis.purposes.purpose(term.function, term.form.call)
+        return list(purpose.deciders) if purpose is not None and purpose.rule == self.id else []
 
 
 class PoseStep(_OtherStep):

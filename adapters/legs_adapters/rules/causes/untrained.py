@@ -36,7 +36,7 @@ class Evaluation(Rule):
     def evidence(self, term: Term) -> List[Decider]:
         if not _is_untrained(term):
             return []
-        around = no_grad_around(term.function, term.call, term.form.node)
+        around = no_grad_around(term.function, term.form.call, term.form.node)
         return [around] if around is not None else _named(term, REPORTING)
 
     def may_be_loss(self, term: Term) -> bool:

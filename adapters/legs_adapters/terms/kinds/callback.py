@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Dict, List, NamedTuple, Set
+from typing import Dict, List, Optional, Set
 
 import libcst as cst
 
@@ -16,17 +16,19 @@ from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.text import Edit, Text
 from legs_adapters.terms.writing import PACKAGE, Writing
 
-__all__ = ["Callback", "Callbacks", "PassedByName"]
+__all__ = ["Callbacks", "PassedByName"]
 
 
 @dataclass(frozen=True)
 class PassedByName(Form):
-    """A function that is passed by name; ``node`` is the name, ``call`` the call of the callback.
+    """A function that is passed by name; ``node`` is the name, ``call`` the call of the callback, in ``caller``.
 
     Example:
         before: criterion = F.mse_loss; if dataset: criterion = l1_loss; loss = criterion(image, gt_image)
         after: if dataset: criterion = legs_loss.l1_loss
     """
+
+    caller: Optional[Function] = None
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Write the weighted function in the name's place; what is not the plain mean is kept as ``own=``."""
@@ -37,13 +39,6 @@ class PassedByName(Form):
         return [text.replace(*text.span(self.node, True), function)]
 
 
-class Callback(NamedTuple):
-    """A callback: the form to replace, and the function in which it is called."""
-
-    form: Form
-    caller: Function
-
-
 class Callbacks:
     """The callbacks of one program: L1 functions that are assigned to names, and that training calls by these."""
 
@@ -52,12 +47,12 @@ class Callbacks:
         self._program = program
         self._training = training
         self._forms = forms
-        self._by_holder: Dict[Function, List[Callback]] = {}
+        self._by_holder: Dict[Function, List[PassedByName]] = {}
         for function in list(training.sites):
             if forms.functions.shape(function) is not None:
                 self._add(function)
 
-    def assigned_in(self, holder: Function) -> List[Callback]:
+    def assigned_in(self, holder: Function) -> List[PassedByName]:
         """Return the callbacks that a function, or a module's top level, assigns."""
         return self._by_holder.get(holder, [])
 
@@ -71,8 +66,8 @@ class Callbacks:
             caller, call = (near or by_name)[0]
             for value in self._values(holder, function):
                 sides = call.args[0].value, call.args[1].value
-                form = PassedByName(value, call, *sides, value, makes=shape(function) or "own")
-                self._by_holder.setdefault(holder, []).append(Callback(form, caller))
+                form = PassedByName(value, call, *sides, value, makes=shape(function) or "own", caller=caller)
+                self._by_holder.setdefault(holder, []).append(form)
                 self.assigned.add(function)
 
     def _values(self, holder: Function, function: Function) -> List[cst.BaseExpression]:

@@ -102,8 +102,6 @@ def main_module(name: str, script: str) -> types.ModuleType:
     module.__dict__.update(
         __file__=script,
         __builtins__=sys.modules["builtins"],
-        __spec__=None,
-        __package__=None,
         __cached__=None,
         __loader__=importlib.machinery.SourceFileLoader(name, script),
         __annotations__={},

@@ -65,7 +65,3 @@ def _make_key(folder: Path) -> None:
             return
         write_whole(key, secrets.token_bytes(_BYTES))
         os.chmod(str(key), 0o600)
-        if hasattr(os, "geteuid") and os.geteuid() == 0:  # under sudo a home folder stays its owner's
-            owner = os.stat(str(folder.parent))
-            for path in (folder, key):
-                os.chown(str(path), owner.st_uid, owner.st_gid)

@@ -114,13 +114,9 @@ def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[s
 
 
 def _excluded(path: str, patterns: Sequence[str]) -> bool:
-    parts = path.split("/")
-    above = ["/".join(parts[: i + 1]) for i in range(len(parts))]
-    return any(
-        fnmatch.fnmatch(name, pattern)
-        for pattern in (pattern.rstrip("/") for pattern in patterns)
-        for name in [*above, *(parts if "/" not in pattern else ())]
-    )
+    parts = [PurePosixPath(path), *PurePosixPath(path).parents][:-1]
+    names = [name for part in parts for name in (part.as_posix(), part.name)]
+    return any(fnmatch.fnmatch(name, pattern.rstrip("/")) for pattern in patterns for name in names)
 
 
 def _submodules(root: Path) -> List[str]:

@@ -9,7 +9,7 @@ import libcst as cst
 
 from legs_adapters.code.flow import Flow
 from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps
-from legs_adapters.code.parsing import STUB, Cut, Lines, Part, Place, body_part, outline_part
+from legs_adapters.code.parsing import STUB, Lines, Part, Place, body_part, outline_part
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import arguments, children, dotted
@@ -41,7 +41,7 @@ class Function:
         node: cst.FunctionDef | cst.Module,
         parent: Optional[Function] = None,
         owner: Optional[Class] = None,
-        cut: Optional[Cut] = None,
+        cut: Optional[slice] = None,
     ) -> None:
         self.module = module
         self.node = node
@@ -54,7 +54,7 @@ class Function:
         self._inner: List[Function] = []
         self._flow: Optional[Flow] = None
         if cut is not None:
-            self.text: str = module.lines.data[cut.start : cut.end].decode("utf-8")
+            self.text: str = module.lines.data[cut].decode("utf-8")
         else:
             self.text = parent.text if parent is not None and parent.parent is not None else module.outline_text
 
@@ -82,20 +82,15 @@ class Function:
         return self._inner
 
     def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
-        """Return the place of a node of its body in the file, on request with the brackets around it.
+        """Return the place of a node of it in the file, on request with the brackets around it.
 
         Raises:
             ValueError: LibCST would write another text than it read.
         """
-        scope: Function = self
+        scope: Function = self.parent if self.parent is not None and node is self.node else self
         while scope._part is None and scope.parent is not None:
             scope = scope.parent
         return (scope._part or self.module.outline).place(node, brackets)
-
-    @property
-    def line(self) -> int:
-        """The line of its ``def``."""
-        return (self.parent or self).place(self.node).line
 
     @property
     def flow(self) -> Flow:
@@ -116,7 +111,7 @@ class Function:
         if not isinstance(self.node, cst.FunctionDef):
             return []
         names = [param.name.value for param in (*self.node.params.posonly_params, *self.node.params.params)]
-        return names[1:] if self.owner is not None and not self.static and names else names
+        return names[1:] if self.owner is not None and "staticmethod" not in self.decorators and names else names
 
     def is_parameter(self, node: cst.CSTNode) -> bool:
         """Return whether a name is a parameter of the function and has no other definition."""
@@ -130,16 +125,6 @@ class Function:
             return keywords.get(parameter)
         position = self.parameters.index(parameter)
         return positional[position] if position < len(positional) else None
-
-    @property
-    def runs_by_instance(self) -> bool:
-        """Return whether a call of an instance of its class runs it."""
-        return self.name in CALLED
-
-    @property
-    def static(self) -> bool:
-        """Return whether it is a static method."""
-        return "staticmethod" in self.decorators
 
     @property
     def decorators(self) -> List[str]:
@@ -193,7 +178,7 @@ class Module:
         self.by_node: Dict[int, Function | Class] = {}
         self.top: Function = Function(self, self.outline.tree)
         self._by_word: Optional[Dict[str, List[Function]]] = None
-        self._cuts: Iterator[Optional[Cut]] = iter(cuts)
+        self._cuts: Iterator[Optional[slice]] = iter(cuts)
         self._functions = self.collect(self.outline.tree, self.top)
         self._cuts = iter(())
 

@@ -19,7 +19,7 @@ from libcst.metadata.span_provider import SpanProvidingCodegenState, byte_length
 
 from legs_adapters.code.syntax import code
 
-__all__ = ["STUB", "Cut", "Lines", "Part", "Place", "body_part", "outline_part"]
+__all__ = ["STUB", "Lines", "Part", "Place", "body_part", "outline_part"]
 
 STUB = re.compile("0#x*")  # what stands for a body
 
@@ -38,13 +38,6 @@ class Place(NamedTuple):
     line: int
     column: int
     last_line: int
-
-
-class Cut(NamedTuple):
-    """The bytes of a function's body: whole lines."""
-
-    start: int
-    end: int
 
 
 class Lines:
@@ -115,25 +108,26 @@ class Part:
         return self._lines.place(start, end)
 
 
-def outline_part(lines: Lines) -> Tuple[Part, List[Optional[Cut]]]:
+def outline_part(lines: Lines) -> Tuple[Part, List[Optional[slice]]]:
     """Parse a file without the bodies of its functions and methods.
 
     Returns:
-        The outline, and for each of those functions, in source order, what was cut; empty where nothing was cut.
+        The outline, and for each of those functions, in source order, the bytes that were cut, whole lines; empty where
+        nothing was cut.
 
     Raises:
         SyntaxError, libcst.ParserSyntaxError, RecursionError, ValueError: it does not parse.
     """
     outline, cuts = bytearray(lines.data), _cuts(lines)
     for cut in filter(None, cuts):
-        body = _BODY.match(lines.data[cut.start : cut.end])
+        body = _BODY.match(lines.data[cut])
         assert body is not None
         indent, statements, end = body.groups()
-        outline[cut.start : cut.end] = indent + b"0#".ljust(len(statements), b"x")[: len(statements)] + end
+        outline[cut] = indent + b"0#".ljust(len(statements), b"x")[: len(statements)] + end
     return Part(lines, bytes(outline)), cuts
 
 
-def body_part(lines: Lines, cut: Cut) -> Part:
+def body_part(lines: Lines, cut: slice) -> Part:
     """Parse what was cut, as the body of the one function of a module.
 
     Raises:
@@ -141,10 +135,10 @@ def body_part(lines: Lines, cut: Cut) -> Part:
     """
     newline = _NEWLINE.search(lines.data)
     header = b"async def _():" + (newline.group() if newline is not None else b"\n")
-    return Part(lines, header + lines.data[cut.start : cut.end], cut.start - len(header))
+    return Part(lines, header + lines.data[cut], cut.start - len(header))
 
 
-def _cuts(lines: Lines) -> List[Optional[Cut]]:
+def _cuts(lines: Lines) -> List[Optional[slice]]:
     if _LONE_RETURN.search(lines.data) is not None:
         return []
     try:
@@ -165,7 +159,7 @@ def _functions(node: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef
             yield from _functions(child)
 
 
-def _cut(lines: Lines, node: ast.FunctionDef | ast.AsyncFunctionDef) -> Optional[Cut]:
+def _cut(lines: Lines, node: ast.FunctionDef | ast.AsyncFunctionDef) -> Optional[slice]:
     """Return the span of a body, if it has its own lines and Python reports where they end."""
     first, last = node.body[0], node.body[-1]
     end_line, end_column = getattr(last, "end_lineno", None), getattr(last, "end_col_offset", None)
@@ -177,4 +171,4 @@ def _cut(lines: Lines, node: ast.FunctionDef | ast.AsyncFunctionDef) -> Optional
     before = b"" if decorators else lines.data[start : start + first.col_offset]
     after = lines.data[lines.start(end_line) + end_column : end]
     continued = lines.data[:start].rstrip(b"\r\n").endswith(b"\\") or after.rstrip().endswith(b"\\")
-    return Cut(start, end) if first_line > node.lineno and not before.strip() and not continued else None
+    return slice(start, end) if first_line > node.lineno and not before.strip() and not continued else None

@@ -104,8 +104,6 @@ class Program(Checkout):
         declared = self._declared(where, definition.node, depth) if kind == "parameter" else []
         if kind in ("assign", "with", "parameter") and value is not None:
             return declared + self.resolve(where, value, depth + 1)
-        if kind == "element" and definition.index is not None and isinstance(value, cst.Call):
-            return self._wrapped(where, value, definition.index, depth)
         return declared
 
     def _declared(self, where: Function, parameter: cst.CSTNode, depth: int) -> List[Reference]:
@@ -126,7 +124,7 @@ class Program(Checkout):
             moved = [r for r in self.resolve(function, node.func.value, depth) if r.kind in ("instance", "made by")]
             if moved:
                 return moved
-        wrapped = self._wrapped(function, node, 0, depth)
+        wrapped = self._wrapped(function, node, depth)
         if wrapped:
             return wrapped
         made = self.resolve(function, node.func, depth)
@@ -134,11 +132,11 @@ class Program(Checkout):
         instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
         return instances + self._returned(made, depth)
 
-    def _wrapped(self, function: Function, node: cst.Call, index: int, depth: int) -> List[Reference]:
-        """Resolve ``DataParallel(model)``, and ``model, optimizer = accelerator.prepare(model, optimizer)``."""
+    def _wrapped(self, function: Function, node: cst.Call, depth: int) -> List[Reference]:
+        """Resolve ``DataParallel(model)``."""
         name = "." + (dotted(node.func) or call_name(node))
         given = arguments(node)[0] if name.endswith(self._wrapping) else []
-        found = self.resolve(function, given[index], depth + 1) if index < len(given) else []
+        found = self.resolve(function, given[0], depth + 1) if given else []
         return [reference for reference in found if reference.kind == "instance"]
 
     def _returned(self, made: List[Reference], depth: int) -> List[Reference]:

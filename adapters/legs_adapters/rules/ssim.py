@@ -8,7 +8,7 @@ from legs_adapters.code.module import Function
 from legs_adapters.lexicon.words import STRUCTURAL
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.causes.ssim import UnprovenSsim
-from legs_adapters.tensors.gradients import is_without_grad
+from legs_adapters.tensors.gradients import no_grad_around
 from legs_adapters.terms.findings import Evidence, Findings, Left, Site
 from legs_adapters.terms.kinds.ssim import Ssim
 from legs_adapters.terms.patched import patched_nodes
@@ -52,7 +52,7 @@ def _in_function(
             yield Left.at(function, place, Evidence(UnprovenSsim.id, UnprovenSsim.reason, [(function, form.node)]))
         elif by_hand and not set(named).intersection(by_hand):
             yield Left.at(function, place, "not chosen")
-        elif is_without_grad(function, call):
+        elif no_grad_around(function, call):
             yield Left.at(function, place, "evaluation")
         else:
-            yield Site.at(function, form, f"{proven.module.path}:{proven.line} is the SSIM of 3DGS")
+            yield Site.at(function, form, f"{proven.module.path}:{proven.place(proven.node).line} is the SSIM of 3DGS")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Optional
 
-from legs_adapters.code.module import Function
+from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.syntax import one_line, words, words_in
 from legs_adapters.lexicon.masks import is_rows
@@ -85,7 +85,7 @@ class Verdicts:
         names = [*dict(term.names_around), *getattr(self.analysis.program.owner_of(function), "methods", ())]
         other = (PERCEPTUAL | WARPED | MESH) & words_in(form.node).union(*map(words, names))
         a, b = term.pair.a, term.pair.b
-        pictures = "image" in (a.kind, b.kind) or (function.runs_by_instance and all(map(is_role, term.sides)))
+        pictures = "image" in (a.kind, b.kind) or (function.name in CALLED and all(map(is_role, term.sides)))
         if other or not pictures or (rule.needs_target and "target" not in (a.role, b.role)):
             return None
         return self.problem(term, place, f"nothing shows that this is the loss: {rule.sentence()}")

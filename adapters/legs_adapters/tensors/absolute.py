@@ -8,7 +8,7 @@ import libcst as cst
 
 from legs_adapters.code.syntax import call_name
 
-__all__ = ["AbsoluteValue", "abs_argument", "absolute_value", "is_abs", "is_difference", "mean_of"]
+__all__ = ["AbsoluteValue", "abs_argument", "absolute_value", "is_difference", "mean_of"]
 
 
 class AbsoluteValue(NamedTuple):
@@ -44,21 +44,14 @@ def mean_of(node: cst.Call) -> Optional[cst.Call]:
 
 
 def abs_argument(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
-    """Return the argument of an absolute value; None for any other node."""
-    if not isinstance(node, cst.Call) or not is_abs(node):
+    """Return the argument of an absolute value, ``abs(x)``, ``torch.abs(x)``, ``x.abs()``; None for any other node."""
+    if not isinstance(node, cst.Call) or call_name(node) not in ("abs", "absolute"):
         return None
-    if isinstance(node.func, cst.Attribute) and not node.args:
-        return node.func.value
-    return node.args[0].value if len(node.args) == 1 and not node.args[0].star else None
-
-
-def is_abs(node: cst.Call) -> bool:
-    """Return whether a call takes an absolute value: ``abs(x)``, ``torch.abs(x)``, ``x.abs()``."""
-    if isinstance(node.func, cst.Name):
-        return node.func.value == "abs"
-    if isinstance(node.func, cst.Attribute) and node.func.attr.value in ("abs", "absolute"):
-        return not node.args or (len(node.args) == 1 and _is_module(node.func.value))
-    return False
+    owner = node.func.value if isinstance(node.func, cst.Attribute) else None
+    if owner is not None and not node.args:
+        return owner
+    is_function = owner is None or _is_module(owner)
+    return node.args[0].value if is_function and len(node.args) == 1 and not node.args[0].star else None
 
 
 def _is_module(node: cst.CSTNode) -> bool:

@@ -34,7 +34,7 @@ class Training:
 
     def __init__(self, program: Program, matters: Callable[[str], bool]) -> None:
         self.program = program
-        self._matters = matters
+        self._matters: Callable[[Function], bool] = lambda function: matters(function.text)
         self.roots: List[Function] = []
         self.sites: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
         self._trained: Set[int] = set()
@@ -133,7 +133,7 @@ class Training:
             self.sites.setdefault(callee, []).append((caller, call))
 
     def _return(self, function: Function, key: object = _ANY) -> None:
-        for value in function.flow.returns if self._matters(function.text) else ():
+        for value in function.flow.returns if self._matters(function) else ():
             self._push(function, value, key)
 
     def _place(self, function: Function, node: cst.CSTNode, key: object) -> None:
@@ -146,13 +146,10 @@ class Training:
             if not isinstance(node.value, cst.Name) or node.value.value != "self":
                 self._push(function, node.value, "." + node.attr.value)
             elif owner is not None:
-                matters = [one.stores(node.attr.value, self._is_near) for one in self.program.lineage(owner)]
+                matters = [one.stores(node.attr.value, self._matters) for one in self.program.lineage(owner)]
                 definitions = [entry for stores in matters for entry in stores]
         for where, definition in definitions or ():
             self._definition(where, definition, key)
-
-    def _is_near(self, function: Function) -> bool:
-        return self._matters(function.text)
 
     def _definition(self, function: Function, definition: Definition, key: object) -> None:
         value, kind = definition.value, definition.kind

@@ -10,17 +10,7 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import attribute_chain, call_name, walk_expressions
 from legs_adapters.tensors.operations import ENDS_GRADIENT, NO_GRAD
 
-__all__ = ["detaches", "is_detached", "is_without_grad", "no_grad_around", "under_no_grad"]
-
-
-def under_no_grad(function: Function, node: cst.CSTNode) -> bool:
-    """Return whether a node is in a ``with torch.no_grad():`` of its function."""
-    return any(map(_stops_gradients, function.flow.contexts.get(id(node), ())))
-
-
-def is_without_grad(function: Function, *nodes: cst.CSTNode) -> bool:
-    """Return whether expressions are under ``no_grad``: in a block, or by a decorator of a function."""
-    return no_grad_around(function, *nodes) is not None
+__all__ = ["detaches", "is_detached", "no_grad_around"]
 
 
 def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Function, cst.CSTNode]]:

@@ -10,7 +10,7 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import attribute_chain, call_name, walk_expressions
 from legs_adapters.lexicon.masks import makes_mask
 from legs_adapters.tensors.backward import Training
-from legs_adapters.tensors.gradients import under_no_grad
+from legs_adapters.tensors.gradients import no_grad_around
 from legs_adapters.tensors.operations import EXTREMES, LEAVES, SIZES
 from legs_adapters.terms.form import Form
 
@@ -47,7 +47,7 @@ def reads_of(training: Training, function: Function, form: Form) -> Reads:
         elif isinstance(part, cst.Call) and makes_mask(part):
             masks += [node for each in (part.func, *(arg.value for arg in part.args)) for node in attribute_chain(each)]
     reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
-    reads = [read for read in reads if read not in unused and not under_no_grad(function, read)]
+    reads = [read for read in reads if read not in unused and not no_grad_around(function, read)]
     loss = [read for read in reads if training.includes(read) and read not in masks]
     is_compared = any(read in compared for read in reads)
     return Reads(loss, reads if is_compared else [read for read in reads if read not in loss])

@@ -64,7 +64,7 @@ def _lines(deciders: Sequence[Decider]) -> Iterator[Line]:
         if isinstance(node, cst.Module):
             continue  # a whole file has no deciding line
         try:
-            line = function.line if node is function.node else function.place(node).line
+            line = function.place(node).line
         except (KeyError, ValueError):  # a node that the analysis made, or a file that LibCST writes differently
             continue
         yield Line(function.module.path, line, function.module.lines.text(line))

@@ -8,7 +8,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import call_name, walk_expressions
-from legs_adapters.tensors.absolute import is_abs
+from legs_adapters.tensors.absolute import abs_argument
 from legs_adapters.tensors.operations import TRANSFORMS
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
@@ -42,7 +42,7 @@ class Forms:
             if form is not None:
                 found.append(form)
                 inside.add(id(form.call))
-                inside.update(id(n) for n in walk_expressions(form.node) if isinstance(n, cst.Call) and is_abs(n))
+                inside.update(id(n) for n in walk_expressions(form.node) if abs_argument(n))
         return found
 
     def _recognise(self, function: Function, call: cst.Call) -> Optional[Form]:

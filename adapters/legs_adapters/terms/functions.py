@@ -7,13 +7,13 @@ from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Sequenc
 
 import libcst as cst
 
-from legs_adapters.code.module import Function
+from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import returned
 from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, walk_expressions
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
-from legs_adapters.tensors.absolute import abs_argument, is_abs, is_difference, mean_of
+from legs_adapters.tensors.absolute import abs_argument, is_difference, mean_of
 from legs_adapters.tensors.operations import ASKS, LIKE, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
 from legs_adapters.terms.prospects import Prospects
 
@@ -85,7 +85,7 @@ class L1Functions:
             return "own"  # the decorator may change what is returned: a mean, a weight
         value = returned(function)
         shape = self._shape_of(function, value, depth) if isinstance(value, cst.Call) else None
-        return shape or ("own" if SPEAKS_OF_LOSS.search(function.name) or function.runs_by_instance else None)
+        return shape or ("own" if SPEAKS_OF_LOSS.search(function.name) or function.name in CALLED else None)
 
     def _shape_of(self, function: Function, node: cst.Call, depth: int) -> Optional[str]:
         """Return what a returned call makes of the two: "mean" or "none", None for anything else."""
@@ -137,7 +137,7 @@ class L1Functions:
             return False  # return loss, mask
         compared = {name for pair in pairs for name in pair}
         names = [node for node in nodes if isinstance(node, cst.Name) and node.value in compared]
-        absolute = any(isinstance(node, cst.Call) and (is_abs(node) or self._is_l1(body, node)) for node in nodes)
+        absolute = any(isinstance(node, cst.Call) and (abs_argument(node) or self._is_l1(body, node)) for node in nodes)
         return absolute and bool(names) and all(id(node) in allowed for node in names)
 
     def _in_operation(self, body: _Body, node: cst.BinaryOperation) -> Optional[List[cst.CSTNode]]:
@@ -177,7 +177,7 @@ class L1Functions:
             return False
         references = self.program.resolve(body.function, node.func)
         # self.l1_loss(...) in a method of its name: there it is the term itself
-        known = [r for r in references if r.kind != "made by" or body.function.runs_by_instance]
+        known = [r for r in references if r.kind != "made by" or body.function.name in CALLED]
         return any(self.shape_of_reference(reference, node, body.depth + 1) for reference in known)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import List
 
 from legs_adapters.code.calls import sure_calls
+from legs_adapters.code.module import CALLED
 from legs_adapters.code.syntax import words
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
@@ -34,4 +35,4 @@ class Definition(Rule):
     def may_be_loss(self, term: Term) -> bool:
         """Return whether it is the body of a module, or of a method that is named a loss."""
         function = term.function
-        return function.runs_by_instance or (function.owner is not None and "loss" in words(function.name))
+        return function.name in CALLED or (function.owner is not None and "loss" in words(function.name))

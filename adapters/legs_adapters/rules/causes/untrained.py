@@ -9,7 +9,7 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import words
 from legs_adapters.lexicon.words import LOSS, REPORTING, SCORING
 from legs_adapters.rules.rule import Rule, Term, header
-from legs_adapters.tensors.gradients import is_detached, is_without_grad, no_grad_around
+from legs_adapters.tensors.gradients import is_detached, no_grad_around
 from legs_adapters.terms.findings import Decider
 
 __all__ = ["UNTRAINED", "Evaluation", "Scoring", "Untrained"]
@@ -67,8 +67,8 @@ def _is_untrained(term: Term) -> bool:
     training, form = term.analysis.training, term.form
     trained = training.includes(form.node) or training.includes(form.call) or _is_called_by_framework(term)
     sites = training.sites.get(term.function, [])  # a caller may drop its gradient: an error map for the next mask
-    without = bool(sites) and all(is_without_grad(caller, call) for caller, call in sites)
-    without = without or is_without_grad(term.function, form.call, form.node) or is_detached(term.prediction)
+    without = bool(sites) and all(no_grad_around(caller, call) for caller, call in sites)
+    without = without or no_grad_around(term.function, form.call, form.node) is not None or is_detached(term.prediction)
     return without or not trained
 
 

@@ -65,7 +65,7 @@ class _Writer:
     def text(self) -> str:
         """Return the normal form of the function by itself."""
         node, statements = self._function.node, list(self._function.body.body)
-        is_method = self._function.owner is not None and not self._function.static
+        is_method = self._function.owner is not None and "staticmethod" not in self._function.decorators
         if not isinstance(node, cst.FunctionDef) or node.asynchronous is not None or is_method:
             raise _NoForm
         if node.with_changes(body=self._function.body).get_docstring(clean=False) is not None:

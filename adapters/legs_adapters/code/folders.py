@@ -114,8 +114,8 @@ def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[s
 
 
 def _excluded(path: str, patterns: Sequence[str]) -> bool:
-    parts = [PurePosixPath(path), *PurePosixPath(path).parents][:-1]
-    names = [name for part in parts for name in (part.as_posix(), part.name)]
+    parts = path.split("/")
+    names = [*parts, *("/".join(parts[: i + 1]) for i in range(len(parts)))]
     return any(fnmatch.fnmatch(name, pattern.rstrip("/")) for pattern in patterns for name in names)
 
 

@@ -33,7 +33,8 @@ __all__ = [
 
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _EMPTY = cst.Module(body=[])
-_LITERALS = (cst.Name, cst.SimpleString, cst.Integer, cst.Float, cst.UnaryOperation, cst.Tuple, cst.List)
+_WORDS = (cst.Name, cst.SimpleString, cst.Integer, cst.Float)
+_LITERALS = (*_WORDS, cst.UnaryOperation, cst.Tuple, cst.List)
 _MISSING = object()
 _PUNCTUATION = re.compile(
     "whitespace|[lr]par|[lr]brac|leading_lines|trailing_whitespace|header|footer|comma|equal|semicolon"
@@ -42,7 +43,7 @@ _PUNCTUATION = re.compile(
 
 def code(node: cst.CSTNode) -> str:
     """Return a node's source text, exactly."""
-    if isinstance(node, cst.Name) and not node.lpar:
+    if isinstance(node, _WORDS) and not node.lpar:
         return node.value
     return _EMPTY.code_for_node(node)
 
@@ -70,7 +71,7 @@ def words(name: str) -> Tuple[str, ...]:
 
 def constant(node: Optional[cst.CSTNode], default: Any = None) -> Any:
     """Return the value of a literal (also a negative number, a tuple of literals), else ``default``."""
-    value = _literal(one_line(node)) if isinstance(node, _LITERALS) else _MISSING
+    value = _literal(code(node)) if isinstance(node, _LITERALS) else _MISSING
     return default if value is _MISSING else value
 
 
@@ -190,11 +191,8 @@ def names_where(test: cst.BaseExpression, holds: bool) -> Tuple[cst.Name | cst.A
 
 def every_parameter(parameters: cst.Parameters) -> Iterator[cst.Param]:
     """Yield the parameters of a function, ``*args`` and ``**kwargs`` included."""
-    for group in (parameters.posonly_params, parameters.params, parameters.kwonly_params):
-        yield from group
-    for extra in (parameters.star_arg, parameters.star_kwarg):
-        if isinstance(extra, cst.Param):
-            yield extra
+    named = (*parameters.posonly_params, *parameters.params, *parameters.kwonly_params)
+    return (each for each in (*named, parameters.star_arg, parameters.star_kwarg) if isinstance(each, cst.Param))
 
 
 def words_in(*nodes: cst.CSTNode) -> Set[str]:

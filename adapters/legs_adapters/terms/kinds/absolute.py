@@ -9,7 +9,6 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.tensors.absolute import absolute_value, is_difference
-from legs_adapters.tensors.operations import NUMBERS
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
@@ -35,8 +34,6 @@ class Absolute(Form):
             return None
         difference = found.argument
         assert isinstance(difference, cst.BinaryOperation)
-        if _is_number(difference.left) or _is_number(difference.right):
-            return None
         return cls(call, found.call, difference.left, difference.right, difference=difference, makes=found.makes)
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
@@ -59,7 +56,3 @@ class Absolute(Form):
             text.replace(right[0], right[1], sides[1]),
             text.replace(right[1], end, f"{settings}{after}){tail}"),
         ]
-
-
-def _is_number(node: cst.CSTNode) -> bool:
-    return isinstance(node, cst.Call) and isinstance(node.func, cst.Name) and node.func.value in NUMBERS

@@ -8,9 +8,8 @@ from typing import List, Optional
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import arguments, call_name, code, constant, words
+from legs_adapters.code.syntax import arguments, call_name, constant
 from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
-from legs_adapters.lexicon.words import PERCEPTUAL
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
@@ -36,8 +35,6 @@ class Called(Form):
         references = functions.program.resolve(function, call.func)
         if any(r.kind == "external" and str(r.target).startswith("legs_loss.") for r in references):
             return None  # patched before
-        if PERCEPTUAL & set(words(code(call.func))):
-            return None  # lpips_model.forward(image, gt)
         if not references and not is_l1_name(call_name(call)):
             return None  # a method of an object of unknown class: its name alone proves nothing
         shapes = {functions.shape_of_reference(reference, call) for reference in references} or {"own"}

@@ -181,13 +181,14 @@ class TestCommandLine:
         before = snapshot(root)
         content = json.loads(run("--json", root).stdout)
         assert [(plain["file"], plain["line"], plain["reason"]) for plain in content["plain"]] == [
+            ("wrapped.py", 18, "distillation"),
             ("avatar.py", 15, "distillation"),
             ("train.py", 15, "distillation"),
             ("train.py", 17, "distillation"),
             ("train.py", 23, "depth"),
             ("slam.py", 7, "tracking"),
         ]
-        assert content["plain"][1]["weighted_at"] == "utils/photometric.py:6"
+        assert content["plain"][2]["weighted_at"] == "utils/photometric.py:6"
         assert "slam.py" in content["wrote"]
         again = run(root)
         assert "nothing to do: it is patched" in again.stdout

@@ -32,6 +32,8 @@ KINDS = {
     "alpha_mask": "mask",
     "image_mask": "mask",  # laid over an image
     "scaling": "parameter",
+    "radii": "parameter",
+    "target_volume": "feature",
     "colors_precomp": "parameter",  # a colour for each Gaussian
     "image_no_sh": "image",
     "sky_rgb": "image",

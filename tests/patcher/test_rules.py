@@ -209,3 +209,34 @@ def step(model, losses, batch, mask, optimizer):
     shown = json.loads(legs_patch("--check", "--json", checkout(tmp_path, texts)).stdout)
     assert [(problem["file"], problem["line"]) for problem in shown["problems"]] == [("losses.py", 7)]
     assert shown["sites"] == []
+
+
+def test_what_is_no_loss_of_a_photograph_is_not_quoted_beside_one_that_is(tmp_path):
+    texts = {
+        "model.py": """import torch
+from diff_gaussian_rasterization import GaussianRasterizer
+
+class Diffusion(torch.nn.Module):
+    def get_loss(self, pred, target):
+        return (target - pred).abs().mean()
+
+    def training_step(self, batch, index):
+        volumes, render_images = batch["volume"], batch["images"]
+        output = self.denoise(volumes)
+        return {"loss": self.get_loss(output, volumes) + self.draw(output, render_images)}
+
+    def draw(self, output, render_images):
+        image = self.render(output)
+        gt_image = render_images[0]
+        return torch.abs(image - gt_image).mean()
+
+def get_loss_tracking_rgb(image, viewpoint):
+    return torch.abs(image - viewpoint.original_image).mean()
+
+def check(view, radii):
+    return (radii - view.radii).abs().max()
+""",
+    }
+    shown = json.loads(legs_patch("--check", "--json", checkout(tmp_path, texts)).stdout)
+    assert [(problem["file"], problem["line"]) for problem in shown["problems"]] == [("model.py", 16)]
+    assert shown["sites"] == []

@@ -31,7 +31,7 @@ WORDS = {
     "feature": """
         feature features feat feats semantic semantics sem language lang clip dino lseg sam embedding embeddings latent
         latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors classes obj
-        objects wavelet wavelets haar fft rfft dct phasor phasors stokes
+        objects wavelet wavelets haar fft rfft dct phasor phasors stokes volume volumes voxel
     """,
     # sds, inpaint, edit: GaussianDreamer, GaussianEditor; pseudo, unseen, virtual: codebases with few views
     "warp": f"""
@@ -48,7 +48,7 @@ WORDS = {
         offset offsets grid grids plane planes pose poses deform deformation delta deltas residual means pts points
         point light lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds
         intrinsics extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints vertex
-        vertices verts bone bones smpl center centers knn kpt kpts keypoint keypoints mu std base precomp
+        vertices verts bone bones smpl center centers knn kpt kpts keypoint keypoints mu std base precomp radii
     """,
     "image": """
         image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering

@@ -9,7 +9,7 @@ from legs_adapters.code.parsing import Place
 from legs_adapters.code.syntax import one_line, words, words_in
 from legs_adapters.lexicon.masks import is_rows
 from legs_adapters.lexicon.meaning import swapped
-from legs_adapters.lexicon.words import MESH, PERCEPTUAL, WARPED
+from legs_adapters.lexicon.words import MESH, PERCEPTUAL, TRACKING, WARPED
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import RULES, first
 from legs_adapters.rules.rule import Term
@@ -84,9 +84,9 @@ class Verdicts:
             return None
         names = [*dict(term.names_around), *getattr(self.analysis.program.owner_of(function), "methods", ())]
         other = (PERCEPTUAL | WARPED | MESH) & words_in(form.node).union(*map(words, names))
-        a, b = term.pair.a, term.pair.b
-        pictures = "image" in (a.kind, b.kind) or (function.name in CALLED and all(map(is_role, term.sides)))
-        if other or not pictures or (rule.needs_target and "target" not in (a.role, b.role)):
+        kinds, roles = zip(term.pair.a, term.pair.b)
+        pictures = "image" in kinds or (function.name in CALLED and all(map(is_role, term.sides)))
+        if other or not pictures or TRACKING & {*words(function.name)} or (rule.needs_target and "target" not in roles):
             return None
         return self.problem(term, place, f"nothing shows that this is the loss: {rule.sentence()}")
 

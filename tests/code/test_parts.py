@@ -131,7 +131,7 @@ def test_a_body_is_parsed_only_when_it_is_asked_for(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("def f(:\n    pass\n", "does not parse (line 1)"),
+        ("def f(:\n    pass\n", "does not parse (line 2)"),
         ("x = 1\n\n\ndef f():\n    return 1 2\n", "does not parse (line 5)"),
     ],
 )

@@ -229,8 +229,8 @@ class TestWhereItLooks:
     @pytest.mark.parametrize(
         ("data", "reason"),
         [
-            (b"print 'hello'\n", "does not parse (line 1)"),
-            (b"def f(:\n", "does not parse (line 1)"),
+            (b"print 'hello'\n", "does not parse (line 2)"),
+            (b"def f(:\n", "does not parse (line 2)"),
             (b"# -*- coding: latin-1 -*-\nx = '\xe9'\n", "not UTF-8 (byte 31)"),
             (b"x = '\xe9'\n", "not UTF-8 (byte 5)"),
         ],

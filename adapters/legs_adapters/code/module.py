@@ -253,14 +253,13 @@ def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadabl
         return Unreadable(source.path, over)
     try:
         return Module(source.path, source.text, budget)
-    except (SyntaxError, cst.ParserSyntaxError, RecursionError, ValueError) as error:
+    except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
         return _failure(source.path, error)
 
 
 def _failure(path: str, error: Exception) -> Unreadable:
-    if isinstance(error, (SyntaxError, cst.ParserSyntaxError)):
-        line = error.lineno if isinstance(error, SyntaxError) else error.raw_line
-        return Unreadable(path, f"does not parse (line {line})")
+    if isinstance(error, cst.ParserSyntaxError):
+        return Unreadable(path, f"does not parse (line {error.raw_line})")
     if isinstance(error, RecursionError):
         return Unreadable(path, "is nested too deeply")
     return Unreadable(path, f"cannot be parsed: {type(error).__name__}")

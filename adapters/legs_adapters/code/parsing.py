@@ -116,7 +116,7 @@ def outline_part(lines: Lines) -> Tuple[Part, List[Optional[slice]]]:
         nothing was cut.
 
     Raises:
-        SyntaxError, libcst.ParserSyntaxError, RecursionError, ValueError: it does not parse.
+        libcst.ParserSyntaxError, RecursionError, ValueError: it does not parse.
     """
     outline, cuts = bytearray(lines.data), _cuts(lines)
     for cut in filter(None, cuts):
@@ -145,8 +145,8 @@ def _cuts(lines: Lines) -> List[Optional[slice]]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             tree = ast.parse(lines.data)
-    except (ValueError, RecursionError, MemoryError):
-        return []  # deeper than Python's parser goes
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return []  # newer than this Python: LibCST knows; or deeper than its parser goes
     return [_cut(lines, node) for node in _functions(tree)]
 
 

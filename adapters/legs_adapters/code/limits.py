@@ -61,7 +61,7 @@ def parsing_steps(text: str) -> int:
 
 
 def over_the_limits(text: str) -> str:
-    """Return why a file is not parsed, or "": it is too long, or an expression is too deep. Python counts blocks."""
+    """Return why a file is not parsed, or "": it is too long, or an expression is too deep. Parsers count blocks."""
     if _TOKEN_STEPS * len(text) > MAX_FILE_STEPS and parsing_steps(text) > MAX_FILE_STEPS:
         return _WHY_OVER
     if text.count("elif") > MAX_PARTS:

@@ -89,14 +89,14 @@ def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str =
     """Return the layout of an image, as its shape shows it.
 
     Args:
-        image: floats, [H, W], [C, H, W] or [B, C, H, W], with more axes in front, or with the channel last. It is taken
-            for the last axis where that is 1, 3 or 4 and the third from last is none of these.
-        channels_last: the caller's word, where both read well, as in [3, 100, 4].
+        image: floats, [H, W], [C, H, W] or [B, C, H, W], with more axes in front, or with the channel last. The channel
+            is the one of the two axes that is 1, 3 or 4.
+        channels_last: the caller's word, where both axes read well, as in [3, 100, 4], or neither, as in [16, 90, 120].
         name: of the image, for messages.
 
     Raises:
-        LegsError: it is no float tensor, has too few axes or an empty one; its channel may be either axis and
-            ``channels_last`` is None; its shape contradicts ``channels_last``; it is a list of pixels, [N] or [N, 3].
+        LegsError: it is no float tensor, has too few axes or an empty one; its channel may be either axis or
+            neither, and ``channels_last`` is None; its shape contradicts ``channels_last``; it is a list of pixels.
 
     Example:
         >>> read_layout(torch.zeros(1, 6, 8, 3)).channels_last
@@ -119,10 +119,10 @@ def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str =
         return Layout(image.shape, False)
     first, last = image.shape[-3], image.shape[-1]
     if channels_last is None:
-        if first in _CHANNELS and last in _CHANNELS:
+        if (first in _CHANNELS) == (last in _CHANNELS):
             raise LegsError(
                 f"{name} {shape_of(image)} may have its channels first or last: say channels_last=False ({first} "
-                f"channels) or channels_last=True ({last} channels)"
+                f"channels) or channels_last=True ({last} channels); gray images are [..., {first}, 1, H, W]"
             )
         return Layout(image.shape, last in _CHANNELS)
     channel, other = (last, first) if channels_last else (first, last)

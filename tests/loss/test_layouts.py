@@ -119,8 +119,6 @@ def test_a_gray_image_without_a_channel():
         ((3, 1, 20, 30), False),
         ((3, 3, 20, 30), False),
         ((2, 5, 20, 30, 4), True),
-        ((16, 20, 30), False),  # features
-        ((2, 20, 30), False),
         ((3, 1, 300), False),
         ((300, 1, 3), True),
     ],
@@ -141,6 +139,16 @@ def test_a_shape_that_reads_either_way_is_refused_with_what_to_pass(shape, funct
     *batch, first, middle, last = shape
     assert function(image, channels_last=False).shape == (*batch, 1, middle, last)
     assert function(image, channels_last=True).shape == (*batch, first, middle, 1)
+
+
+@pytest.mark.parametrize("shape", [(16, 20, 30), (2, 20, 30), (2, 5, 20, 30)])
+@pytest.mark.parametrize("function", [weight_map, response])
+def test_gray_images_in_a_row_are_no_channels_of_one(shape, function):
+    image = torch.rand(shape)
+    with pytest.raises(LegsError, match=rf"; gray images are \[\.\.\., {shape[-3]}, 1, H, W\]"):
+        function(image)
+    assert function(image.unsqueeze(-3)).shape == (*shape[:-2], 1, *shape[-2:])
+    assert function(image, channels_last=False).shape == (*shape[:-3], 1, *shape[-2:])
 
 
 @pytest.mark.parametrize("shape", [(500,), (500, 3), (3, 500), (500, 4), (1, 9), (500, 1)])

@@ -84,7 +84,7 @@ def test_kornia_agrees():
 
 @pytest.mark.parametrize("padding", ["zeros", "reflect", "replicate", "valid"])
 def test_gradcheck(padding):
-    prediction, target = pair(2, 12, 13, dtype=torch.float64)
+    prediction, target = pair(3, 12, 13, dtype=torch.float64)
     prediction.requires_grad_()
     assert torch.autograd.gradcheck(lambda p: ssim(p, target, padding=padding), (prediction,), fast_mode=True)
 

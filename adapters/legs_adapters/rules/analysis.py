@@ -15,7 +15,6 @@ from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.kinds.callback import Callbacks
 from legs_adapters.terms.prospects import Prospects
-from legs_adapters.terms.ssim.calls import SsimCalls
 
 __all__ = ["Analysis"]
 
@@ -34,7 +33,6 @@ class Analysis:
         forms: its L1 expressions.
         purposes: the purposes of its backward passes.
         callbacks: the L1 functions that are passed by name.
-        ssims: its SSIM functions, by their code.
         splats: which of its functions are about Gaussian splatting.
     """
 
@@ -48,7 +46,6 @@ class Analysis:
         self.purposes: Purposes = Purposes(self.program, self.training)
         self.splats: Splats = Splats(self.program, self.training)
         self.callbacks: Callbacks = Callbacks(self.program, self.training, self.forms)
-        self.ssims: SsimCalls = SsimCalls(self.program)
 
     @classmethod
     def of_files(cls, sources: Iterable[Source]) -> Analysis:

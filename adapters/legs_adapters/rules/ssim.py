@@ -12,6 +12,7 @@ from legs_adapters.tensors.gradients import no_grad_around
 from legs_adapters.terms.findings import Evidence, Findings, Left, Site
 from legs_adapters.terms.kinds.ssim import Ssim
 from legs_adapters.terms.patched import patched_nodes
+from legs_adapters.terms.ssim.calls import proven_ssim
 from legs_adapters.terms.writing import PACKAGE
 
 __all__ = ["with_ssims"]
@@ -46,7 +47,7 @@ def _in_function(
         form, place = Ssim.find(analysis.forms.functions, function, call), function.place(call)
         if form is None or any(at.start <= place.start < at.end for at in edited):
             continue
-        proven = analysis.ssims.proven(function, form)
+        proven = proven_ssim(analysis.program, function, form)
         named = [(function.module.path, line) for line in range(place.line, place.last_line + 1)]
         if proven is None:
             yield Left.at(function, place, Evidence(UnprovenSsim.id, UnprovenSsim.reason, [(function, form.node)]))

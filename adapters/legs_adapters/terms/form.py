@@ -26,7 +26,6 @@ class Form:
         first, second: the two arguments, as written.
         callee: what is called, for a form that is a call of a function; None for ``abs``.
         extras: the call's further arguments.
-        difference: the ``a - b``, for a form that is an absolute value.
         makes: what becomes of the differences: "mean", "none" (the map), or "own", anything else that is an L1; see
             `L1Functions.shape`.
         weighs: whether the edit weights the term.
@@ -40,7 +39,6 @@ class Form:
     second: cst.BaseExpression
     callee: Optional[cst.BaseExpression] = None
     extras: Tuple[cst.Arg, ...] = ()
-    difference: Optional[cst.BinaryOperation] = None
     makes: str = "own"
 
     weighs: ClassVar[bool] = True
@@ -80,4 +78,4 @@ class Form:
         return writing.call(prediction, target, self.is_map, self._own(writing))
 
     def _own(self, writing: Writing) -> str:
-        return ""
+        return writing.own(self.callee, self.extras) if self.callee is not None and self.makes == "own" else ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional, Set, Tuple, Type
+from typing import Dict, List, Set, Tuple, Type
 
 import libcst as cst
 
@@ -38,16 +38,13 @@ class Forms:
         found: List[Form] = []
         inside = _transformed(function)
         for call in function.flow.calls:
-            form = self._recognise(function, call) if id(call) not in inside else None
+            forms = (kind.find(self.functions, function, call) for kind in KINDS if id(call) not in inside)
+            form = next(filter(None, forms), None)
             if form is not None:
                 found.append(form)
                 inside.add(id(form.call))
                 inside.update(id(n) for n in walk_expressions(form.node) if abs_argument(n))
         return found
-
-    def _recognise(self, function: Function, call: cst.Call) -> Optional[Form]:
-        forms = (kind.find(self.functions, function, call) for kind in KINDS)
-        return next((form for form in forms if form is not None), None)
 
 
 def _transformed(function: Function) -> Set[int]:

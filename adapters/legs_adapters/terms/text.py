@@ -46,9 +46,9 @@ class Text:
         """Return the text of a span of bytes."""
         return self.bytes[start:end].decode("utf-8")
 
-    def written(self, node: cst.CSTNode, brackets: bool = False) -> str:
-        """Return a node as written."""
-        return self.between(*self.span(node, brackets))
+    def written(self, node: cst.CSTNode) -> str:
+        """Return a node as written, with the brackets around it."""
+        return self.between(*self.span(node, True))
 
     def replace(self, start: int, end: int, after: str) -> Edit:
         """Return the edit that replaces a span of bytes by a text."""
@@ -57,11 +57,9 @@ class Text:
 
     def argument(self, node: cst.BaseExpression, index: str) -> str:
         """Return an image as written, without the index that it carries."""
-        start, end = self.span(node, True)
         if not index or not isinstance(node, cst.Subscript):
-            return self.between(start, end)
-        start, end = self.span(node.value, True)
-        return self.between(start, end) + residue(self.between(end, self.span(node)[1]))
+            return self.written(node)
+        return self.written(node.value) + residue(self.between(self.span(node.value, True)[1], self.span(node)[1]))
 
 
 def names_for_two(text: str) -> Tuple[str, str]:

@@ -44,9 +44,7 @@ class Writing(NamedTuple):
             as_map: whether the unreduced map is asked for.
             own: the codebase's own L1, where it is more than a mean.
         """
-        parts = ['reduction="none"'] if as_map else []
-        parts += [f"own={own}"] if own else []
-        return "".join(f", {part}" for part in parts)
+        return (', reduction="none"' if as_map else "") + (f", own={own}" if own else "")
 
     def own(self, callee: cst.BaseExpression, extras: Sequence[cst.Arg]) -> str:
         """Return the codebase's own function of (prediction, target), with its further arguments."""

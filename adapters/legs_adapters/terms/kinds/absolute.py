@@ -30,21 +30,15 @@ class Absolute(Form):
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
         """Find ``abs`` of a difference that is not of numbers."""
         found = absolute_value(call)
-        if found is None or not is_difference(found.argument):
+        if found is None or not isinstance(found.argument, cst.BinaryOperation) or not is_difference(found.argument):
             return None
-        difference = found.argument
-        assert isinstance(difference, cst.BinaryOperation)
-        return cls(call, found.call, difference.left, difference.right, difference=difference, makes=found.makes)
+        return cls(call, found.call, found.argument.left, found.argument.right, makes=found.makes)
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace what stands before, between and after the two sides, comments kept."""
-        difference = self.difference
-        assert difference is not None
         start, end = text.span(self.node)
-        left, right = text.span(difference.left, True), text.span(difference.right, True)
-        sides = writing.ordered(
-            *(text.argument(side, writing.selection) for side in (difference.left, difference.right))
-        )
+        left, right = text.span(self.first, True), text.span(self.second, True)
+        sides = writing.ordered(*(text.argument(side, writing.selection) for side in (self.first, self.second)))
         middle = residue(text.between(left[1], right[0]))
         settings = writing.settings(as_map=bool(writing.selection) or self.is_map)
         tail = writing.selection + (".mean()" if writing.selection and self.is_mean else "")

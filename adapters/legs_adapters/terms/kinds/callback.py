@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Dict, List, Optional, Set
+from typing import Dict, Iterator, List, Optional, Set
 
 import libcst as cst
 
@@ -70,14 +70,12 @@ class Callbacks:
                 self._by_holder.setdefault(holder, []).append(form)
                 self.assigned.add(function)
 
-    def _values(self, holder: Function, function: Function) -> List[cst.BaseExpression]:
-        """Return the assigned values in one function that are another function, by its name."""
+    def _values(self, holder: Function, function: Function) -> Iterator[cst.BaseExpression]:
+        """Yield the assigned values in one function that are another function, by its name."""
         reads = {read.value for read in holder.flow.reads}
-        found: List[cst.BaseExpression] = []
         for made in holder.flow.every_definition:
             is_called = "." in made.place or holder.parent is None or made.place in reads
             if made.kind == "assign" and isinstance(made.value, (cst.Name, cst.Attribute)) and is_called:
                 references = self._program.resolve(holder, made.value)
                 if [r.target for r in references] == [function]:
-                    found.append(made.value)
-        return found
+                    yield made.value

@@ -52,19 +52,14 @@ class Called(Form):
             extras = ()  # they settled the shape; the call no longer needs them
         return cls(call, call, first, second, call.func, extras, makes=makes or "own")
 
-    def _own(self, writing: Writing) -> str:
-        assert self.callee is not None
-        return writing.own(self.callee, self.extras) if self.makes == "own" else ""
-
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the function, order the two images, and replace the further arguments by the settings."""
         first, second = self.call.args[:2]
         edits = [text.replace(*text.span(self.call.func, True), f"{PACKAGE}.l1_loss")]
         sides = writing.ordered(*(text.argument(arg.value, writing.selection) for arg in (first, second)))
         edits += [text.replace(*text.span(arg), side) for arg, side in zip((first, second), sides)]
-        tail = ""
-        if self.makes != "own" and writing.selection:
-            tail = writing.selection + (".mean()" if self.is_mean else "")
+        tail = writing.selection if self.makes != "own" else ""
+        tail += ".mean()" if tail and self.is_mean else ""
         settings = writing.settings(self.is_map or bool(tail), self._own(writing))
         after, end = text.span(second)[1], text.span(self.call.args[-1])[1]
         if settings or end != after:

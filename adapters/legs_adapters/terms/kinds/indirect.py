@@ -8,7 +8,7 @@ from typing import Iterator, Optional
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import code, one_line
+from legs_adapters.code.syntax import one_line
 from legs_adapters.tensors.absolute import absolute_value, is_difference
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
@@ -26,7 +26,12 @@ class Indirect(Form):
     Example:
         before: diff = image - gt_image; diff = diff[diff ** 2 < 0.1]; loss = diff.abs().mean()
         advice: torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))
+
+    Attributes:
+        difference: the ``a - b``.
     """
+
+    difference: Optional[cst.BinaryOperation] = None
 
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
@@ -35,7 +40,7 @@ class Indirect(Form):
         made = next(_differences(function, found.argument, 0), None) if found is not None else None
         if found is None or made is None:
             return None
-        return cls(call, found.call, made.left, made.right, difference=made, makes=found.makes)
+        return cls(call, found.call, made.left, made.right, makes=found.makes, difference=made)
 
     def why_by_hand(self) -> str:
         """Return that the difference stands elsewhere."""
@@ -46,8 +51,8 @@ class Indirect(Form):
         """Return the absolute value of the weighted difference."""
         assert self.difference is not None
         _, target = writing.ordered(self.first, self.second)
-        made = f"({code(self.difference.with_changes(lpar=[], rpar=[]))})"
-        return f"torch.abs({PACKAGE}.weight_map({one_line(target)}) * {' '.join(made.split())})"
+        made = one_line(self.difference.with_changes(lpar=[], rpar=[]))
+        return f"torch.abs({PACKAGE}.weight_map({one_line(target)}) * ({made}))"
 
 
 def _differences(function: Function, node: cst.CSTNode, depth: int) -> Iterator[cst.BinaryOperation]:

@@ -34,15 +34,11 @@ class Masked(Form):
     term: ClassVar[str] = "mask"
     done: ClassVar[str] = "is masked, in every term that gets the rendering,"
 
-    def line(self, text: Text, package: str) -> str:
-        """Return the line without its indentation."""
-        prediction, target = (on_one_line(text.written(side, True)) for side in (self.first, self.second))
-        return f"{prediction} = {package}.masked({prediction}, {target})"
-
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Write the line; where lines have to keep their numbers, before or after a statement beside it, if one can."""
         assert self.before is not None
-        line = self.line(text, PACKAGE)
+        prediction, target = (on_one_line(text.written(side)) for side in (self.first, self.second))
+        line = f"{prediction} = {PACKAGE}.masked({prediction}, {target})"
         if writing.in_place and isinstance(self.before, cst.SimpleStatementLine):
             at = text.span(self.before)[0]
             return [text.replace(at, at, f"{line}; ")]

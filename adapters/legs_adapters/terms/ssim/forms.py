@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import builtins
 import dataclasses
+import functools
 import hashlib
 from typing import Any, Dict, List, Optional
 
@@ -41,6 +42,7 @@ _WITHOUT_EFFECT = (
 )
 
 
+@functools.lru_cache(maxsize=8)  # every call of a function asks
 def form_of(program: Program, function: Function) -> Optional[str]:
     """Return the hash of a function's normal form; None where it has none, since a name in it is not resolved."""
     functions = [function]

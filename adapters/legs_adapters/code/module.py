@@ -53,10 +53,8 @@ class Function:
         self._body: Optional[cst.BaseSuite | cst.Module] = None
         self._inner: List[Function] = []
         self._flow: Optional[Flow] = None
-        if cut is not None:
-            self.text: str = module.lines.data[cut].decode("utf-8")
-        else:
-            self.text = parent.text if parent is not None and parent.parent is not None else module.outline_text
+        around = parent.text if parent is not None and parent.parent is not None else module.outline_text
+        self.text: str = around if cut is None else module.lines.data[cut].decode("utf-8")
 
     @property
     def body(self) -> cst.BaseSuite | cst.Module:
@@ -146,13 +144,10 @@ class Class:
 
     def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
         """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""
-        found: List[Tuple[Function, Definition]] = []
-        for method in self.methods.values():
-            if attribute in method.text and where(method):
-                definitions = method.flow.definitions.get(f"self.{attribute}", [])
-                # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
-                found.extend((method, d) for d in definitions if not str(d.key).startswith("."))
-        return found
+        methods = [method for method in self.methods.values() if attribute in method.text and where(method)]
+        found = [(method, d) for method in methods for d in method.flow.definitions.get(f"self.{attribute}", ())]
+        # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
+        return [(method, made) for method, made in found if not str(made.key).startswith(".")]
 
 
 class Module:

@@ -56,8 +56,8 @@ class Program(Checkout):
             return []
         known = self._resolved.setdefault(function, {})
         if (id(node), depth) not in known:
-            found = _unique(self._resolve(function, node, depth + 1)) if function.module.spend(1) else []
-            known[id(node), depth] = node, found  # the node, lest another gets its id
+            found = self._resolve(function, node, depth + 1) if function.module.spend(1) else ()
+            known[id(node), depth] = node, list(dict.fromkeys(found))  # the node, lest another gets its id
         return known[id(node), depth][1]
 
     def _resolve(self, function: Function, node: cst.CSTNode, depth: int) -> Iterable[Reference]:
@@ -85,13 +85,10 @@ class Program(Checkout):
         if local:
             return [(function, definition) for definition in sorted(local, key=lambda made: made.order)]
         place, scope = path_of(node), function.parent or function
-        while place is not None:
-            if place in scope.flow.definitions:
-                return [(scope, definition) for definition in scope.flow.definitions[place]]
-            if scope.parent is None:
-                break
+        while place is not None and place not in scope.flow.definitions and scope.parent is not None:
             scope = scope.parent
-        return None
+        found = scope.flow.definitions.get(place) if place is not None else None
+        return None if found is None else [(scope, definition) for definition in found]
 
     def of_definition(self, where: Function, definition: Definition, depth: int = 0) -> List[Reference]:
         """Return what a definition may bind its place to."""
@@ -208,22 +205,17 @@ class Program(Checkout):
 
     def owner_of(self, function: Function) -> Optional[Class]:
         """Return the class whose ``self`` a function sees."""
-        scope: Optional[Function] = function
-        while scope is not None and scope.owner is None:
-            scope = scope.parent
-        return scope.owner if scope is not None else None
-
-    def bases(self, owner: Class) -> List[Class]:
-        """Return the base classes that are defined in the checkout."""
-        found = [ref.target for arg in owner.node.bases for ref in self.resolve(owner.parent, arg.value)]
-        return [base for base in found if isinstance(base, Class) and base is not owner]
+        while function.owner is None and function.parent is not None:
+            function = function.parent
+        return function.owner
 
     def lineage(self, owner: Class) -> Iterator[Class]:
-        """Yield a class, then its base classes and theirs."""
+        """Yield a class, then its base classes that are defined in the checkout, and theirs."""
         known = [owner]
         for current in known:  # which grows
             yield current
-            known += [base for base in self.bases(current) if base not in known]
+            bases = [ref.target for arg in current.node.bases for ref in self.resolve(current.parent, arg.value)]
+            known += [base for base in bases if isinstance(base, Class) and base not in known]
 
     def member(self, owner: Class, name: str, depth: int = 0) -> List[Reference]:
         """Return what ``instance.name`` may be: a method, or a value that methods of the class store."""
@@ -234,7 +226,7 @@ class Program(Checkout):
                 break
             for method, definition in current.stores(name):
                 references += self.of_definition(method, definition, depth + 1)
-        return _unique(references)
+        return list(dict.fromkeys(references))
 
     def _overrides(self, owner: Class, name: str) -> List[Reference]:
         """Resolve ``self.step()`` in a base class: the methods of classes that derive from it."""
@@ -248,11 +240,3 @@ class Program(Checkout):
         if reference.kind == "instance" and isinstance(reference.target, Class):
             found = [ref for name in CALLED for ref in self.member(reference.target, name)]
         return [ref.target for ref in found if isinstance(ref.target, Function)]
-
-
-def _unique(references: Iterable[Reference]) -> List[Reference]:
-    """Return each reference once, in their order."""
-    found: Dict[Tuple[str, object], Reference] = {}
-    for ref in references:
-        found.setdefault((ref.kind, ref.target), ref)
-    return list(found.values())

@@ -17,7 +17,7 @@ def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Fu
     """Return the ``no_grad`` around expressions, with its function: the block's call, or the decorator."""
     for node in nodes:
         for context in function.flow.contexts.get(id(node), ()):
-            if _stops_gradients(context):
+            if isinstance(context, cst.Call) and call_name(context) in NO_GRAD:
                 return function, context
     for decorator, name in zip(getattr(function.node, "decorators", ()), function.decorators):
         if name in NO_GRAD:
@@ -33,7 +33,3 @@ def is_detached(node: cst.CSTNode) -> bool:
 def detaches(node: cst.CSTNode) -> bool:
     """Return whether a gradient is cut somewhere in an expression."""
     return any(isinstance(part, cst.Call) and call_name(part) == "detach" for part in walk_expressions(node))
-
-
-def _stops_gradients(node: cst.CSTNode) -> bool:
-    return isinstance(node, cst.Call) and call_name(node) in NO_GRAD

@@ -21,11 +21,8 @@ def is_backward(call: cst.Call) -> bool:
 def is_step(call: cst.Call) -> bool:
     """Return whether a call steps an optimiser: ``optimizer.step()``, ``optimizers.optimizer_step_all()``."""
     tokens = set(words(call_name(call)))
-    if not isinstance(call.func, cst.Attribute) or not (
-        tokens == {"step"} or ("step" in tokens and tokens & OPTIMISERS)
-    ):
-        return False
-    return not _is_of_schedule(call)
+    is_named = "step" in tokens and (len(tokens) == 1 or bool(tokens & OPTIMISERS))
+    return isinstance(call.func, cst.Attribute) and is_named and not _is_of_schedule(call)
 
 
 def may_step(calls: Iterable[cst.Call]) -> bool:

@@ -15,7 +15,7 @@ from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import arguments, call_name, constant, words
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
-from legs_adapters.lexicon.words import LOADING, MATCHED, OF_DIFFUSION, RENDERERS, STATISTICS
+from legs_adapters.lexicon.words import RENDERERS, STATISTICS
 from legs_adapters.tensors.operations import (
     ASKS,
     EXTREMES,
@@ -76,11 +76,6 @@ def meaning_of_call(call: CallReading) -> Meaning:
     return next((known for known in (reading(call) for reading in _READINGS) if known is not None), UNKNOWN)
 
 
-def _painted(call: CallReading) -> Optional[Meaning]:
-    paints = "prompt" in call.keywords and OF_DIFFUSION & set(call.keywords)
-    return Meaning("warp", None) if paints else None
-
-
 def _number(call: CallReading) -> Optional[Meaning]:
     """A number, or what has only the shape of its argument."""
     is_number = call.name in NUMBERS if isinstance(call.node.func, cst.Name) else call.name == "item"
@@ -106,8 +101,7 @@ def _reduced(call: CallReading) -> Optional[Meaning]:
 
 
 def _statistic(call: CallReading) -> Optional[Meaning]:
-    tokens = set(words(call.name))
-    is_statistic = tokens & STATISTICS and not tokens & MATCHED and call.values
+    is_statistic = STATISTICS & set(words(call.name)) and call.values
     return Meaning("feature", call.ask(call.values[0]).role) if is_statistic else None
 
 
@@ -137,10 +131,7 @@ def _named(call: CallReading) -> Optional[Meaning]:
     kind, role = kind_of_words(call.name), role_of_words(call.name)
     if kind not in (None, "image", "mask", "parameter"):
         return Meaning(kind, role)
-    if kind == "image" and (role == "target" or set(words(call.name)) & LOADING):
-        holder = call.ask(call.owner).role if call.owner is not None else None
-        return Meaning("image", role or holder or "target")
-    return None
+    return Meaning(kind, role) if kind == "image" and role == "target" else None
 
 
 def _of_images(call: CallReading) -> Optional[Meaning]:
@@ -166,7 +157,7 @@ def _of_owner(call: CallReading) -> Optional[Meaning]:
 
 
 _READINGS: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
-    *(_painted, _number, _extreme, _reduced, _statistic, _filtered, _moved),
+    *(_number, _extreme, _reduced, _statistic, _filtered, _moved),
     *(_rendered, _named),
     *(_of_images, _returned, _of_owner),
 )

@@ -20,7 +20,7 @@ from legs_adapters.code.syntax import arguments, call_name, constant, dotted, ke
 from legs_adapters.lexicon.calls import CallReading, MeaningOf, meaning_of_call
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
-from legs_adapters.lexicon.words import BACKGROUND, DATA, LOSS, PARAMETERS, RENDERERS
+from legs_adapters.lexicon.words import BACKGROUND, DATA, LOSS, RENDERERS
 from legs_adapters.tensors.backward import Training
 
 __all__ = ["Meanings"]
@@ -99,11 +99,12 @@ class Meanings:
             return Meaning("mask", None)
         if isinstance(node, cst.BinaryOperation) and _is_of_neighbours(node):
             return Meaning("gradient", self.meaning(function, node.left).role)
-        return mix(self.meaning(function, part) for part in _parts(node))
+        return mix((self.meaning(function, part) for part in _parts(node)), isinstance(node, cst.BinaryOperation))
 
     def _name(self, function: Function, node: cst.Name, flow: Meaning) -> Meaning:
         """Return the meaning of a name, of its words and of what is assigned to it."""
-        kind, role = kind_of_words(node.value), role_of_words(node.value)
+        shown = "image_" if flow.kind == "image" else ""
+        kind, role = kind_of_words(shown + node.value), role_of_words(node.value)
         if kind == "mask" and flow.kind == "image" and _is_masked(function, node):
             return flow  # gt_mask_images = gt_image * mask
         role = role or flow.role if self._by_name else flow.role or role
@@ -115,8 +116,6 @@ class Meanings:
 
     def _subscript(self, function: Function, node: cst.Subscript) -> Meaning:
         key = key_of(node) or formatted_key(node) or default_key(function, node)
-        if isinstance(node.value, (cst.Name, cst.Attribute)) and root_of(node.value) in PARAMETERS:
-            return Meaning("parameter", None)
         last = node.slice[-1].slice
         if len(node.slice) > 1 and isinstance(last, cst.Index) and constant(last.value) == 3:
             return Meaning("depth", self.meaning(function, node.value).role)  # of RGB+D, render[0, ..., 3]

@@ -25,10 +25,16 @@ def more_special(word: Optional[str], flow: Optional[str]) -> Optional[str]:
     return min(kinds, key=KINDS.index) if kinds else None
 
 
-def mix(parts: Iterable[Meaning]) -> Meaning:
-    """Join the meanings of an expression's parts: a mask or a number applied to an image gives an image."""
+def mix(parts: Iterable[Meaning], computed: bool = False) -> Meaning:
+    """Join the meanings of an expression's parts: a mask or a number applied to an image gives an image.
+
+    So does a map of labels or of motion in what is computed, ``image * objects``.
+    """
+    laid_over = (None, "mask", "parameter", *(("feature", "flow") if computed else ()))
     known = [part for part in parts if part != UNKNOWN]
-    known = [part for part in known if part.kind not in (None, "mask", "parameter")] or known
+    if computed and {part.kind for part in known} == {None, "mask"}:
+        known = [part for part in known if part.kind is None]  # pred * mask
+    known = [part for part in known if part.kind not in laid_over] or known
     kinds = [part.kind for part in known if part.kind is not None]
     roles = {part.role for part in known if part.role is not None}
     role = roles.pop() if len(roles) == 1 else "both" if roles else None

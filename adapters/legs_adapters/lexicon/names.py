@@ -7,14 +7,12 @@ from typing import Optional
 
 from legs_adapters.code.syntax import words
 from legs_adapters.lexicon.words import (
-    HELD_IN,
     KIND_OF,
     KINDS,
     LAID_OVER,
     OF_PICTURES,
     RENDER,
     TARGET,
-    WHICH,
 )
 
 __all__ = ["TORCH_L1", "is_l1_name", "kind_of_words", "role_of_words"]
@@ -28,8 +26,7 @@ _L1_NAME = re.compile(
 def kind_of_words(name: str) -> Optional[str]:
     """Return the kind of image in a name; the most specific of several."""
     tokens = words(name)
-    own = [word for word in tokens if not word.isdigit() and word not in HELD_IN | WHICH]
-    if own and own[-1] in LAID_OVER:
+    if LAID_OVER & {*tokens[-1:]}:
         return "mask"  # applied to an image, it gives an image
     kinds = {KIND_OF[word] for word in tokens if word in KIND_OF}
     if "image" in kinds:  # sky_rgb, render_sh

@@ -31,7 +31,8 @@ WORDS = {
     "feature": """
         feature features feat feats semantic semantics sem language lang clip dino lseg sam embedding embeddings latent
         latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors classes obj
-        objects wavelet wavelets haar fft rfft dct phasor phasors stokes volume volumes voxel
+        objects orientation orientations orient angle angles wavelet wavelets haar fft rfft dct phasor phasors stokes
+        volume volumes voxel
     """,
     # sds, inpaint, edit: GaussianDreamer, GaussianEditor; pseudo, unseen, virtual: codebases with few views
     "warp": f"""
@@ -57,6 +58,7 @@ WORDS = {
 }
 KINDS = tuple(WORDS)
 KIND_OF = {word: kind for kind in reversed(KINDS) for word in WORDS[kind].split()}
+COLORS = word_set("color colors colour colours")  # of a picture, or of Gaussians
 LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}  # the kinds that a photograph's name may speak of, too
 TARGET = word_set("gt gts target targets tgt ground truth original orig real true observed reference pixels")
 RENDERERS = word_set("render rendering rasterize rasterization rasterizer renderer raster splat splatting")
@@ -67,15 +69,12 @@ RENDER = RENDERERS | word_set(
     """
 )
 LAID_OVER = word_set("mask masks valid weight weights diff error errors")
-WHICH = word_set("first second third last left right front back")  # of several of a kind
-OF_PICTURES = word_set("sky sh shs prior time dx dy")  # a mask, for example, unless something shows that it is an image
-HELD_IN = word_set("tensor tensors t batch np torch cuda gpu list map maps full")
+OF_PICTURES = word_set(
+    "sky sh shs prior time light dx dy"
+)  # a mask, for example, unless something shows that it is an image
 BACKGROUND = word_set("bg bkgd background backgrounds")  # a colour to lay things over, whoever keeps it
 PICKING = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
 STATISTICS = word_set("histc histogram bincount entropy gram moments")  # of a picture, no picture
-MATCHED = word_set("match matching matched equalize equalized")  # histogram_matching(image, photo) is a picture
-LOADING = word_set("load read get open fetch")
-OF_DIFFUSION = word_set("guidance_scale negative_prompt num_inference_steps strength")  # arguments where it paints
 PERCEPTUAL = word_set("vgg perceptual lpips gram dists clip dino")
 MESH = word_set("bake baked baking mesh meshhead texture")  # of triangles: what they draw is no splat
 ROBUST = word_set("huber tukey cauchy")  # a weight would move their thresholds
@@ -96,7 +95,6 @@ MODELS = GAUSSIANS | word_set(
     anchors primitives points parameters params variables
     """
 )
-PARAMETERS = word_set("params param parameters variables splats gauss_params")  # names of what holds a model's
 PLUMBING = word_set("torch optim adam params parameters lr name eps self")  # around what an optimiser is given
 
 # -- purposes
@@ -110,7 +108,9 @@ NOT_TRAINING = _SHOWING | word_set("eval evaluate test inference")
 REPORTING = (
     EVALUATING
     | _SHOWING
-    | word_set("testing report reports metric metrics valid visualize vis benchmark compare psnr quality")
+    | word_set(
+        "testing report reports metric metrics valid visualize vis benchmark check gradcheck compare psnr quality"
+    )
 )
 SCORING = word_set(
     "score scores scoring importance densify densification prune pruning sensitivity sample sampling error"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Dict
+import re
+from typing import Dict, Iterable, Tuple
 
 import libcst as cst
 
@@ -15,6 +16,8 @@ from legs_adapters.terms.form import Form
 
 __all__ = ["Splats"]
 
+_COMMENT = re.compile("#.*")  # proves nothing
+
 
 class Splats:
     """Decide which functions of one program are about Gaussian splatting."""
@@ -22,20 +25,21 @@ class Splats:
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
-        self._known: Dict[str, bool] = {}
+        self._known: Dict[Tuple[str, re.Pattern[str]], bool] = {}
 
-    def is_about(self, function: Function, form: Form) -> bool:
+    def is_about(self, function: Function, forms: Iterable[Form]) -> bool:
         """Return whether the file, one that trains through it, or a neighbour mentions Gaussian splatting."""
         module, above = function.module, [function]
         for current in above:  # which grows
-            speaks = self._speaks(current.module.path) or self._takes_splats(current.module)
+            speaks = self._speaks(current.module.path, DRAWS_SPLATS) or self._takes_splats(current.module)
             if speaks and self._runs_with(module, current.module):
                 return True
             above += [caller for caller, _ in self.training.sites.get(current, []) if caller not in above]
-        is_rendered = "render" in code(form.first) + code(form.second)  # what is in the whole of a folder renders it
+        sides = [code(side) for form in forms for side in (form.first, form.second)]
+        is_rendered = "render" in " ".join(sides)  # what is in the whole of a folder renders it
         folder = module.path[: module.path.find("/") + 1 if is_rendered else module.path.rfind("/") + 1]
-        near = [source.text for path, source in self.program.sources.items() if path.startswith(folder)]
-        return not RAYS.search(module.text) and any(map(SPLATS.search, near))
+        near = [path for path in self.program.sources if path.startswith(folder)]
+        return not RAYS.search(module.text) and any(self._speaks(path, SPLATS) for path in near)
 
     def _runs_with(self, module: Module, other: Module) -> bool:
         """Return whether a module that calls a name can call this one: it lies near, or mentions this one."""
@@ -46,9 +50,10 @@ class Splats:
         """Return whether a file imports a Gaussian class, ``GazeGaussianNet``, from one that mentions splats."""
         taken = [node for node in module.top.flow.imports if "gaussian" in code(node).lower()]
         found = [self.program.imported_from(module, node) for node in taken if isinstance(node, cst.ImportFrom)]
-        return any(made is not None and self._speaks(made.path) for made in found)
+        return any(made is not None and self._speaks(made.path, DRAWS_SPLATS) for made in found)
 
-    def _speaks(self, path: str) -> bool:
-        if path not in self._known:
-            self._known[path] = DRAWS_SPLATS.search(self.program.sources[path].text) is not None
-        return self._known[path]
+    def _speaks(self, path: str, words: re.Pattern[str]) -> bool:
+        if (path, words) not in self._known:
+            text = _COMMENT.sub("", self.program.sources[path].text)
+            self._known[path, words] = words.search(text) is not None
+        return self._known[path, words]

@@ -10,6 +10,7 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import arguments
 from legs_adapters.lexicon.meaning import Meaning, swapped
 from legs_adapters.rules.analysis import Analysis
+from legs_adapters.rules.causes.distillation import is_rendered
 from legs_adapters.rules.causes.kinds import KINDS
 from legs_adapters.rules.order import RULES
 from legs_adapters.terms.findings import Evidence, Use
@@ -29,7 +30,7 @@ def uses_of(analysis: Analysis, function: Function, prediction: cst.CSTNode, tar
             found.append(Use(caller, call, None, False))
         elif sides[-1] is not None:
             given = [analysis.meanings.meaning(caller, side) for side in sides if side is not None]
-            other = _why_other(analysis, caller, call, given)
+            other = _why_other(analysis, caller, call, given, is_rendered(analysis, caller, sides[-1]))
             is_loss = given[0].kind == "image" and given[-1].role == "target"
             is_loss = is_loss and (len(given) == 1 or swapped(*given) is False)
             found.append(Use(caller, call, other, is_loss or other is not None))
@@ -48,10 +49,12 @@ def _calls(analysis: Analysis, function: Function, names: Sequence[str], depth: 
             yield caller, call, sides
 
 
-def _why_other(analysis: Analysis, caller: Function, call: cst.Call, given: Sequence[Meaning]) -> Optional[Evidence]:
+def _why_other(
+    analysis: Analysis, caller: Function, call: cst.Call, given: Sequence[Meaning], is_drawn: bool
+) -> Optional[Evidence]:
     """Return the evidence that a call is not for the loss: by what it is given, or by the step after it."""
     rules = [rule.id for meaning in given for rule in KINDS if rule.kind == meaning.kind]
-    rules += ["distillation"] if given[-1].role == "render" else []
+    rules += ["distillation"] if is_drawn or given[-1].role == "render" else []
     if not rules:
         return analysis.purposes.purpose(caller, call)
     return Evidence(rules[0], RULES[rules[0]].reason, [(caller, call)])

@@ -8,7 +8,7 @@ import libcst as cst
 
 from legs_adapters.code.syntax import call_name
 
-__all__ = ["AbsoluteValue", "abs_argument", "absolute_value", "is_difference", "mean_of"]
+__all__ = ["AbsoluteValue", "abs_argument", "absolute_value", "is_difference", "is_distance", "mean_of"]
 
 
 class AbsoluteValue(NamedTuple):
@@ -30,6 +30,12 @@ def absolute_value(node: cst.Call) -> Optional[AbsoluteValue]:
 def is_difference(node: cst.CSTNode) -> bool:
     """Return whether an expression is ``a - b``."""
     return isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Subtract)
+
+
+def is_distance(node: cst.CSTNode) -> bool:
+    """Return whether an expression is ``abs(a - b)``."""
+    argument = abs_argument(node)
+    return argument is not None and is_difference(argument)
 
 
 def mean_of(node: cst.Call) -> Optional[cst.Call]:

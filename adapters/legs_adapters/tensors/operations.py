@@ -36,7 +36,9 @@ LEAVES = word_set("item numpy tolist")  # conversions of a tensor to numbers or 
 ENDS_GRADIENT = LEAVES | {"detach"}
 NO_GRAD = word_set("inference_mode no_grad")  # contexts and decorators
 BACKWARD = word_set("backward manual_backward")  # the second is Lightning's
-TRANSFORMS = word_set("exp log log10 log1p log2 pow sigmoid sqrt square tanh")  # no longer an absolute error
+TRANSFORMS = word_set(
+    "exp log log10 log1p log2 maximum minimum pow sigmoid sqrt square tanh"
+)  # no longer an absolute error
 OTHER_LOSSES = word_set("huber_loss mse_loss norm smooth_l1_loss")
 MODULES = word_set("F TF einops functional nn np numpy torch")  # as torch and its neighbours are imported
 MODULE_SELF = word_set("cpu cuda double eval float half requires_grad_ to train")  # a module's methods that return it

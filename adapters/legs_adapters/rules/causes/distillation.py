@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from typing import List
+from typing import TYPE_CHECKING, List
 
+import libcst as cst
+
+from legs_adapters.code.module import Function
 from legs_adapters.rules.rule import Rule, Term, source_of
 from legs_adapters.tensors.gradients import detaches
 from legs_adapters.terms.findings import Decider
 
-__all__ = ["Distillation"]
+if TYPE_CHECKING:
+    from legs_adapters.rules.analysis import Analysis
+
+__all__ = ["Distillation", "is_rendered"]
 
 
 class Distillation(Rule):
@@ -20,13 +26,15 @@ class Distillation(Rule):
 
     def evidence(self, term: Term) -> List[Decider]:
         rendered = term.pair.a.role == term.pair.b.role == "render"
-        analysis, target = term.analysis, (term.function, term.target)
-        rendered = rendered or "render" in (
-            analysis.meanings.origin(*target).role,
-            analysis.origins.meaning(*target).role,
-        )
+        rendered = rendered or is_rendered(term.analysis, term.function, term.target)
         return [source_of(term.function, term.target) or term.here[0]] if rendered else []
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether no side is detached; a photograph needs no ``detach()``."""
         return not any(detaches(side) for side in term.sides)
+
+
+def is_rendered(analysis: Analysis, function: Function, target: cst.CSTNode) -> bool:
+    """Return whether what is assigned to a target is a rendering, whatever its name."""
+    origin, flow = analysis.meanings.origin(function, target), analysis.origins.meaning(function, target)
+    return "render" in (origin.role, flow.role)

@@ -30,7 +30,7 @@ class NotSplats(Rule):
         text = term.function.module.text
         if _OTHER_FRAMEWORK.search(text) and not _TORCH.search(text):
             return term.here
-        if not term.analysis.splats.is_about(term.function, term.form):
+        if not term.analysis.splats.is_about(term.function, term.analysis.forms.in_function(term.function)):
             return [header(term.function)]
         by_class = _ray_method(term)
         rays = bool(by_class) or of_rays(term.form)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import List
 
+from legs_adapters.code.syntax import words_in
 from legs_adapters.lexicon.meaning import swapped
+from legs_adapters.lexicon.words import COLORS, KIND_OF
 from legs_adapters.rules.rule import Rule, Term
-from legs_adapters.tensors.absolute import is_difference
+from legs_adapters.tensors.absolute import is_difference, is_distance
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import same_root
 
@@ -20,13 +22,24 @@ class Unknown(Rule):
     INVALID = [
         "loss = l1_loss(network(camera), camera.something)",
         "loss = l1_loss(fused_image(camera), other(camera))",
+        "loss = l1_loss(torch.abs(image - gt), 0.5)",
+        """
+        def fit(model, gt, optimizer):
+            color = model.colors()
+            l1_loss(color, gt["color"]).backward()
+            optimizer.step()
+        """,
     ]
 
     def evidence(self, term: Term) -> List[Decider]:
         pair = term.pair
         pictures = "image" in (pair.a.kind, pair.b.kind)
+        if pictures and "render" not in (pair.a.role, pair.b.role):  # two colours may be of Gaussians
+            named = [{word for word in words_in(side) if KIND_OF.get(word) == "image"} for side in term.sides]
+            pictures = not all(named) or bool(set().union(*named) - COLORS)
         sure = swapped(pair.a, pair.b) is not None or pair.speaks_of_images
         changes = same_root(term.form) or all(map(is_difference, term.sides))  # of two views, or of neighbours
+        changes = changes or any(map(is_distance, term.sides))  # the error of an error: of angles
         return [] if pictures and sure and not changes else term.here
 
     def may_be_loss(self, term: Term) -> bool:

@@ -105,7 +105,6 @@ _MODES = {
     "--check": "exit with 1 if something would change; write nothing",
     "--verify": "patch, then train copies on the CPU with and without the patch for a few dozen steps, and compare",
 }
-_UNDO = {"--undo": "undo the patch, byte for byte; with --diff: show what would change"}
 _GROUPS = {
     "the loss, written to legs.toml": {
         "--preset NAME": "3dgs, eggs, legs-l, legs or legs-robust; default: legs",
@@ -150,7 +149,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EXIT_CODES
     parser.add_argument("folder", metavar="FOLDER", help="the checkout")
     _declare(parser.add_mutually_exclusive_group(), _MODES)
-    _declare(parser, _UNDO)
+    _declare(parser, {"--undo": "undo the patch, byte for byte; with --diff: show what would change"})
     for title, options in _GROUPS.items():
         _declare(parser.add_argument_group(title), options)
 
@@ -239,16 +238,18 @@ def _undo(args: argparse.Namespace) -> int:
     from legs_adapters.report import as_diff
     from legs_adapters.undo import undo
 
-    done = undo(args.folder, args.force, args.trust, look=args.diff)
+    changes, kept = undo(args.folder, args.force, args.trust, look=args.diff)
+    removed = [name for name, (_, after) in changes.items() if after is None]
+    restored = [name for name in changes if name not in removed]
     if args.json:
-        say(json.dumps({"restored": done.restored, "removed": done.removed, "kept": done.kept}, indent=2), lines=True)
+        say(json.dumps({"restored": restored, "removed": removed, "kept": kept}, indent=2), lines=True)
         return 0
     if args.diff:
-        say(as_diff(done.changes), end="", lines=True)
+        say(as_diff(changes), end="", lines=True)
     else:
-        for line in [f"restored {name}" for name in done.restored] + [f"removed {name}" for name in done.removed]:
+        for line in [f"restored {name}" for name in restored] + [f"removed {name}" for name in removed]:
             say(line)
-    for name, reason in done.kept:
+    for name, reason in kept:
         say(f"kept {name}: {reason}", stream=sys.stderr if args.diff else sys.stdout)
     return 0
 

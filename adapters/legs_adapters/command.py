@@ -8,11 +8,8 @@ run on the CPU and a shim replaces the rasterizer: slow, but it trains.
 from __future__ import annotations
 
 import argparse
-import os
-from typing import Sequence
 
 from legs_adapters.cli import check_libcst
-from legs_loss import LegsError
 
 HELP = "run a training script with the LEGS loss, without changing its files"
 
@@ -27,23 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the script and return its exit code.
-
-    Raises:
-        LegsError: an option of ours stands behind the script, which does not know it.
-    """
-    _refuse_ours(args.script, args.arguments)
+    """Run the script and return its exit code."""
     check_libcst()
     from legs_adapters.runner import run_script
 
     return run_script(args.script, args.arguments, args.cpu, args.ssim, args.masks)
-
-
-def _refuse_ours(script: str, arguments: Sequence[str]) -> None:
-    """Raise for `legs run train.py --cpu`: what stands behind the script is the script's own."""
-    for option in ("--cpu", "--ssim", "--masks"):
-        if option in arguments and os.path.isfile(script):
-            with open(script, "rb") as file:
-                if option[2:].encode() not in file.read():
-                    behind = f"{option} stands behind {script}, which does not know it"
-                    raise LegsError(f"{behind}: legs run {option} {script} ...")

@@ -98,9 +98,7 @@ def _import(text: Text) -> Edit:
         at = module.lines.start(min(first)) if first else len(text.bytes)
         return text.replace(at, at, line + newline)
     at = module.lines.start(module.top.place(anchor).last_line + 1)
-    ending = re.search(rb"(\r\n|\r|\n)?\Z", text.bytes[:at])
-    assert ending is not None
-    before = ending.group().decode()  # "": the last line of a file that does not end in one
+    before = re.findall(rb"(\r\n|\r|\n)?\Z", text.bytes[:at])[0].decode()  # "": the file ends without one
     return text.replace(at, at, line + before if before else newline + line)
 
 

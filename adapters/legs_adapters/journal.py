@@ -12,13 +12,14 @@ import json
 import re
 import zlib
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple, Optional, Tuple
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence
 
 from legs_adapters.checkout.replace import MAX_FILE_BYTES, read_file
 from legs_adapters.checkout.seal import is_sealed, seal
 from legs_adapters.code.folders import check_name
 from legs_adapters.code.limits import MAX_BYTES
 from legs_adapters.settings import SETTINGS_FILE
+from legs_adapters.terms.text import Edit
 from legs_loss import LegsError
 
 __all__ = ["JOURNAL", "Journal", "Layer", "digest"]
@@ -34,7 +35,7 @@ class Layer(NamedTuple):
     """One patch of one file: its bytes before, the edits in order, and the checksum of the bytes after."""
 
     original: bytes
-    edits: Tuple[Tuple[int, int, str], ...]
+    edits: Sequence[Edit]
     after: str
 
 
@@ -80,17 +81,7 @@ class Journal(NamedTuple):
 
     def dump(self, root: Path) -> bytes:
         """Return the file's content, sealed; without a seal where this machine keeps no key."""
-        files = {
-            path: [
-                {
-                    "after": layer.after,
-                    "edits": layer.edits,
-                    "original": base64.b64encode(zlib.compress(layer.original, 9)).decode("ascii"),
-                }
-                for layer in layers
-            ]
-            for path, layers in sorted(self.files.items())
-        }
+        files = {path: [_written(layer) for layer in layers] for path, layers in sorted(self.files.items())}
         content: Dict[str, Any] = {"note": _NOTE, "version": _VERSION, "files": files, "created": self.created}
         content["seal"] = seal(_canonical(content), root)
         data = (json.dumps(content, indent=1) + "\n").encode("utf-8")
@@ -120,6 +111,12 @@ def _canonical(content: Dict[str, Any]) -> bytes:
     return json.dumps(content, sort_keys=True, separators=(",", ":")).encode("ascii")
 
 
+def _written(layer: Layer) -> Dict[str, Any]:
+    edits = [(edit.start, edit.end, edit.after.decode("utf-8")) for edit in layer.edits]
+    original = base64.b64encode(zlib.compress(layer.original, 9)).decode("ascii")
+    return {"after": layer.after, "edits": edits, "original": original}
+
+
 def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
     files: Dict[str, List[Layer]] = {}
     room = MAX_BYTES
@@ -140,15 +137,14 @@ def _read_layer(content: Dict[str, Any], room: int) -> Layer:
     original = stream.decompress(base64.b64decode(content["original"], validate=True), room + 1)
     if len(original) > room or not stream.eof:
         raise ValueError(f"a file is cut off, or all are larger than {MAX_BYTES >> 20} MiB")
-    edits: List[Tuple[int, int, str]] = []
+    edits: List[Edit] = []
     at = 0
     for start, end, text in sorted(content["edits"]):
         if type(start) is not int or type(end) is not int or not at <= start <= end <= len(original):
             raise ValueError(f"an edit of bytes {start!r} to {end!r} of {len(original)}")
-        text.encode("utf-8")
-        edits.append((start, end, text))
+        edits.append(Edit(start, end, original[start:end], text.encode("utf-8")))
         at = end
-    return Layer(original, tuple(edits), _checksum(content["after"]))
+    return Layer(original, edits, _checksum(content["after"]))
 
 
 def _only(name: str, is_written: bool) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_adapters.checkout.git import changed_files
-from legs_adapters.checkout.replace import locked, read_file, replace_files
+from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
 from legs_adapters.code.folders import first_of, why_left_out
 from legs_adapters.code.sources import Unreadable, check_root, read_files
 from legs_adapters.edit import Edit, apply_edits, rewrite, why_not_compiled
@@ -44,11 +44,9 @@ class Plan(NamedTuple):
         """Return a file's bytes as they were read."""
         return self.findings.program.sources[path].data
 
-    def changes(self) -> Dict[str, Tuple[Optional[bytes], bytes]]:
+    def changes(self) -> Changes:
         """Return by path the bytes before (None: no file) and after, of files that differ."""
-        changes: Dict[str, Tuple[Optional[bytes], bytes]] = {
-            path: (self.source(path), after) for path, after in self.after.items()
-        }
+        changes: Changes = {path: (self.source(path), after) for path, after in self.after.items()}
         if self.settings is not None:
             before, after = read_file(self.root, SETTINGS_FILE), self.settings.encode("utf-8")
             if before != after:
@@ -160,11 +158,11 @@ def write(plan: Plan, force: bool = False) -> List[str]:
     with locked(root, f"legs-patch {root}"):
         journal = Journal.read(root)
         changes = plan.changes()
-        if SETTINGS_FILE in changes:
-            current, data = changes[SETTINGS_FILE]
+        if plan.settings is not None and SETTINGS_FILE in changes:
+            current = changes[SETTINGS_FILE][0]
             if current is not None and not journal.is_as_written(SETTINGS_FILE, current):
                 raise LegsError(f"{SETTINGS_FILE} exists and is not as legs-patch wrote it: change the settings in it")
-            journal.created[SETTINGS_FILE] = digest(data)
+            journal.created[SETTINGS_FILE] = digest(plan.settings.encode("utf-8"))
         if not changes:
             return []
         if not journal.is_own:
@@ -179,8 +177,7 @@ def write(plan: Plan, force: bool = False) -> List[str]:
                 f"uncommitted changes in what would be patched ({first_of(changed, 5)}): commit them, or use --force"
             )
         for path, data in plan.after.items():
-            edits = tuple((edit.start, edit.end, edit.after.decode("utf-8")) for edit in sorted(plan.edits[path]))
-            journal.files.setdefault(path, []).append(Layer(plan.source(path), edits, digest(data)))
+            journal.files.setdefault(path, []).append(Layer(plan.source(path), plan.edits[path], digest(data)))
         # The journal is written first, so that --undo works whatever happens next.
         replace_files(root, {JOURNAL: (journal.data, journal.dump(root)), **changes})
     return list(changes)

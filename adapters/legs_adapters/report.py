@@ -12,6 +12,7 @@ from legs_adapters.code.syntax import call_name, one_line
 from legs_adapters.plan import Plan
 from legs_adapters.rules.order import RULES
 from legs_adapters.terms.findings import Left
+from legs_adapters.terms.form import Form
 from legs_loss.system import printable
 
 __all__ = ["as_diff", "as_json", "as_table"]
@@ -54,13 +55,7 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
     content: Dict[str, object] = {
         "root": str(plan.root),
         "sites": [
-            line(
-                site,
-                one_line(site.form.node),
-                column=site.column,
-                function=site.scope.name,
-                **({} if site.form.weighs else {"term": site.form.term}),
-            )
+            line(site, one_line(site.form.node), column=site.column, function=site.scope.name, **_term(site.form))
             for site in found.sites
         ],
         "plain": [
@@ -68,12 +63,7 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
             for use, site in found.unweighted
         ],
         "left": [
-            line(
-                left,
-                reason=left.reason,
-                rule=left.rule or None,
-                because=[line(at) for at in left.because],
-            )
+            line(left, reason=left.reason, rule=left.rule or None, because=[line(at) for at in left.because])
             for left in found.left
         ],
         "patched": [line(entry) for entry in found.patched],
@@ -84,6 +74,11 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
         "wrote": list(wrote),
     }
     return json.dumps(content, indent=2) + "\n"
+
+
+def _term(form: Form) -> Dict[str, str]:
+    """Return the name of a term that is not weighted: an SSIM, or a line that masks."""
+    return {} if form.weighs else {"term": form.term}
 
 
 def as_diff(changes: Changes) -> str:

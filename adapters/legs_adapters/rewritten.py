@@ -11,7 +11,7 @@ import os
 import sys
 import types
 from types import CodeType
-from typing import Any, Dict, Optional, Sequence
+from typing import Any, Dict, Mapping, Optional, Sequence
 
 __all__ = ["Finder", "Loader", "install", "main_module"]
 
@@ -22,53 +22,43 @@ def install(sources: Dict[str, bytes]) -> None:
     A process that is spawned (`torch.multiprocessing.spawn`, DataLoader workers) starts as a new Python, which imports
     the script again: it installs the same sources before.
     """
-    sys.meta_path.insert(0, Finder(sources))
+    finder = Finder(sources)
+    sys.meta_path.insert(0, finder)
     spawn: Any = multiprocessing.spawn
     prepare = spawn.get_preparation_data
-
-    def get_preparation_data(name: str) -> Dict[str, Any]:
-        return dict(prepare(name), legs_sources=_Inherited(sources))
-
-    spawn.get_preparation_data = get_preparation_data
+    spawn.get_preparation_data = lambda name: dict(prepare(name), legs_finder=finder)
 
     def import_main(path: str) -> None:  # as multiprocessing does, which reads the file
         if getattr(sys.modules["__main__"], "__file__", None) == path:
             return
         spawn.old_main_modules.append(sys.modules["__main__"])
         module = main_module("__mp_main__", path)
-        exec(Loader("__mp_main__", path, sources.get(os.path.realpath(path))).get_code("__mp_main__"), module.__dict__)
+        exec(Loader("__mp_main__", path, sources).get_code("__mp_main__"), module.__dict__)
         sys.modules["__main__"] = sys.modules["__mp_main__"] = module
 
     spawn._fixup_main_from_path = import_main
 
 
-class _Inherited:
-    """Sources that install themselves where they are unpickled: in a spawned process, before it does anything else."""
-
-    def __init__(self, sources: Dict[str, bytes]) -> None:
-        self._sources = sources
-
-    def __reduce__(self) -> Any:
-        return install, (self._sources,)
-
-
 class Loader(importlib.machinery.SourceFileLoader):
-    """Load a file's rewritten source in place of the file; no bytecode cache is read or written."""
+    """Load a file's rewritten source, ``data``, in place of the file; no bytecode cache is read or written.
 
-    def __init__(self, name: str, path: str, data: Optional[bytes]) -> None:
+    ``data`` is None for a file that was not rewritten: it is loaded as it is.
+    """
+
+    def __init__(self, name: str, path: str, sources: Mapping[str, bytes]) -> None:
         super().__init__(name, path)
-        self._data = data
+        self.data = sources.get(os.path.realpath(path))
 
     def get_data(self, path: str | os.PathLike[str]) -> bytes:
         """Return the source; other files as they are on disk."""
-        if self._data is not None and os.fspath(path) == self.path:
-            return self._data
+        if self.data is not None and os.fspath(path) == self.path:
+            return self.data
         return super().get_data(os.fspath(path))
 
     def get_code(self, fullname: str) -> CodeType:
         """Compile the source, and let tracebacks quote it."""
         data = self.get_data(self.path)
-        if self._data is not None:
+        if self.data is not None:
             text = importlib.util.decode_source(data)
             # Without a time of last change, linecache does not look at the disk again.
             linecache.cache[self.path] = (len(text), None, text.splitlines(keepends=True), self.path)
@@ -77,10 +67,16 @@ class Loader(importlib.machinery.SourceFileLoader):
 
 
 class Finder:
-    """Find modules as Python does, and replace the loader of rewritten ones."""
+    """Find modules as Python does, and replace the loader of rewritten ones.
+
+    Unpickled it installs itself: in a spawned process, before that does anything else.
+    """
 
     def __init__(self, sources: Dict[str, bytes]) -> None:
         self._sources = sources
+
+    def __reduce__(self) -> Any:
+        return install, (self._sources,)
 
     def find_spec(
         self, name: str, path: Optional[Sequence[str]] = None, target: Optional[types.ModuleType] = None
@@ -89,21 +85,13 @@ class Finder:
         spec = importlib.machinery.PathFinder.find_spec(name, path, target)
         if spec is None or not spec.origin or type(spec.loader) is not importlib.machinery.SourceFileLoader:
             return None
-        data = self._sources.get(os.path.realpath(spec.origin))
-        if data is None:
-            return None
-        spec.loader = Loader(name, spec.origin, data)
-        return spec
+        spec.loader = loader = Loader(name, spec.origin, self._sources)
+        return None if loader.data is None else spec
 
 
 def main_module(name: str, script: str) -> types.ModuleType:
     """Return an empty module with the attributes that Python gives a script that it runs."""
     module = types.ModuleType(name)
-    module.__dict__.update(
-        __file__=script,
-        __builtins__=sys.modules["builtins"],
-        __cached__=None,
-        __loader__=importlib.machinery.SourceFileLoader(name, script),
-        __annotations__={},
-    )
+    module.__loader__ = importlib.machinery.SourceFileLoader(name, script)
+    module.__dict__.update(__file__=script, __builtins__=builtins, __cached__=None, __annotations__={})
     return module

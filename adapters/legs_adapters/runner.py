@@ -58,12 +58,18 @@ def run_script(
         The exit code, where the script does not leave by ``sys.exit`` (which goes on as it is).
 
     Raises:
-        LegsError: there is no such script; or a setting is wrong; or its codebase has only terms that cannot be
-            decided, or, unless ``cpu``, none; or, with ``cpu``, the script uses a CUDA feature that has no shim.
+        LegsError: there is no such script; or an option of ours is among its arguments, and it does not know it (what
+            stands behind the script is the script's own); or a setting is wrong; or its codebase has only terms that
+            cannot be decided, or, unless ``cpu``, none; or, with ``cpu``, the script uses a CUDA feature that has no
+            shim.
     """
     path = Path(script)
     if not path.is_file():
         raise LegsError(f"{script} is not a file: give the training script")
+    for option in ("--cpu", "--ssim", "--masks"):
+        if option in arguments and option[2:].encode() not in path.read_bytes():
+            behind = f"{option} stands behind {script}, which does not know it"
+            raise LegsError(f"{behind}: legs run {option} {script} ...")
     find_config(path, argv=[])  # report wrong settings now, not at the first training step
     root = check_root(checkout_of(path))
     found = plan(root, in_place=True, ssim=ssim, masks=masks)
@@ -112,10 +118,9 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
         passed_on += (MissingShim,)
     sys.argv[:] = [name, *arguments]
     sys.path[0] = os.path.dirname(os.path.realpath(name))
-    main = main_module("__main__", file)
-    sys.modules["__main__"] = main
+    sys.modules["__main__"] = main = main_module("__main__", file)
     try:
-        code = Loader("__main__", file, sources.get(os.path.realpath(name))).get_code("__main__")
+        code = Loader("__main__", file, sources).get_code("__main__")
     except SyntaxError as error:
         sys.excepthook(type(error), error.with_traceback(None), None)
         return 1
@@ -124,7 +129,8 @@ def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_
     except passed_on:
         raise
     except BaseException as error:
-        _show(error)
+        traceback = error.__traceback__ and error.__traceback__.tb_next  # from the script on, without this frame
+        sys.excepthook(type(error), error.with_traceback(traceback), traceback)
         return _interrupted() if isinstance(error, KeyboardInterrupt) else 1
     return 0
 
@@ -134,14 +140,6 @@ def _as_python_names(script: str) -> str:
     if sys.version_info < (3, 9):
         return script
     return os.path.join(os.getcwd(), script) if os.name == "posix" else os.path.abspath(script)
-
-
-def _show(error: BaseException) -> None:
-    """Print a traceback that begins at the script, without this module's frame."""
-    traceback = error.__traceback__
-    if traceback is not None and traceback.tb_next is not None:
-        traceback = traceback.tb_next
-    sys.excepthook(type(error), error.with_traceback(traceback), traceback)
 
 
 def _interrupted() -> int:

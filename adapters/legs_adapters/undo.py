@@ -4,37 +4,24 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import List, Optional, Sequence, Tuple
 
-from legs_adapters.checkout.comparing import changed_lines
+from legs_adapters.checkout.comparing import compared
 from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
 from legs_adapters.code.folders import first_of
 from legs_adapters.code.limits import Budget
 from legs_adapters.code.sources import check_root
-from legs_adapters.edit import Edit, apply_edits
+from legs_adapters.edit import apply_edits
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_loss import LegsError
 
-__all__ = ["Undone", "undo"]
+__all__ = ["undo"]
+
+# What an undo changes, and the files that it leaves as they are, each with the reason.
+_Undone = Tuple[Changes, List[Tuple[str, str]]]
 
 
-class Undone(NamedTuple):
-    """The changes that an undo made, or would make.
-
-    Attributes:
-        restored: the files that are as before the patch.
-        removed: the files that the patch had created.
-        kept: the files left as they are, with the reason.
-        changes: by path, the bytes before and after.
-    """
-
-    restored: List[str]
-    removed: List[str]
-    kept: List[Tuple[str, str]]
-    changes: Changes
-
-
-def undo(path: str | os.PathLike[str], force: bool = False, trust: Optional[str] = None, look: bool = False) -> Undone:
+def undo(path: str | os.PathLike[str], force: bool = False, trust: Optional[str] = None, look: bool = False) -> _Undone:
     """Undo every patch of a checkout.
 
     Args:
@@ -42,6 +29,10 @@ def undo(path: str | os.PathLike[str], force: bool = False, trust: Optional[str]
         force: in files that were edited since, put the patch's own lines back and leave the edits.
         trust: the name of a journal that this user did not write, to accept it.
         look: change nothing, and return what would be done; any journal is accepted then.
+
+    Returns:
+        By path, the bytes before and after, None of a file that the patch had created; and the files left as they are,
+        each with the reason.
 
     Raises:
         LegsError: nothing was patched; another user wrote the journal; or a file was edited since, and not ``force``.
@@ -60,23 +51,22 @@ def undo(path: str | os.PathLike[str], force: bool = False, trust: Optional[str]
                 f"anyway, check its changes with `legs-patch --undo --diff {path}`, then run "
                 f"`legs-patch --undo --trust {journal.name} {path}`"
             )
-        done = _undone(root, journal, force)
+        changes, kept = _undone(root, journal, force)
         if not look:
-            replace_files(root, {**done.changes, JOURNAL: (journal.data, None)})
-    return done
+            replace_files(root, {**changes, JOURNAL: (journal.data, None)})
+    return changes, kept
 
 
-def _undone(root: Path, journal: Journal, force: bool) -> Undone:
-    changes: Dict[str, Tuple[Optional[bytes], Optional[bytes]]] = {}
-    done = Undone([], [], [], changes)
+def _undone(root: Path, journal: Journal, force: bool) -> _Undone:
+    changes: Changes = {}
+    kept: List[Tuple[str, str]] = []
     edited: List[str] = []
     budget = Budget()
     for name, layers in journal.files.items():
-        current = read_file(root, name)
-        if current is None:
-            done.kept.append((name, "the file is gone"))
+        data = current = read_file(root, name)
+        if data is None:
+            kept.append((name, "the file is gone"))
             continue
-        data = current
         for layer in reversed(layers):
             if digest(data) == layer.after:
                 data = layer.original
@@ -86,11 +76,10 @@ def _undone(root: Path, journal: Journal, force: bool) -> Undone:
                 if lost:
                     data = current
                     shown = first_of([line[:200] for line in sorted(set(lost))], 20, "; ")
-                    done.kept.append((name, f"these lines were edited since and are kept, with the others: {shown}"))
+                    kept.append((name, f"these lines were edited since and are kept, with the others: {shown}"))
                     break
         if data != current:
             changes[name] = (current, data)
-            done.restored.append(name)
     if edited and not force:
         raise LegsError(
             f"{', '.join(sorted(set(edited)))}: edited since it was patched; --undo --force restores the patched lines "
@@ -100,10 +89,9 @@ def _undone(root: Path, journal: Journal, force: bool) -> Undone:
         current = read_file(root, name)
         if current is not None and journal.is_as_written(name, current):
             changes[name] = (current, None)
-            done.removed.append(name)
         elif current is not None:
-            done.kept.append((name, "it was edited since"))
-    return done
+            kept.append((name, "it was edited since"))
+    return changes, kept
 
 
 def _undo_edits(name: str, layer: Layer, current: bytes, budget: Budget) -> Tuple[bytes, List[str]]:
@@ -113,10 +101,9 @@ def _undo_edits(name: str, layer: Layer, current: bytes, budget: Budget) -> Tupl
         The file with the patch's lines as they were and the edits as they are; and the patched lines that are no longer
         there as the patch left them: then the file is as it was.
     """
-    edits = [Edit(start, end, layer.original[start:end], text.encode("utf-8")) for start, end, text in layer.edits]
-    patched = apply_edits(layer.original, edits)
+    patched = apply_edits(layer.original, layer.edits)
     before, after, lines = (data.splitlines(keepends=True) for data in (layer.original, patched, current))
-    parts = changed_lines(before, after)
+    parts = [part[1:] for part in compared(before, after) if part[0] != "equal"]
     over = budget.spend(name, len(parts) * (len(after) + len(lines))) or budget.why_none_left()
     restored: List[bytes] = []
     lost: List[str] = []

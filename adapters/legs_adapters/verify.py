@@ -30,7 +30,7 @@ from legs_loss import LegsError
 
 __all__ = ["Run", "Verdict", "check_verifiable", "verify"]
 
-VIEWS, WIDTH, HEIGHT, POINTS = 12, 96, 64, 800  # of the embedded scene
+SCENE = {"views": 12, "width": 96, "height": 64, "points": 800, "samples": 1}  # the embedded one
 SECONDS = 1800  # that a run may take
 NOT_COPIED = (".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs")
 MAX_COPIED = 64 << 20  # bytes of a file
@@ -139,9 +139,7 @@ def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str]
     root = check_root(folder)
     runs: Dict[str, Run] = {}
     with tempfile.TemporaryDirectory(prefix="legs-verify-") as work:
-        scene = write_embedded_scene(
-            Path(work) / "scene", views=VIEWS, width=WIDTH, height=HEIGHT, points=POINTS, samples=1
-        )
+        scene = write_embedded_scene(Path(work) / "scene", **SCENE)
         precompute(read_scene(scene), scene / "legs_weights")
         patched, unpatched = (Path(work) / name / root.name for name in ("patched", "unpatched"))
         with locked(root, f"legs-patch --verify {folder}"):

@@ -12,12 +12,7 @@ import time
 from pathlib import Path
 from typing import Any, List
 
-from legs_loss import LegsError
-from legs_loss.system import say_error
-
-
-class _Enough(SystemExit):
-    """Ends the script after the requested steps; the runner lets it pass, like the script's own exit."""
+from legs_loss.cli import exit_code
 
 
 def _main(path: str, limit: str, root: str, script: str, *arguments: str) -> int:
@@ -35,7 +30,7 @@ def _main(path: str, limit: str, root: str, script: str, *arguments: str) -> int
     def backward(tensor: Any, *args: Any, **kwargs: Any) -> Any:
         if tensor.numel() == 1:
             if len(losses) >= int(limit):
-                raise _Enough
+                sys.exit()  # the runner lets it pass, like the script's own
             losses.append(float(tensor.detach()).hex())
             times.append(time.perf_counter())
         return own_backward(tensor, *args, **kwargs)
@@ -45,12 +40,7 @@ def _main(path: str, limit: str, root: str, script: str, *arguments: str) -> int
     np.random.seed(0)
     torch.manual_seed(0)
     try:
-        return execute(script, arguments, {}, Path(root))
-    except _Enough:
-        return 0
-    except LegsError as error:
-        say_error("legs", error)
-        return 2
+        return exit_code("legs", lambda: execute(script, arguments, {}, Path(root)))
     finally:
         counted = {name: getattr(counts(), name) for name in ("weighted", "plain", "stored", "computed", "remembered")}
         seconds = [after - before for before, after in zip(times, times[1:])]

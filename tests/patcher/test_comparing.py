@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("libcst")
 
-from legs_adapters.checkout.comparing import changed_lines, unified_diff
+from legs_adapters.checkout.comparing import compared, unified_diff
 
 HUNK = re.compile(r"@@ -(\d+)(?:,(\d+))? \+(\d+)(?:,(\d+))? @@\n")
 
@@ -56,4 +56,5 @@ def test_single_lines_are_found_as_difflib_finds_them():
             after += [[f"new {at.random()}\n", line], [f"other {at.random()}\n"]][what] if what < 2 else [line]
         for one, other in ((before, after), (after, before)):
             assert unified_diff(one, other, ("a", "b")) == list(difflib.unified_diff(one, other, "a", "b"))
-    assert changed_lines(["a\n"], ["a\n"]) == []
+    assert unified_diff(["a\n"], ["a\n"], ("a", "b"))[2:] == unified_diff([], [], ("a", "b"))[2:] == []
+    assert compared(["a\n"], ["a\n"]) == [("equal", 0, 1, 0, 1)]

@@ -113,9 +113,9 @@ class TestUndo:
         edited = (root / "train.py").read_text()
         edited = edited.replace("        loss.backward()\n", "        loss = 2 * loss\n        loss.backward()\n")
         (root / "train.py").write_text("# mine\n" + edited)
-        done = undo(root, force=True)
-        assert done.restored == ["train.py"]
-        assert done.kept == []
+        changes, kept = undo(root, force=True)
+        assert changes["train.py"][1] == (root / "train.py").read_bytes()
+        assert (list(changes), kept) == (["train.py"], [])
         assert (root / "train.py").read_text() == "# mine\n" + original.replace(
             "        loss.backward()\n", "        loss = 2 * loss\n        loss.backward()\n"
         )
@@ -125,18 +125,18 @@ class TestUndo:
         root = patched(checkout(tmp_path, files("inria")))
         text = (root / "train.py").read_text().replace("l1_loss(image, gt_image)", "l1_loss(gt_image, image)")
         (root / "train.py").write_text(text)
-        done = undo(root, force=True)
-        assert [name for name, _ in done.kept] == ["train.py"]
-        assert "legs_loss.l1_loss" in done.kept[0][1]
+        _, kept = undo(root, force=True)
+        assert [name for name, _ in kept] == ["train.py"]
+        assert "legs_loss.l1_loss" in kept[0][1]
         assert (root / "train.py").read_text() == text  # with the import, which that line needs
 
     def test_legs_toml_is_removed_unless_it_was_edited(self, tmp_path):
         root = checkout(tmp_path, files("inria"))
         write(plan(root)._replace(settings="beta = 2.0\n"))
-        assert undo(root).removed == ["legs.toml"]
+        assert undo(root)[0]["legs.toml"] == (b"beta = 2.0\n", None)
         write(plan(root)._replace(settings="beta = 2.0\n"))
         (root / "legs.toml").write_text("beta = 3.0\n")
-        assert undo(root).kept == [("legs.toml", "it was edited since")]
+        assert undo(root)[1] == [("legs.toml", "it was edited since")]
         assert (root / "legs.toml").read_text() == "beta = 3.0\n"
 
     def test_what_git_took_back_already_is_fine(self, tmp_path):

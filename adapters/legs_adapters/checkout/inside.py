@@ -24,13 +24,12 @@ def folder_of(root: Path, path: str) -> Iterator[Tuple[Optional[int], str]]:
         yield None, str(root / path)
         return
     *folders, name = path.split("/")
-    options = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+    options = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
+    folder: Optional[int] = None
     try:
         with contextlib.ExitStack() as opened:  # each is closed once, wherever Ctrl-C comes
-            folder = os.open(str(root), options)
-            opened.callback(os.close, folder)
-            for part in folders:
-                folder = os.open(part, options | os.O_NOFOLLOW, dir_fd=folder)
+            for part in (str(root), *folders):
+                folder = os.open(part, options, dir_fd=folder)
                 opened.callback(os.close, folder)
             yield folder, name
     except OSError as error:

@@ -8,7 +8,7 @@ import secrets
 import shutil
 import stat
 from pathlib import Path
-from typing import Dict, Iterator, List, Mapping, Optional, Tuple
+from typing import Dict, Iterator, Optional, Tuple
 
 from legs_adapters.checkout.inside import BY_DESCRIPTOR, folder_of
 from legs_adapters.code.folders import check_name
@@ -18,7 +18,7 @@ from legs_loss.system import FileLock, HeldError, held_back, read_regular
 __all__ = ["MAX_FILE_BYTES", "Changes", "locked", "read_file", "replace_files"]
 
 # By relative path, in order: the bytes expected there now (None: no file), and the bytes to put there (None: remove).
-Changes = Mapping[str, Tuple[Optional[bytes], Optional[bytes]]]
+Changes = Dict[str, Tuple[Optional[bytes], Optional[bytes]]]
 
 MAX_FILE_BYTES = 8 << 20  # of a file that is read here: no source, no journal is larger
 _LOCK, _STAGING = ".legs-patch.lock", ".legs-patch.tmp"
@@ -59,22 +59,16 @@ def replace_files(root: Path, changes: Changes) -> None:
         if read_file(root, path) != expected:
             raise LegsError(f"{path} changed while legs-patch was running: nothing was written; run it again")
     staged: Dict[str, str] = {}
-    done: List[str] = []
     try:
         (root / _STAGING).mkdir(mode=0o700)
         for path, (_, data) in changes.items():
             if data is not None:
                 staged[path] = _stage(root, path, data)
-        with held_back():
-            try:
-                for path in changes:
-                    _put(root, path, staged.get(path))
-                    done.append(path)
-            except BaseException:
-                for path in reversed(done):
-                    before = changes[path][0]
-                    _put(root, path, None if before is None else _stage(root, path, before))
-                raise
+        with held_back(), contextlib.ExitStack() as back:
+            for path, (before, _) in changes.items():
+                _put(root, path, staged.get(path))
+                back.callback(_put_back, root, path, before)
+            back.pop_all()
     except OSError as error:
         raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
     finally:
@@ -111,9 +105,8 @@ def _stage(root: Path, path: str, data: bytes) -> str:
             os.fsync(file.fileno())
             with contextlib.suppress(FileNotFoundError), folder_of(root, path) as (target, old):
                 before = os.stat(old, dir_fd=target, follow_symlinks=False)
-                if hasattr(os, "fchown"):
-                    with contextlib.suppress(PermissionError):  # only root can give a file away
-                        os.fchown(file.fileno(), before.st_uid, before.st_gid)
+                with contextlib.suppress(PermissionError, AttributeError):  # only root can give a file away, on POSIX
+                    os.fchown(file.fileno(), before.st_uid, before.st_gid)
                 # Last: giving a file away takes bits of its mode.
                 os.chmod(file.fileno() if BY_DESCRIPTOR else name, stat.S_IMODE(before.st_mode))
     return staged
@@ -127,6 +120,10 @@ def _put(root: Path, path: str, staged: Optional[str]) -> None:
             return
         with folder_of(root, staged) as (source, new):
             os.replace(new, name, src_dir_fd=source, dst_dir_fd=folder)
+
+
+def _put_back(root: Path, path: str, before: Optional[bytes]) -> None:
+    _put(root, path, None if before is None else _stage(root, path, before))
 
 
 def _sweep(root: Path) -> None:

@@ -248,7 +248,10 @@ class TestSelection:
             prediction, target = prediction.double(), target.double()
         target.requires_grad_(case == "target learns")
         padding, share = "reflect" if case == "reflect" else "zeros", 0.0 if case == "l1 alone" else 0.2
-        loss = legs_loss(prediction, target, weight=weight, padding=padding, lambda_dssim=share)
+        channels_last = False if case == "five channels" else None
+        loss = legs_loss(
+            prediction, target, weight=weight, padding=padding, lambda_dssim=share, channels_last=channels_last
+        )
         assert used(loss) == "torch"
         loss.backward()
 

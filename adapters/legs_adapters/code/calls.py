@@ -65,6 +65,5 @@ def handed(program: Program, function: Function, node: cst.CSTNode) -> List[Refe
     instances = [reference for reference in dict.fromkeys(found) if reference.kind == "instance"]
     if not isinstance(node, cst.Attribute):
         return instances
-    return [
-        ref for one in instances if isinstance(one.target, Class) for ref in program.member(one.target, node.attr.value)
-    ]
+    owners = [reference.target for reference in instances if isinstance(reference.target, Class)]
+    return [reference for owner in owners for reference in program.member(owner, node.attr.value)]

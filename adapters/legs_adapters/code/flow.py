@@ -369,17 +369,16 @@ class Flow:
 
     def _visit_ListComp(self, node: cst.BaseSimpleComp | cst.DictComp, env: Env) -> None:
         inner = self._copy(env)
-        loop: Optional[cst.CompFor] = node.for_in
-        while loop is not None:
-            self._visit(loop.iter, inner)
-            self._assign(inner, loop.target, loop.iter, loop, "element")
-            for condition in loop.ifs:
-                self._visit(condition.test, inner)
-            loop = loop.inner_for_in
-        for part in (node.key, node.value) if isinstance(node, cst.DictComp) else (node.elt,):
+        for part in (node.for_in, *((node.key, node.value) if isinstance(node, cst.DictComp) else (node.elt,))):
             self._visit(part, inner)
 
     _visit_GeneratorExp = _visit_SetComp = _visit_DictComp = _visit_ListComp
+
+    def _visit_CompFor(self, node: cst.CompFor, env: Env) -> None:
+        self._visit(node.iter, env)
+        self._assign(env, node.target, node.iter, node, "element")
+        for part in (*node.ifs, *filter(None, [node.inner_for_in])):
+            self._visit(part, env)
 
 
 def _counts(value: Optional[cst.CSTNode]) -> bool:

@@ -90,17 +90,13 @@ def folders_of(root: Path, exclude: Sequence[str]) -> Iterator[Tuple[List[str], 
     submodules = _submodules(root)
     for here, folders, names in os.walk(str(root), followlinks=False):
         relative = Path(here).relative_to(root)
-        paths = {name: (relative / name).as_posix() for name in sorted([*folders, *names])}
-        own = {
-            name: path
-            for name, path in paths.items()
-            if not _excluded(path, exclude) and not os.path.islink(os.path.join(here, name))
-        }
-        why = {name: _why_foreign(root, path, submodules) for name, path in own.items() if name in folders}
-        folders[:] = [name for name in own if name in why and why[name] is None]
-        files = [own[name] for name in names if name in own and name.endswith(".py") and not _TEST_FILE.match(name)]
-        regular = [path for path in sorted(files) if os.path.isfile(str(root / path))]
-        yield regular, [Skipped(own[name], reason) for name, reason in why.items() if reason is not None]
+        paths = {(relative / name).as_posix(): name for name in sorted([*folders, *names])}
+        own = [path for path in paths if not _excluded(path, exclude) and not os.path.islink(str(root / path))]
+        why = {path: _why_foreign(root, path, submodules) for path in own if paths[path] in folders}
+        folders[:] = [paths[path] for path, reason in why.items() if reason is None]
+        files = [path for path in own if path.endswith(".py") and not _TEST_FILE.match(paths[path])]
+        regular = [path for path in files if path not in why and os.path.isfile(str(root / path))]
+        yield regular, [Skipped(path, reason) for path, reason in why.items() if reason is not None]
 
 
 def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[str]:

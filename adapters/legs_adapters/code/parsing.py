@@ -61,18 +61,6 @@ class Lines:
         return Place(start, end, line, start - self._starts[line - 1], max(line, last))
 
 
-class _Written(ByteSpanPositionProvider):
-    """Write a tree once, for its text and its spans: LibCST's own wrapper walks it three times."""
-
-    def write(self, tree: cst.Module) -> Tuple[bytes, Mapping[cst.CSTNode, CodeSpan]]:
-        """Return the bytes of a tree, and the spans of its nodes."""
-        state = SpanProvidingCodegenState(
-            tree.default_indent, tree.default_newline, provider=self, get_length=byte_length_in_utf8
-        )
-        tree._codegen(state)
-        return "".join(state.tokens).encode(tree.encoding), cast("Mapping[cst.CSTNode, CodeSpan]", self._computed)
-
-
 class Part:
     """Bytes that were parsed separately.
 
@@ -96,10 +84,15 @@ class Part:
             ValueError: LibCST would write another text than it read.
         """
         if not self._spans:
-            text, spans = _Written().write(self.tree)
-            if text != self.text:
+            # Written once, for the text and the spans: LibCST's own wrapper walks a tree three times.
+            tree, spans = self.tree, ByteSpanPositionProvider()
+            state = SpanProvidingCodegenState(
+                tree.default_indent, tree.default_newline, provider=spans, get_length=byte_length_in_utf8
+            )
+            tree._codegen(state)
+            if "".join(state.tokens).encode(tree.encoding) != self.text:
                 raise ValueError("LibCST would write another text")
-            self._spans = spans
+            self._spans = cast("Mapping[cst.CSTNode, CodeSpan]", spans._computed)
         span = self._spans[node]
         start, end = self.shift + span.start, self.shift + span.start + span.length
         if brackets and isinstance(node, cst.BaseExpression):

@@ -106,9 +106,9 @@ class Program(Checkout):
     def _declared(self, where: Function, parameter: cst.CSTNode, depth: int) -> List[Reference]:
         """Resolve ``metric: Metric``: an instance of the class, or of one that derives from it."""
         note = parameter.annotation.annotation if isinstance(parameter, cst.Param) and parameter.annotation else None
-        named = (
-            self.resolve(where.parent or where, note, depth + 1) if isinstance(note, (cst.Name, cst.Attribute)) else []
-        )
+        if not isinstance(note, (cst.Name, cst.Attribute)):
+            return []
+        named = self.resolve(where.parent or where, note, depth + 1)
         return [Reference("declared", ref.target) for ref in named if ref.kind == "class"]
 
     # -- calls
@@ -139,9 +139,8 @@ class Program(Checkout):
     def _returned(self, made: List[Reference], depth: int) -> List[Reference]:
         """Resolve what functions return: ``render = get_renderer(kind)``."""
         callees = [ref.target for ref in made if isinstance(ref.target, Function)]
-        found = [
-            ref for callee in callees for value in callee.flow.returns for ref in self.resolve(callee, value, depth + 1)
-        ]
+        values = [(callee, value) for callee in callees for value in callee.flow.returns]
+        found = [ref for callee, value in values for ref in self.resolve(callee, value, depth + 1)]
         return [r for r in found if r.kind in ("function", "lambda", "instance")]
 
     # -- modules

@@ -53,15 +53,12 @@ def _filled(node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> c
 
 def formatted_key(node: cst.Subscript) -> Optional[str]:
     """Return the literal part of the key of ``outputs[f"image_{i}"]`` or ``outputs["color", i]``."""
-    element = node.slice[0].slice
     values = [each.slice.value for each in node.slice if isinstance(each.slice, cst.Index)]
     values += [each.value for value in values if isinstance(value, cst.Tuple) for each in value.elements]
     texts = [text for text in map(constant, values) if isinstance(text, str)]
-    if texts:
-        return "_".join(texts)
-    if len(node.slice) != 1 or not isinstance(element, cst.Index) or not isinstance(element.value, cst.FormattedString):
-        return None
-    return "_".join(p.value for p in element.value.parts if isinstance(p, cst.FormattedStringText)) or None
+    if not texts and len(node.slice) == len(values) == 1 and isinstance(values[0], cst.FormattedString):
+        texts = [part.value for part in values[0].parts if isinstance(part, cst.FormattedStringText)]
+    return "_".join(texts) or None
 
 
 def default_key(function: Function, node: cst.Subscript) -> object:

@@ -94,10 +94,10 @@ class Training:
             self._place(function, node, key)
         elif isinstance(node, (cst.BaseSimpleComp, cst.DictComp)):
             self._push(function, node.value if isinstance(node, cst.DictComp) else node.elt)
-            loop: Optional[cst.CompFor] = node.for_in
-            while loop is not None:
-                self._push(function, loop.iter)
-                loop = loop.inner_for_in
+            self._push(function, node.for_in)
+        elif isinstance(node, cst.CompFor):
+            self._push(function, node.iter)
+            self._push(function, node.inner_for_in)
         elif isinstance(node, cst.IfExp):
             self._push(function, node.body, key)
             self._push(function, node.orelse, key)
@@ -120,9 +120,10 @@ class Training:
                 self._push(function, reference.target.body)
             for callee in self.program.run_by(reference):
                 self._record(function, node, callee)
-                self._return(callee, key)
-        for value in [arg.value for arg in node.args]:
-            self._push(function, value)
+                for value in callee.flow.returns if self._matters(callee) else ():
+                    self._push(callee, value, key)
+        for arg in node.args:
+            self._push(function, arg.value)
         if not isinstance(node.func, cst.Name):
             self._push(function, owner or node.func)
 
@@ -131,10 +132,6 @@ class Training:
         if (callee, id(call)) not in self._met:
             self._met.add((callee, id(call)))
             self.sites.setdefault(callee, []).append((caller, call))
-
-    def _return(self, function: Function, key: object = _ANY) -> None:
-        for value in function.flow.returns if self._matters(function) else ():
-            self._push(function, value, key)
 
     def _place(self, function: Function, node: cst.CSTNode, key: object) -> None:
         definitions = self.program.lookup(function, node)

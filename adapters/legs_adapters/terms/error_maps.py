@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, NamedTuple
+from typing import List, Tuple
 
 import libcst as cst
 
@@ -14,21 +14,18 @@ from legs_adapters.tensors.gradients import no_grad_around
 from legs_adapters.tensors.operations import EXTREMES, LEAVES, SIZES
 from legs_adapters.terms.form import Form
 
-__all__ = ["Reads", "is_measured", "reads_of"]
+__all__ = ["is_measured", "reads_of"]
 
 
-class Reads(NamedTuple):
-    """The reads of a named error map that are the loss, and the others: a mask or a threshold is made of them."""
+def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[cst.Name], List[cst.Name]]:
+    """Return the reads of a named error map, logging and sizes aside; none where the map has no name of its own.
 
-    loss: List[cst.Name]
-    others: List[cst.Name]
-
-
-def reads_of(training: Training, function: Function, form: Form) -> Reads:
-    """Return the reads of a named error map, logging and sizes aside; none where the map has no name of its own."""
+    Returns:
+        The reads that are the loss, and the others: a mask or a threshold is made of them.
+    """
     made = [d for d in function.flow.every_definition if d.kind == "assign" and d.value is form.node]
     if not form.is_map or not made or "." in made[0].place:
-        return Reads([], [])
+        return [], []
     unused: List[cst.CSTNode] = []
     masks: List[cst.CSTNode] = []
     compared: List[cst.CSTNode] = []  # or squared, or scaled: a weight moves the threshold
@@ -50,7 +47,7 @@ def reads_of(training: Training, function: Function, form: Form) -> Reads:
     reads = [read for read in reads if read not in unused and not no_grad_around(function, read)]
     loss = [read for read in reads if training.includes(read) and read not in masks]
     is_compared = any(read in compared for read in reads)
-    return Reads(loss, reads if is_compared else [read for read in reads if read not in loss])
+    return loss, reads if is_compared else [read for read in reads if read not in loss]
 
 
 def is_measured(function: Function, form: Form) -> bool:

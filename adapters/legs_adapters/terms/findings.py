@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
@@ -61,13 +62,11 @@ class Left(NamedTuple):
 
 def _lines(deciders: Sequence[Decider]) -> Iterator[Line]:
     for function, node in deciders:
-        if isinstance(node, cst.Module):
-            continue  # a whole file has no deciding line
-        try:
-            line = function.place(node).line
-        except (KeyError, ValueError):  # a node that the analysis made, or a file that LibCST writes differently
-            continue
-        yield Line(function.module.path, line, function.module.lines.text(line))
+        if not isinstance(node, cst.Module):  # a whole file has no deciding line
+            # Nor has a node that the analysis made, or one of a file that LibCST writes differently.
+            with contextlib.suppress(KeyError, ValueError):
+                line = function.place(node).line
+                yield Line(function.module.path, line, function.module.lines.text(line))
 
 
 class Use(NamedTuple):

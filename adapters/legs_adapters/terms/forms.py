@@ -30,11 +30,8 @@ class Forms:
 
     def in_function(self, function: Function) -> List[Form]:
         """Return the L1 expressions in a function's own body, in source order; the widest where they nest."""
-        if function not in self._known:
-            self._known[function] = self._find(function)
-        return self._known[function]
-
-    def _find(self, function: Function) -> List[Form]:
+        if function in self._known:
+            return self._known[function]
         found: List[Form] = []
         inside = _transformed(function)
         for call in function.flow.calls:
@@ -44,6 +41,7 @@ class Forms:
                 found.append(form)
                 inside.add(id(form.call))
                 inside.update(id(n) for n in walk_expressions(form.node) if abs_argument(n))
+        self._known[function] = found
         return found
 
 

@@ -20,9 +20,7 @@ from legs_adapters.terms.prospects import Prospects
 __all__ = ["L1Functions"]
 
 _DEPTH = 4
-_GSPLAT_L1 = re.compile(r"^gsplat\.losses\.l1_loss$")
 _AS_MAP = (["reduction='none'"], ['reduction="none"'])
-_TORCH_MODULE = re.compile(r"(^|\.)L1Loss$")  # nerfstudio hands torch's on
 
 
 class _Body(NamedTuple):
@@ -55,25 +53,20 @@ class L1Functions:
         self.program = program
         self._prospects = prospects
         self._only: Dict[Function, bool] = {}
-        self._uncalled: Dict[Function, Optional[str]] = {}  # shapes, whatever a call may give
+        self._shapes: Dict[Function, Optional[str]] = {}
 
-    def shape(self, function: Function, call: Optional[cst.Call] = None, depth: int = 0) -> Optional[str]:
+    def shape(self, function: Function) -> Optional[str]:
         """Return what a function of the checkout computes from its first two arguments.
-
-        Args:
-            call: a call of it: arguments that are missing have their defaults.
 
         Returns:
             "mean" for ``abs(a - b).mean()``, "none" for ``abs(a - b)``, "own" for any other L1 that depends on
             the difference (and on further arguments) only; None where it is not an L1.
         """
-        if call is None and depth == 0:  # each of a function's terms asks it
-            if function not in self._uncalled:
-                self._uncalled[function] = self._shape(function, None, 0)
-            return self._uncalled[function]
-        return self._shape(function, call, depth)
+        if function not in self._shapes:  # each of its terms asks
+            self._shapes[function] = self._shape(function, 0)
+        return self._shapes[function]
 
-    def _shape(self, function: Function, call: Optional[cst.Call], depth: int) -> Optional[str]:
+    def _shape(self, function: Function, depth: int) -> Optional[str]:
         if len(function.parameters) < 2 or depth > _DEPTH or not self._prospects.may_lead(function.text):
             return None
         if function not in self._only:
@@ -99,25 +92,25 @@ class L1Functions:
             return None
         if TORCH_L1.search(str(references[0].target)):
             return "none" if [code(arg).replace(" ", "") for arg in node.args[2:]] in _AS_MAP else None
-        shape = self.shape_of_reference(references[0], node, depth + 1) if len(node.args) == 2 else None
+        shape = self.shape_of_reference(references[0], depth + 1) if len(node.args) == 2 else None
         return shape if shape != "own" else None
 
-    def shape_of_reference(self, reference: Reference, node: cst.Call, depth: int = 0) -> Optional[str]:
-        """Return what `shape` does for the function of a call, torch's functions included."""
+    def shape_of_reference(self, reference: Reference, depth: int = 0) -> Optional[str]:
+        """Return what `shape` does for what is called, torch's functions included."""
         name = str(reference.target)
-        if reference.kind == "external" and _GSPLAT_L1.match(name):
+        if reference.kind == "external" and name == "gsplat.losses.l1_loss":
             return "none"
         if reference.kind == "external":
             is_l1 = is_l1_name(name.split(".")[-1]) and not name.endswith("L1Loss")
             return "own" if is_l1 or TORCH_L1.search(name) else None
         if reference.kind == "made by":
-            return "own" if _TORCH_MODULE.search(name) else None
+            return "own" if name.split(".")[-1] == "L1Loss" else None  # nerfstudio hands torch's on
         if reference.kind == "function" and isinstance(reference.target, Function):
-            return self.shape(reference.target, node, depth)
+            return self._shape(reference.target, depth)
         if reference.kind == "instance" and depth == 0:
             methods = self.program.member(reference.target, "forward")  # type: ignore[arg-type]
             if len(methods) == 1 and isinstance(methods[0].target, Function):
-                return "own" if self.shape(methods[0].target, node) else None
+                return "own" if self._shape(methods[0].target, 0) else None
         return None
 
     # -- what a body may do with the two
@@ -178,7 +171,7 @@ class L1Functions:
         references = self.program.resolve(body.function, node.func)
         # self.l1_loss(...) in a method of its name: there it is the term itself
         known = [r for r in references if r.kind != "made by" or body.function.name in CALLED]
-        return any(self.shape_of_reference(reference, node, body.depth + 1) for reference in known)
+        return any(self.shape_of_reference(reference, body.depth + 1) for reference in known)
 
 
 _MAY_BE: Dict[type, Callable[..., Optional[Iterable[cst.CSTNode]]]] = {

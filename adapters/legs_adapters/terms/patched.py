@@ -22,8 +22,5 @@ def patched_nodes(program: Program, function: Function, names: Sequence[str] = _
     nodes: List[cst.CSTNode] = [call.func for call in function.flow.calls]
     named = [d.value for d in function.flow.every_definition if d.kind == "assign"]
     nodes += [value for value in named if isinstance(value, cst.Attribute)]
-    return [
-        node
-        for node in nodes
-        if any(r.kind == "external" and r.target in names for r in program.resolve(function, node))
-    ]
+    resolved = [(node, program.resolve(function, node)) for node in nodes]
+    return [node for node, found in resolved if any(r.kind == "external" and r.target in names for r in found)]

@@ -98,8 +98,6 @@ def is_role(node: cst.CSTNode) -> bool:
 
 
 def _speaks_of_images(node: cst.CSTNode) -> bool:
-    return any(
-        kind_of_words(str(part.value if isinstance(part, cst.Name) else constant(part))) == "image"
-        for part in walk_expressions(node)
-        if isinstance(part, (cst.Name, cst.SimpleString))
-    )
+    parts = [part for part in walk_expressions(node) if isinstance(part, (cst.Name, cst.SimpleString))]
+    names = [str(part.value if isinstance(part, cst.Name) else constant(part)) for part in parts]
+    return "image" in map(kind_of_words, names)

@@ -39,14 +39,9 @@ class Absolute(Form):
         start, end = text.span(self.node)
         left, right = text.span(self.first, True), text.span(self.second, True)
         sides = writing.ordered(*(text.argument(side, writing.selection) for side in (self.first, self.second)))
-        middle = residue(text.between(left[1], right[0]))
+        middle = residue(text.between(left[1], right[0])) or " "
         settings = writing.settings(as_map=bool(writing.selection) or self.is_map)
         tail = writing.selection + (".mean()" if writing.selection and self.is_mean else "")
         before, after = residue(text.between(start, left[0])), residue(text.between(right[1], end))
-        return [
-            text.replace(start, left[0], f"{PACKAGE}.l1_loss({before}"),
-            text.replace(left[0], left[1], sides[0]),
-            text.replace(left[1], right[0], f",{middle}" if middle else ", "),
-            text.replace(right[0], right[1], sides[1]),
-            text.replace(right[1], end, f"{settings}{after}){tail}"),
-        ]
+        arguments = f"{before}{sides[0]},{middle}{sides[1]}{settings}{after}"
+        return [text.replace(start, end, f"{PACKAGE}.l1_loss({arguments}){tail}")]

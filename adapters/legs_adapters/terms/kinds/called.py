@@ -37,7 +37,7 @@ class Called(Form):
             return None  # patched before
         if not references and not is_l1_name(call_name(call)):
             return None  # a method of an object of unknown class: its name alone proves nothing
-        shapes = {functions.shape_of_reference(reference, call) for reference in references} or {"own"}
+        shapes = {functions.shape_of_reference(reference) for reference in references} or {"own"}
         names = {p for r in references if isinstance(r.target, Function) for p in r.target.parameters[:2]}
         keywords = [arg.keyword.value for arg in call.args[:2] if arg.keyword is not None]
         if None in shapes or not set(keywords) <= {"input", "target"} | names:

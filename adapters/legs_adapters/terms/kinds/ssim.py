@@ -17,8 +17,6 @@ from legs_adapters.terms.writing import PACKAGE, Writing
 
 __all__ = ["Ssim"]
 
-_NO_LITERAL = object()
-
 
 @dataclass(frozen=True)
 class Ssim(Form):
@@ -40,7 +38,7 @@ class Ssim(Form):
         if not STRUCTURAL.search(call_name(call) or inner):
             return None
         positional, _, starred = arguments(call)
-        pair = [side for side in positional[:2] if constant(side, _NO_LITERAL) is _NO_LITERAL]
+        pair = [side for side in positional[:2] if constant(side) is None]
         references = functions.program.resolve(function, call.func)
         is_patched = any(r.kind == "external" and str(r.target).startswith("legs_loss.") for r in references)
         if is_patched or starred or len(pair) < 2:

@@ -227,6 +227,24 @@ def test_a_method_is_not_resolved_by_its_bare_name(tmp_path):
     assert found.problems == []
 
 
+@pytest.mark.parametrize(("kind", "attribute"), [("VGGPerceptualLoss", "extra"), ("Features", "vgg_l1")])
+def test_a_perceptual_loss_is_no_l1_by_its_name_or_its_class(tmp_path, kind, attribute):
+    texts = files("inria")
+    texts["losses.py"] = (
+        f"import torch\n\n\nclass {kind}(torch.nn.Module):\n"
+        "    def forward(self, x, y):\n        return torch.nn.functional.l1_loss(self.vgg(x), self.vgg(y))\n\n\n"
+        f"class Losses:\n    def __init__(self):\n        self.{attribute} = {kind}()\n\n"
+        f"    def all(self, image, gt_image):\n        return self.{attribute}(image[None], gt_image[None])\n"
+    )
+    texts["train.py"] = texts["train.py"].replace(
+        "        loss = ", "        extra = Losses().all(image, gt_image)\n        loss = extra + ", 1
+    )
+    texts["train.py"] = texts["train.py"].replace("import torch\n", "import torch\nfrom losses import Losses\n", 1)
+    found = plan(checkout(tmp_path, texts)).findings
+    assert [site.form.callee.value for site in found.sites] == ["l1_loss"]
+    assert found.problems == []
+
+
 def test_depth_by_another_name_is_left(tmp_path):
     texts = files("inria")
     texts["losses.py"] = (

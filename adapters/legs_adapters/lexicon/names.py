@@ -11,11 +11,12 @@ from legs_adapters.lexicon.words import (
     KINDS,
     LAID_OVER,
     OF_PICTURES,
+    PERCEPTUAL,
     RENDER,
     TARGET,
 )
 
-__all__ = ["TORCH_L1", "is_l1_name", "kind_of_words", "role_of_words"]
+__all__ = ["TORCH_L1", "has_perceptual_name", "is_l1_name", "kind_of_words", "role_of_words"]
 
 TORCH_L1 = re.compile(r"(^|\.)(torch\.nn\.functional|nn\.functional|functional)\.l1_loss$")
 _L1_NAME = re.compile(
@@ -41,6 +42,11 @@ def role_of_words(name: str) -> Optional[str]:
     if target and render:  # rendered_gt, gt_pred: the name does not decide
         return None
     return "target" if target else "render" if render else None
+
+
+def has_perceptual_name(name: str) -> bool:
+    """Return whether the name of a function or a class is of a perceptual loss."""
+    return not PERCEPTUAL.isdisjoint(words(name))
 
 
 def is_l1_name(name: str) -> bool:

@@ -11,7 +11,7 @@ from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import returned
 from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, walk_expressions
-from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
+from legs_adapters.lexicon.names import TORCH_L1, has_perceptual_name, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
 from legs_adapters.tensors.absolute import abs_argument, is_difference, mean_of
 from legs_adapters.tensors.operations import ASKS, LIKE, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
@@ -97,7 +97,9 @@ class L1Functions:
 
     def shape_of_reference(self, reference: Reference, depth: int = 0) -> Optional[str]:
         """Return what `shape` does for what is called, torch's functions included."""
-        name = str(reference.target)
+        name = str(getattr(reference.target, "name", reference.target))
+        if has_perceptual_name(name.split(".")[-1]):
+            return None  # whatever its body: an L1 of features
         if reference.kind == "external" and name == "gsplat.losses.l1_loss":
             return "none"
         if reference.kind == "external":

@@ -9,7 +9,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import arguments, call_name, constant
-from legs_adapters.lexicon.names import TORCH_L1, is_l1_name
+from legs_adapters.lexicon.names import TORCH_L1, has_perceptual_name, is_l1_name
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
@@ -35,7 +35,7 @@ class Called(Form):
         references = functions.program.resolve(function, call.func)
         if any(r.kind == "external" and str(r.target).startswith("legs_loss.") for r in references):
             return None  # patched before
-        if not references and not is_l1_name(call_name(call)):
+        if not (references or is_l1_name(call_name(call))) or has_perceptual_name(call_name(call)):
             return None  # a method of an object of unknown class: its name alone proves nothing
         shapes = {functions.shape_of_reference(reference) for reference in references} or {"own"}
         names = {p for r in references if isinstance(r.target, Function) for p in r.target.parameters[:2]}

@@ -227,7 +227,9 @@ class Meanings:
 def _parts(node: cst.CSTNode) -> List[cst.CSTNode]:
     """Return the parts of an operation whose meanings are those of the whole."""
     if isinstance(node, (cst.BinaryOperation, cst.BooleanOperation)):
-        return [node.left, node.right]
+        parts: List[cst.CSTNode] = [node.left, node.right]
+        has_only_its_shape = isinstance(node.operator, cst.Multiply) and 0 in map(constant, parts)  # image * 0 + color
+        return [] if has_only_its_shape else parts
     if isinstance(node, cst.IfExp):
         return [node.body, node.orelse]
     if isinstance(node, (cst.Tuple, cst.List)):
@@ -252,7 +254,8 @@ def _is_masked(function: Function, node: cst.Name) -> bool:
 
 
 def _is_of_neighbours(node: cst.BinaryOperation) -> bool:
-    """Return whether it is the difference of shifted parts of one picture: ``x[1:] - x[:-1]``."""
+    """Return whether it is a change in one picture: between shifted parts, ``x[1:] - x[:-1]``, or ``x - blur(x)``."""
     left, right = node.left, node.right
     are_parts = isinstance(left, cst.Subscript) and isinstance(right, cst.Subscript) and same(left.value, right.value)
-    return are_parts and isinstance(node.operator, cst.Subtract)
+    is_filtered = isinstance(right, cst.Call) and bool(right.args) and same(right.args[0].value, left)
+    return (are_parts or is_filtered) and isinstance(node.operator, cst.Subtract)

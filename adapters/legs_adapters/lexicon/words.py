@@ -58,7 +58,7 @@ WORDS = {
 }
 KINDS = tuple(WORDS)
 KIND_OF = {word: kind for kind in reversed(KINDS) for word in WORDS[kind].split()}
-COLORS = word_set("color colors colour colours")  # of a picture, or of Gaussians
+COLORS = word_set("color colors colour colours rgb rgbs")  # of a picture, or of Gaussians
 LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}  # the kinds that a photograph's name may speak of, too
 TARGET = word_set("gt gts target targets tgt ground truth original orig real true observed reference pixels")
 RENDERERS = word_set("render rendering rasterize rasterization rasterizer renderer raster splat splatting")
@@ -86,7 +86,7 @@ CAMERAS = _CAMERA | word_set("view views viewpoint viewpoints")
 DATA = CAMERAS | word_set(
     "data batch sample item items datum info infos keyframe frame dataset input inputs entry"
 )  # what holds photographs
-POSES = _CAMERA | word_set("pose poses extrinsic extrinsics camtoworld camtoworlds tracking")
+POSES = _CAMERA | word_set("pose poses so se extrinsic extrinsics camtoworld camtoworlds tracking")
 EMBEDDING = word_set("embedding embeddings")
 GAUSSIANS = word_set("gaussian gaussians gs splat splats")
 MODELS = GAUSSIANS | word_set(

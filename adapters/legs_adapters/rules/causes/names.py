@@ -30,7 +30,10 @@ class Tracking(Rule):
     """The name of the function, its class or a condition around the term is about tracking."""
 
     id = reason = "tracking"
-    INVALID = ["def track_camera(image, gt):\n    l1_loss(image, gt).backward()"]
+    INVALID = [
+        "def track_camera(image, gt):\n    l1_loss(image, gt).backward()",
+        "def refine_pose(image, gt):\n    l1_loss(image, gt).backward()",
+    ]
 
     def evidence(self, term: Term) -> List[Decider]:
         named = [decider for name, decider in term.names_around if _is_of_tracking(name)]
@@ -89,9 +92,10 @@ NAMES = (
 
 
 def _is_of_tracking(name: str) -> bool:
-    """Return whether a name is about optimising poses: for tracking, or to align a test view."""
+    """Return whether a name is about optimising poses: for tracking, or to align a view."""
     tokens = set(words(name))
-    return {"test", "pose"} <= tokens or bool(tokens & TRACKING and not tokens & MAPPING)
+    of_pose = "pose" in tokens and tokens & {"test", "refine"}
+    return bool(of_pose or (tokens & TRACKING and not tokens & MAPPING))
 
 
 def _trains_its_own(term: Term) -> bool:

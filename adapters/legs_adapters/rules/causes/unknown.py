@@ -6,7 +6,7 @@ from typing import List
 
 from legs_adapters.code.syntax import words_in
 from legs_adapters.lexicon.meaning import swapped
-from legs_adapters.lexicon.words import COLORS, KIND_OF
+from legs_adapters.lexicon.words import BACKGROUND, COLORS, KIND_OF
 from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.tensors.absolute import is_difference, is_distance
 from legs_adapters.terms.findings import Decider
@@ -29,18 +29,29 @@ class Unknown(Rule):
             l1_loss(color, gt["color"]).backward()
             optimizer.step()
         """,
+        """
+        def fit(model, sampled, optimizer):
+            target = sampled["target"]
+            l1_loss(model.current_rgb, target).backward()
+            optimizer.step()
+        """,
+        """
+        bg_img = gt * 0 + background[:, None, None]
+        loss = l1_loss(image, bg_img)
+        """,
     ]
 
     def evidence(self, term: Term) -> List[Decider]:
         pair = term.pair
         pictures = "image" in (pair.a.kind, pair.b.kind)
         if pictures and "render" not in (pair.a.role, pair.b.role):  # two colours may be of Gaussians
-            named = [{word for word in words_in(side) if KIND_OF.get(word) == "image"} for side in term.sides]
-            pictures = not all(named) or bool(set().union(*named) - COLORS)
+            named = {word for word in words_in(*term.sides) if KIND_OF.get(word) == "image"}
+            pictures = not named or bool(named - COLORS)
         sure = swapped(pair.a, pair.b) is not None or pair.speaks_of_images
         changes = same_root(term.form) or all(map(is_difference, term.sides))  # of two views, or of neighbours
         changes = changes or any(map(is_distance, term.sides))  # the error of an error: of angles
-        return [] if pictures and sure and not changes else term.here
+        backdrop = {pair.a.role, pair.b.role} == {"render", None} and BACKGROUND & words_in(term.target)
+        return [] if pictures and sure and not (changes or backdrop) else term.here
 
     def may_be_loss(self, term: Term) -> bool:
         return True

@@ -129,6 +129,8 @@ def _rendered(call: CallReading) -> Optional[Meaning]:
 
 def _named(call: CallReading) -> Optional[Meaning]:
     kind, role = kind_of_words(call.name), role_of_words(call.name)
+    if call.name.lower().strip("_") == "sh2rgb":
+        return Meaning("parameter", None)  # the colours of Gaussians
     if kind not in (None, "image", "mask", "parameter"):
         return Meaning(kind, role)
     return Meaning(kind, role) if kind == "image" and role == "target" else None

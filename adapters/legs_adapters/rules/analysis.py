@@ -44,7 +44,7 @@ class Analysis:
         self.origins: Meanings = Meanings(self.program, self.training, by_name=False)
         self.forms: Forms = Forms(L1Functions(self.program, self.prospects))
         self.purposes: Purposes = Purposes(self.program, self.training)
-        self.splats: Splats = Splats(self.program, self.training)
+        self.splats: Splats = Splats(self.program, self.training, self.forms)
         self.callbacks: Callbacks = Callbacks(self.program, self.training, self.forms)
 
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Dict, Iterable, Tuple
+from typing import Dict, Tuple
 
 import libcst as cst
 
@@ -12,7 +12,7 @@ from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import code
 from legs_adapters.lexicon.words import DRAWS_SPLATS, RAYS, SPLATS
 from legs_adapters.tensors.backward import Training
-from legs_adapters.terms.form import Form
+from legs_adapters.terms.forms import Forms
 
 __all__ = ["Splats"]
 
@@ -22,12 +22,13 @@ _COMMENT = re.compile("#.*")  # proves nothing
 class Splats:
     """Decide which functions of one program are about Gaussian splatting."""
 
-    def __init__(self, program: Program, training: Training) -> None:
+    def __init__(self, program: Program, training: Training, forms: Forms) -> None:
         self.program = program
         self.training = training
+        self.forms = forms
         self._known: Dict[Tuple[str, re.Pattern[str]], bool] = {}
 
-    def is_about(self, function: Function, forms: Iterable[Form]) -> bool:
+    def is_about(self, function: Function) -> bool:
         """Return whether the file, one that trains through it, or a neighbour mentions Gaussian splatting."""
         module, above = function.module, [function]
         for current in above:  # which grows
@@ -35,7 +36,7 @@ class Splats:
             if speaks and self._runs_with(module, current.module):
                 return True
             above += [caller for caller, _ in self.training.sites.get(current, []) if caller not in above]
-        sides = [code(side) for form in forms for side in (form.first, form.second)]
+        sides = [code(side) for form in self.forms.in_function(function) for side in (form.first, form.second)]
         is_rendered = "render" in " ".join(sides)  # what is in the whole of a folder renders it
         folder = module.path[: module.path.find("/") + 1 if is_rendered else module.path.rfind("/") + 1]
         near = [path for path in self.program.sources if path.startswith(folder)]

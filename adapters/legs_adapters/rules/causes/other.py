@@ -31,7 +31,7 @@ class NotSplats(Rule):
         text = term.function.module.text
         if _OTHER_FRAMEWORK.search(text) and not _TORCH.search(text):
             return term.here
-        if not term.analysis.splats.is_about(term.function, term.analysis.forms.in_function(term.function)):
+        if not term.analysis.splats.is_about(term.function):
             return [header(term.function)]
         by_class = _ray_method(term)
         picked = any(is_rows(term.analysis.meanings, term.function, side) for side in term.sides)  # pixels of an image

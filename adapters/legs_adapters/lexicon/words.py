@@ -32,7 +32,7 @@ WORDS = {
         feature features feat feats semantic semantics sem language lang clip dino lseg sam embedding embeddings latent
         latents logits logit label labels identity instance codebook vgg lpips hash descriptor descriptors classes obj
         objects orientation orientations orient angle angles wavelet wavelets haar fft rfft dct phasor phasors stokes
-        volume volumes voxel
+        volume volumes voxel embed embeds
     """,
     # sds, inpaint, edit: GaussianDreamer, GaussianEditor; pseudo, unseen, virtual: codebases with few views
     "warp": f"""
@@ -50,6 +50,7 @@ WORDS = {
         point light lights envmap roughness metallic albedo diffuse specular material brdf camtoworld camtoworlds
         intrinsics extrinsics time entropy prior uncertainty weights audio landmark landmarks joint joints vertex
         vertices verts bone bones smpl center centers knn kpt kpts keypoint keypoints mu std base precomp radii
+        timestamp timestamps
     """,
     "image": """
         image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering

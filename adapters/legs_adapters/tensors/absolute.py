@@ -39,19 +39,19 @@ def is_distance(node: cst.CSTNode) -> bool:
 
 
 def mean_of(node: cst.Call) -> Optional[cst.Call]:
-    """Return ``x`` of ``x.mean()`` or ``torch.mean(x)``: the mean over all axes, without further arguments."""
-    if call_name(node) != "mean" or not isinstance(node.func, cst.Attribute):
-        return None
-    if not node.args and isinstance(node.func.value, cst.Call):
-        return node.func.value
-    if _is_module(node.func.value) and len(node.args) == 1 and isinstance(node.args[0].value, cst.Call):
-        return node.args[0].value
-    return None
+    """Return the call ``x`` of ``x.mean()`` or ``torch.mean(x)``: the mean over all axes, without further arguments."""
+    averaged = _argument(node, "mean")
+    return averaged if isinstance(averaged, cst.Call) else None
 
 
 def abs_argument(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
     """Return the argument of an absolute value, ``abs(x)``, ``torch.abs(x)``, ``x.abs()``; None for any other node."""
-    if not isinstance(node, cst.Call) or call_name(node) not in ("abs", "absolute"):
+    return _argument(node, "abs", "absolute")
+
+
+def _argument(node: cst.CSTNode, *names: str) -> Optional[cst.BaseExpression]:
+    """Return the only argument of a function or method of these names; None for any other node."""
+    if not isinstance(node, cst.Call) or call_name(node) not in names:
         return None
     owner = node.func.value if isinstance(node.func, cst.Attribute) else None
     if owner is not None and not node.args:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, Tuple
+from typing import List, Optional, Tuple
 
 import libcst as cst
 
@@ -11,7 +11,7 @@ from legs_adapters.code.syntax import attribute_chain, call_name, walk_expressio
 from legs_adapters.lexicon.masks import makes_mask
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.gradients import no_grad_around
-from legs_adapters.tensors.operations import EXTREMES, LEAVES, SIZES
+from legs_adapters.tensors.operations import EXTREMES, LEAVES, SIZES, TRANSFORMS
 from legs_adapters.terms.form import Form
 
 __all__ = ["is_measured", "reads_of"]
@@ -23,7 +23,8 @@ def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[c
     Returns:
         The reads that are the loss, and the others: a mask or a threshold is made of them.
     """
-    made = [d for d in function.flow.every_definition if d.kind == "assign" and d.value is form.node]
+    named = [d for d in function.flow.every_definition if d.kind == "assign"]
+    made = [d for d in named if d.value is form.node or _averages(d.value, form.node)]
     if not form.is_map or not made or "." in made[0].place:
         return [], []
     unused: List[cst.CSTNode] = []
@@ -37,6 +38,8 @@ def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[c
             unused.append(part.value)
         elif isinstance(part, cst.Call) and call_name(part) in EXTREMES and not part.args:
             compared += attribute_chain(part.func)
+        elif isinstance(part, cst.Call) and call_name(part) in TRANSFORMS:
+            compared += walk_expressions(part)
         elif isinstance(part, cst.AugAssign):
             unused += attribute_chain(part.target)
         elif isinstance(part, cst.Call) and call_name(part) in LEAVES:
@@ -46,8 +49,16 @@ def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[c
     reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
     reads = [read for read in reads if read not in unused and not no_grad_around(function, read)]
     loss = [read for read in reads if training.includes(read) and read not in masks]
-    is_compared = any(read in compared for read in reads)
-    return loss, reads if is_compared else [read for read in reads if read not in loss]
+    others = [read for read in reads if read not in loss]
+    is_changed = any(read in compared for read in reads) or (others and made[0].value is not form.node)
+    return loss, reads if is_changed else others
+
+
+def _averages(value: Optional[cst.CSTNode], node: cst.CSTNode) -> bool:
+    """Return whether a value is the mean of an error map over an axis."""
+    if not isinstance(value, cst.Call) or call_name(value) != "mean":
+        return False
+    return any(part is node for part in (*attribute_chain(value.func), *(arg.value for arg in value.args)))
 
 
 def is_measured(function: Function, form: Form) -> bool:

@@ -23,22 +23,9 @@ class Unknown(Rule):
         "loss = l1_loss(network(camera), camera.something)",
         "loss = l1_loss(fused_image(camera), other(camera))",
         "loss = l1_loss(torch.abs(image - gt), 0.5)",
-        """
-        def fit(model, gt, optimizer):
-            color = model.colors()
-            l1_loss(color, gt["color"]).backward()
-            optimizer.step()
-        """,
-        """
-        def fit(model, sampled, optimizer):
-            target = sampled["target"]
-            l1_loss(model.current_rgb, target).backward()
-            optimizer.step()
-        """,
-        """
-        bg_img = gt * 0 + background[:, None, None]
-        loss = l1_loss(image, bg_img)
-        """,
+        'color = model.colors()\nloss = l1_loss(color, gt["color"])',
+        'loss = l1_loss(model.current_rgb, sampled["target"])',
+        "bg_img = gt * 0 + background[:, None, None]\nloss = l1_loss(image, bg_img)",
     ]
 
     def evidence(self, term: Term) -> List[Decider]:

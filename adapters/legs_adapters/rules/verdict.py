@@ -8,7 +8,7 @@ from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.syntax import one_line, words, words_in
 from legs_adapters.lexicon.masks import is_rows
-from legs_adapters.lexicon.meaning import swapped
+from legs_adapters.lexicon.meaning import UNKNOWN, swapped
 from legs_adapters.lexicon.words import MESH, PERCEPTUAL, TRACKING, WARPED
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.order import RULES, first
@@ -105,6 +105,8 @@ class Verdicts:
             return f"cannot tell which of {sides} is the rendering and which the photograph"
         if "target" not in (pair.a.role, pair.b.role) and not by_hand:
             return f"nothing shows that {one_line(term.target)} is a photograph"
+        if UNKNOWN in (pair.a, pair.b) and not by_hand:
+            return f"nothing shows that {one_line(term.prediction)} is a rendering"
         if self._has_rows(term):
             return "the sides are lists of pixels: a weight map needs whole images"
         return term.form.why_by_hand()

@@ -49,8 +49,9 @@ def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[c
     reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
     reads = [read for read in reads if read not in unused and not no_grad_around(function, read)]
     loss = [read for read in reads if training.includes(read) and read not in masks]
-    others = [read for read in reads if read not in loss]
-    is_changed = any(read in compared for read in reads) or (others and made[0].value is not form.node)
+    averaged = made[0].value is not form.node
+    is_changed = any(read in compared or (averaged and read in masks) for read in reads)
+    others = [] if averaged else [read for read in reads if read not in loss]
     return loss, reads if is_changed else others
 
 

@@ -12,7 +12,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, call_name, constant, words
+from legs_adapters.code.syntax import arguments, call_name, constant, dotted, words
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import RENDERERS, STATISTICS
@@ -58,6 +58,11 @@ class CallReading:
         self.values: List[cst.BaseExpression] = [*self.positional, *self.keywords.values()]
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
         self.owner: Optional[cst.BaseExpression] = None if self._is_module(base) else base
+
+    @property
+    def is_of_self(self) -> bool:
+        """Whether a member of the object itself is called, ``self.net(image)``."""
+        return self.owner is not None and dotted(self.owner) == "self"
 
     def ask(self, node: cst.CSTNode) -> Meaning:
         """Return the meaning of an expression of the function."""
@@ -137,7 +142,13 @@ def _named(call: CallReading) -> Optional[Meaning]:
 
 
 def _of_images(call: CallReading) -> Optional[Meaning]:
-    """A function of an image is an image, unless its name says otherwise: exposure, appearance, a background."""
+    """A function of an image is an image, unless its name says otherwise: exposure, appearance, a background.
+
+    What an object of a library makes of one, ``dwt(image)``, is not known.
+    """
+    references = call.program.resolve(call.function, call.node.func)
+    if any(reference.kind == "made by" for reference in references) or (not references and call.is_of_self):
+        return None
     images = [meaning for meaning in map(call.ask, call.values) if meaning.kind == "image"]
     return mix(images) if images else None
 

@@ -59,11 +59,6 @@ class CallReading:
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
         self.owner: Optional[cst.BaseExpression] = None if self._is_module(base) else base
 
-    @property
-    def is_of_self(self) -> bool:
-        """Whether a member of the object itself is called, ``self.net(image)``."""
-        return self.owner is not None and dotted(self.owner) == "self"
-
     def ask(self, node: cst.CSTNode) -> Meaning:
         """Return the meaning of an expression of the function."""
         return self.meaning_of(self.function, node)
@@ -144,10 +139,11 @@ def _named(call: CallReading) -> Optional[Meaning]:
 def _of_images(call: CallReading) -> Optional[Meaning]:
     """A function of an image is an image, unless its name says otherwise: exposure, appearance, a background.
 
-    What an object of a library makes of one, ``dwt(image)``, is not known.
+    What an object of a library makes of one, ``dwt(image)``, or an unknown member, ``self.net(image)``, is not known.
     """
     references = call.program.resolve(call.function, call.node.func)
-    if any(reference.kind == "made by" for reference in references) or (not references and call.is_of_self):
+    is_member = call.owner is not None and dotted(call.owner) == "self"
+    if any(reference.kind == "made by" for reference in references) or (is_member and not references):
         return None
     images = [meaning for meaning in map(call.ask, call.values) if meaning.kind == "image"]
     return mix(images) if images else None

@@ -208,8 +208,10 @@ def _selected(function: Function, nodes: Sequence[cst.CSTNode]) -> Tuple[List[Tu
 
 
 def _are_mirrored(left: cst.CSTNode, right: cst.CSTNode, a: str, b: str) -> bool:
-    """Return whether two expressions are equal except for ``a`` in one and ``b`` in the other."""
+    """Return whether two expressions are equal except for ``a`` in one and ``b`` in the other; not ``self.net(a)``."""
     either = re.compile(rf"\b({re.escape(a)}|{re.escape(b)})\b")
     texts = [re.sub(r"\s+", "", code(node)).strip("()") for node in (left, right)]
     one, other = (set(either.findall(text)) for text in texts)
+    if re.search(r"\bself\.\w+\(", texts[0]):
+        return False
     return len(one) == len(other) == 1 and one != other and either.sub("?", texts[0]) == either.sub("?", texts[1])

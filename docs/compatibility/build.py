@@ -93,17 +93,19 @@ def verdict_table(blind):
 
 def round_table(blind):
     """Return the table of rounds, with the rules that each of them met; the older ones in one row."""
-    lines = ["| round | rules of | codebases | right |", "| --- | --- | --- | --- |"]
+    shown = ("right", "error", "wrong term", "false alarm")
+    lines = [f"| round | rules of | codebases | {' | '.join(shown)} |", "| --- | --- " + "| --- " * 5 + "|"]
     recent = recent_from(blind)
     older = [row for row in blind if int(row["round"]) < recent]
-    rounds = [(f"1 to {recent - 1}", "commits 77fafa3 to 748344f: [rounds.csv](compatibility/rounds.csv)", older)]
-    for entry in read("rounds.csv"):
+    entries = read("rounds.csv")
+    until = re.search(r"\b[0-9a-f]{7}\b", entries[recent - 1]["rules"]).group()
+    rounds = [(f"1 to {recent - 1}", f"commits 77fafa3 to {until}: [rounds.csv](compatibility/rounds.csv)", older)]
+    for entry in entries:
         if int(entry["round"]) >= recent:
             rounds.append((entry["round"], entry["rules"], [row for row in blind if row["round"] == entry["round"]]))
-    lines += [
-        f"| {name} | {rules} | {len(rows)} | {sum(r['first'] == 'right' for r in rows)} |"
-        for name, rules, rows in rounds
-    ]
+    for name, rules, rows in rounds:
+        counts = Counter(row["first"] for row in rows)
+        lines.append(f"| {name} | {rules} | {len(rows)} | {' | '.join(str(counts[verdict]) for verdict in shown)} |")
     return "\n".join(lines)
 
 

@@ -205,7 +205,7 @@ def plots() -> None:
                 panel.plot(*zip(*sorted(points)), marker="o", markersize=4, color=colour, label=arm)
         panel.set(xlabel="iteration of 30,000", title=label)
         panel.grid(alpha=0.3)
-    figure.axes[0].legend(fontsize=8)
+    figure.axes[-1].legend(fontsize=8, loc="lower right")
     _save(figure, "evidence_schedule.png")
 
 

@@ -47,7 +47,7 @@ class Loader(importlib.machinery.SourceFileLoader):
 
     def __init__(self, name: str, path: str, sources: Mapping[str, bytes]) -> None:
         super().__init__(name, path)
-        self.data = sources.get(os.path.realpath(path))
+        self.data: Optional[bytes] = sources.get(os.path.realpath(path))
 
     def get_data(self, path: str | os.PathLike[str]) -> bytes:
         """Return the source; other files as they are on disk."""

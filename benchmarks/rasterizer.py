@@ -60,7 +60,7 @@ def project(leaves, camera):
     from legs_loss.reference.conventions import View
     from legs_loss.reference.rasterizer import oracle
 
-    view = View.of(camera)
+    view = View.from_camera(camera)
     splats = oracle.project(*(leaf.detach() for leaf in leaves[:3]), view)
     return splats, oracle.tile_bounds(splats.centres, splats.radii, view.tiles)
 

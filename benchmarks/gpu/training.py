@@ -32,7 +32,7 @@ def fastgs(options: Options, record: Record) -> None:
         need([copy / "train.py", copy / "render.py"])
     profile = find_profile(copy)
     checkout = Checkout(copy, profile, scene, None, options.resolution, options.iterations, None, (), options.emulate)
-    equal = Schedule.of(options.iterations).densify_from
+    equal = Schedule.of_run(options.iterations).densify_from
     for name, spec in ARMS.items():
         folder = Path(options.work) / profile.name / name
         folder.mkdir(parents=True, exist_ok=True)

@@ -55,7 +55,7 @@ def l1_loss(
 
     Returns:
         A scalar, or the result of ``reduction`` or ``own``. With beta 0 or LEGS_OFF it is
-        ``torch.abs(prediction - target).mean()``, or ``own(prediction, target)``, to the last bit.
+        ``torch.abs(prediction - target).mean()``, or ``own(prediction, target)``, bit-identical.
 
     Raises:
         LegsError: shapes that do not fit (both are named), that may be read either way, or that contradict

@@ -132,9 +132,9 @@ def test_transparent_ones_are_pruned_and_later_too_wide_ones() -> None:
 
 
 def test_the_schedule_of_a_short_run() -> None:
-    schedule = Schedule.of(400)
+    schedule = Schedule.of_run(400)
     assert [i for i in range(1, 401) if schedule.densifies(i)] == [60, 80, 100, 120, 140, 160, 180, 200, 220]
     assert not any(schedule.resets(i) for i in range(1, 401))
-    assert [i for i in range(1, 30001) if Schedule.of(30000).resets(i)] == [3000, 6000, 9000, 12000]
+    assert [i for i in range(1, 30001) if Schedule.of_run(30000).resets(i)] == [3000, 6000, 9000, 12000]
     for iterations in (1, 2, 3, 10):
-        Schedule.of(iterations)
+        Schedule.of_run(iterations)

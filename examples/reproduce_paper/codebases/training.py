@@ -58,7 +58,7 @@ class Checkout:
         """Return the commands that train into ``output``, with the thresholds times ``factor``."""
         places: Dict[str, Any] = dict(scene=self.scene, output=output, name=_run_name(output))
         commands = [fill(words, places) for words in self.profile.train]
-        schedule = {} if self.iterations is None else Schedule.of(self.iterations)._asdict()
+        schedule = {} if self.iterations is None else Schedule.of_run(self.iterations)._asdict()
         for option, value, more in (
             ("images", self.images, {}),
             ("resolution", self.resolution, {}),

@@ -184,7 +184,7 @@ class _Device:
         return differentiable(prediction, (target, weights.map, weights.mask, weights.range), compute, scale)
 
     def response_range(self, y: Tensor, spec: WeightSpec) -> Tensor:
-        """Return the least response of each view of [B, C, H, W], and the greatest less the least: float32 [B, 2]."""
+        """Return the least response of each view of [B, C, H, W], and max - min: float32 [B, 2]."""
         key = (y.shape, y.stride(), y.dtype, spec)
         plan = self._plans.get(key) or self._keep(key, self._plan_of(y, y, spec, None, False))
         y = y.contiguous() if plan.copies[1] else y

@@ -149,7 +149,7 @@ def _check_camera(camera: Any) -> View:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise LegsError(f"world_to_camera must be a finite [4, 4] matrix; found shape {list(matrix.shape)}")
     try:
-        view = View.of(camera)
+        view = View.from_camera(camera)
     except np.linalg.LinAlgError:
         raise LegsError("world_to_camera cannot be inverted: its upper left 3x3 must be a rotation") from None
     if view.width < 1 or view.height < 1 or not (view.fx > 0 and view.fy > 0):

@@ -30,7 +30,7 @@ class Schedule(NamedTuple):
     sh_every: int
 
     @classmethod
-    def of(cls, iterations: int) -> Schedule:
+    def of_run(cls, iterations: int) -> Schedule:
         """Return 3DGS's schedule, for runs of any length.
 
         Densification begins after a tenth of the run, at iteration 500 at the latest, ends after three fifths of it,
@@ -38,9 +38,9 @@ class Schedule(NamedTuple):
         Opacities are reset every tenth of the run but not before iteration 3000, and only while densifying: a run of
         5000 iterations or less has no time to recover from a reset.
 
-        >>> Schedule.of(30000)
+        >>> Schedule.of_run(30000)
         Schedule(densify_from=500, densify_until=15000, densify_every=100, reset_every=3000, sh_every=1000)
-        >>> Schedule.of(1000)
+        >>> Schedule.of_run(1000)
         Schedule(densify_from=100, densify_until=600, densify_every=50, reset_every=3000, sh_every=33)
         """
         return cls(

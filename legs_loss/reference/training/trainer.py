@@ -188,7 +188,7 @@ class _Run:
     def __init__(self, data: Dataset, config: TrainConfig, adam: Adam) -> None:
         self.data, self.config, self.adam = data, config, adam
         self.extent = extent(data.train)
-        self.schedule = Schedule.of(config.iterations)
+        self.schedule = Schedule.of_run(config.iterations)
         self.threshold = config.densify_grad_threshold or default_threshold(data.train)
         self.iteration = 0
         self.clocks = np.zeros(2)  # seconds: on the wall, and of the processor

@@ -6,7 +6,6 @@ from typing import AbstractSet, List
 
 from legs_adapters.code.syntax import call_name, root_of, words
 from legs_adapters.lexicon.words import (
-    EMBEDDING,
     EVALUATING,
     GAUSSIANS,
     LOSS,
@@ -85,7 +84,6 @@ class OtherName(Rule):
 NAMES = (
     OtherName("warping", "synthetic", WARPED, "A name says that one view is warped into another.", "reprojection"),
     OtherName("perceptual", "features", PERCEPTUAL, "A name is of a perceptual loss: it compares features.", "vgg_l1"),
-    OtherName("embedding-fit", "evaluation", EMBEDDING, "A name is of a fit of an embedding.", "optimize_embedding"),
     OtherName("mesh", "mesh", MESH, "A name is of a mesh: no Gaussians are drawn.", "train_texture"),
     OtherName("robust", "huber", ROBUST, "A name is of a robust loss: a weight would move its threshold.", "huber"),
 )

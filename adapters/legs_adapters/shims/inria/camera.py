@@ -36,7 +36,7 @@ def pinhole(settings: Any, module: str) -> View:
         given = np.asarray(campos.detach().cpu().numpy(), np.float64).reshape(-1)[:3]
         if np.abs(centre - given).max() > TOLERANCE * max(1.0, float(np.abs(centre).max())):
             raise MissingShim(module, "GaussianRasterizer", f"campos {given} is not viewmatrix's centre {centre}")
-    return View.of(camera)
+    return View.from_camera(camera)
 
 
 def matrix(tensor: Any) -> np.ndarray:

@@ -89,6 +89,7 @@ def beside(folder, others):
     return checkout(folder, {**shared, "train.py": TRAIN, **others})
 
 
+@pytest.mark.slow
 def test_the_training_is_planned_beside_them(tmp_path):
     """All of them in one checkout: a fault of one file costs only that file."""
     others = {}

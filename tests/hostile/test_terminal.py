@@ -88,6 +88,7 @@ class TestLegs:
 
     LINES = ("a\nlegs: error: b.png", "\x1b[31mred.png")
 
+    @pytest.mark.slow
     def test_a_line_end_in_a_name_ends_no_line(self, lines, tmp_path):
         colmap = colmap_scene(tmp_path / "colmap", self.LINES)
         (colmap / "images" / self.LINES[0]).write_bytes(b"\x89PNG\r\n\x1a\n")

@@ -110,6 +110,7 @@ def precompute(scene):
     subprocess.run([sys.executable, *map(str, command)], env=legs_environment(), capture_output=True, check=True)
 
 
+@pytest.mark.slow
 def test_a_patched_run_masks_every_term_and_without_masks_nothing_changes(scene, tmp_path):
     plain, masked = (checkout(tmp_path / name, FILES) for name in ("plain", "masked"))
     assert legs_patch(plain).returncode == 0

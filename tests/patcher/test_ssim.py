@@ -172,6 +172,7 @@ class TestPatch:
         assert "no photometric L1 term was found" in done.stderr
 
 
+@pytest.mark.slow
 def test_in_memory_the_losses_are_those_of_the_l1_alone(tmp_path):
     pytest.importorskip("numba")
     scene = write_embedded_scene(tmp_path / "scene", views=2, width=40, height=30, points=100, samples=1)

@@ -315,7 +315,7 @@ def test_harmonics_wait_for_their_degree(scene: Scene) -> None:
 
 def test_a_long_run_resets_opacities_and_prunes_wide_gaussians(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     schedule = Schedule(densify_from=5, densify_until=60, densify_every=10, reset_every=20, sh_every=10)
-    monkeypatch.setattr(trainer, "Schedule", type("S", (), {"of": staticmethod(lambda _: schedule)}))
+    monkeypatch.setattr(trainer, "Schedule", type("S", (), {"of_run": staticmethod(lambda _: schedule)}))
     seen = []
     reset = Adam.reset_opacity
     monkeypatch.setattr(Adam, "reset_opacity", lambda self, value: (seen.append(self.steps), reset(self, value)))

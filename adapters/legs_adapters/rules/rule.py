@@ -12,6 +12,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import walk_expressions
+from legs_adapters.lexicon.masks import is_rows
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.form import Form
@@ -52,6 +53,12 @@ class Term:
     def sides(self) -> Sequence[cst.BaseExpression]:
         """Both sides as they are written."""
         return self.form.first, self.form.second
+
+    @property
+    def has_rows(self) -> bool:
+        """Whether a side is a list of pixels, without neighbours."""
+        sides = self.pair.first, self.pair.second
+        return any(is_rows(self.analysis.meanings, self.function, side) for side in sides)
 
     @property
     def names_around(self) -> Iterator[Tuple[str, Decider]]:

@@ -7,7 +7,6 @@ from typing import Optional
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.syntax import one_line, words, words_in
-from legs_adapters.lexicon.masks import is_rows
 from legs_adapters.lexicon.meaning import UNKNOWN, swapped
 from legs_adapters.lexicon.words import MESH, PERCEPTUAL, TRACKING, WARPED
 from legs_adapters.rules.analysis import Analysis
@@ -93,7 +92,7 @@ class Verdicts:
     def problem(self, term: Term, place: Place, reason: str) -> Problem:
         """Return a term as a problem, with the advice for the manual edit."""
         advice = term.form.advice(Writing(swapped=term.target is term.pair.first))
-        if self._has_rows(term):
+        if term.has_rows:
             advice = "legs_loss.l1_loss(rendering, photograph), on the images before they are flattened"
         return Problem.at(term.function, place, reason, advice)
 
@@ -107,12 +106,9 @@ class Verdicts:
             return f"nothing shows that {one_line(term.target)} is a photograph"
         if UNKNOWN in (pair.a, pair.b) and not by_hand:
             return f"nothing shows that {one_line(term.prediction)} is a rendering"
-        if self._has_rows(term):
+        if term.has_rows:
             return "the sides are lists of pixels: a weight map needs whole images"
         return term.form.why_by_hand()
-
-    def _has_rows(self, term: Term) -> bool:
-        return any(is_rows(self.analysis.meanings, term.function, side) for side in (term.pair.first, term.pair.second))
 
     def _why_photograph(self, term: Term) -> str:
         """Return what shows that a side is the photograph."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from typing import List
 
-from legs_adapters.lexicon.masks import is_rows
 from legs_adapters.lexicon.words import RAY_BUNDLES
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
@@ -34,8 +33,7 @@ class NotSplats(Rule):
         if not term.analysis.splats.is_about(term.function):
             return [header(term.function)]
         by_class = _ray_method(term)
-        picked = any(is_rows(term.analysis.meanings, term.function, side) for side in term.sides)  # pixels of an image
-        rays = bool(by_class) or (of_rays(term.form) and not picked)
+        rays = bool(by_class) or (of_rays(term.form) and not term.has_rows)  # pixels of an image, by that name
         return (by_class or term.here) if rays and not is_beside_ssim(term.function, *term.sides) else []
 
     def may_be_loss(self, term: Term) -> bool:

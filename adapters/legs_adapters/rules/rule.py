@@ -56,7 +56,7 @@ class Term:
 
     @property
     def has_rows(self) -> bool:
-        """Whether a side is a list of pixels, without neighbours."""
+        """Return whether a side is a list of pixels, without neighbours."""
         sides = self.pair.first, self.pair.second
         return any(is_rows(self.analysis.meanings, self.function, side) for side in sides)
 

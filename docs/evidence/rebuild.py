@@ -26,6 +26,22 @@ CANDIDATE = "percentile=99,normalise=mean,scale=0.6,error=1,curve=C1@3dgs"
 CODEBASES = {name: tuple(f"{scene}_{name}_200" for scene in ("fox", "fern", "kitchen")) for name in ("3dgs", "fastgs")}
 CODEBASES["mcmc"] = tuple(f"{scene}_mcmc_200" for scene in ("fox", "fern", "kitchen"))
 SCHEDULE = "fern_800_schedule"
+SCHEDULE_GPU = "schedule_gpu"
+SCHEDULE_SHOWN = (
+    ("fern/CPU", 3000),
+    ("fern/CPU", 7000),
+    ("fern/H200", 7000),
+    ("fern/H200", 10000),
+    ("kitchen/H200", 7000),
+    ("monstree/H200", 3000),
+)
+SCHEDULE_COLUMNS = (
+    ("train", "psnr", ".2f"),
+    ("train", "ssim", ".3f"),
+    ("test", "psnr", ".2f"),
+    ("test", "ssim", ".3f"),
+    ("test", "psnr_strong", ".2f"),
+)
 SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs-l")
 COLOURS = ("#555555", "#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#ff7f0e")
 COLUMNS = {
@@ -92,18 +108,19 @@ def differences(table: Table) -> str:
 
 
 def schedule() -> str:
-    """Return the scores by 3DGS's own schedule, at three of its milestones."""
-    rows = {(row["arm"], row["iteration"]): row for row in rows_of(SCHEDULE)}
+    """Return the scores by 3DGS's own schedule at its milestones, by the package's trainer and on a GPU."""
+    found = {("fern/CPU", row["arm"], row["iteration"]): row["metrics"] for row in rows_of(SCHEDULE)}
+    found.update(
+        ((f"{row['scene']}/H200", row["arm"], row["iteration"]), row["metrics"]) for row in rows_of(SCHEDULE_GPU)
+    )
     lines = []
-    for iteration in (3000, 5000, 7000):
+    for scene, iteration in SCHEDULE_SHOWN:
         for arm in SCHEDULE_ARMS:
-            if (arm, iteration) in rows:
-                row = rows[arm, iteration]["metrics"]
-                train, test = row["train"], row["test"]
-                scores = [f"{train['psnr']:.2f}", f"{train['ssim']:.3f}", f"{test['psnr']:.2f}", f"{test['ssim']:.3f}"]
-                count = f"{row['gaussians']:,}"
-                lines.append([f"{iteration:,}", arm, *scores, f"{test['psnr_strong']:.2f}", count])
-    heads = ["iteration", "arm", "train PSNR", "SSIM", "held-out PSNR", "SSIM", "strongest 10%", "Gaussians"]
+            if (scene, arm, iteration) in found:
+                row = found[scene, arm, iteration]
+                cells = [f"{row[split][key]:{form}}" for split, key, form in SCHEDULE_COLUMNS]
+                lines.append([scene, f"{iteration:,}", arm, *cells, f"{row['gaussians']:,}"])
+    heads = ["capture", "iteration", "arm", "train PSNR", "SSIM", "held-out PSNR", "SSIM", "strongest 10%", "Gaussians"]
     return compact(heads, lines)
 
 

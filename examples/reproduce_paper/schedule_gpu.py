@@ -1,6 +1,6 @@
 """Train arms by 3DGS's own schedule of 30,000 iterations on a GPU, and score them at milestones.
 
-    python schedule_gpu.py SCENE OUT --arms 3dgs legs 3dgs@legs --seed 0 --until 7000
+    python -m examples.reproduce_paper.schedule_gpu SCENE OUT --arms 3dgs legs 3dgs@legs --until 7000   # at the root
 
 The density control, the rates, the order of the views and the scores are those of the package's trainer, schedule.py;
 the pictures and their gradients are drawn by 3DGS's own CUDA rasterizer (its branch 3dgs_accel), the loss is computed
@@ -76,14 +76,13 @@ class Optimiser:
     """The parameters, by name as 3DGS holds them, and torch's fused Adam over them."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        self.adam: Optional[torch.optim.Adam] = None
         self._set(_parts(gaussians), None, {})
 
     def _set(self, values: Dict[str, Tensor], steps: Optional[Tensor], moments: Dict[str, List[Tensor]]) -> None:
         self.values = {name: value.detach().contiguous().requires_grad_(True) for name, value in values.items()}
         rates = {**RATES, "means": 0.0, "dc": COLOUR_RATE, "rest": COLOUR_RATE / 20}
         groups = [{"params": [value], "lr": rates[name]} for name, value in self.values.items()]
-        self.adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self.adam: torch.optim.Adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
         if steps is not None:
             for name, value in self.values.items():
                 first, second = moments[name]
@@ -99,14 +98,12 @@ class Optimiser:
 
     def step(self, rate: float) -> None:
         """Update every parameter from its gradient, and drop the gradients."""
-        assert self.adam is not None
         self.adam.param_groups[0]["lr"] = rate
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
 
     def replace(self, kept: Tensor, new: Optional[Gaussians] = None) -> None:
         """Keep the Gaussians of index ``kept`` with their moments, and append ``new`` ones, whose moments are 0."""
-        assert self.adam is not None
         added = {name: value[:0] for name, value in self.values.items()} if new is None else _parts(new)
         states = {name: self.adam.state[value] for name, value in self.values.items()}
         moments = {
@@ -118,7 +115,6 @@ class Optimiser:
 
     def reset_opacity(self) -> None:
         """Lower every opacity to 3DGS's ceiling at most, and forget its moments."""
-        assert self.adam is not None
         logits = self.values["opacity_logits"]
         with torch.no_grad():
             logits.clamp_(max=float(torch.logit(torch.tensor(RESET_OPACITY))))

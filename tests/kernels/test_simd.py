@@ -74,3 +74,33 @@ def test_the_negative_turns_every_sign():
     assert turned[:3] == [-1, -2, -3] and turned[7] == -math.inf
     assert math.copysign(1, turned[6]) == 1  # 0 - a would leave 0.0 of 0.0, and of -0.0
     assert math.copysign(1, by_lanes(of_first, B, A)[6]) == -1
+
+
+def test_eight_rows_transposed_are_their_columns():
+    import numba
+
+    from legs_loss.kernels.simd.lanes import transposed
+    from legs_loss.kernels.simd.memory import load, store
+
+    @numba.njit
+    def turn(rows, result):
+        columns = transposed(
+            load(rows, 0), load(rows, 8), load(rows, 16), load(rows, 24),
+            load(rows, 32), load(rows, 40), load(rows, 48), load(rows, 56),
+        )  # fmt: skip
+        for k in range(8):
+            store(result, 8 * k, columns[k])
+
+    rows, result = np.arange(64, dtype=np.float32), np.empty(64, np.float32)
+    turn(rows, result)
+    assert (result.reshape(8, 8) == rows.reshape(8, 8).T).all()
+
+
+def test_a_number_multiplies_every_lane():
+    import numba
+
+    @numba.njit
+    def thrice(a, b):
+        return np.float32(3) * b
+
+    assert by_lanes(thrice, A, range(8)) == [0, 3, 6, 9, 12, 15, 18, 21]

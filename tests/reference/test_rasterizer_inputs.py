@@ -143,11 +143,11 @@ class TestErrors:
         pytest.importorskip("numba")
         from legs_loss.reference.rasterizer import sorting
 
-        nothing = np.empty(0, np.float32), np.empty(0, np.int64)
-        firsts, reached = sorting.make_slots(np.empty((0, 4), np.int32), nothing[1], 32)
+        firsts, reached = sorting.make_slots(np.empty((0, 4), np.int32), np.empty(0, np.int64), 32)
+        nothing = np.empty(0, np.float32), firsts, reached
         with pytest.raises(LegsError, match="2048 x 257 strips cannot be drawn"):  # 16384 x 8224 pixels
-            sorting.sort_entries(*nothing, firsts, reached, 2048, 257)
-        sorting.sort_entries(*nothing, firsts, reached, 2048, 256)
+            sorting.sort_entries(*nothing, 2048, 257)
+        sorting.sort_entries(*nothing, 2048, 256)
 
     def test_without_numba(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "numba", None)

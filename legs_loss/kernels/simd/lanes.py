@@ -9,12 +9,12 @@ from numba.core.errors import RequireLiteralValue
 from legs_loss.kernels.compiling import inlined
 from legs_loss.kernels.simd.vectors import INTEGERS, LANES, float8, intrinsic
 
-__all__ = ["lane", "total", "totals"]
+__all__ = ["lane", "total", "totals", "transposed"]
 
 
 @intrinsic
-def _pairs_added(typingctx, a, b, distance):  # type: ignore[no-untyped-def]
-    """Return sums of two lanes of a, `distance` apart, and of two of b, in turn for every `distance` lanes."""
+def _exchanged(typingctx, a, b, distance):  # type: ignore[no-untyped-def]
+    """Return two vectors, a and b mixed: in turn for every `distance` lanes, those of a and of b; and what is left."""
     if not isinstance(distance, types.IntegerLiteral):
         raise RequireLiteralValue("distance")
     distance = distance.literal_value
@@ -24,9 +24,25 @@ def _pairs_added(typingctx, a, b, distance):  # type: ignore[no-untyped-def]
         both = args[:2]
         first = builder.shuffle_vector(*both, ir.Constant(INTEGERS, firsts))
         second = builder.shuffle_vector(*both, ir.Constant(INTEGERS, [k + distance for k in firsts]))
-        return builder.fadd(first, second)
+        return context.make_tuple(builder, sig.return_type, [first, second])
 
-    return float8(float8, float8, types.IntegerLiteral(distance)), generate
+    return types.UniTuple(float8, 2)(float8, float8, types.IntegerLiteral(distance)), generate
+
+
+@inlined
+def _pairs_added(a, b, distance):  # type: ignore[no-untyped-def]
+    """Return sums of two lanes of a, `distance` apart, and of two of b, in turn for every `distance` lanes."""
+    first, second = _exchanged(a, b, distance)
+    return first + second
+
+
+@inlined
+def transposed(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
+    """Return the columns of eight vectors, the first lanes of all first."""
+    (a, b), (c, d), (e, f), (g, h) = _exchanged(a, b, 1), _exchanged(c, d, 1), _exchanged(e, f, 1), _exchanged(g, h, 1)
+    (a, c), (b, d), (e, g), (f, h) = _exchanged(a, c, 2), _exchanged(b, d, 2), _exchanged(e, g, 2), _exchanged(f, h, 2)
+    (a, e), (b, f), (c, g), (d, h) = _exchanged(a, e, 4), _exchanged(b, f, 4), _exchanged(c, g, 4), _exchanged(d, h, 4)
+    return a, b, c, d, e, f, g, h
 
 
 @inlined

@@ -122,22 +122,13 @@ def draw(
     projection.find_rows(splats, boxes, slots, firsts, across, reached)
     if clip is not None:
         clip(np.array(view.tiles), splats, boxes, slots, firsts, reached, radii)
-    ranges, draws, bands = sorting.sort_entries(depths, slots, firsts, reached, across, down)
+    ranges, draws, bands = sorting.sort_entries(depths, firsts, reached, across, down)
     return Drawing(
-        parameters=parameters,
-        camera=camera,
-        splats=splats,
-        radii=radii,
-        clamped=clamped,
-        firsts=firsts,
-        across=across,
-        bands=bands,
-        ranges=ranges,
-        draws=draws,
+        parameters, camera, splats, radii, clamped, firsts, across, bands, ranges, draws,
         entries=np.empty((int(ranges[-1]), strips.FIELDS), np.float32),
         ends=np.empty(across * down, np.int64),
         image=np.empty((3, view.height, view.width), np.float32),
-    ).blended(_array(background))
+    ).blended(_array(background))  # fmt: skip
 
 
 def attach(drawing: Drawing, tensors: Tensors) -> Tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ from numba import prange
 
 from legs_loss.kernels.compiling import compiled
 from legs_loss.reference.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from legs_loss.reference.rasterizer.projection import TALL, WIDE
+from legs_loss.reference.rasterizer.projection import WIDE
 from legs_loss.reference.rasterizer.sorting import OWNER
 from legs_loss.reference.rasterizer.strips import PIXELS, STATE, WORK, T, X, place, reach, respond
 
@@ -21,13 +21,13 @@ _MAX, _MIN, _LAST, _ONE = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float
 
 
 @compiled()
-def _strip(left, top, wide, tall, begin, end, splats, draws, entries, values, image, g_image, sums):
+def _strip(strip, across, begin, end, splats, draws, entries, values, image, g_image, sums):
     """Fill the sums of one strip's entries, [entries, FIELDS]."""
     before, finished = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.bool_)
     largest, whose = np.zeros(PIXELS, np.float32), np.full(PIXELS, -1, np.int64)
     rest, g = np.zeros(PIXELS, np.float32), np.zeros((PIXELS, 3), np.float32)
     state = np.empty(STATE, np.float32)
-    place(state[X:], state[T : T + PIXELS], wide, tall)
+    left, top, wide, tall = place(strip, across, image, state[X:], state[T : T + PIXELS])
     for row in range(tall):
         for column in range(wide):
             for channel in range(3):
@@ -76,13 +76,9 @@ def contribute(across, ranges, ends, splats, draws, entries, values, image, g_im
     in pixels; MOST: how many in which no other weighs more; SLOPES: of the squared derivative by the Gaussian's alpha
     there, ``g_image`` being the image's.
     """
-    height, width = values.shape
     parts = np.zeros((len(entries), FIELDS))
     for strip in prange(len(ends)):
-        left, top = strip % across * WIDE, strip // across * TALL
-        wide, tall = min(WIDE, width - left), min(TALL, height - top)
-        begin, end = ranges[strip], ends[strip]
-        _strip(left, top, wide, tall, begin, end, splats, draws, entries, values, image, g_image, parts)
+        _strip(strip, across, ranges[strip], ends[strip], splats, draws, entries, values, image, g_image, parts)
     sums[:] = 0
     for strip in range(len(ends)):
         for k in range(ranges[strip], ends[strip]):

@@ -43,16 +43,10 @@ def rotation(w, x, y, z):
     shorter = 1 / length
     w, x, y, z = w * shorter, x * shorter, y * shorter, z * shorter
     matrix = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    )
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
     return matrix, (w, x, y, z), length
 
 
@@ -73,26 +67,19 @@ def linearised(x, y, z, intrinsics, pose):
     j00, j11 = fx * inverse, fy * inverse
     j02, j12 = -j00 * held_x * inverse, -j11 * held_y * inverse
     return (
-        j00 * pose[0][0] + j02 * pose[2][0],
-        j00 * pose[0][1] + j02 * pose[2][1],
-        j00 * pose[0][2] + j02 * pose[2][2],
-        j11 * pose[1][0] + j12 * pose[2][0],
-        j11 * pose[1][1] + j12 * pose[2][1],
-        j11 * pose[1][2] + j12 * pose[2][2],
-    )
+        j00 * pose[0][0] + j02 * pose[2][0], j00 * pose[0][1] + j02 * pose[2][1], j00 * pose[0][2] + j02 * pose[2][2],
+        j11 * pose[1][0] + j12 * pose[2][0], j11 * pose[1][1] + j12 * pose[2][1], j11 * pose[1][2] + j12 * pose[2][2],
+    )  # fmt: skip
 
 
 @inlined
 def times_rotation(t, r):
     """Return a 2x3 matrix times a 3x3 one."""
     return (
-        t[0] * r[0] + t[1] * r[3] + t[2] * r[6],
-        t[0] * r[1] + t[1] * r[4] + t[2] * r[7],
-        t[0] * r[2] + t[1] * r[5] + t[2] * r[8],
-        t[3] * r[0] + t[4] * r[3] + t[5] * r[6],
-        t[3] * r[1] + t[4] * r[4] + t[5] * r[7],
-        t[3] * r[2] + t[4] * r[5] + t[5] * r[8],
-    )
+        t[0] * r[0] + t[1] * r[3] + t[2] * r[6], t[0] * r[1] + t[1] * r[4] + t[2] * r[7],
+        t[0] * r[2] + t[1] * r[5] + t[2] * r[8], t[3] * r[0] + t[4] * r[3] + t[5] * r[6],
+        t[3] * r[1] + t[4] * r[4] + t[5] * r[7], t[3] * r[2] + t[4] * r[5] + t[5] * r[8],
+    )  # fmt: skip
 
 
 @inlined
@@ -100,13 +87,9 @@ def times_covariance(t, v):
     """Return a 2x3 matrix times a covariance, given by its upper triangle's rows."""
     xx, xy, xz, yy, yz, zz = v
     return (
-        t[0] * xx + t[1] * xy + t[2] * xz,
-        t[0] * xy + t[1] * yy + t[2] * yz,
-        t[0] * xz + t[1] * yz + t[2] * zz,
-        t[3] * xx + t[4] * xy + t[5] * xz,
-        t[3] * xy + t[4] * yy + t[5] * yz,
-        t[3] * xz + t[4] * yz + t[5] * zz,
-    )
+        t[0] * xx + t[1] * xy + t[2] * xz, t[0] * xy + t[1] * yy + t[2] * yz, t[0] * xz + t[1] * yz + t[2] * zz,
+        t[3] * xx + t[4] * xy + t[5] * xz, t[3] * xy + t[4] * yy + t[5] * yz, t[3] * xz + t[4] * yz + t[5] * zz,
+    )  # fmt: skip
 
 
 @inlined

@@ -139,7 +139,6 @@ def _project_block(first, end, parameters, camera, footprint, found):
     degree, intrinsics, pose, position, size = camera
     dilation, square = footprint
     splats, depths, radii, clamped, boxes, slots = found
-    basis = np.empty(16, np.float32)
     state, before_camera, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
     for i in range(np.uint64(first), np.uint64(end)):
         radii[i] = 0
@@ -156,6 +155,7 @@ def _project_block(first, end, parameters, camera, footprint, found):
         _shapes(count, intrinsics, pose, dilation, state)
     if covariances is not None:
         _covariances(count, intrinsics, pose, dilation, state)
+    drawn, seen = before_camera, 0
     for j in range(np.uint64(count)):
         i = np.uint64(before_camera[j])
         centre_x, centre_y = state[CENTRE, j], state[CENTRE + 1, j]
@@ -188,9 +188,10 @@ def _project_block(first, end, parameters, camera, footprint, found):
         x0, x1 = x0 // WIDE, (x1 - 1) // WIDE + 1
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, y0, x1, y1
         slots[i] = (x1 - x0) * ((y1 - 1) // TALL + 1 - y0 // TALL)
-
-        shade(means, i, position, degree, sh, basis, clamped, splats[i, 6:])
         splats[i, 5] = summit
+        drawn[seen] = i  # where what was read stood, or before
+        seen += 1
+    shade(drawn, seen, means, position, degree, sh, clamped, splats, 6)
 
 
 @compiled(parallel=True)

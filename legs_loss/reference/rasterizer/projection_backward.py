@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import compiled, inlined
 from legs_loss.kernels.simd.lanes import lane
 from legs_loss.kernels.simd.memory import load
 from legs_loss.reference.rasterizer.geometry import (
@@ -56,15 +56,21 @@ def _collect(first, end, sums, state, j):
     state[ABSOLUTE, j], state[ABSOLUTE + 1, j] = LENGTH**2 * along_u, LENGTH**2 * along_v
 
 
+@inlined
+def _in_the_image(state, j, intrinsics, pose):
+    """Return mean and linear map of column `j`, and the gradients to the splat's centre and covariance."""
+    x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
+    axes = state[AXES, j], state[AXES + 1, j], state[AXES + 2, j]
+    gu, gv = centre_gradient(axes, state[FIRST, j], state[FIRST + 1, j])
+    s00, s01, s11 = covariance_gradient(axes, state[SECOND, j], state[SECOND + 1, j], state[SECOND + 2, j])
+    return x, y, z, linearised(x, y, z, intrinsics, pose), gu, gv, s00, s01, s11
+
+
 @compiled()
 def _shapes_backward(count, intrinsics, pose, state):
     intrinsics, pose = numbers(intrinsics, pose)
     for j in range(np.uint64(count)):
-        x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
-        t = linearised(x, y, z, intrinsics, pose)
-        axes = state[AXES, j], state[AXES + 1, j], state[AXES + 2, j]
-        gu, gv = centre_gradient(axes, state[FIRST, j], state[FIRST + 1, j])
-        s00, s01, s11 = covariance_gradient(axes, state[SECOND, j], state[SECOND + 1, j], state[SECOND + 2, j])
+        x, y, z, t, gu, gv, s00, s01, s11 = _in_the_image(state, j, intrinsics, pose)
         # The scaled axes U S, U = T R: 2 G U S.
         r, q, length = rotation(state[SHAPE + 3, j], state[SHAPE + 4, j], state[SHAPE + 5, j], state[SHAPE + 6, j])
         u = times_rotation(t, r)
@@ -84,13 +90,9 @@ def _shapes_backward(count, intrinsics, pose, state):
         w0, w1, w2, w3 = quaternion_gradient(g_rotation, q, length)
         state[SHAPE + 3, j], state[SHAPE + 4, j], state[SHAPE + 5, j], state[SHAPE + 6, j] = w0, w1, w2, w3
         g_t = (
-            e0 * r[0] + e1 * r[1] + e2 * r[2],
-            e0 * r[3] + e1 * r[4] + e2 * r[5],
-            e0 * r[6] + e1 * r[7] + e2 * r[8],
-            e3 * r[0] + e4 * r[1] + e5 * r[2],
-            e3 * r[3] + e4 * r[4] + e5 * r[5],
-            e3 * r[6] + e4 * r[7] + e5 * r[8],
-        )
+            e0 * r[0] + e1 * r[1] + e2 * r[2], e0 * r[3] + e1 * r[4] + e2 * r[5], e0 * r[6] + e1 * r[7] + e2 * r[8],
+            e3 * r[0] + e4 * r[1] + e5 * r[2], e3 * r[3] + e4 * r[4] + e5 * r[5], e3 * r[6] + e4 * r[7] + e5 * r[8],
+        )  # fmt: skip
         gx, gy, gz = mean_gradient(x, y, z, gu, gv, g_t, intrinsics, pose)
         state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j] = gx, gy, gz
 
@@ -99,11 +101,7 @@ def _shapes_backward(count, intrinsics, pose, state):
 def _covariances_backward(count, intrinsics, pose, state):
     intrinsics, pose = numbers(intrinsics, pose)
     for j in range(np.uint64(count)):
-        x, y, z = to_camera(state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j], pose)
-        t = linearised(x, y, z, intrinsics, pose)
-        axes = state[AXES, j], state[AXES + 1, j], state[AXES + 2, j]
-        gu, gv = centre_gradient(axes, state[FIRST, j], state[FIRST + 1, j])
-        s00, s01, s11 = covariance_gradient(axes, state[SECOND, j], state[SECOND + 1, j], state[SECOND + 2, j])
+        x, y, z, t, gu, gv, s00, s01, s11 = _in_the_image(state, j, intrinsics, pose)
         xx, xy, xz = state[SHAPE, j], state[SHAPE + 1, j], state[SHAPE + 2, j]
         yy, yz, zz = state[SHAPE + 3, j], state[SHAPE + 4, j], state[SHAPE + 5, j]
         # The image's is T V T^t: 2 G T V; and to V, of which the triangle has three numbers that stand twice.
@@ -155,7 +153,6 @@ def _project_backward_block(first, end, parameters, camera, splats, clamped, fir
     degree, intrinsics, pose, position, size = camera
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances = gradients
     half = size[0] / 2, size[1] / 2
-    basis, g_basis = np.empty(16, np.float32), np.empty(16, np.float32)
     state, drawn, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
     for i in range(first, end):
         if firsts[i, FIRST_SUM] == firsts[i + 1, FIRST_SUM]:
@@ -172,6 +169,9 @@ def _project_backward_block(first, end, parameters, camera, splats, clamped, fir
         _shapes_backward(count, intrinsics, pose, state)
     if covariances is not None:
         _covariances_backward(count, intrinsics, pose, state)
+    # The colour: to the coefficients, and through the direction to the mean.
+    colours, towards = state[COLOUR : COLOUR + 3], state[MEAN : MEAN + 3]
+    shade_gradient(drawn, count, means, position, degree, sh, clamped, colours, towards, g_sh)
     for j in range(np.uint64(count)):
         i = np.uint64(drawn[j])
         _take_out(g_scales, g_quaternions, g_covariances, i, state, j)
@@ -181,14 +181,8 @@ def _project_backward_block(first, end, parameters, camera, splats, clamped, fir
         g_view[i, 0], g_view[i, 1] = gu * half[0], gv * half[1]
         if g_view.shape[1] == 4:
             g_view[i, 2], g_view[i, 3] = state[ABSOLUTE, j] * half[0], state[ABSOLUTE + 1, j] * half[1]
-
-        # Colour: to the coefficients, and through the direction to the mean.
-        red, green, blue = state[COLOUR, j], state[COLOUR + 1, j], state[COLOUR + 2, j]
-        mx, my, mz = shade_gradient(
-            means, i, position, degree, sh, clamped, red, green, blue, basis, g_basis, g_sh
-        )  # fmt: skip
-        g_means[i, 0], g_means[i, 1] = state[MEAN, j] + mx, state[MEAN + 1, j] + my
-        g_means[i, 2] = state[MEAN + 2, j] + mz
+        for k in range(3):
+            g_means[i, k] = state[MEAN + k, j]
 
 
 @compiled(parallel=True)

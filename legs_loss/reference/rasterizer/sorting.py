@@ -13,14 +13,13 @@ from __future__ import annotations
 from typing import Tuple
 
 import numpy as np
+from numba import prange
 
 from legs_loss.errors import LegsError
 from legs_loss.kernels.compiling import compiled, inlined
-from legs_loss.kernels.simd.memory import prefetch
 
 BAND = 16  # strips
 MOST_BANDS = 1 << 15  # in an image: of 8 x 32 pixel strips, 134 million pixels
-AHEAD = 16  # splats whose slots are asked for while another's are worked on
 
 FIRST_SLOT, FIRST_SUM = 0, 1  # where a splat's slots begin, and its rows of sums
 STRIP, ROWS = 0, 1  # of a slot: its strip, or -1 where the splat does not reach it, and its rows (see `packed`)
@@ -43,7 +42,7 @@ def make_slots(boxes: np.ndarray, slots: np.ndarray, tall: int) -> Tuple[np.ndar
 
 
 def sort_entries(
-    depths: np.ndarray, slots: np.ndarray, firsts: np.ndarray, reached: np.ndarray, across: int, down: int
+    depths: np.ndarray, firsts: np.ndarray, reached: np.ndarray, across: int, down: int
 ) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where each strip's entries begin [strips + 1], the entries [E, 3] by strip and then depth, and the bands.
 
@@ -54,7 +53,9 @@ def sort_entries(
         LegsError: the image, ``across`` times ``down`` strips, is too large.
     """
     ranges, draws = np.zeros(across * down + 1, np.int64), np.empty((len(reached), 3), np.int32)
-    _sort_slots(order_by_depth(depths, slots), firsts, reached, ranges, draws)
+    keys = np.empty(len(reached), np.uint32)
+    _by_strip(depths.view(np.uint32), firsts, reached, ranges, keys, draws)
+    _by_depth(ranges, keys, draws)
     rows = np.arange(0, across * down, across)[:, None]
     begins = (rows + np.arange(0, across, BAND)).reshape(-1)
     ends = np.minimum(rows + np.arange(BAND, across + BAND, BAND), rows + across).reshape(-1)
@@ -107,42 +108,15 @@ def unpacked(rows):
 
 
 @compiled()
-def order_by_depth(depths, slots):
-    """Return indices of the splats that are drawn, front to back; equal depths keep their order. A radix sort."""
-    bits, count = depths.view(np.uint32), 0
-    order, starts = np.empty(len(slots), np.int32), np.zeros((3, 2049), np.int64)
-    for i in range(len(slots)):
-        if slots[i] > 0:
-            order[count] = i
-            count += 1
-            for digit in range(3):  # depths are positive: their bits, as integers, sort as they do
-                starts[digit, (bits[i] >> 11 * digit & 2047) + 1] += 1
-    order = order[:count]
-    other = np.empty_like(order)
-    for digit in range(3):
-        for k in range(1, 2049):
-            starts[digit, k] += starts[digit, k - 1]
-        for i in order:
-            k = np.uint64(bits[i] >> 11 * digit & 2047)
-            other[starts[digit, k]] = i
-            starts[digit, k] += 1
-        order, other = other, order
-    return order
-
-
-@compiled()
-def _sort_slots(order, firsts, reached, ranges, draws):
+def _by_strip(depths, firsts, reached, ranges, keys, draws):
+    """Fill each strip's entries in the order of their splats, and `keys` with the bits of their depths."""
     for slot in range(len(reached)):
         ranges[reached[slot, STRIP] + 1] += 1
     ranges[0] = 0  # those that reach none
     for strip in range(1, len(ranges)):
         ranges[strip] += ranges[strip - 1]
     cursors = ranges.copy()
-    for turn in range(len(order)):
-        prefetch(firsts, order[min(turn + 2 * AHEAD, len(order) - 1)])
-        prefetch(reached, firsts[order[min(turn + AHEAD, len(order) - 1)], FIRST_SLOT])
-        owner = order[turn]
-        i = np.uint64(owner)
+    for i in range(np.uint64(len(depths))):
         first_sum = firsts[i, FIRST_SUM]
         for slot in range(np.uint64(firsts[i, FIRST_SLOT]), np.uint64(firsts[i + np.uint64(1), FIRST_SLOT])):
             strip = reached[slot, STRIP]
@@ -150,5 +124,41 @@ def _sort_slots(order, firsts, reached, ranges, draws):
                 at, (_, _, band) = np.uint64(strip), unpacked(reached[slot, ROWS])
                 place = np.uint64(cursors[at])
                 cursors[at] += 1
-                draws[place, OWNER], draws[place, ROWS] = owner, reached[slot, ROWS]
+                keys[place], draws[place, OWNER], draws[place, ROWS] = depths[i], i, reached[slot, ROWS]
                 draws[place, SUM] = first_sum + band
+
+
+@compiled()
+def _sort_strip(keys, draws):
+    """Sort the entries of a strip, front to back; equal depths keep their order: a radix sort by bytes.
+
+    Depths are positive: their bits, as integers, sort as they do.
+    """
+    count, entries, starts = np.uint64(len(keys)), draws.copy(), np.zeros((4, 256), np.uint32)
+    order, other = np.arange(len(keys), dtype=np.uint32), np.empty(len(keys), np.uint32)
+    for i in range(count):
+        for digit in range(4):
+            starts[digit, keys[i] >> 8 * digit & 255] += 1
+    for digit in range(4):
+        if starts[digit, keys[0] >> 8 * digit & 255] == count:
+            continue  # a byte that all share
+        total = np.uint32(0)
+        for byte in range(256):
+            starts[digit, byte], total = total, total + starts[digit, byte]
+        for k in range(count):
+            i = order[k]
+            byte = keys[i] >> 8 * digit & 255
+            other[starts[digit, byte]] = i
+            starts[digit, byte] += 1
+        order, other = other, order
+    for k in range(count):
+        for column in range(3):
+            draws[k, column] = entries[order[k], column]
+
+
+@compiled(parallel=True)
+def _by_depth(ranges, keys, draws):
+    for strip in prange(len(ranges) - 1):
+        begin, end = ranges[strip], ranges[strip + 1]
+        if end - begin > 1:
+            _sort_strip(keys[begin:end], draws[begin:end])

@@ -114,12 +114,19 @@ def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
 
 
 @compiled()
-def place(xs, transmittance, across, down):
-    """Fill a row's pixel coordinates and full transmittance; pixels outside the image count as finished."""
+def place(strip, across, image, xs, transmittance):
+    """Return a strip's first column and row, and how many of each are in an image [3, H, W] of so many strips across.
+
+    Fills a row's pixel coordinates and full transmittance; pixels outside the image count as finished.
+    """
+    tall = len(transmittance) // WIDE
+    left, top = strip % across * WIDE, strip // across * tall
+    columns, rows = min(WIDE, image.shape[2] - left), min(tall, image.shape[1] - top)
     for x in range(WIDE):
         xs[x] = x - (WIDE - 1) / 2
     for pixel in range(len(transmittance)):
-        transmittance[pixel] = _ONE if pixel % WIDE < across and pixel // WIDE < down else -_ONE
+        transmittance[pixel] = _ONE if pixel % WIDE < columns and pixel // WIDE < rows else -_ONE
+    return left, top, columns, rows
 
 
 @compiled()
@@ -192,10 +199,7 @@ def _blend(state, begin, end, draws, entries):
 
 @compiled()
 def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image):
-    height, width = image.shape[1], image.shape[2]
-    left, top = strip % across * WIDE, strip // across * TALL
-    wide, tall = min(WIDE, width - left), min(TALL, height - top)
-    place(state[X:], state[T : T + PIXELS], wide, tall)
+    left, top, wide, tall = place(strip, across, image, state[X:], state[T : T + PIXELS])
     state[RED : RED + 3 * PIXELS] = 0
     end = ranges[strip]
     while end < ranges[strip + 1] and unfinished(state[T : T + PIXELS]):
@@ -267,10 +271,7 @@ def _blend_backward(state, begin, end, draws, entries, moments, sums):
 
 @compiled()
 def _render_backward_strip(strip, across, state, ranges, draws, entries, ends, image, g_image, moments, sums):
-    height, width = image.shape[1], image.shape[2]
-    left, top = strip % across * WIDE, strip // across * TALL
-    wide, tall = min(WIDE, width - left), min(TALL, height - top)
-    place(state[X:], state[T : T + PIXELS], wide, tall)
+    left, top, wide, tall = place(strip, across, image, state[X:], state[T : T + PIXELS])
     state[RED:X] = 0
     for channel in range(3):
         for y in range(tall):

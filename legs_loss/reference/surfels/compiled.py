@@ -47,7 +47,7 @@ class _Render(torch.autograd.Function):
         across, down = -(-width // projection.WIDE), -(-height // projection.TALL)
         firsts, reached = sorting.make_slots(found.boxes, found.slots, projection.TALL)
         projection.find_rows(found.extents, found.boxes, found.slots, firsts, across, reached)
-        ranges, draws, bands = sorting.sort_entries(found.depths, found.slots, firsts, reached, across, down)
+        ranges, draws, bands = sorting.sort_entries(found.depths, firsts, reached, across, down)
 
         image, others = torch.empty(3, height, width), torch.empty(CHANNELS, height, width)
         entries = np.empty((int(ranges[-1]), strips.FIELDS), np.float32)

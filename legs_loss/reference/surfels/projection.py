@@ -34,7 +34,7 @@ def _project_block(begin, end, discs, camera, found):
     means, scales, quaternions, homographies, opacities, sh, colours = discs
     degree, pose, pixels, position, width, height = camera
     splats, extents, depths, radii, clamped, boxes, slots = found
-    basis = np.empty(16, np.float32)
+    drawn, count = np.empty(BLOCK, np.int64), 0
     for i in range(np.uint64(begin), np.uint64(end)):
         radii[i] = slots[i] = 0
         depth = through(point(means, i), pose, 2) + pose[3, 2]
@@ -83,8 +83,8 @@ def _project_block(begin, end, discs, camera, found):
         if len(colours) > 0:
             for channel in range(3):
                 splats[i, COLOUR + channel] = colours[i, channel]
-        else:
-            shade(means, i, position, degree, sh, basis, clamped, splats[i, COLOUR:])
+        drawn[count] = i
+        count += 1
         for k in range(3):
             splats[i, P + k] = constant[k] * scale
             splats[i, P + 3 + k] = along[k] * scale
@@ -92,6 +92,8 @@ def _project_block(begin, end, discs, camera, found):
             splats[i, NORMAL + k] = turn * normal[k]
         splats[i, CENTRE], splats[i, CENTRE + 1], splats[i, OPACITY] = u, v, math.log2(opacity)
         depths[i] = np.float32(depth)
+    if len(colours) == 0:
+        shade(drawn, count, means, position, degree, sh, clamped, splats, COLOUR)
 
 
 @compiled(parallel=True)

@@ -72,7 +72,7 @@ def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, 
     degree, pose, pixels, position, width, height = camera
     g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours = gradients
     given = len(homographies) > 0
-    basis, g_basis = np.empty(16, np.float32), np.empty(16, np.float32)
+    drawn, count, colour, towards = np.empty(BLOCK, np.int64), 0, np.empty((3, BLOCK)), np.zeros((3, BLOCK))
     sums = np.empty(GRADIENTS, np.float64)
     for i in range(begin, end):
         if firsts[i, FIRST_SUM] == firsts[i + 1, FIRST_SUM]:
@@ -109,16 +109,15 @@ def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, 
         if len(colours) > 0:
             g_colours[i, 0], g_colours[i, 1], g_colours[i, 2] = sums[G_COLOUR], sums[G_COLOUR + 1], sums[G_COLOUR + 2]
         else:
-            red, green, blue = sums[G_COLOUR], sums[G_COLOUR + 1], sums[G_COLOUR + 2]
-            mx, my, mz = shade_gradient(
-                means, i, position, degree, sh, clamped, red, green, blue, basis, g_basis, g_sh
-            )  # fmt: skip
+            drawn[count] = i
+            for k in range(3):
+                colour[k, count] = sums[G_COLOUR + k]
+            count += 1
         if given:
             for k in range(3):
                 g_homographies[i, k], g_homographies[i, 3 + k], g_homographies[i, 6 + k] = gx[k], gy[k], gw[k]
         else:
-            centre = _to_world(gx, gy, gw, pixels, 2)
-            mx, my, mz = mx + centre[0], my + centre[1], mz + centre[2]
+            mx, my, mz = _to_world(gx, gy, gw, pixels, 2)
             axes, q, _ = turned(quaternions, i)
             long, short = np.float64(scales[i, 0]), np.float64(scales[i, 1])
             a0, a1, a2 = _to_world(gx, gy, gw, pixels, 0)
@@ -137,6 +136,10 @@ def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, 
             )  # fmt: skip
             g_quaternions[i, 0], g_quaternions[i, 1], g_quaternions[i, 2], g_quaternions[i, 3] = w0, w1, w2, w3
         g_means[i, 0], g_means[i, 1], g_means[i, 2] = mx, my, mz
+    shade_gradient(drawn, count, means, position, degree, sh, clamped, colour, towards, g_sh)
+    for j in range(count):
+        for k in range(3):
+            g_means[drawn[j], k] += towards[k, j]
 
 
 @compiled(parallel=True)

@@ -150,10 +150,7 @@ def _blend(state, start, begin, end, draws, entries):
 def _render_strip(strip, state, work, splats, background, pictures):
     _, across, ranges, draws, entries, ends = work
     image, others, kept = pictures
-    height, width = image.shape[1], image.shape[2]
-    left, top = strip % across * WIDE, strip // across * TALL
-    wide, tall = min(WIDE, width - left), min(TALL, height - top)
-    place(state[X:], state[T : T + PIXELS], wide, tall)
+    left, top, wide, tall = place(strip, across, image, state[X:], state[T : T + PIXELS])
     state[RED:] = 0
     end = ranges[strip]
     while end < ranges[strip + 1] and unfinished(state[T : T + PIXELS]):
@@ -268,10 +265,7 @@ def _blend_backward(state, begin, end, draws, entries, g_others, sums):
 def _render_backward_strip(strip, state, work, background, pictures, g_image, g_others, sums):
     _, across, ranges, draws, entries, ends = work
     image, others, kept = pictures
-    height, width = image.shape[1], image.shape[2]
-    left, top = strip % across * WIDE, strip // across * TALL
-    wide, tall = min(WIDE, width - left), min(TALL, height - top)
-    place(state[X:], state[T : T + PIXELS], wide, tall)
+    left, top, wide, tall = place(strip, across, image, state[X:], state[T : T + PIXELS])
     state[G_RED:] = 0
     for y in range(tall):
         for x in range(wide):

@@ -54,6 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ),
     ):
         advanced.add_argument(f"--{name}", type=kind, metavar="N" if kind is int else "X", help=what)
+    sparse = "update only the Gaussians that a view shows: other results, faster where those are few"
+    advanced.add_argument("--sparse_adam", action="store_true", help=sparse)
     places = parser.add_argument_group("advanced: files and threads")
     places.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")
     places.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")

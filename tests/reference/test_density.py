@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from legs_loss.reference.gaussians import Gaussians
-from legs_loss.reference.training.adam import COLOUR_RATE, FIELDS, RATES, Adam, position_rate
+from legs_loss.reference.training.adam import COLOUR_RATE, FIELDS, RATES, Adam, position_rate, select
 from legs_loss.reference.training.densify import Schedule, densify, prunable
 
 pytest.importorskip("numba")
@@ -54,6 +54,25 @@ def test_adam_is_torchs_adam_with_3dgs_rates() -> None:
     for name, value in result.items():
         torch.testing.assert_close(value, theirs[name], rtol=1e-5, atol=1e-6, msg=name)
     assert torch.equal(ours.gaussians.means[0], start.means[0])  # never had a gradient: never moved
+
+
+def test_a_sparse_step_is_the_whole_step_where_it_is_taken_and_nothing_elsewhere() -> None:
+    start = gaussians_of([[0.1, 0.2, 0.3]] * 21)
+    sparse, whole = (Adam(select(start, torch.arange(21))) for _ in range(2))
+    seen = torch.tensor([0, 3, 4, 5, 13, 20])
+    others = torch.tensor([i for i in range(21) if i not in seen])
+    for _ in range(3):
+        for name in FIELDS:
+            gradient = torch.randn_like(getattr(whole.gaussians, name))
+            for adam in (sparse, whole):
+                getattr(adam.gaussians, name).grad = gradient.clone()
+        sparse.step(0.1, seen)
+        whole.step(0.1)
+    for name in FIELDS:
+        for ours, theirs in ((sparse.gaussians, whole.gaussians), (sparse.moment2, whole.moment2)):
+            assert torch.equal(getattr(ours, name)[seen], getattr(theirs, name)[seen]), name
+        assert torch.equal(getattr(sparse.gaussians, name)[others], getattr(start, name)[others]), name
+        assert not getattr(sparse.moment1, name)[others].any(), name
 
 
 def test_moments_follow_their_gaussians() -> None:

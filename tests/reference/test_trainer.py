@@ -243,9 +243,9 @@ def test_the_rate_of_positions_falls_over_as_many_iterations_as_3dgs_would_take(
     rates: List[float] = []
     step = Adam.step
 
-    def spy(adam: Adam, rate: float) -> None:
+    def spy(adam: Adam, rate: float, seen: Optional[torch.Tensor] = None) -> None:
         rates.append(rate)
-        step(adam, rate)
+        step(adam, rate, seen)
 
     monkeypatch.setattr(Adam, "step", spy)
     train(scene, TrainConfig(iterations=6, position_lr_max_steps=steps))
@@ -271,6 +271,14 @@ def test_l1_scale_is_a_weight_of_that_value_everywhere(scene: Scene) -> None:
     assert_equal(scaled.gaussians, weighted.gaussians)
     assert scaled.metrics["mean_weight"] == 2.5
     assert not torch.equal(scaled.gaussians.means, train(scene, config).gaussians.means)
+
+
+def test_sparse_adam_leaves_what_no_view_shows(scene: Scene) -> None:
+    sparse = train(scene, replace(SHORT, iterations=20, sparse_adam=True))
+    dense = train(scene, replace(SHORT, iterations=20))
+    assert not torch.equal(sparse.gaussians.means, dense.gaussians.means)  # what left a view coasts on in one of them
+    assert sparse.metrics["train"]["psnr"] == pytest.approx(dense.metrics["train"]["psnr"], abs=1.0)
+    assert "sparse_adam" not in SHORT.as_dict() and replace(SHORT, sparse_adam=True).as_dict()["sparse_adam"] is True
 
 
 def test_a_cap_holds_and_a_threshold_counts(scene: Scene) -> None:

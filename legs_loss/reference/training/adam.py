@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, Dict
+from typing import Any, Dict, Optional
 
 import numpy as np
 import torch
@@ -57,24 +57,24 @@ class Adam:
             *(getattr(gaussians, name).detach().contiguous().requires_grad_(True) for name in FIELDS)
         )
 
-    def step(self, position_rate: float) -> None:
-        """Update every parameter from its gradient, and drop the gradients."""
+    def step(self, position_rate: float, seen: Optional[Tensor] = None) -> None:
+        """Update every parameter from its gradient, or those of the Gaussians ``seen`` [M] alone; drop the gradients.
+
+        What is not seen keeps its moments, too: the sparse Adam of Taming 3DGS and gsplat, but that the moments' biases
+        are corrected here, by the number of all steps.
+        """
         from legs_loss.reference.training.adam_kernel import BETA1, BETA2, update
 
         self.steps += 1
-        correction1, correction2 = 1 - BETA1**self.steps, 1 - BETA2**self.steps
+        correction1, correction2 = 1 - BETA1**self.steps, np.float32(1 / math.sqrt(1 - BETA2**self.steps))
         for name in FIELDS:
             parameter = getattr(self.gaussians, name)
-            rates = _rates(name, parameter[0].numel() if len(parameter) else 1)
-            scale = position_rate if name == "means" else 1.0
-            update(
-                _flat(parameter.detach()),
-                _flat(parameter.grad),
-                _flat(getattr(self.moment1, name)),
-                _flat(getattr(self.moment2, name)),
-                rates * np.float32(scale / correction1),
-                np.float32(1 / math.sqrt(correction2)),
-            )
+            columns = parameter[0].numel() if len(parameter) else 1
+            rates, scale = _rates(name, columns), position_rate if name == "means" else 1.0
+            arrays = parameter.detach(), parameter.grad, getattr(self.moment1, name), getattr(self.moment2, name)
+            starts = np.arange(0, parameter.numel(), rates.size) if seen is None else columns * seen.numpy()
+            length = rates.size if seen is None else columns
+            update(*map(_flat, arrays), starts, length, rates * np.float32(scale / correction1), correction2)
             parameter.grad = None
 
     def keep(self, kept: Tensor) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import prange
 
 from legs_loss.kernels.compiling import compiled, inlined
 from legs_loss.kernels.simd.arithmetic import splat, square_root
@@ -27,21 +28,26 @@ def _eight(parameter, gradient, moment1, moment2, i, rates, j, correction):  # t
     store(parameter, i, load(parameter, i) - change)
 
 
-@compiled(fastmath=False)
-def update(parameter, gradient, moment1, moment2, rates, correction):  # type: ignore[no-untyped-def]
-    """Update flat float32 arrays in place; ``rates`` is one block of learning rates, which repeats, of whole vectors.
+@inlined
+def _one(parameter, gradient, moment1, moment2, i, rate, correction):  # type: ignore[no-untyped-def]
+    """Update one number as `_eight` does."""
+    g = gradient[i]
+    moment1[i] += _NEW1 * (g - moment1[i])
+    moment2[i] += _NEW2 * (g * g - moment2[i])
+    parameter[i] -= rate * moment1[i] / (np.sqrt(moment2[i]) * correction + _EPS)
+
+
+@compiled(fastmath=False, parallel=True)
+def update(parameter, gradient, moment1, moment2, starts, length, rates, correction):  # type: ignore[no-untyped-def]
+    """Update parts of flat float32 arrays in place: from each of ``starts`` on, so many numbers, ``rates`` theirs.
 
     The rates are already divided by the first moment's bias; ``correction`` is 1 / sqrt(the second one's).
     """
-    whole = parameter.size - parameter.size % LANES
-    for start in range(0, whole, rates.size):
-        for j in range(0, min(rates.size, whole - start), LANES):
-            _eight(parameter, gradient, moment1, moment2, start + j, rates, j, correction)
-    if whole < parameter.size:  # what is left, as part of a vector
-        last = np.zeros((4, LANES), np.float32)
-        for k in range(parameter.size - whole):
-            last[0, k], last[1, k] = parameter[whole + k], gradient[whole + k]
-            last[2, k], last[3, k] = moment1[whole + k], moment2[whole + k]
-        _eight(last[0], last[1], last[2], last[3], 0, rates, whole % rates.size, correction)
-        for k in range(parameter.size - whole):
-            parameter[whole + k], moment1[whole + k], moment2[whole + k] = last[0, k], last[2, k], last[3, k]
+    for part in prange(starts.size):
+        start = starts[part]
+        end = min(start + length, parameter.size)
+        whole = end - (end - start) % LANES
+        for i in range(start, whole, LANES):
+            _eight(parameter, gradient, moment1, moment2, i, rates, i - start, correction)
+        for i in range(whole, end):
+            _one(parameter, gradient, moment1, moment2, i, rates[i - start], correction)

@@ -17,6 +17,7 @@ __all__ = ["TrainConfig", "default_threshold"]
 
 # What a spec had not when the first comparisons were written: absent where it is the default, so that they go on.
 ADDED_SETTINGS = ("over", "noise_floor", "smooth")
+SWITCHES = ("shuffled", "sparse_adam")  # for the same reason absent where they are off
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class TrainConfig:
         max_gaussians: a cap on their number, None for none.
         white_background: white in place of black.
         shuffled: each weight map's pixels in random order, the same weights displaced: for experiments.
+        sparse_adam: a step changes only the Gaussians that its view shows: less work where a view shows few of them,
+            other results.
         seed: of the order of the views and of the places of split Gaussians.
     """
 
@@ -51,6 +54,7 @@ class TrainConfig:
     max_gaussians: Optional[int] = None
     white_background: bool = False
     shuffled: bool = False
+    sparse_adam: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -70,7 +74,7 @@ class TrainConfig:
                 self.densify_grad_threshold is None or self.densify_grad_threshold > 0.0,
                 "above 0",
             ),
-            ("shuffled", type(self.shuffled) is bool, "True or False"),
+            *((name, type(getattr(self, name)) is bool, "True or False") for name in SWITCHES),
             ("max_gaussians", self.max_gaussians is None or self.max_gaussians >= 1, "at least 1"),
             ("seed", -(1 << 63) <= self.seed < 1 << 63, "an integer of 64 bits"),
         ):
@@ -84,8 +88,9 @@ class TrainConfig:
         for name in ADDED_SETTINGS:
             if values["spec"][name] == getattr(PRESETS["legs"], name):
                 del values["spec"][name]
-        if not self.shuffled:
-            del values["shuffled"]
+        for name in SWITCHES:
+            if not values[name]:
+                del values[name]
         return values
 
     @classmethod

@@ -275,7 +275,8 @@ class _Run:
         if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
             self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image, view.counts))
         steps = self.config.position_lr_max_steps or self.config.iterations
-        self.adam.step(position_rate(min(1.0, self.iteration / steps), self.extent))
+        seen = torch.nonzero(drawn.radii)[:, 0] if self.config.sparse_adam else None
+        self.adam.step(position_rate(min(1.0, self.iteration / steps), self.extent), seen)
         if self.evaluate_every is not None and self.iteration % self.evaluate_every == 0:
             self._evaluate()  # as in 3DGS before Gaussians are added, which blurs the picture for some iterations
         if self.iteration < self.schedule.densify_until:

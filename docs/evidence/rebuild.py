@@ -25,8 +25,7 @@ FRESH = ("fresh_fern", "fresh_monstree", "fresh_kitchen")
 CANDIDATE = "percentile=99,normalise=mean,scale=0.6,error=1,curve=C1@3dgs"
 CODEBASES = {name: tuple(f"{scene}_{name}_200" for scene in ("fox", "fern", "kitchen")) for name in ("3dgs", "fastgs")}
 CODEBASES["mcmc"] = tuple(f"{scene}_mcmc_200" for scene in ("fox", "fern", "kitchen"))
-SCHEDULE = "fern_800_schedule"
-SCHEDULE_GPU = "schedule_gpu"
+SCHEDULES = {"CPU": "schedule_cpu", "H200": "schedule_gpu"}
 SCHEDULE_SHOWN = (
     ("fern/CPU", 3000),
     ("fern/CPU", 7000),
@@ -109,10 +108,11 @@ def differences(table: Table) -> str:
 
 def schedule() -> str:
     """Return the scores by 3DGS's own schedule at its milestones, by the package's trainer and on a GPU."""
-    found = {("fern/CPU", row["arm"], row["iteration"]): row["metrics"] for row in rows_of(SCHEDULE)}
-    found.update(
-        ((f"{row['scene']}/H200", row["arm"], row["iteration"]), row["metrics"]) for row in rows_of(SCHEDULE_GPU)
-    )
+    found = {
+        (f"{row['scene']}/{machine}", row["arm"], row["iteration"]): row["metrics"]
+        for machine, name in SCHEDULES.items()
+        for row in rows_of(name)
+    }
     lines = []
     for scene, iteration in SCHEDULE_SHOWN:
         for arm in SCHEDULE_ARMS:
@@ -141,7 +141,7 @@ def captures() -> str:
     ]
     for path in sorted(HERE.glob("*.json")):
         found = json.loads(path.read_text(encoding="utf-8"))
-        if "settings" not in found or path.stem == SCHEDULE:
+        if "settings" not in found:
             continue
         base, scene, by = found["settings"]["base"], found["settings"]["scene"], found["settings"].get("upstream")
         trainer = f"by the script of {by['profile']}" if by else "by the package's trainer"
@@ -212,17 +212,19 @@ def plots() -> None:
     figure.axes[-1].legend(fontsize=8, loc="center right")
     _save(figure, "evidence_codebases.png")
 
-    rows = rows_of(SCHEDULE)
-    figure = Figure(figsize=(11, 3.4), constrained_layout=True)
+    rows = rows_of(SCHEDULES["CPU"])
+    figure = Figure(figsize=(11, 6.4), constrained_layout=True)
     scores = {"train PSNR": ("train", "psnr"), "held-out PSNR": ("test", "psnr"), "held-out SSIM": ("test", "ssim")}
-    for panel, (label, (split, key)) in zip(figure.subplots(1, 3), scores.items()):
-        for arm, colour in zip(SCHEDULE_ARMS, COLOURS):
-            points = [(row["iteration"], row["metrics"][split][key]) for row in rows if row["arm"] == arm]
-            if points:
-                panel.plot(*zip(*sorted(points)), marker="o", markersize=4, color=colour, label=arm)
-        panel.set(xlabel="iteration of 30,000", title=label)
-        panel.grid(alpha=0.3)
-    figure.axes[-1].legend(fontsize=8, loc="lower right")
+    for scene, panels in zip(("fern", "fox"), figure.subplots(2, 3)):
+        for panel, (label, (split, key)) in zip(panels, scores.items()):
+            for arm, colour in zip(SCHEDULE_ARMS, COLOURS):
+                mine = [row for row in rows if (row["scene"], row["arm"]) == (scene, arm)]
+                points = [(row["iteration"], row["metrics"][split][key]) for row in mine]
+                if points:
+                    panel.plot(*zip(*sorted(points)), marker="o", markersize=4, color=colour, label=arm)
+            panel.set(title=f"{scene}: {label}", xlabel="iteration of 30,000")
+            panel.grid(alpha=0.3)
+        panels[-1].legend(fontsize=8, loc="lower right")
     _save(figure, "evidence_schedule.png")
 
 

@@ -33,6 +33,7 @@ def main() -> None:
     parser.add_argument("--until", type=int, default=7000, metavar="N")
     parser.add_argument("-r", "--resolution", type=int, default=800)
     parser.add_argument("--iterations", type=int, default=30000, help="of the schedule")
+    parser.add_argument("--seed", type=int, default=0, help="each seed needs an OUT of its own")
     args = parser.parse_args()
     torch.set_num_threads(1)  # one thread an arm: several scripts, each with arms of its own, use more cores
     numba.set_num_threads(1)
@@ -48,7 +49,11 @@ def main() -> None:
 def reach(arm: ArmSpec, milestone: int, args: argparse.Namespace) -> dict:
     """Train an arm on to a milestone, and return its scores there."""
     base = TrainConfig(
-        iterations=args.iterations, resolution=args.resolution, sh_degree=3, position_lr_max_steps=args.iterations
+        iterations=args.iterations,
+        resolution=args.resolution,
+        sh_degree=3,
+        position_lr_max_steps=args.iterations,
+        seed=args.seed,
     )
     caps = None
     if arm.at is not None:

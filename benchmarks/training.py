@@ -1,12 +1,14 @@
 """The parts of an iteration of the trainer, each with its time and its bytes, of one checkout or of two side by side.
 
     PYTHONPATH=. python benchmarks/training.py SCENE RUN                  # RUN: a training's folder, with a checkpoint
-    PYTHONPATH=. python benchmarks/training.py SCENE RUN --against DIR    # and of another checkout, in turns
+    PYTHONPATH=. python benchmarks/training.py SCENE RUN --against DIR    # and before it another checkout's, in turns
+    PYTHONPATH=. python benchmarks/training.py SCENE RUN --sparse_adam    # and before it the same without, in turns
 
-Each round runs some iterations from the checkpoint, without density control, in a process of each checkout; medians
-over all of them, of the processor's time. The bytes of a part are what it has to read and write once; what is written
-counts twice, since a processor reads it first. Beside them stands the time that a copy takes for as many. A part near
-that is bound by memory, one far above it by operations, or by waiting for memory that is read in no order.
+Each round runs some iterations from the checkpoint, without density control, in a process of each; medians over all of
+them, of the processor's time, or by the clock where there are several threads. The bytes of a part are what it has to
+read and write once; what is written counts twice, since a processor reads it first. Beside them stands the time that a
+copy takes for as many. A part near that is bound by memory, one far above it by operations, or by waiting for memory
+that is read in no order.
 """
 
 from __future__ import annotations
@@ -43,26 +45,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
     parser.add_argument("run", type=Path)
-    parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout: the baseline")
+    baselines = parser.add_mutually_exclusive_group()
+    baselines.add_argument("--against", type=Path, metavar="DIR", help="another checkout: the baseline")
+    baselines.add_argument("--sparse_adam", action="store_true", help="the dense one is the baseline")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--iterations", type=int, default=8, help="of a round")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--sparse_adam", action="store_true")
-    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--child", choices=("dense", "sparse"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child:
         print(json.dumps(measure(args)))
         return
     here = Path(__file__).resolve().parents[1]
-    trees = [here] if args.against is None else [args.against.resolve(), here]
-    found = {tree: [] for tree in trees}
+    contestants = [(here, "sparse" if args.sparse_adam else "dense")]
+    if args.against is not None or args.sparse_adam:
+        contestants.insert(0, (args.against.resolve() if args.against else here, "dense"))
+    found = [[] for _ in contestants]
     for _ in range(args.rounds):
-        for tree in trees:
+        for (tree, adam), results in zip(contestants, found):
+            command = [sys.executable, __file__, *sys.argv[1:], "--child", adam]
             environment = dict(os.environ, PYTHONPATH=str(tree))
-            command = [sys.executable, __file__, *sys.argv[1:], "--child"]
             done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-            found[tree].append(json.loads(done.stdout.splitlines()[-1]))
-    show(args, [found[tree] for tree in trees])
+            results.append(json.loads(done.stdout.splitlines()[-1]))
+    show(args, found)
 
 
 def measure(args):
@@ -83,7 +88,7 @@ def measure(args):
     from legs_loss.scenes import read_scene
 
     facts = read_state(args.run / "checkpoint.npz")[1]
-    settings = dict(facts["config"], sparse_adam=True) if args.sparse_adam else facts["config"]
+    settings = dict(facts["config"], sparse_adam=True) if args.child == "sparse" else facts["config"]
     config = TrainConfig.from_dict(settings)
     data = load_dataset(read_scene(args.scene), config.weights, config.resolution, config.white_background)
     restored = TrainConfig.from_dict(facts["config"])
@@ -148,7 +153,9 @@ def show(args, found):
     last, facts = columns[-1], found[-1][-1]
     speed = statistics.median(one["copy"] for one in found[-1])
     n, entries = facts["gaussians"], facts["entries"]
-    megabytes = {  # of arrays that are gone through once; see the module's docstring
+    # Of a Gaussian 44 bytes beside its coefficients' 192, of a splat 72 and 35 of its footprint, of an entry 12, and 36
+    # in the strip's coordinates.
+    megabytes = {
         "forward: checks": n * 236 / 1e6,
         "forward: projection": n * (44 + 192 + 2 * 107) / 1e6,
         "forward: rows and sorting": (n * 200 + entries * 50) / 1e6,

@@ -27,8 +27,9 @@ CODEBASES = {name: tuple(f"{scene}_{name}_200" for scene in ("fox", "fern", "kit
 CODEBASES["mcmc"] = tuple(f"{scene}_mcmc_200" for scene in ("fox", "fern", "kitchen"))
 SCHEDULES = {"CPU": "schedule_cpu", "H200": "schedule_gpu"}
 SCHEDULE_SHOWN = (
-    ("fern/CPU", 3000),
     ("fern/CPU", 7000),
+    ("fox/CPU", 7000),
+    ("fox/CPU", 10000),
     ("fern/H200", 7000),
     ("fern/H200", 10000),
     ("kitchen/H200", 7000),

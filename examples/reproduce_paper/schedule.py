@@ -26,15 +26,7 @@ MILESTONES = (*range(500, 4000, 500), *range(4000, 8000, 1000), 10000, 15000, 20
 
 def main() -> None:
     """Train what is missing."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--arms", nargs="+", default=["3dgs", "legs", "3dgs@legs"])
-    parser.add_argument("--until", type=int, default=7000, metavar="N")
-    parser.add_argument("-r", "--resolution", type=int, default=800)
-    parser.add_argument("--iterations", type=int, default=30000, help="of the schedule")
-    parser.add_argument("--seed", type=int, default=0, help="each seed needs an OUT of its own")
-    args = parser.parse_args()
+    args = arguments(str(__doc__))
     torch.set_num_threads(1)  # one thread an arm: several scripts, each with arms of its own, use more cores
     numba.set_num_threads(1)
     for milestone in (at for at in MILESTONES if at <= args.until):
@@ -46,8 +38,21 @@ def main() -> None:
                 print(milestone, arm.name, metrics["train"], metrics["test"], metrics["gaussians"], flush=True)
 
 
-def reach(arm: ArmSpec, milestone: int, args: argparse.Namespace) -> dict:
-    """Train an arm on to a milestone, and return its scores there."""
+def arguments(description: str) -> argparse.Namespace:
+    """Return the command's arguments."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--arms", nargs="+", default=["3dgs", "legs", "3dgs@legs"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--until", type=int, default=7000, metavar="N")
+    parser.add_argument("-r", "--resolution", type=int, default=800)
+    parser.add_argument("--iterations", type=int, default=30000, help="of the schedule")
+    return parser.parse_args()
+
+
+def settings(arm: ArmSpec, args: argparse.Namespace) -> TrainConfig:
+    """Return the settings of an arm by 3DGS's schedule."""
     base = TrainConfig(
         iterations=args.iterations,
         resolution=args.resolution,
@@ -55,15 +60,19 @@ def reach(arm: ArmSpec, milestone: int, args: argparse.Namespace) -> dict:
         position_lr_max_steps=args.iterations,
         seed=args.seed,
     )
+    return arm.config(base, THRESHOLD, mean_weight=1.0)
+
+
+def reach(arm: ArmSpec, milestone: int, args: argparse.Namespace) -> dict:
+    """Train an arm on to a milestone, and return its scores there."""
     caps = None
     if arm.at is not None:
         leader = args.out / parse_arm(arm.at).folder / f"metrics-{milestone}.json"
         caps = dict(json.loads(leader.read_text(encoding="utf-8"))["growth"])
-    config = arm.config(base, THRESHOLD, mean_weight=1.0)
     stop = milestone if milestone == args.iterations else milestone - 1
     folder = args.out / arm.folder
     folder.mkdir(parents=True, exist_ok=True)
-    return train(read_scene(args.scene), config, folder, resume=None, stop=stop, caps=caps).metrics
+    return train(read_scene(args.scene), settings(arm, args), folder, resume=None, stop=stop, caps=caps).metrics
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ run beside Y, whose numbers of Gaussians it reads as they come. OUT/seed-N/ARM/m
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -20,7 +19,7 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 from torch import Tensor
 
-from examples.reproduce_paper.schedule import MILESTONES, THRESHOLD
+from examples.reproduce_paper.schedule import MILESTONES, arguments, settings
 from legs_loss import legs_loss, ssim
 from legs_loss.experiments.arms import ArmSpec, parse_arm, parse_arms
 from legs_loss.reference.gaussians import Gaussians
@@ -38,28 +37,13 @@ PATIENCE = 600.0  # seconds to wait for another arm's numbers
 
 def main() -> None:
     """Train what is missing."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--arms", nargs="+", default=["3dgs", "legs", "3dgs@legs"])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--until", type=int, default=7000, metavar="N")
-    parser.add_argument("-r", "--resolution", type=int, default=800)
-    parser.add_argument("--iterations", type=int, default=30000, help="of the schedule")
-    args = parser.parse_args()
+    args = arguments(str(__doc__))
     torch.set_default_device("cuda")
     for arm in parse_arms(args.arms):
-        base = TrainConfig(
-            iterations=args.iterations,
-            resolution=args.resolution,
-            sh_degree=3,
-            position_lr_max_steps=args.iterations,
-            seed=args.seed,
-        )
         folder = args.out / f"seed-{args.seed}"
         milestones = [at for at in MILESTONES if at <= args.until]
         if not (folder / arm.folder / f"metrics-{milestones[-1]}.json").is_file():
-            Run(read_scene(args.scene), arm, arm.config(base, THRESHOLD, mean_weight=1.0), folder).go(milestones)
+            Run(read_scene(args.scene), arm, settings(arm, args), folder).go(milestones)
 
 
 class Shown(NamedTuple):

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ),
     ):
         advanced.add_argument(f"--{name}", type=kind, metavar="N" if kind is int else "X", help=what)
-    sparse = "update only the Gaussians that a view shows: other results, faster where those are few"
+    sparse = "a step updates only the Gaussians that its view shows, which changes the results"
     advanced.add_argument("--sparse_adam", action="store_true", help=sparse)
     places = parser.add_argument_group("advanced: files and threads")
     places.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")

@@ -273,7 +273,7 @@ def test_l1_scale_is_a_weight_of_that_value_everywhere(scene: Scene) -> None:
     assert not torch.equal(scaled.gaussians.means, train(scene, config).gaussians.means)
 
 
-def test_sparse_adam_leaves_what_no_view_shows(scene: Scene) -> None:
+def test_sparse_adam_is_an_option_that_changes_the_result(scene: Scene) -> None:
     sparse = train(scene, replace(SHORT, iterations=20, sparse_adam=True))
     dense = train(scene, replace(SHORT, iterations=20))
     assert not torch.equal(sparse.gaussians.means, dense.gaussians.means)  # what left a view coasts on in one of them

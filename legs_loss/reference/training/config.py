@@ -38,8 +38,7 @@ class TrainConfig:
         max_gaussians: a cap on their number, None for none.
         white_background: white in place of black.
         shuffled: each weight map's pixels in random order, the same weights displaced: for experiments.
-        sparse_adam: a step changes only the Gaussians that its view shows: less work where a view shows few of them,
-            other results.
+        sparse_adam: a step updates only the Gaussians that its view shows, which changes the results.
         seed: of the order of the views and of the places of split Gaussians.
     """
 

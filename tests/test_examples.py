@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -32,17 +33,31 @@ def test_the_training_loop_learns():
 @pytest.mark.slow
 def test_arms_are_trained_milestone_by_milestone(tiny_scene, tmp_path):
     pytest.importorskip("numba")
-    script = ROOT / "examples" / "reproduce_paper" / "schedule.py"
-    words = [str(tiny_scene), str(tmp_path), "--until", "1000", "-r", "24", "--arms", "3dgs@legs"]
-    for _ in range(2):  # the second time everything is there
-        result = subprocess.run(
-            [sys.executable, str(script), *words],
-            env=dict(os.environ, PYTHONPATH=str(ROOT)),
-            capture_output=True,
-            text=True,
-        )
-        assert result.returncode == 0, result.stderr
-    found = {name: json.loads((tmp_path / name / "metrics-1000.json").read_text()) for name in ("legs", "3dgs-at-legs")}
-    assert [one["iterations"] for one in found.values()] == [999, 999]
-    assert found["3dgs-at-legs"]["gaussians"] == pytest.approx(found["legs"]["gaussians"], rel=0.02)
-    assert result.stdout == ""
+    pytest.importorskip("libcst")
+    examples = ROOT / "examples" / "reproduce_paper"
+    words = [tiny_scene, tmp_path / "cpu", "--until", "1000", "-r", "24", "--arms", "3dgs@legs"]
+    python(examples / "schedule.py", *words)
+    assert python(examples / "schedule.py", *words) == ""  # the second time everything is there
+    # The script for a GPU has the same scores by the shims. It is run away from this repository, which `legs run` would
+    # take for the codebase to rewrite; it trains no arm that is not named.
+    (tmp_path / "script").mkdir()
+    script = shutil.copy(examples / "schedule_gpu.py", tmp_path / "script")
+    words[1:] = [tmp_path / "gpu", *words[2:-1], "legs", "3dgs@legs"]
+    python("-m", "legs_loss", "run", "--cpu", script, *words)
+    for arm in ("legs", "3dgs-at-legs"):
+        folders = tmp_path / "cpu" / arm, tmp_path / "gpu" / "seed-0" / arm
+        cpu, gpu = (json.loads((folder / "metrics-1000.json").read_text()) for folder in folders)
+        assert cpu["iterations"] == gpu["iterations"] == 999
+        assert gpu["gaussians"] == pytest.approx(cpu["gaussians"], rel=0.03)
+        for split in ("train", "test"):
+            assert gpu[split]["psnr"] == pytest.approx(cpu[split]["psnr"], abs=0.5)
+            assert gpu[split]["ssim"] == pytest.approx(cpu[split]["ssim"], abs=0.02)
+
+
+def python(*words):
+    """Run python, and return what it printed."""
+    environment = dict(os.environ, PYTHONPATH=os.pathsep.join([str(ROOT), str(ROOT / "adapters")]))
+    command = [sys.executable, *map(str, words)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout

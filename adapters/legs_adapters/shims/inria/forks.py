@@ -15,7 +15,7 @@ from typing import Any, Callable, Dict, Optional, Tuple
 import torch
 from torch import Tensor
 
-from legs_adapters.shims.inria.rasterizer import Gaussians, Rasterizer
+from legs_adapters.shims.inria.rasterizer import Rasterizer
 from legs_adapters.shims.inria.relocation import compute_relocation
 from legs_adapters.shims.inria.settings import SETTINGS, settings_type
 from legs_adapters.shims.inria.sparse_adam import SparseGaussianAdam
@@ -64,7 +64,7 @@ def module(name: str, interface: Interface) -> types.ModuleType:
         """Draw Gaussians from the view of its settings, and return the results that the caller unpacks."""
 
         module = name
-        inputs = (*Gaussians._fields, "dc", "means2D_densify", "scores")
+        inputs = (*Rasterizer.inputs, "means2D_densify", "scores")
 
         def lens(self) -> Lens:
             return _lens(self.raster_settings, name)

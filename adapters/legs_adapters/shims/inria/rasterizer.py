@@ -75,6 +75,8 @@ class RasterizerBase(nn.Module):
 class Rasterizer(RasterizerBase):
     """Draw Gaussians from the view of its settings. A fork's differs in ``inputs``, `lens`, `clip` and `results`."""
 
+    inputs: Tuple[str, ...] = (*Gaussians._fields, "dc")
+
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Draw, and return `results`."""
         given = self.bind(args, kwargs)

@@ -54,7 +54,7 @@ def curve(name: str) -> Curve:
     Raises:
         LegsError: no curve has that name.
 
-    Example:
+    Examples:
         >>> import torch
         >>> curve("C3")(torch.tensor([0.0, 0.25, 1.0]))
         tensor([0.0000, 0.5000, 1.0000])
@@ -83,7 +83,7 @@ def register_curve(name: str, function: Curve) -> None:
     Raises:
         LegsError: the name is taken, or the function leaves [0, 1] or changes the shape.
 
-    Example:
+    Examples:
         >>> import torch
         >>> register_curve("cube-root", lambda x: x ** (1 / 3))
         >>> curve("cube-root")(torch.tensor([0.125]))

@@ -18,7 +18,7 @@ class LegsError(ValueError):
 def did_you_mean(name: object, names: Iterable[str]) -> str:
     """Return the end of an error message that proposes the known name nearest to a mistyped one, "" if none is near.
 
-    Example:
+    Examples:
         >>> did_you_mean("legz", ["3dgs", "eggs", "legs"]), did_you_mean("best", ["3dgs", "eggs", "legs"])
         ("; did you mean 'legs'?", '')
     """

@@ -98,7 +98,7 @@ def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str =
         LegsError: it is no float tensor, has too few axes or an empty one; its channel may be either axis or
             neither, and ``channels_last`` is None; its shape contradicts ``channels_last``; it is a list of pixels.
 
-    Example:
+    Examples:
         >>> read_layout(torch.zeros(1, 6, 8, 3)).channels_last
         True
     """

@@ -37,7 +37,7 @@ def response_levels(strength: Tensor, spec: WeightSpec) -> Tensor:
     Returns:
         [2] or [B, 2], on the same device; nothing waits for it.
 
-    Example:
+    Examples:
         >>> response_levels(torch.tensor([[[0.0, 1.0, 2.0, 7.0, 9.0]]]), WeightSpec(percentile=80))
         tensor([2., 7.])
     """
@@ -73,7 +73,7 @@ def over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor] = Non
     Returns:
         The same shape. A NaN in an image makes all of its map NaN.
 
-    Example:
+    Examples:
         >>> spec = WeightSpec(over="scene", percentile=80, noise_floor=1.0)
         >>> over_scene(torch.tensor([[[0.0, 1.0, 2.0, 7.0, 9.0]]]), spec, torch.tensor([3.0, 10.0]))
         tensor([[[0.0000, 0.0000, 0.0000, 0.4000, 0.6000]]])
@@ -90,7 +90,7 @@ def over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor] = Non
 class RunningLevels:
     """The levels of a scene, over the views seen so far.
 
-    Example:
+    Examples:
         >>> seen = RunningLevels()
         >>> seen.scene() is None
         True

@@ -48,7 +48,7 @@ def weighted_l1(
 
     Source: the LEGS paper, its weighted L1; the mean over channels (the paper writes a sum) is 3DGS's.
 
-    Example:
+    Examples:
         >>> prediction, target = torch.zeros(1, 1, 2), torch.ones(1, 1, 2)
         >>> weighted_l1(prediction, target, weight=torch.tensor([[1.0, 3.0]]))
         tensor(2.)
@@ -105,7 +105,7 @@ def ssim(
         LegsError: the shapes differ or may be read either way, the padding is unknown, the window is even, or the image
             is too small for it.
 
-    Example:
+    Examples:
         >>> image = torch.rand(3, 16, 16)
         >>> round(float(ssim(image, image)), 5)
         1.0
@@ -159,7 +159,7 @@ def legs_loss(
 
     Source: the LEGS paper, its total loss; 3D Gaussian Splatting (Kerbl et al. 2023), equation 7.
 
-    Example:
+    Examples:
         >>> target = torch.rand(3, 16, 16)
         >>> prediction = torch.rand(3, 16, 16, requires_grad=True)
         >>> legs_loss(prediction, target).backward()

@@ -45,7 +45,7 @@ def response(
     Raises:
         LegsError: not an image, one whose channel may be first or last, or an unknown operator or norm.
 
-    Example:
+    Examples:
         >>> dot = torch.zeros(2, 5)
         >>> dot[0, 2] = 1.0
         >>> response(dot)
@@ -75,7 +75,7 @@ def normalise_response(response: Tensor, eps: float = 1e-8) -> Tensor:
     Returns:
         The same shape, in [0, 1]. A NaN in an image makes all of its map NaN: it is never hidden.
 
-    Example:
+    Examples:
         >>> normalise_response(torch.tensor([[[1.0, 2.0, 5.0]]]))
         tensor([[[0.0000, 0.2500, 1.0000]]])
     """
@@ -92,7 +92,7 @@ def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
         image: [C, H, W] or [B, C, H, W].
         sigma: 0 leaves it as it is.
 
-    Example:
+    Examples:
         >>> (100 * gaussian_blur(torch.tensor([[[0.0, 0.0, 1.0, 0.0, 0.0]]]), 0.5)).round()
         tensor([[[ 0., 11., 79., 11.,  0.]]])
     """

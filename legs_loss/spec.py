@@ -35,19 +35,19 @@ class WeightSpec:
             responses are clamped to 1.
         normalise: "none", as in the paper, or "mean": each map is divided by its mean, so that it changes the
             distribution of weight, but not the scale of the L1 term.
-        eps: >= 1e-30, in the normalisation's denominator.
+        eps: in the normalisation's denominator, at least 1e-30.
         over: what the response is normalised over: "image", as in the paper, or "scene": the response that counts as 1
             is the median over views of each one's percentile, so that a photograph out of focus gets small weights
             beside sharp ones. ``legs precompute`` uses all views; without its maps the views seen so far are used as
             the scene (:mod:`legs_loss.levels`).
-        noise_floor: >= 0, only over "scene": this multiple of the median response, the view's or the scene's, whichever
-            is larger, is subtracted from the response. 3 removes most noise.
+        noise_floor: in [0, 1e6], only over "scene": this multiple of the median response, the view's or the scene's,
+            whichever is larger, is subtracted from the response. 3 removes most noise.
         smooth: in [0, 100], the standard deviation in pixels of a Gaussian before the operator.
 
     Raises:
         LegsError: a setting is unknown or out of range.
 
-    Example:
+    Examples:
         >>> from dataclasses import replace
         >>> replace(as_spec("legs"), beta=4.0).curve
         'C3'
@@ -106,7 +106,7 @@ def as_spec(spec: Spec) -> WeightSpec:
     Raises:
         LegsError: no preset has that name.
 
-    Example:
+    Examples:
         >>> as_spec("eggs").operator
         'sobel'
     """

@@ -61,7 +61,7 @@ def apply_to(library: str) -> Applied:
     Raises:
         LegsError: no such library is known, it is not installed, or it does not have the expected loss.
 
-    Example:
+    Examples:
         >>> apply_to("no_such_library")
         Traceback (most recent call last):
         ...

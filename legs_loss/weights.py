@@ -40,7 +40,7 @@ def weight_map(
 
     Source: the LEGS paper, its weighted loss; the reflected border and the constant image are this project's choice.
 
-    Example:
+    Examples:
         >>> dot = torch.zeros(2, 5)
         >>> dot[0, 2] = 1.0
         >>> weight_map(dot, "legs-l")
@@ -63,7 +63,7 @@ def weight_maps(images: Iterable[Tensor], spec: Spec = "legs") -> List[Tensor]:
     Raises:
         LegsError: as :func:`weight_map`.
 
-    Example:
+    Examples:
         >>> sharp = (torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) > 0.9).float()
         >>> from legs_loss.responses import gaussian_blur
         >>> blurred = gaussian_blur(sharp, 2.0)
@@ -103,7 +103,7 @@ def weight_from_response(normalised: Tensor, spec: Spec = "legs") -> Tensor:
     Raises:
         LegsError: the spec normalises over the scene, and E^ is normalised by itself.
 
-    Example:
+    Examples:
         >>> weight_from_response(torch.tensor([[[0.0, 0.25, 1.0]]]), "legs")
         tensor([[[ 1.,  6., 11.]]])
     """

@@ -39,6 +39,7 @@ class TestSite:
         for name in ("l1_loss", "WeightSpec", "register_curve", "percentile"):
             assert name in reference
         assert ":func:<code>" not in reference
+        assert "<blockquote>" not in reference  # a doctest that is no code
         assert "data:image/png;base64" in (site / "decision.html").read_text(encoding="utf-8")
         start = (site / "index.html").read_text(encoding="utf-8")
         assert start.index("legs-patch") < start.index("legs run")

@@ -62,7 +62,7 @@ def l1_loss(
             ``channels_last``; on the CPU a target with NaN or infinity; a setting in legs.toml or LEGS_* that is out of
             range.
 
-    Example:
+    Examples:
         >>> target = torch.rand(3, 8, 8)
         >>> prediction = torch.rand(3, 8, 8, requires_grad=True)
         >>> l1_loss(prediction, target) > torch.abs(prediction - target).mean()
@@ -114,7 +114,7 @@ def masked(prediction: Tensor, target: Tensor) -> Tensor:
     Raises:
         LegsError: as :func:`l1_loss`; with LEGS_MASKS=require a target that is not in the store.
 
-    Example:
+    Examples:
         >>> image, gt_image = torch.rand(3, 8, 8, requires_grad=True), torch.rand(3, 8, 8)
         >>> masked(image, gt_image) is image
         True
@@ -148,7 +148,7 @@ def unweighted(function: Callable[..., Result]) -> Callable[..., Result]:
     Args:
         function: the function or module to call.
 
-    Example:
+    Examples:
         >>> def photometric(image, gt_image):
         ...     return 0.8 * l1_loss(image, gt_image) + 0.2 * (image - gt_image).square().mean()
         >>> image, other = torch.rand(3, 8, 8, requires_grad=True), torch.rand(3, 8, 8)

@@ -39,7 +39,7 @@ class WeightMemo:
     Args:
         limit: bytes of memory.
 
-    Example:
+    Examples:
         >>> memo, target = WeightMemo(), torch.rand(3, 4, 4)
         >>> weight = memo.recall(target, lambda: torch.ones(1, 4, 4))
         >>> memo.recall(target.clone(), lambda: torch.zeros(1, 4, 4)) is weight

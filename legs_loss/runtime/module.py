@@ -40,7 +40,7 @@ class LEGSLoss(nn.Module):
     Shape:
         prediction, target: [H, W], [C, H, W], [H, W, C] or batches; weight, mask: one value a pixel; output: a scalar.
 
-    Example:
+    Examples:
         >>> criterion = LEGSLoss("legs-l")
         >>> target = torch.rand(3, 16, 16)
         >>> criterion(target, target) < 1e-6

@@ -164,7 +164,7 @@ def configure(
     Raises:
         LegsError: an unknown preset, or settings elsewhere that are out of range.
 
-    Example:
+    Examples:
         >>> configure("legs-l")
         >>> configure(replace(as_spec("legs"), curve="C5", beta=4.0))
         >>> configure("legs")

@@ -49,7 +49,7 @@ def training_size(width: int, height: int, resolution: int = -1) -> Tuple[int, i
     Raises:
         LegsError: the resolution is none of these, or leaves no pixel.
 
-    Example:
+    Examples:
         >>> training_size(4032, 3024), training_size(4032, 3025, 4), training_size(1000, 701, 500)
         ((1600, 1200), (1008, 756), (500, 350))
     """
@@ -114,7 +114,7 @@ def image_size(path: Path) -> Tuple[int, int]:
 def image_tensor(image: np.ndarray) -> Tensor:
     """Return a photograph uint8 or uint16 [H, W, C] as float32 [C, H, W] in [0, 1].
 
-    Example:
+    Examples:
         >>> image_tensor(np.full((1, 2, 3), 255, np.uint8)).shape
         torch.Size([3, 1, 2])
     """

@@ -24,7 +24,7 @@ def fingerprint(image: Union[Tensor, np.ndarray]) -> str:
     Args:
         image: floats in [0, 1], [C, H, W], on any device; or uint8 or uint16 [H, W, C].
 
-    Example:
+    Examples:
         >>> pixels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
         >>> fingerprint(pixels) == fingerprint(torch.from_numpy(pixels).permute(2, 0, 1) / 255.0)
         True
@@ -42,7 +42,7 @@ def sampled_fingerprint(image: Union[Tensor, np.ndarray]) -> str:
     On a device the values are gathered there, and one short copy waits for it: for where :func:`fingerprint` would move
     the whole image. Arguments as there.
 
-    Example:
+    Examples:
         >>> pixels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
         >>> sampled_fingerprint(pixels) == sampled_fingerprint(torch.from_numpy(pixels).permute(2, 0, 1) / 255.0)
         True

@@ -30,7 +30,7 @@ class StoreWriter:
         LegsError: the folder cannot be written, or a newer version wrote it.
         DamagedStoreError: its manifest is damaged.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> import numpy as np
         >>> from legs_loss import WeightSpec

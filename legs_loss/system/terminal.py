@@ -19,7 +19,7 @@ def printable(text: str, lines: bool = False) -> str:
         text: what is to be printed.
         lines: whether it has several lines; else a line feed is escaped, since it could look like a line of a report.
 
-    Example:
+    Examples:
         >>> print(printable("train\x1b[2J\nall is well.py"))
         train\x1b[2J\nall is well.py
     """

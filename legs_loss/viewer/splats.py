@@ -53,7 +53,7 @@ def left_of(
         aspect: width by height.
         share: of the screen's width that is left of the line, in [0, 1].
 
-    Example:
+    Examples:
         >>> points = np.array([[-1.0, 0.0, 2.0], [1.0, 0.0, 2.0]])
         >>> left_of(points, np.eye(3), np.zeros(3), 1.0, 1.0, 0.5).tolist()
         [True, False]

@@ -57,7 +57,7 @@ def rasterize(
     Raises:
         LegsError: shapes, types or values that cannot be drawn, and a missing numba.
 
-    Example:
+    Examples:
         >>> from types import SimpleNamespace
         >>> camera = SimpleNamespace(width=3, height=3, fx=3.0, fy=3.0, cx=1.5, cy=1.5, world_to_camera=np.eye(4))
         >>> one = torch.ones(1, 1)

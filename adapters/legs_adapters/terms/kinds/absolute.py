@@ -21,7 +21,7 @@ __all__ = ["Absolute"]
 class Absolute(Form):
     """An absolute difference: the text around it is replaced, and the difference becomes two arguments.
 
-    Example:
+    Examples:
         before: loss = torch.abs(image - gt_image).mean()
         after: loss = legs_loss.l1_loss(image, gt_image)
     """

@@ -23,7 +23,7 @@ __all__ = ["Callbacks", "PassedByName"]
 class PassedByName(Form):
     """A function that is passed by name; ``node`` is the name, ``call`` the call of the callback, in ``caller``.
 
-    Example:
+    Examples:
         before: criterion = F.mse_loss; if dataset: criterion = l1_loss; loss = criterion(image, gt_image)
         after: if dataset: criterion = legs_loss.l1_loss
     """

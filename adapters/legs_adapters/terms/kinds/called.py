@@ -22,7 +22,7 @@ __all__ = ["Called"]
 class Called(Form):
     """A call of an L1 function with two images.
 
-    Example:
+    Examples:
         before: loss = l1_loss(image, gt_image)
         after: loss = legs_loss.l1_loss(image, gt_image)
     """

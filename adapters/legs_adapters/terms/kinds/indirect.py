@@ -23,7 +23,7 @@ _DEPTH = 4
 class Indirect(Form):
     """The absolute value of a difference that has a name, or that was changed before: filtered, scaled, weighted.
 
-    Example:
+    Examples:
         before: diff = image - gt_image; diff = diff[diff ** 2 < 0.1]; loss = diff.abs().mean()
         advice: torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))
 

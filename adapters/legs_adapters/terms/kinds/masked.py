@@ -22,7 +22,7 @@ class Masked(Form):
         after: the statement before the line; None where the block begins with it.
         before: the statement after the line.
 
-    Example:
+    Examples:
         before: gt_image = cam.original_image; loss = l1_loss(image, gt_image)
         after: image = legs_loss.masked(image, gt_image)
     """

@@ -16,7 +16,7 @@ __all__ = ["Reread"]
 class Reread(Form):
     """The read of an error map that is the loss; ``node`` is that read.
 
-    Example:
+    Examples:
         before: error = torch.abs(image - gt_image); seen = error.detach() > 0.1; loss = error.mean(); log(seen)
         after: loss = legs_loss.l1_loss(image, gt_image, reduction="none").mean(); log(seen)
     """

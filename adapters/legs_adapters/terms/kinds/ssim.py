@@ -22,7 +22,7 @@ __all__ = ["Ssim"]
 class Ssim(Form):
     """A call of an SSIM with two images; only legs-patch --ssim looks for it.
 
-    Example:
+    Examples:
         before: loss = l1_loss(image, gt_image) + 1.0 - ssim(image, gt_image)
         after: 1.0 - legs_loss.ssim(image, gt_image)
     """

@@ -2,6 +2,7 @@
 
     python docs/evidence/rebuild.py                                       # from the .json files beside it
     python docs/evidence/rebuild.py --take OUT docs/evidence/NAME.json    # first: the rows of a `legs compare` folder
+    python docs/evidence/rebuild.py --take-schedule OUT SCENE             # first: those of a folder of schedule.py
 
 A table stands in the text between `<!-- NAMES -->` and `<!-- end -->`; TABLES says what it shows.
 """
@@ -14,6 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any, List, Mapping, NamedTuple, Sequence, Tuple
 
+from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import read_rows
 from legs_loss.experiments.statistics import pooled_difference, summarise_all, times_gaussians
 from legs_loss.experiments.tables import difference_cell, times_cell
@@ -26,15 +28,6 @@ CANDIDATE = "percentile=99,normalise=mean,scale=0.6,error=1,curve=C1@3dgs"
 CODEBASES = {name: tuple(f"{scene}_{name}_200" for scene in ("fox", "fern", "kitchen")) for name in ("3dgs", "fastgs")}
 CODEBASES["mcmc"] = tuple(f"{scene}_mcmc_200" for scene in ("fox", "fern", "kitchen"))
 SCHEDULES = {"CPU": "schedule_cpu", "H200": "schedule_gpu"}
-SCHEDULE_SHOWN = (
-    ("fern/CPU", 7000),
-    ("fox/CPU", 7000),
-    ("fox/CPU", 10000),
-    ("fern/H200", 7000),
-    ("fern/H200", 10000),
-    ("kitchen/H200", 7000),
-    ("monstree/H200", 3000),
-)
 SCHEDULE_COLUMNS = (
     ("train", "psnr", ".2f"),
     ("train", "ssim", ".3f"),
@@ -43,6 +36,8 @@ SCHEDULE_COLUMNS = (
     ("test", "psnr_strong", ".2f"),
 )
 SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs-l")
+SCHEDULE_TICKS = (500, 1000, 2000, 4000, 7000, 15000, 30000)
+SCHEDULE_KEPT = ("train", "test", "gaussians", "mean_weight", "processor_seconds")
 COLOURS = ("#555555", "#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#ff7f0e")
 COLUMNS = {
     "train PSNR": ("train", "psnr"),
@@ -94,6 +89,26 @@ def take(out: Path, path: Path) -> None:
     path.write_text(f'{{"settings":{json.dumps(settings)},"rows":[\n{lines}\n]}}\n', encoding="utf-8")
 
 
+def take_schedule(out: Path, scene: str) -> None:
+    """Put the rows of a folder of schedule.py in the place of those of the same scene and seed."""
+    path = HERE / f"{SCHEDULES['CPU']}.json"
+    found = json.loads(path.read_text(encoding="utf-8"))
+    rows = []
+    for arm in SCHEDULE_ARMS:
+        folder = out / parse_arm(arm).folder
+        for milestone in sorted(int(file.stem[8:]) for file in folder.glob("metrics-*.json")):
+            seed = json.loads((folder / "cfg.json").read_text(encoding="utf-8"))["seed"]
+            metrics = json.loads((folder / f"metrics-{milestone}.json").read_text(encoding="utf-8"))
+            kept = {name: metrics[name] for name in SCHEDULE_KEPT}
+            kept["views"] = {"test": metrics["views"]["test"]}
+            rows.append({"scene": scene, "arm": arm, "seed": seed, "iteration": milestone, "metrics": _rounded(kept)})
+    seeds = {row["seed"] for row in rows}
+    others = [row for row in found["rows"] if row["scene"] != scene or row["seed"] not in seeds]
+    rows = sorted(others + rows, key=lambda row: (row["scene"], row["seed"]))
+    lines = ",\n".join(map(json.dumps, rows))
+    path.write_text(f'{{"schedule": {json.dumps(found["schedule"])},\n"rows": [\n{lines}\n]}}\n', encoding="utf-8")
+
+
 def differences(table: Table) -> str:
     """Return a table of differences with their intervals; ? marks what is not clear."""
     scenes = [rows_of(capture) for capture in table.captures]
@@ -107,21 +122,15 @@ def differences(table: Table) -> str:
     return compact(["difference", *COLUMNS, "Gaussians"], lines)
 
 
-def schedule() -> str:
-    """Return the scores by 3DGS's own schedule at its milestones, by the package's trainer and on a GPU."""
-    found = {
-        (f"{row['scene']}/{machine}", row["arm"], row["iteration"]): row["metrics"]
-        for machine, name in SCHEDULES.items()
-        for row in rows_of(name)
-    }
+def schedule(iteration: int) -> str:
+    """Return the scores at a milestone of 3DGS's own schedule, by the package's trainer and on a GPU."""
     lines = []
-    for scene, iteration in SCHEDULE_SHOWN:
-        for arm in SCHEDULE_ARMS:
-            if (scene, arm, iteration) in found:
-                row = found[scene, arm, iteration]
-                cells = [f"{row[split][key]:{form}}" for split, key, form in SCHEDULE_COLUMNS]
-                lines.append([scene, f"{iteration:,}", arm, *cells, f"{row['gaussians']:,}"])
-    heads = ["capture", "iteration", "arm", "train PSNR", "SSIM", "held-out PSNR", "SSIM", "strongest 10%", "Gaussians"]
+    for machine, name in SCHEDULES.items():
+        rows = [row for row in rows_of(name) if row["iteration"] == iteration]
+        for row in sorted(rows, key=lambda row: (row["scene"], SCHEDULE_ARMS.index(row["arm"]), row["seed"])):
+            scores = [f"{row['metrics'][split][key]:{form}}" for split, key, form in SCHEDULE_COLUMNS]
+            lines.append([f"{row['scene']}/{machine}", row["arm"], *scores, f"{row['metrics']['gaussians']:,}"])
+    heads = ["capture", "arm", "train PSNR", "SSIM", "held-out PSNR", "SSIM", "strongest 10%", "Gaussians"]
     return compact(heads, lines)
 
 
@@ -214,18 +223,24 @@ def plots() -> None:
     _save(figure, "evidence_codebases.png")
 
     rows = rows_of(SCHEDULES["CPU"])
-    figure = Figure(figsize=(11, 6.4), constrained_layout=True)
-    scores = {"train PSNR": ("train", "psnr"), "held-out PSNR": ("test", "psnr"), "held-out SSIM": ("test", "ssim")}
-    for scene, panels in zip(("fern", "fox"), figure.subplots(2, 3)):
+    figure = Figure(figsize=(14, 7.5), constrained_layout=True)
+    scores = {
+        f"{label} {name}": (split, name.lower())
+        for name in ("PSNR", "SSIM")
+        for split, label in (("train", "train"), ("test", "held-out"))
+    }
+    for scene, panels in zip(("fern", "fox"), figure.subplots(2, 4)):
         for panel, (label, (split, key)) in zip(panels, scores.items()):
             for arm, colour in zip(SCHEDULE_ARMS, COLOURS):
                 mine = [row for row in rows if (row["scene"], row["arm"]) == (scene, arm)]
                 points = [(row["iteration"], row["metrics"][split][key]) for row in mine]
                 if points:
                     panel.plot(*zip(*sorted(points)), marker="o", markersize=4, color=colour, label=arm)
-            panel.set(title=f"{scene}: {label}", xlabel="iteration of 30,000")
+            panel.set(title=f"{scene}: {label}", xlabel="iteration", xscale="log", xlim=(450, 33000))
+            panel.set_xticks(SCHEDULE_TICKS, [f"{tick / 1000:g}k" for tick in SCHEDULE_TICKS])
+            panel.minorticks_off()
             panel.grid(alpha=0.3)
-        panels[-1].legend(fontsize=8, loc="lower right")
+        panels[-1].legend(fontsize=8, loc="lower center")
     _save(figure, "evidence_schedule.png")
 
 
@@ -248,14 +263,18 @@ def _rounded(value: Any) -> Any:
 
 
 def main(words: List[str]) -> None:
-    """Take the files that --take names, then rebuild."""
+    """Take the rows that are named, then rebuild."""
     while words[:1] == ["--take"]:
         take(Path(words[1]), Path(words[2]))
+        words = words[3:]
+    while words[:1] == ["--take-schedule"]:
+        take_schedule(Path(words[1]), words[2])
         words = words[3:]
 
     def table(match: re.Match[str]) -> str:
         name = match.group(1)
-        body = schedule() if name == "schedule" else differences(TABLES[name])
+        milestone = re.fullmatch(r"schedule-(\d+)", name)
+        body = schedule(int(milestone.group(1))) if milestone else differences(TABLES[name])
         return f"<!-- {name} -->\n\n{body}\n\n<!-- end -->"
 
     text = re.sub(r"<!-- ([\w-]+) -->.*?<!-- end -->", table, TEXT.read_text(encoding="utf-8"), flags=re.DOTALL)

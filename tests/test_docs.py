@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
+import runpy
+import shutil
 from pathlib import Path
 from typing import Dict, Set
 
@@ -60,6 +63,39 @@ def test_readme_fits_a_screen_or_two() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(text.split()) <= 700
     assert (text.count("!["), len(re.findall(r"^\| --- ", text, re.M))) == (1, 1)  # one picture, one table
+
+
+@pytest.mark.slow
+def test_the_tables_of_the_evidence_are_those_of_its_rows() -> None:
+    rebuild = runpy.run_path(str(ROOT / "docs" / "evidence" / "rebuild.py"))
+    text = rebuild["TEXT"].read_text(encoding="utf-8")
+    assert rebuild["with_tables"](text) == text
+    assert rebuild["captures"]() == (ROOT / "docs/evidence/captures.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("machine", ["cpu", "gpu"])
+def test_the_rows_of_a_run_are_taken_in_the_place_of_its_earlier_ones(machine: str, tmp_path: Path) -> None:
+    copy = tmp_path / "evidence"
+    copy.mkdir()
+    for name in ("rebuild.py", "schedule_cpu.json", "schedule_gpu.json"):
+        shutil.copy(ROOT / "docs" / "evidence" / name, copy)
+    before = json.loads((copy / f"schedule_{machine}.json").read_text(encoding="utf-8"))["rows"]
+    run = {"scene": "fern", "arm": "3dgs@legs", "seed": 0}
+    folder = tmp_path / "out" / ("3dgs-at-legs" if machine == "cpu" else "seed-0/3dgs-at-legs")
+    folder.mkdir(parents=True)
+    if machine == "cpu":
+        (folder / "cfg.json").write_text('{"seed": 0}', encoding="utf-8")
+    metrics = {"train": {"psnr": 1.0}, "test": {"psnr": 2.0}, "gaussians": 3, "mean_weight": 4.0}
+    views = {"train": {"a": {"psnr": 1.0}}, "test": {"b": {"psnr": 2.0}}}
+    (folder / "metrics-500.json").write_text(json.dumps({**metrics, "growth": [], "views": views}), encoding="utf-8")
+
+    runpy.run_path(str(copy / "rebuild.py"))["take_schedule"](tmp_path / "out", "fern")
+    after = json.loads((copy / f"schedule_{machine}.json").read_text(encoding="utf-8"))["rows"]
+    mine = [row for row in after if all(row[name] == value for name, value in run.items())]
+    assert mine == [{**run, "iteration": 500, "metrics": {**metrics, "views": {"test": views["test"]}}}]
+    others = [row for row in before if any(row[name] != value for name, value in run.items())]
+    assert len(others) < len(before)
+    assert [row for row in after if row not in mine] == others
 
 
 def test_the_map_has_every_folder_of_the_core_and_of_the_adapters() -> None:

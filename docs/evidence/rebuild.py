@@ -2,7 +2,7 @@
 
     python docs/evidence/rebuild.py                                       # from the .json files beside it
     python docs/evidence/rebuild.py --take OUT docs/evidence/NAME.json    # first: the rows of a `legs compare` folder
-    python docs/evidence/rebuild.py --take-schedule OUT SCENE             # first: those of a folder of schedule.py
+    python docs/evidence/rebuild.py --take-schedule OUT SCENE             # first: those of schedule.py or schedule_gpu.py
 
 A table stands in the text between `<!-- NAMES -->` and `<!-- end -->`; TABLES says what it shows.
 """
@@ -13,7 +13,7 @@ import json
 import re
 import sys
 from pathlib import Path
-from typing import Any, List, Mapping, NamedTuple, Sequence, Tuple
+from typing import Any, Dict, List, Mapping, NamedTuple, Sequence, Tuple
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import read_rows
@@ -28,13 +28,14 @@ CANDIDATE = "percentile=99,normalise=mean,scale=0.6,error=1,curve=C1@3dgs"
 CODEBASES = {name: tuple(f"{scene}_{name}_200" for scene in ("fox", "fern", "kitchen")) for name in ("3dgs", "fastgs")}
 CODEBASES["mcmc"] = tuple(f"{scene}_mcmc_200" for scene in ("fox", "fern", "kitchen"))
 SCHEDULES = {"CPU": "schedule_cpu", "H200": "schedule_gpu"}
-SCHEDULE_COLUMNS = (
-    ("train", "psnr", ".2f"),
-    ("train", "ssim", ".3f"),
-    ("test", "psnr", ".2f"),
-    ("test", "ssim", ".3f"),
-    ("test", "psnr_strong", ".2f"),
-)
+SCHEDULE_COLUMNS = {
+    "train PSNR": ".2f",
+    "train SSIM": ".3f",
+    "held-out PSNR": ".2f",
+    "held-out SSIM": ".3f",
+    "strongest 10%": ".2f",
+    "Gaussians": ",.0f",
+}
 SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs-l")
 SCHEDULE_TICKS = (500, 1000, 2000, 4000, 7000, 15000, 30000)
 SCHEDULE_KEPT = ("train", "test", "gaussians", "mean_weight", "processor_seconds")
@@ -90,21 +91,28 @@ def take(out: Path, path: Path) -> None:
 
 
 def take_schedule(out: Path, scene: str) -> None:
-    """Put the rows of a folder of schedule.py in the place of those of the same scene and seed."""
-    path = HERE / f"{SCHEDULES['CPU']}.json"
-    found = json.loads(path.read_text(encoding="utf-8"))
-    rows = []
+    """Put the rows of a folder of schedule.py or schedule_gpu.py in the place of those of the same runs."""
     for arm in SCHEDULE_ARMS:
-        folder = out / parse_arm(arm).folder
-        for milestone in sorted(int(file.stem[8:]) for file in folder.glob("metrics-*.json")):
-            seed = json.loads((folder / "cfg.json").read_text(encoding="utf-8"))["seed"]
-            metrics = json.loads((folder / f"metrics-{milestone}.json").read_text(encoding="utf-8"))
-            kept = {name: metrics[name] for name in SCHEDULE_KEPT}
-            kept["views"] = {"test": metrics["views"]["test"]}
-            rows.append({"scene": scene, "arm": arm, "seed": seed, "iteration": milestone, "metrics": _rounded(kept)})
-    seeds = {row["seed"] for row in rows}
-    others = [row for row in found["rows"] if row["scene"] != scene or row["seed"] not in seeds]
-    rows = sorted(others + rows, key=lambda row: (row["scene"], row["seed"]))
+        for folder in (*out.glob(parse_arm(arm).folder), *out.glob(f"seed-*/{parse_arm(arm).folder}")):
+            settings = folder / "cfg.json"
+            by_gpu = not settings.is_file()
+            seed = int(folder.parent.name[5:]) if by_gpu else json.loads(settings.read_text(encoding="utf-8"))["seed"]
+            run = {"scene": scene, "arm": arm, "seed": seed}
+            rows = []
+            for milestone in sorted(int(file.stem[8:]) for file in folder.glob("metrics-*.json")):
+                metrics = json.loads((folder / f"metrics-{milestone}.json").read_text(encoding="utf-8"))
+                kept = {name: metrics[name] for name in SCHEDULE_KEPT if name in metrics}
+                kept["views"] = {"test": metrics["views"]["test"]}
+                rows.append({**run, "iteration": milestone, "metrics": _rounded(kept)})
+            if rows:
+                _replace(HERE / f"{SCHEDULES['H200' if by_gpu else 'CPU']}.json", run, rows)
+
+
+def _replace(path: Path, run: Mapping[str, Any], rows: Sequence[Any]) -> None:
+    found = json.loads(path.read_text(encoding="utf-8"))
+    others = [row for row in found["rows"] if any(row[name] != value for name, value in run.items())]
+    order = {arm: place for place, arm in enumerate(SCHEDULE_ARMS)}
+    rows = sorted([*others, *rows], key=lambda row: (row["scene"], row["seed"], order[row["arm"]], row["iteration"]))
     lines = ",\n".join(map(json.dumps, rows))
     path.write_text(f'{{"schedule": {json.dumps(found["schedule"])},\n"rows": [\n{lines}\n]}}\n', encoding="utf-8")
 
@@ -122,16 +130,33 @@ def differences(table: Table) -> str:
     return compact(["difference", *COLUMNS, "Gaussians"], lines)
 
 
+def with_tables(text: str) -> str:
+    """Return a text with its tables made anew."""
+
+    def table(match: re.Match[str]) -> str:
+        name = match.group(1)
+        milestone = re.fullmatch(r"schedule-(\d+)", name)
+        body = schedule(int(milestone.group(1))) if milestone else differences(TABLES[name])
+        return f"<!-- {name} -->\n\n{body}\n\n<!-- end -->"
+
+    return re.sub(r"<!-- ([\w-]+) -->.*?<!-- end -->", table, text, flags=re.DOTALL)
+
+
 def schedule(iteration: int) -> str:
     """Return the scores at a milestone of 3DGS's own schedule, by the package's trainer and on a GPU."""
     lines = []
     for machine, name in SCHEDULES.items():
         rows = [row for row in rows_of(name) if row["iteration"] == iteration]
-        for row in sorted(rows, key=lambda row: (row["scene"], SCHEDULE_ARMS.index(row["arm"]), row["seed"])):
-            scores = [f"{row['metrics'][split][key]:{form}}" for split, key, form in SCHEDULE_COLUMNS]
-            lines.append([f"{row['scene']}/{machine}", row["arm"], *scores, f"{row['metrics']['gaussians']:,}"])
-    heads = ["capture", "arm", "train PSNR", "SSIM", "held-out PSNR", "SSIM", "strongest 10%", "Gaussians"]
-    return compact(heads, lines)
+        for row in rows:
+            row["metrics"]["iterations"] = iteration
+        for scene in sorted({row["scene"] for row in rows}):
+            for one in summarise_all([row for row in rows if row["scene"] == scene], SCHEDULE_ARMS):
+                cells = [f"{one.mean[label]:{form}}" for label, form in SCHEDULE_COLUMNS.items()]
+                if one.seeds > 1:
+                    spreads = [f"{one.spread[label]:{form}}" for label, form in SCHEDULE_COLUMNS.items()]
+                    cells = [f"{cell} ± {spread}" for cell, spread in zip(cells, spreads)]
+                lines.append([f"{scene}/{machine}", one.arm, *cells])
+    return compact(["capture", "arm", *SCHEDULE_COLUMNS], lines)
 
 
 def compact(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
@@ -222,20 +247,24 @@ def plots() -> None:
     figure.axes[-1].legend(fontsize=8, loc="center right")
     _save(figure, "evidence_codebases.png")
 
-    rows = rows_of(SCHEDULES["CPU"])
-    figure = Figure(figsize=(14, 7.5), constrained_layout=True)
+    runs: Dict[Tuple[str, str, str, int], List[Any]] = {}
+    for machine, name in SCHEDULES.items():
+        for row in rows_of(name):
+            runs.setdefault((row["scene"], row["arm"], machine, row["seed"]), []).append(row)
+    figure = Figure(figsize=(14, 11), constrained_layout=True)
     scores = {
         f"{label} {name}": (split, name.lower())
         for name in ("PSNR", "SSIM")
         for split, label in (("train", "train"), ("test", "held-out"))
     }
-    for scene, panels in zip(("fern", "fox"), figure.subplots(2, 4)):
+    for scene, panels in zip(("fern", "kitchen", "fox"), figure.subplots(3, 4)):
         for panel, (label, (split, key)) in zip(panels, scores.items()):
             for arm, colour in zip(SCHEDULE_ARMS, COLOURS):
-                mine = [row for row in rows if (row["scene"], row["arm"]) == (scene, arm)]
-                points = [(row["iteration"], row["metrics"][split][key]) for row in mine]
-                if points:
-                    panel.plot(*zip(*sorted(points)), marker="o", markersize=4, color=colour, label=arm)
+                lines = [(run, rows) for run, rows in runs.items() if run[:2] == (scene, arm)]
+                for place, ((_, _, machine, _), rows) in enumerate(lines):
+                    points = sorted((row["iteration"], row["metrics"][split][key]) for row in rows)
+                    style = "-" if machine == "CPU" else ":"
+                    panel.plot(*zip(*points), style, color=colour, label=None if place else arm)
             panel.set(title=f"{scene}: {label}", xlabel="iteration", xscale="log", xlim=(450, 33000))
             panel.set_xticks(SCHEDULE_TICKS, [f"{tick / 1000:g}k" for tick in SCHEDULE_TICKS])
             panel.minorticks_off()
@@ -270,15 +299,7 @@ def main(words: List[str]) -> None:
     while words[:1] == ["--take-schedule"]:
         take_schedule(Path(words[1]), words[2])
         words = words[3:]
-
-    def table(match: re.Match[str]) -> str:
-        name = match.group(1)
-        milestone = re.fullmatch(r"schedule-(\d+)", name)
-        body = schedule(int(milestone.group(1))) if milestone else differences(TABLES[name])
-        return f"<!-- {name} -->\n\n{body}\n\n<!-- end -->"
-
-    text = re.sub(r"<!-- ([\w-]+) -->.*?<!-- end -->", table, TEXT.read_text(encoding="utf-8"), flags=re.DOTALL)
-    TEXT.write_text(text, encoding="utf-8")
+    TEXT.write_text(with_tables(TEXT.read_text(encoding="utf-8")), encoding="utf-8")
     (HERE / "captures.md").write_text(captures(), encoding="utf-8")
     plots()
 

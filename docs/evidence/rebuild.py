@@ -2,7 +2,7 @@
 
     python docs/evidence/rebuild.py                                       # from the .json files beside it
     python docs/evidence/rebuild.py --take OUT docs/evidence/NAME.json    # first: the rows of a `legs compare` folder
-    python docs/evidence/rebuild.py --take-schedule OUT SCENE             # first: those of schedule.py or schedule_gpu.py
+    python docs/evidence/rebuild.py --take-schedule OUT SCENE             # first: those of schedule.py, schedule_gpu.py
 
 A table stands in the text between `<!-- NAMES -->` and `<!-- end -->`; TABLES says what it shows.
 """

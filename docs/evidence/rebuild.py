@@ -17,7 +17,7 @@ from typing import Any, Dict, List, Mapping, NamedTuple, Sequence, Tuple
 
 from legs_loss.experiments.arms import parse_arm
 from legs_loss.experiments.running import read_rows
-from legs_loss.experiments.statistics import pooled_difference, summarise_all, times_gaussians
+from legs_loss.experiments.statistics import Summary, pooled_difference, summarise_all, times_gaussians
 from legs_loss.experiments.tables import difference_cell, times_cell
 
 HERE = Path(__file__).resolve().parent
@@ -36,6 +36,7 @@ SCHEDULE_COLUMNS = {
     "strongest 10%": ".2f",
     "Gaussians": ",.0f",
 }
+SPREAD = ("train PSNR", "held-out PSNR", "strongest 10%")  # over seeds, shown beside the mean
 SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs-l")
 SCHEDULE_TICKS = (500, 1000, 2000, 4000, 7000, 15000, 30000)
 SCHEDULE_KEPT = ("train", "test", "gaussians", "mean_weight", "processor_seconds")
@@ -151,12 +152,15 @@ def schedule(iteration: int) -> str:
             row["metrics"]["iterations"] = iteration
         for scene in sorted({row["scene"] for row in rows}):
             for one in summarise_all([row for row in rows if row["scene"] == scene], SCHEDULE_ARMS):
-                cells = [f"{one.mean[label]:{form}}" for label, form in SCHEDULE_COLUMNS.items()]
-                if one.seeds > 1:
-                    spreads = [f"{one.spread[label]:{form}}" for label, form in SCHEDULE_COLUMNS.items()]
-                    cells = [f"{cell} ± {spread}" for cell, spread in zip(cells, spreads)]
-                lines.append([f"{scene}/{machine}", one.arm, *cells])
+                lines.append(
+                    [f"{scene}, {machine}", one.arm, *(_schedule_cell(one, label) for label in SCHEDULE_COLUMNS)]
+                )
     return compact(["capture", "arm", *SCHEDULE_COLUMNS], lines)
+
+
+def _schedule_cell(one: Summary, label: str) -> str:
+    cell = f"{one.mean[label]:{SCHEDULE_COLUMNS[label]}}"
+    return cell if one.seeds == 1 or label not in SPREAD else f"{cell} ±{one.spread[label]:{SCHEDULE_COLUMNS[label]}}"
 
 
 def compact(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

@@ -36,7 +36,6 @@ SCHEDULE_COLUMNS = {
     "strongest 10%": ".2f",
     "Gaussians": ",.0f",
 }
-SPREAD = ("train PSNR", "held-out PSNR", "strongest 10%")  # over seeds, shown beside the mean
 SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs-l")
 SCHEDULE_TICKS = (500, 1000, 2000, 4000, 7000, 15000, 30000)
 SCHEDULE_KEPT = ("train", "test", "gaussians", "mean_weight", "processor_seconds")
@@ -149,7 +148,7 @@ def schedule(iteration: int) -> str:
     for machine, name in SCHEDULES.items():
         rows = [row for row in rows_of(name) if row["iteration"] == iteration]
         for row in rows:
-            row["metrics"]["iterations"] = iteration
+            row["metrics"]["iterations"] = iteration  # a summary has milliseconds by it
         for scene in sorted({row["scene"] for row in rows}):
             for one in summarise_all([row for row in rows if row["scene"] == scene], SCHEDULE_ARMS):
                 lines.append(
@@ -159,8 +158,9 @@ def schedule(iteration: int) -> str:
 
 
 def _schedule_cell(one: Summary, label: str) -> str:
-    cell = f"{one.mean[label]:{SCHEDULE_COLUMNS[label]}}"
-    return cell if one.seeds == 1 or label not in SPREAD else f"{cell} ±{one.spread[label]:{SCHEDULE_COLUMNS[label]}}"
+    form = SCHEDULE_COLUMNS[label]
+    spread = "" if one.seeds == 1 or label == "Gaussians" else f" ±{one.spread[label]:{form}}"
+    return f"{one.mean[label]:{form}}{spread}"
 
 
 def compact(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

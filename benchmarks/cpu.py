@@ -39,8 +39,8 @@ def main():
     from legs_adapters.shims.modules import diff_surfel_rasterization as surfels
 
     from legs_loss.kernels.numba_loss import fused_loss
-    from legs_loss.reference import Gaussians, rasterize
-    from legs_loss.reference.embedded import write_embedded_scene
+    from legs_loss.lab.embedded import write_embedded_scene
+    from legs_loss.lab.rasterizer import Gaussians, rasterize
     from legs_loss.scenes import read_scene
 
     torch.set_num_threads(args.threads)

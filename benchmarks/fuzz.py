@@ -37,15 +37,15 @@ from PIL import Image
 
 from legs_loss.config import find_config
 from legs_loss.errors import LegsError
+from legs_loss.lab.embedded import write_embedded_scene
+from legs_loss.lab.gaussians import Gaussians
+from legs_loss.lab.ply import read_ply, write_ply
+from legs_loss.lab.training.checkpoint import read_state, write_checkpoint
+from legs_loss.lab.viewer.splats import splats
 from legs_loss.precompute import precompute
-from legs_loss.reference.embedded import write_embedded_scene
-from legs_loss.reference.gaussians import Gaussians
-from legs_loss.reference.ply import read_ply, write_ply
-from legs_loss.reference.training.checkpoint import read_state, write_checkpoint
 from legs_loss.scenes import View, load_training_image, read_scene
 from legs_loss.store import Entry, WeightStore
 from legs_loss.store.manifest import MANIFEST, manifest_bytes, read_manifest
-from legs_loss.viewer.splats import splats
 
 SECONDS = 30  # that a case may take
 PIECES = [b"\0", b"\xff" * 8, b"-1", b"1e999", b"NaN", b'"', b"[" * 50, b"{", b"(" * 50, b"\n", b"\r", b"#", b"    "]
@@ -147,7 +147,7 @@ def some_gaussians() -> Gaussians:
 def make_checkpoint(folder: Path) -> None:
     import torch
 
-    from legs_loss.reference.training.adam import Adam
+    from legs_loss.lab.training.adam import Adam
 
     arrays = dict(
         Adam(some_gaussians()).state(), gradient_sum=np.zeros(9, np.float32), times_seen=np.zeros(9, np.float32)
@@ -188,7 +188,7 @@ def resume(folder: Path) -> None:
     """Take a step from a checkpoint."""
     import torch
 
-    from legs_loss.reference.training.adam import FIELDS, Adam
+    from legs_loss.lab.training.adam import FIELDS, Adam
 
     arrays, facts = read_state(folder / "c.npz")
     adam = Adam.restore(arrays)
@@ -208,8 +208,8 @@ BASELINE = {"views": 2, "loss": 0.5, "loss_3dgs": 0.5, "gradient_error": 1e-7}
 
 def make_comparison(folder: Path) -> None:
     """Write a comparison of one row, as ``legs compare`` does."""
-    from legs_loss.experiments.running import read_rows, write_json
-    from legs_loss.reference.training.config import TrainConfig
+    from legs_loss.lab.experiments.running import read_rows, write_json
+    from legs_loss.lab.training.config import TrainConfig
 
     scene = {"name": "a", "views": 2, "sha256": "0" * 16}
     base = TrainConfig(densify_grad_threshold=1e-3).as_dict()
@@ -226,11 +226,11 @@ def make_comparison(folder: Path) -> None:
 
 
 def read_comparison(folder: Path) -> None:
-    from legs_loss.experiments.arms import parse_arm
-    from legs_loss.experiments.running import read_rows
-    from legs_loss.experiments.tables import scores_table
-    from legs_loss.report import html
-    from legs_loss.report.html_pictures import Pictures
+    from legs_loss.lab.experiments.arms import parse_arm
+    from legs_loss.lab.experiments.running import read_rows
+    from legs_loss.lab.experiments.tables import scores_table
+    from legs_loss.lab.report import html
+    from legs_loss.lab.report.html_pictures import Pictures
 
     settings, rows = read_rows(folder)
     for row in rows:

@@ -50,15 +50,15 @@ def make_scene(count, width, height, degree, seed=0):
 
 
 def ours(backend, camera, degree):
-    from legs_loss.reference import rasterize
+    from legs_loss.lab.rasterizer import rasterize
 
     return lambda *leaves: rasterize(*leaves, camera, BACKGROUND, degree, backend=backend).image
 
 
 def project(leaves, camera):
     """Splats, and the bounds of their tiles; the camera stands in the origin."""
-    from legs_loss.reference.conventions import View
-    from legs_loss.reference.rasterizer import oracle
+    from legs_loss.lab.conventions import View
+    from legs_loss.lab.rasterizer import oracle
 
     view = View.from_camera(camera)
     splats = oracle.project(*(leaf.detach() for leaf in leaves[:3]), view)
@@ -73,7 +73,7 @@ def describe(leaves, camera, threads):
 
 def contributing_pairs(leaves, camera):
     """Indices (Gaussian, pixel) where alpha reaches 1/255, sorted by pixel and depth."""
-    from legs_loss.reference.conventions import MIN_ALPHA
+    from legs_loss.lab.conventions import MIN_ALPHA
 
     splats, bounds = project(leaves, camera)
     opacities = leaves[3].detach()

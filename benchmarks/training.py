@@ -23,16 +23,16 @@ import time
 from pathlib import Path
 
 PARTS = {
-    "forward: checks": ("legs_loss.reference.rasterizer.rasterize", "_check_values"),
-    "forward: projection": ("legs_loss.reference.rasterizer.projection", "project"),
-    "forward: rows": ("legs_loss.reference.rasterizer.projection", "find_rows"),
-    "forward: slots": ("legs_loss.reference.rasterizer.sorting", "make_slots"),
-    "forward: sorting": ("legs_loss.reference.rasterizer.sorting", "sort_entries"),
-    "forward: blending": ("legs_loss.reference.rasterizer.strips", "render"),
-    "loss": ("legs_loss.reference.training.trainer", "step_loss"),
-    "backward: sums": ("legs_loss.reference.rasterizer.sorting", "make_sums"),
-    "backward: blending": ("legs_loss.reference.rasterizer.strips", "render_backward"),
-    "backward: projection": ("legs_loss.reference.rasterizer.projection_backward", "project_backward"),
+    "forward: checks": ("legs_loss.lab.rasterizer.rasterize", "_check_values"),
+    "forward: projection": ("legs_loss.lab.rasterizer.projection", "project"),
+    "forward: rows": ("legs_loss.lab.rasterizer.projection", "find_rows"),
+    "forward: slots": ("legs_loss.lab.rasterizer.sorting", "make_slots"),
+    "forward: sorting": ("legs_loss.lab.rasterizer.sorting", "sort_entries"),
+    "forward: blending": ("legs_loss.lab.rasterizer.strips", "render"),
+    "loss": ("legs_loss.lab.training.trainer", "step_loss"),
+    "backward: sums": ("legs_loss.lab.rasterizer.sorting", "make_sums"),
+    "backward: blending": ("legs_loss.lab.rasterizer.strips", "render_backward"),
+    "backward: projection": ("legs_loss.lab.rasterizer.projection_backward", "project_backward"),
 }
 ADAM, REST, ALL = "Adam", "the rest (activations, autograd)", "an iteration"
 JOINED = {  # of the parts above, what is one row of the table
@@ -80,11 +80,11 @@ def measure(args):
 
     torch.set_num_threads(args.threads)
     numba.set_num_threads(args.threads)
-    from legs_loss.reference.rasterizer import strips
-    from legs_loss.reference.training import trainer
-    from legs_loss.reference.training.checkpoint import read_state
-    from legs_loss.reference.training.config import TrainConfig
-    from legs_loss.reference.training.dataset import load_dataset
+    from legs_loss.lab.rasterizer import strips
+    from legs_loss.lab.training import trainer
+    from legs_loss.lab.training.checkpoint import read_state
+    from legs_loss.lab.training.config import TrainConfig
+    from legs_loss.lab.training.dataset import load_dataset
     from legs_loss.scenes import read_scene
 
     facts = read_state(args.run / "checkpoint.npz")[1]

@@ -1,4 +1,4 @@
-"""The rasterizer's blending of one strip: with the vectors of kernels/simd, and as plain loops for LLVM's vectoriser.
+"""The rasterizer's blending of one strip: with the vectors of lab/simd, and as plain loops for LLVM's vectoriser.
 
     python -m benchmarks.vectors
 
@@ -17,9 +17,9 @@ from numba import types
 from numba.extending import intrinsic
 
 from legs_loss.kernels.compiling import compiled, multiply_add
-from legs_loss.reference.rasterizer import strips
-from legs_loss.reference.rasterizer.projection import WIDE
-from legs_loss.reference.rasterizer.strips import BLUE, GREEN, PIXELS, RED, REST, STATE, T, X
+from legs_loss.lab.rasterizer import strips
+from legs_loss.lab.rasterizer.projection import WIDE
+from legs_loss.lab.rasterizer.strips import BLUE, GREEN, PIXELS, RED, REST, STATE, T, X
 
 SPLATS, TURNS, CALLS = 200, 25, 200
 SUMS = STATE  # behind the state: six sums a column

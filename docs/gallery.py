@@ -12,8 +12,8 @@ from torch import Tensor
 
 from legs_loss import WeightSpec, response, weight_map
 from legs_loss.cli.masks import mask_of
+from legs_loss.lab.embedded import write_embedded_scene
 from legs_loss.operators import OPERATORS
-from legs_loss.reference.embedded import write_embedded_scene
 from legs_loss.responses import gaussian_blur, normalise_response
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
 

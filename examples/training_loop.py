@@ -15,10 +15,10 @@ import tempfile
 import torch
 
 from legs_loss import l1_loss, ssim  # <- the one line: in place of `from utils.loss_utils import l1_loss, ssim`
-from legs_loss.reference import rasterize
-from legs_loss.reference.embedded import write_embedded_scene
-from legs_loss.reference.gaussians import Gaussians
-from legs_loss.reference.training.dataset import load_dataset
+from legs_loss.lab.embedded import write_embedded_scene
+from legs_loss.lab.gaussians import Gaussians
+from legs_loss.lab.rasterizer import rasterize
+from legs_loss.lab.training.dataset import load_dataset
 from legs_loss.scenes import read_scene
 from legs_loss.spec import PRESETS
 

@@ -55,7 +55,7 @@ def seed() -> None:
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The embedded scene at 64x48 with 12 views, for real trainings of seconds. Not to be written to."""
-    from legs_loss.reference.embedded import write_embedded_scene
+    from legs_loss.lab.embedded import write_embedded_scene
 
     root = tmp_path_factory.mktemp("tiny") / "table"
     return write_embedded_scene(root, views=12, width=64, height=48, points=900, samples=2)

@@ -132,8 +132,8 @@ def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str]
     Raises:
         LegsError: the folder is not patched any more.
     """
+    from legs_loss.lab.embedded import write_embedded_scene
     from legs_loss.precompute import precompute
-    from legs_loss.reference.embedded import write_embedded_scene
     from legs_loss.scenes import read_scene
 
     root = check_root(folder)

@@ -15,7 +15,7 @@ from benchmarks.gpu.measured import EQUAL
 from benchmarks.gpu.options import Options, Record, Skipped
 from examples.reproduce_paper.codebases.profile import find_profile
 from examples.reproduce_paper.codebases.training import Checkout, train_and_score
-from legs_loss.reference.training.densify import Schedule
+from legs_loss.lab.training.densify import Schedule
 from legs_loss.spec import PRESETS
 
 __all__ = ["fastgs", "gsplat"]

@@ -15,10 +15,10 @@ import sys
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, NamedTuple, Sequence, Tuple
 
-from legs_loss.experiments.arms import parse_arm
-from legs_loss.experiments.running import read_rows
-from legs_loss.experiments.statistics import Summary, pooled_difference, summarise_all, times_gaussians
-from legs_loss.experiments.tables import difference_cell, times_cell
+from legs_loss.lab.experiments.arms import parse_arm
+from legs_loss.lab.experiments.running import read_rows
+from legs_loss.lab.experiments.statistics import Summary, pooled_difference, summarise_all, times_gaussians
+from legs_loss.lab.experiments.tables import difference_cell, times_cell
 
 HERE = Path(__file__).resolve().parent
 TEXT = HERE.parent / "evidence.md"

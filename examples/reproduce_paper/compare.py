@@ -56,10 +56,10 @@ def run(args: argparse.Namespace) -> int:
     """Train what is missing and print the tables."""
     from examples.reproduce_paper.codebases.comparison import UpstreamComparison
     from examples.reproduce_paper.codebases.profile import find_profile, split
-    from legs_loss.cli.compare import say_scores, seeds_of
     from legs_loss.cli.shared.checks import check_writable
     from legs_loss.errors import LegsError
-    from legs_loss.experiments.arms import needed, parse_arms, these_arms
+    from legs_loss.lab.commands.compare import say_scores, seeds_of
+    from legs_loss.lab.experiments.arms import needed, parse_arms, these_arms
     from legs_loss.system import say
 
     seeds = seeds_of(args)

@@ -25,9 +25,9 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 import numpy as np
 from PIL import Image, ImageFilter
 
-from legs_loss.experiments.statistics import pooled_difference
-from legs_loss.reference.training.dataset import load_view, split_views
-from legs_loss.reference.training.metrics import mean_scores, score
+from legs_loss.lab.experiments.statistics import pooled_difference
+from legs_loss.lab.training.dataset import load_view, split_views
+from legs_loss.lab.training.metrics import mean_scores, score
 from legs_loss.scenes import read_scene
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the repository

@@ -16,8 +16,8 @@ from pathlib import Path
 import numba
 import torch
 
-from legs_loss.experiments.arms import ArmSpec, needed, parse_arm, parse_arms
-from legs_loss.reference.training import TrainConfig, train
+from legs_loss.lab.experiments.arms import ArmSpec, needed, parse_arm, parse_arms
+from legs_loss.lab.training import TrainConfig, train
 from legs_loss.scenes import read_scene
 
 THRESHOLD = 2e-4  # 3DGS's own, at any size

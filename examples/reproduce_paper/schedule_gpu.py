@@ -21,13 +21,13 @@ from torch import Tensor
 
 from examples.reproduce_paper.schedule import MILESTONES, arguments, settings
 from legs_loss import legs_loss, ssim
-from legs_loss.experiments.arms import ArmSpec, parse_arm, parse_arms
-from legs_loss.reference.gaussians import Gaussians
-from legs_loss.reference.training import TrainConfig
-from legs_loss.reference.training.adam import COLOUR_RATE, RATES, position_rate
-from legs_loss.reference.training.dataset import TrainingView, extent, load_dataset
-from legs_loss.reference.training.densify import RESET_OPACITY, Schedule, densify, prunable
-from legs_loss.reference.training.metrics import mean_scores, psnr, strongest
+from legs_loss.lab.experiments.arms import ArmSpec, parse_arm, parse_arms
+from legs_loss.lab.gaussians import Gaussians
+from legs_loss.lab.training import TrainConfig
+from legs_loss.lab.training.adam import COLOUR_RATE, RATES, position_rate
+from legs_loss.lab.training.dataset import TrainingView, extent, load_dataset
+from legs_loss.lab.training.densify import RESET_OPACITY, Schedule, densify, prunable
+from legs_loss.lab.training.metrics import mean_scores, psnr, strongest
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.system import write_whole
 

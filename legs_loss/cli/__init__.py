@@ -1,6 +1,6 @@
 """The ``legs`` command. Each sub-command is one module: HELP, add_arguments(parser), run(args).
 
-It is in this folder, or another package registers it in the entry point group ``legs_loss.commands``.
+It is in this folder, or registered in the entry point group ``legs_loss.commands``, as the lab's and the adapters' are.
 """
 
 from __future__ import annotations
@@ -18,20 +18,7 @@ from legs_loss.system import never_fail_to_print, plugins, say, say_error
 
 __all__ = ["Parser", "exit_code", "main"]
 
-COMMANDS = (
-    "scene",
-    "masks",
-    "precompute",
-    "export",
-    "show",
-    "info",
-    "train",
-    "demo",
-    "compare",
-    "report",
-    "view",
-    "env",
-)
+COMMANDS = ("masks", "precompute", "export", "show", "info", "env")
 
 EXIT_CODES = "exit codes: 0 done; 1 done, but some items failed; 2 bad input or usage; 130 interrupted"
 

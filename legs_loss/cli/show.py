@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
-    from legs_loss.report.sheet import Shown
+    from legs_loss.cli.shared.sheet import Shown
     from legs_loss.scenes import View
     from legs_loss.spec import WeightSpec
     from legs_loss.store import Entry
@@ -41,9 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw and save the sheet."""
+    from legs_loss.cli.shared.sheet import save_sheet
     from legs_loss.errors import LegsError
     from legs_loss.precompute.own_maps import OwnMaps, is_below
-    from legs_loss.report.sheet import save_sheet
     from legs_loss.scenes import View, read_scene
     from legs_loss.spec import as_spec
     from legs_loss.store import MANIFEST
@@ -89,8 +89,8 @@ def _masks(path: Path, views: Sequence[View], named: Optional[str]) -> Dict[str,
 
 
 def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor], mask: Optional[Callable[[], np.ndarray]]) -> Shown:
+    from legs_loss.cli.shared.sheet import Shown
     from legs_loss.precompute import normalised_map, response_map
-    from legs_loss.report.sheet import Shown
     from legs_loss.scenes import load_training_image
     from legs_loss.scenes.own_maps import averaged
 
@@ -127,8 +127,8 @@ def _levels(views: Sequence[View], spec: WeightSpec) -> Optional[Tensor]:
 
 
 def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
+    from legs_loss.cli.shared.sheet import Shown
     from legs_loss.errors import LegsError
-    from legs_loss.report.sheet import Shown
     from legs_loss.store import MASK, WEIGHTS, WeightStore
     from legs_loss.store.origin import scene_of_store
 

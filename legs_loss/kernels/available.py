@@ -18,7 +18,6 @@ import torch
 
 from legs_loss.errors import LegsError
 from legs_loss.kernels.contract import Backend, DeviceFault, NotNow
-from legs_loss.kernels.trial import difference_from_torch
 
 __all__ = ["BACKENDS", "OUT_OF_MEMORY", "Availability", "Backends", "Known", "forced_backend", "is_capturing"]
 
@@ -123,6 +122,8 @@ class Backends:
             return self._trial(name, device)
 
     def _trial(self, name: str, device: torch.device) -> Availability:
+        from legs_loss.kernels.trial import difference_from_torch
+
         try:
             backend = importlib.import_module(self._known[name].module).BACKEND
             threads = torch.get_num_threads()

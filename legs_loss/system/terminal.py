@@ -1,12 +1,13 @@
-"""Print safely: names and lines of foreign files can contain terminal control sequences."""
+"""Print safely, from one rank: names and lines of foreign files can contain terminal control sequences."""
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from typing import Optional, TextIO
 
-__all__ = ["never_fail_to_print", "printable", "say", "say_error"]
+__all__ = ["is_first_process", "never_fail_to_print", "printable", "say", "say_error"]
 
 # Control characters but tab and line feed; the marks that turn the direction of text, and halves of characters.
 _OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -46,3 +47,18 @@ def say_error(command: str, error: Exception) -> None:
     say(f"{command}: error: {message}", sys.stderr)
     for text in quoted:
         say(text, sys.stderr, lines=True)
+
+
+def is_first_process() -> bool:
+    """Return whether this process is rank 0 of its run, or the run's only one.
+
+    The process group says so once it is initialised; before that, RANK as torchrun and Slurm's wrappers set it. torch
+    is not imported for it.
+
+    >>> is_first_process()
+    True
+    """
+    distributed = sys.modules.get("torch.distributed")
+    if distributed is not None and distributed.is_available() and distributed.is_initialized():
+        return bool(distributed.get_rank() == 0)
+    return os.environ.get("RANK", "0") in ("", "0")

@@ -25,7 +25,7 @@ from benchmarks.gpu.options import ROOT, Options, Skipped
 from benchmarks.gpu.stages import CERTAIN, STAGES
 from benchmarks.losses import timing
 from tests.cuda_emulation import COMPILER
-from tests.experiments.miniature import RENDER, RENDERER, TRAIN
+from tests.lab.experiments.miniature import RENDER, RENDERER, TRAIN
 from tests.support import legs_environment
 
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs g++")

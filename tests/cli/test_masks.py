@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from legs_loss.report.sheet import Shown, save_sheet
+from legs_loss.cli.shared.sheet import Shown, save_sheet
 from legs_loss.spec import PRESETS
 
 
@@ -116,9 +116,9 @@ def test_show_draws_masks_before_there_is_a_store_and_of_the_store(scene, tmp_pa
 
 def test_the_viewer_darkens_what_a_mask_leaves_out(scene):
     pytest.importorskip("numba")
+    from legs_loss.lab.viewer.server import _Cameras
     from legs_loss.scenes import read_scene
     from legs_loss.store import MASK, WeightStore
-    from legs_loss.viewer.server import _Cameras
 
     legs("masks", scene, "--from", "saturated", "dark")
     legs("precompute", scene, "--workers", 1, "--masks", "masks")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from legs_loss.cli.shared.sheet import Shown, save_sheet
 from legs_loss.errors import LegsError
-from legs_loss.report.sheet import Shown, save_sheet
 from legs_loss.spec import PRESETS, WeightSpec
 from tests.support import legs, legs_environment, photograph, save
 

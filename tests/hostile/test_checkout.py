@@ -99,7 +99,7 @@ def test_verify_beside_another(other, number, tmp_path, monkeypatch):
     monkeypatch.setattr(verifying, "check_imports", lambda *_: None)
     monkeypatch.setattr(verifying, "_run", look)
     monkeypatch.setattr(verifying, "_claims", lambda runs: {"whole": all(run.code == 0 for run in runs.values())})
-    monkeypatch.setattr("legs_loss.reference.embedded.write_embedded_scene", lambda place, **_: place)
+    monkeypatch.setattr("legs_loss.lab.embedded.write_embedded_scene", lambda place, **_: place)
     monkeypatch.setattr("legs_loss.scenes.read_scene", lambda place: place)
     monkeypatch.setattr("legs_loss.precompute.precompute", lambda scene, store: None)
     verify = ["--verify", "--script", "train.py", root]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from legs_loss.errors import LegsError
-from legs_loss.reference.gaussians import Gaussians
-from legs_loss.reference.ply import read_ply, write_ply
+from legs_loss.lab.gaussians import Gaussians
+from legs_loss.lab.ply import read_ply, write_ply
 
 pytest.importorskip("numba")
 
-from legs_loss.experiments.running import read_rows
+from legs_loss.lab.experiments.running import read_rows
 
 ROW = [
     (["seed"], "../../../x"),
@@ -121,7 +121,7 @@ def test_a_file_of_anything(name, data, compared):
 def test_a_picture_from_outside_is_none(path, tmp_path):
     from types import SimpleNamespace
 
-    from legs_loss.report.html_pictures import _upstreams_own
+    from legs_loss.lab.report.html_pictures import _upstreams_own
     from tests.support import photograph, save
 
     row = tmp_path / "out" / "legs" / "seed-0"

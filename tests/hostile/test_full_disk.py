@@ -14,10 +14,10 @@ import torch
 from legs_loss.cli import main
 from legs_loss.errors import LegsError
 from legs_loss.kernels.cuda.modules import BinaryCache
-from legs_loss.reference.embedded import write_embedded_scene
-from legs_loss.reference.gaussians import Gaussians
-from legs_loss.reference.ply import read_ply, write_ply
-from legs_loss.reference.training.checkpoint import read_state
+from legs_loss.lab.embedded import write_embedded_scene
+from legs_loss.lab.gaussians import Gaussians
+from legs_loss.lab.ply import read_ply, write_ply
+from legs_loss.lab.training.checkpoint import read_state
 from legs_loss.store import WeightStore
 from tests.scenes.test_cluster import Cluster
 from tests.support import colmap_scene, legs
@@ -171,7 +171,7 @@ def test_train(disk, tiny_scene, capsys):
 
 def in_this_process(arms, processes, on_progress, on_done=lambda name, metrics: None):
     """Train arms one after another, in place of a process for each."""
-    from legs_loss.reference.training.side_by_side import train_arm
+    from legs_loss.lab.training.side_by_side import train_arm
 
     found = {}
     for arm in arms:
@@ -183,7 +183,7 @@ def in_this_process(arms, processes, on_progress, on_done=lambda name, metrics: 
 @pytest.mark.slow
 def test_compare_and_report(disk, tiny_scene, capsys, monkeypatch):
     pytest.importorskip("jinja2")
-    from legs_loss.experiments import running
+    from legs_loss.lab.experiments import running
 
     monkeypatch.setattr(running, "train_side_by_side", in_this_process)
     subprocess.run(["mount", "-o", "remount,size=8m", str(disk.path)], check=True)
@@ -207,7 +207,7 @@ def test_compare_and_report(disk, tiny_scene, capsys, monkeypatch):
 def test_demo(disk, tiny_scene, capsys, monkeypatch):
     """One error wherever its room ends; an earlier demo's files stay whole."""
     pytest.importorskip("matplotlib")
-    from legs_loss.reference.training import side_by_side
+    from legs_loss.lab.training import side_by_side
 
     monkeypatch.setattr(side_by_side, "train_side_by_side", in_this_process)
     subprocess.run(["mount", "-o", "remount,size=8m", str(disk.path)], check=True)
@@ -239,7 +239,7 @@ def test_show(disk, tiny_scene, capsys):
 
 
 def test_the_demo_s_scene_and_pictures(disk):
-    from legs_loss.report.comparison import Compared, save_pictures
+    from legs_loss.lab.report.comparison import Compared, save_pictures
 
     with disk.full(8192):
         with pytest.raises(LegsError, match=FULL):

@@ -93,8 +93,8 @@ def _writes(event, found):
 
 def _in_this_process():
     """Train the arms of a comparison here, one after another: the operations of parent and children in one count."""
-    from legs_loss.experiments import running
-    from legs_loss.reference.training.side_by_side import train_arm
+    from legs_loss.lab.experiments import running
+    from legs_loss.lab.training.side_by_side import train_arm
 
     def train(arms, processes, on_progress, on_done=None):
         for arm in arms:
@@ -125,8 +125,8 @@ def _drive(what, name, scene, folder):
     import matplotlib.figure  # noqa: F401
     import numba  # noqa: F401
 
-    import legs_loss.cli.compare
-    import legs_loss.report.html  # noqa: F401
+    import legs_loss.lab.commands.compare
+    import legs_loss.lab.report.html  # noqa: F401
 
     _in_this_process()
     folder, number = Path(folder), getattr(signal, name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from examples.reproduce_paper.compare import main
-from tests.experiments.miniature import write_miniature
+from tests.lab.experiments.miniature import write_miniature
 
 pytest.importorskip("libcst")
 pytest.importorskip("numba")

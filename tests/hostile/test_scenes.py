@@ -13,7 +13,7 @@ from PIL import EpsImagePlugin, Image
 
 from legs_loss.cli import main
 from legs_loss.errors import LegsError
-from legs_loss.reference.training.checkpoint import read_state, write_checkpoint
+from legs_loss.lab.training.checkpoint import read_state, write_checkpoint
 from legs_loss.scenes import View, image_size, load_training_image, read_scene
 from tests.support import colmap_scene, legs, legs_environment, photograph, save
 

@@ -142,7 +142,7 @@ def as_nobody(arguments):
     import legs_loss.cli.info
     import legs_loss.cli.precompute
     import legs_loss.cli.show
-    import legs_loss.cli.train
+    import legs_loss.lab.commands.train
     import legs_loss.precompute
 
     words, written = os.pipe()

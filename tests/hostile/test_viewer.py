@@ -9,10 +9,10 @@ import time
 import pytest
 
 from legs_loss import LegsError
-from legs_loss.reference.ply import write_ply
-from legs_loss.viewer.content import find_content
-from legs_loss.viewer.guard import check_address
-from tests.cli.test_view import free_port, some
+from legs_loss.lab.ply import write_ply
+from legs_loss.lab.viewer.content import find_content
+from legs_loss.lab.viewer.guard import check_address
+from tests.lab.test_view import free_port, some
 
 viser = pytest.importorskip("viser")
 msgpack = pytest.importorskip("msgspec").msgpack
@@ -55,7 +55,7 @@ class Page:
 
 @pytest.fixture(scope="module", params=["127.0.0.1", "0.0.0.0"])
 def page(request, tmp_path_factory):
-    from legs_loss.viewer.server import serve
+    from legs_loss.lab.viewer.server import serve
 
     path = tmp_path_factory.mktemp("viewer") / "g.ply"
     write_ply(path, some((255, 0, 0), 4))
@@ -75,7 +75,7 @@ def types(connection):
 
 
 def test_no_address_is_printed_that_is_refused(tmp_path, capsys):
-    from legs_loss.viewer.server import serve
+    from legs_loss.lab.viewer.server import serve
 
     write_ply(tmp_path / "g.ply", some((255, 0, 0), 4))
     server, address = serve(find_content(tmp_path / "g.ply"), port=free_port())
@@ -196,7 +196,7 @@ NOWHERE = {
 
 @pytest.mark.parametrize("what", NOWHERE, ids=lambda what: what.replace(" ", "_"))
 def test_what_is_left_out_is_counted(what, tmp_path, capsys):
-    from legs_loss.viewer.server import serve
+    from legs_loss.lab.viewer.server import serve
 
     name, value = NOWHERE[what]
     gaussians = some((255, 0, 0), 16)

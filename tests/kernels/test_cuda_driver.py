@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from legs_loss import legs_loss
-from legs_loss.kernels import available
+from legs_loss.kernels import available, trial
 from legs_loss.kernels.available import BACKENDS, Known
 from legs_loss.kernels.contract import DeviceFault, NotNow, Weights
 from legs_loss.kernels.cuda.backend import THREADS, CudaBackend, Task
@@ -245,7 +245,7 @@ class TestAvailability:
         monkeypatch.setattr(BACKENDS, "_found", {})
         monkeypatch.setattr(available, "_why_missing", lambda name: None)
         problems = {torch.device("cuda", 0): "its card is odd", torch.device("cuda", 1): None}
-        monkeypatch.setattr(available, "difference_from_torch", lambda backend, device: problems[device])
+        monkeypatch.setattr(trial, "difference_from_torch", lambda backend, device: problems[device])
         found = [BACKENDS.availability("cuda", torch.device("cuda", index)) for index in (0, 1)]
         assert found[0].backend is None and found[1].backend is not None
         assert capfd.readouterr().err == "legs-loss: cuda is unavailable, torch is used: its card is odd\n"
@@ -255,14 +255,14 @@ class TestAvailability:
 def test_a_forked_process_may_use_cuda_and_says_that_numba_is_unavailable():
     pytest.importorskip("numba")
     code = (
-        "import os, torch\nfrom legs_loss.kernels import available\n"
+        "import os, torch\nfrom legs_loss.kernels import available, trial\n"
         "from legs_loss.kernels.available import BACKENDS\n"
         "cpu, card = torch.device('cpu'), torch.device('cuda', 0)\n"
         "assert BACKENDS.chosen(cpu) == 'numba'\n"
         "child = os.fork()\n"
         "if child == 0:\n"
         "    available._why_missing = lambda name: None\n"
-        "    available.difference_from_torch = lambda backend, device: None\n"
+        "    trial.difference_from_torch = lambda backend, device: None\n"
         "    assert BACKENDS.chosen(cpu) == 'torch' and BACKENDS.chosen(card) == 'cuda'\n"
         "    os._exit(0)\n"
         "assert os.waitpid(child, 0)[1] == 0\n"

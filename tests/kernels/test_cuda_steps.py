@@ -9,7 +9,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from legs_loss import LegsError, configure, l1_loss, legs_loss, ssim
-from legs_loss.kernels import available, backends
+from legs_loss.kernels import available, backends, trial
 from legs_loss.kernels.available import BACKENDS, Availability, Known
 from legs_loss.kernels.contract import Weights
 from legs_loss.kernels.cuda.backend import CudaBackend, Layout, Task, chunks_of, strip_of
@@ -192,7 +192,7 @@ class TestCapture:
     def test_the_trial_does_not_run_in_a_capture(self, monkeypatch):
         monkeypatch.setattr(BACKENDS, "_found", {})
         monkeypatch.setattr(available, "is_capturing", lambda device: True)
-        monkeypatch.setattr(available, "difference_from_torch", lambda *_: pytest.fail("a trial waits for the device"))
+        monkeypatch.setattr(trial, "difference_from_torch", lambda *_: pytest.fail("a trial waits for the device"))
         assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         assert not BACKENDS._found
 

@@ -271,7 +271,7 @@ class TestTraining:
 
     def test_the_trainers_views(self, tiny_scene, tmp_path):
         pytest.importorskip("numba")
-        from legs_loss.reference.training.dataset import load_dataset
+        from legs_loss.lab.training.dataset import load_dataset
 
         scene = read_scene(tiny_scene)
         computed = load_dataset(scene, ROBUST)

@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from legs_loss.reference.embedded import write_embedded_scene
+from legs_loss.lab.embedded import write_embedded_scene
 from tests.patcher.support import checkout, files, legs_patch, snapshot
 from tests.support import legs, legs_environment
 

@@ -11,7 +11,7 @@ pytest.importorskip("libcst")
 from legs_adapters.plan import plan
 from legs_adapters.terms.ssim.forms import FORMS, form_of
 
-from legs_loss.reference.embedded import write_embedded_scene
+from legs_loss.lab.embedded import write_embedded_scene
 from tests.code.support import function, program
 from tests.patcher.support import checkout, files, legs_patch, snapshot
 from tests.patcher.test_run import python, result

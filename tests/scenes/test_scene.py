@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from legs_loss.cli import main
-from legs_loss.reference.embedded import write_embedded_scene
+from legs_loss.lab.embedded import write_embedded_scene
 from legs_loss.scenes import read_scene
 
 pycolmap = pytest.importorskip("pycolmap")

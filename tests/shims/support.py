@@ -16,8 +16,8 @@ from legs_adapters.shims.inria.camera import pinhole
 from legs_adapters.shims.modules import diff_gaussian_rasterization as inria
 from legs_adapters.shims.modules import diff_gaussian_rasterization_fastgs as fastgs
 
-from legs_loss.reference.conventions import NEAR, TILE
-from legs_loss.reference.rasterizer import oracle
+from legs_loss.lab.conventions import NEAR, TILE
+from legs_loss.lab.rasterizer import oracle
 
 WIDTH, HEIGHT = 72, 50
 

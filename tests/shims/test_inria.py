@@ -16,8 +16,8 @@ from legs_adapters.shims.missing import Absent, MissingShim
 from legs_adapters.shims.modules import diff_gaussian_rasterization as inria
 
 from legs_loss import LegsError
-from legs_loss.reference.conventions import TILE
-from legs_loss.reference.rasterizer import covariance
+from legs_loss.lab.conventions import TILE
+from legs_loss.lab.rasterizer import covariance
 from tests.shims.support import BACKGROUND, HEIGHT, WIDTH, Dense, camera, close, draw, gaussians
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from legs_loss.reference.embedded import write_embedded_scene
+from legs_loss.lab.embedded import write_embedded_scene
 from tests.patcher.support import checkout, snapshot
 from tests.support import legs_environment
 

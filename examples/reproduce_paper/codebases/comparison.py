@@ -19,11 +19,11 @@ from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 from examples.reproduce_paper.codebases.profile import Profile
 from examples.reproduce_paper.codebases.training import Checkout, check_copy, copy_checkout, train_and_score
 from legs_loss.errors import LegsError
-from legs_loss.experiments.arms import BASELINE, ArmSpec, needed, parse_arm
-from legs_loss.experiments.running import Row, identity, read_json, versions, write_json, write_or_check
-from legs_loss.reference.training.checkpoint import alone_in
-from legs_loss.reference.training.dataset import load_view, split_views
-from legs_loss.reference.training.trainer import TrainConfig
+from legs_loss.lab.experiments.arms import BASELINE, ArmSpec, needed, parse_arm
+from legs_loss.lab.experiments.running import Row, identity, read_json, versions, write_json, write_or_check
+from legs_loss.lab.training.checkpoint import alone_in
+from legs_loss.lab.training.dataset import load_view, split_views
+from legs_loss.lab.training.trainer import TrainConfig
 from legs_loss.scenes import Scene, read_scene, training_size
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_maps

@@ -16,9 +16,9 @@ from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence, Set
 
 from examples.reproduce_paper.codebases.profile import Edit, Profile, fill
 from legs_loss.errors import LegsError
-from legs_loss.reference.training.densify import Schedule
-from legs_loss.reference.training.metrics import mean_scores, score
-from legs_loss.report.html_pictures import read_picture
+from legs_loss.lab.report.html_pictures import read_picture
+from legs_loss.lab.training.densify import Schedule
+from legs_loss.lab.training.metrics import mean_scores, score
 from legs_loss.spec import WeightSpec
 from legs_loss.system import read_regular, write_whole
 

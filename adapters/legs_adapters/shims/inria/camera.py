@@ -8,7 +8,7 @@ from typing import Any, Optional
 import numpy as np
 
 from legs_adapters.shims.missing import MissingShim
-from legs_loss.reference.rasterizer import View
+from legs_loss.lab.rasterizer import View
 
 __all__ = ["pinhole"]
 

@@ -21,7 +21,7 @@ from legs_adapters.shims.inria.settings import SETTINGS, settings_type
 from legs_adapters.shims.inria.sparse_adam import SparseGaussianAdam
 from legs_adapters.shims.inria.survey import Interface
 from legs_adapters.shims.missing import Absent, MissingShim, complete
-from legs_loss.reference.rasterizer import Drawn, Lens
+from legs_loss.lab.rasterizer import Drawn, Lens
 
 __all__ = ["kind_of", "module"]
 

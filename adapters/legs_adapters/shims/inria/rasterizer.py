@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from legs_adapters.shims.inria.camera import pinhole
 from legs_adapters.shims.missing import MissingShim, check_finite, refuse_unknown
 from legs_loss import LegsError
-from legs_loss.reference.rasterizer import NEAR, CompactBox, Drawn, Lens, Tensors, draw
+from legs_loss.lab.rasterizer import NEAR, CompactBox, Drawn, Lens, Tensors, draw
 
 __all__ = ["Gaussians", "Rasterizer", "RasterizerBase", "check_one_of", "given_or_none"]
 

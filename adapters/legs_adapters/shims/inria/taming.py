@@ -16,7 +16,7 @@ from legs_adapters.shims.inria.settings import SETTINGS, settings_type
 from legs_adapters.shims.inria.sparse_adam import SparseGaussianAdam
 from legs_adapters.shims.inria.survey import Interface
 from legs_adapters.shims.missing import Absent, complete
-from legs_loss.reference.rasterizer import Drawn
+from legs_loss.lab.rasterizer import Drawn
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "module"]
 

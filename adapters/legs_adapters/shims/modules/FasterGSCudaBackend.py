@@ -19,7 +19,7 @@ from torch import Tensor
 from legs_adapters.shims.inria.relocation import relocated
 from legs_adapters.shims.inria.survey import Interface
 from legs_adapters.shims.missing import check_finite, complete
-from legs_loss.reference.rasterizer import (
+from legs_loss.lab.rasterizer import (
     MIN_ALPHA,
     NEAR,
     Drawn,

@@ -15,7 +15,7 @@ from torch import Tensor
 from legs_adapters.shims.inria.rasterizer import Gaussians, Rasterizer
 from legs_adapters.shims.inria.settings import SETTINGS, settings_type
 from legs_adapters.shims.inria.sparse_adam import SparseGaussianAdam
-from legs_loss.reference.rasterizer import CompactBox, Drawn, Lens
+from legs_loss.lab.rasterizer import CompactBox, Drawn, Lens
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from legs_adapters.shims.inria.rasterizer import RasterizerBase, check_one_of, given_or_none
 from legs_adapters.shims.inria.settings import settings_type
-from legs_loss.reference.surfels import Surfels, SurfelView, rasterize_surfels
+from legs_loss.lab.surfels import Surfels, SurfelView, rasterize_surfels
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 

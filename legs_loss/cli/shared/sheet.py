@@ -1,0 +1,124 @@
+"""A contact sheet: photograph, response and weight map of some views, and the curves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple, Optional, Sequence, Union
+
+import numpy as np
+import torch
+
+from legs_loss.cli.shared.labels import label
+from legs_loss.cli.shared.saving import save_figure
+from legs_loss.curves import curve, curve_names
+from legs_loss.errors import LegsError
+from legs_loss.spec import WeightSpec
+from legs_loss.weights import curved, weight_from_response
+
+__all__ = ["Shown", "save_sheet"]
+
+_INK, _FAINT = "#222222", "#9a9a9a"
+
+
+class Shown(NamedTuple):
+    """One view of a sheet: its label, its photograph uint8 or uint16 [H, W, C] if there is one, its E^ [H, W].
+
+    For a spec that is normalised over the scene, E^ is its response normalised so. The user's own mask and weights are
+    factors of the weight, [H, W].
+    """
+
+    label: str
+    photograph: Optional[np.ndarray]
+    normalised: np.ndarray
+    mask: Optional[np.ndarray] = None
+    weights: Optional[np.ndarray] = None
+
+
+def save_sheet(path: Union[str, Path], views: Sequence[Shown], spec: WeightSpec, title: str) -> None:
+    """Draw the sheet to a PNG: photograph, E^ and W of every view with colour bars, and the curves below.
+
+    The bar of E^ ends at its 99th percentile over the views: a few pixels own the maximum.
+
+    Raises:
+        LegsError: matplotlib is missing, or the file cannot be written.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise LegsError("pictures need matplotlib: pip install 'legs-loss[report]'") from None
+
+    many = len(views) > 1
+    rows = 4 if any(view.mask is not None for view in views) else 3
+    aspect = max(view.normalised.shape[0] / view.normalised.shape[1] for view in views)
+    column = min(4.2, 3.6 / aspect) if many else min(4.8, 5.0 / aspect)
+    width, height = (
+        (column * len(views) + 1.4, rows * column * aspect) if many else (rows * column, column * aspect + 0.6)
+    )
+    figure: Any = Figure(figsize=(max(7.0, width), height + 4.4), constrained_layout=True)
+    figure.suptitle(label(title), fontsize=13, color=_INK)
+    maps, below = figure.subfigures(2, 1, height_ratios=[height + 0.8, 3.4])
+    if many:  # a column a view
+        grid = maps.subplots(
+            rows, len(views) + 1, squeeze=False, gridspec_kw={"width_ratios": [1] * len(views) + [0.06]}
+        )
+        cells, bars = grid[:, :-1], grid[:, -1]
+    else:  # side by side
+        grid = maps.subplots(2, rows, gridspec_kw={"height_ratios": [1, 0.03]})
+        cells, bars = grid[:1].T, grid[1]
+    _draw_maps(cells, bars, views, spec)
+    _draw_curves(below.subplots(), spec)
+    save_figure(figure, path, 140)
+
+
+def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) -> None:
+    """Fill cells [rows, views] and the colour bars of the rows: photograph, mask if there is one, response, weight."""
+    masked = len(cells) == 4
+    own = [factor for view in views for factor in (view.mask, view.weights) if factor is not None]
+    most = max([float(view.weights.max()) for view in views if view.weights is not None], default=1.0)
+    # A few pixels own the maximum: shown up to it, a response is all black.
+    brightest = max(float(np.quantile(view.normalised.astype(np.float32), 0.99)) for view in views) or 1.0
+    for column, view in enumerate(views):
+        photograph, response, weighted = cells[[0, -2, -1], column]
+        for axes in cells[:, column]:
+            axes.set(xticks=[], yticks=[], frame_on=False)
+        weighted_by = curved if spec.over == "scene" else weight_from_response
+        weight = weighted_by(torch.from_numpy(view.normalised.astype(np.float32))[None], spec)[0].numpy()
+        for factor in (view.mask, view.weights):
+            weight = weight if factor is None else weight * factor
+        if masked:
+            shown = np.ones_like(weight) if view.mask is None else view.mask
+            cells[1, column].imshow(shown, cmap="gray", vmin=0, vmax=1)
+        if view.photograph is None:
+            photograph.text(0.5, 0.5, "not found,\nor changed since", ha="center", va="center", color=_FAINT)
+        else:
+            unit = view.photograph / np.float32(np.iinfo(view.photograph.dtype).max)
+            photograph.imshow(unit.squeeze(-1) if unit.shape[-1] == 1 else unit, cmap="gray", vmin=0, vmax=1)
+        strengths = response.imshow(view.normalised.astype(np.float32), cmap="magma", vmin=0, vmax=brightest)
+        weights = weighted.imshow(weight, cmap="viridis", vmin=0 if own else 1, vmax=(1 + (spec.beta or 1)) * most)
+        weighted.set_xlabel(f"mean weight {weight.mean():.2f}", fontsize=9, color=_INK)
+        if len(views) > 1:
+            photograph.set_title(label(view.label), fontsize=10, color=_INK)
+    names = ["photograph", *(["mask"] if masked else []), r"response  $\hat{E}$", "weight  $W$"]
+    for axes, name in zip(cells[:, 0], names):
+        (axes.set_ylabel if len(views) > 1 else axes.set_title)(name, fontsize=11, color=_INK)
+    along = "vertical" if len(views) > 1 else "horizontal"
+    figure = cells[0, 0].figure
+    for bar in bars[:-2]:
+        bar.axis("off")
+    figure.colorbar(strengths, cax=bars[-2], orientation=along, extend="max" if brightest < 1 else "neither")
+    figure.colorbar(weights, cax=bars[-1], orientation=along)
+
+
+def _draw_curves(axes: Any, spec: WeightSpec) -> None:
+    x = torch.linspace(0.0, 1.0, 501)
+    for name in curve_names():
+        chosen = name == spec.curve
+        style = {"linewidth": 2.6, "zorder": 3} if chosen else {"linewidth": 1.3, "alpha": 0.75}
+        axes.plot(x.numpy(), curve(name)(x).numpy(), label=f"{name} (this sheet)" if chosen else name, **style)
+    axes.set_title(r"curves $f$:  $W = 1 + \beta\, f(\hat{E})$", fontsize=11, color=_INK)
+    axes.set_xlabel(r"normalised response $\hat{E}$")
+    axes.set_ylabel(r"$f(\hat{E})$")
+    axes.set_xlim(0, 1)
+    axes.set_ylim(0, 1)
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -1,0 +1,1 @@
+"""Sub-commands of ``legs``, which finds them by their entry points: each as those in legs_loss/cli."""

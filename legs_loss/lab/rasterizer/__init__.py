@@ -1,0 +1,46 @@
+"""Gaussians to an image: the readable oracle, the compiled rasterizer that must agree with it, and their one entry.
+
+`rasterize` is the entry for 3DGS's own rasterizer; `draw` is the one for forks that change or return more. Modules that
+need numba are imported on first use.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from legs_loss.lab.conventions import MIN_ALPHA as MIN_ALPHA
+from legs_loss.lab.conventions import NEAR as NEAR
+from legs_loss.lab.conventions import View as View
+from legs_loss.lab.gaussians import Gaussians as Gaussians
+from legs_loss.lab.rasterizer.oracle import rotations as rotations
+from legs_loss.lab.rasterizer.rasterize import Rendering as Rendering
+from legs_loss.lab.rasterizer.rasterize import rasterize as rasterize
+
+if TYPE_CHECKING:
+    from legs_loss.lab.rasterizer.compact_box import CompactBox as CompactBox
+    from legs_loss.lab.rasterizer.compiled import Tensors as Tensors
+    from legs_loss.lab.rasterizer.drawing import Contributions as Contributions
+    from legs_loss.lab.rasterizer.drawing import Drawn as Drawn
+    from legs_loss.lab.rasterizer.drawing import Lens as Lens
+    from legs_loss.lab.rasterizer.drawing import compensation as compensation
+    from legs_loss.lab.rasterizer.drawing import covariance as covariance
+    from legs_loss.lab.rasterizer.drawing import draw as draw
+
+_HOMES = {
+    "CompactBox": "compact_box",
+    "Contributions": "drawing",
+    "Drawn": "drawing",
+    "Lens": "drawing",
+    "Tensors": "compiled",
+    "compensation": "drawing",
+    "covariance": "drawing",
+    "draw": "drawing",
+}
+__all__ = ["MIN_ALPHA", "NEAR", "Gaussians", "Rendering", "View", "rasterize", "rotations", *_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

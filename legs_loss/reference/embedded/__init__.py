@@ -1,5 +1,0 @@
-"""The scene that the package makes itself, so that everything can be tried without a dataset."""
-
-from legs_loss.reference.embedded.scene import write_embedded_scene
-
-__all__ = ["write_embedded_scene"]

@@ -25,6 +25,7 @@ _DEFAULTS = "defaults"
 _SETTINGS = ("preset", "store", *(field.name for field in fields(WeightSpec)))
 _TEXT_FIELDS = ("operator", "curve", "normalise", "over")
 _OTHER_VARIABLES = ("off", "backend", "masks")
+_JOURNAL = ".legs-patch.json"  # beside the legs.toml that legs-patch wrote
 _LARGEST = 1 << 20  # bytes of a legs.toml
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("", "0", "false", "no", "off")
 
@@ -66,8 +67,8 @@ def find_config(
 
     Args:
         start: a file or folder of the codebase: legs.toml is looked for there and in the folders above it, up to the
-            root of its git checkout, the user's home folder, or the first legs.toml of another owner, which is not
-            read. None: no file is searched.
+            root of its git checkout (or of the codebase around it that legs-patch patched with it), the user's home
+            folder, or the first legs.toml of another owner, which is not read. None: no file is searched.
         environ: in place of ``os.environ``: LEGS_PRESET, LEGS_BETA, LEGS_CURVE, LEGS_OPERATOR, LEGS_P,
             LEGS_PERCENTILE, LEGS_NORMALISE, LEGS_EPS, LEGS_OVER, LEGS_NOISE_FLOOR, LEGS_SMOOTH, LEGS_STORE, LEGS_OFF,
             LEGS_MASKS.
@@ -182,14 +183,15 @@ def _unknown_variables(environ: Mapping[str, str]) -> Tuple[str, ...]:
 
 def _find_file(start: Path) -> Tuple[Optional[Path], str]:
     """Return the legs.toml of a script or folder, and a note if one was found and not read."""
-    home = Path(os.path.expanduser("~"))
+    home, is_above = Path(os.path.expanduser("~")), False
     for folder in [start, *start.parents] if start.is_dir() else start.parents:
         path = folder / CONFIG_FILE
-        if path.is_file():
+        if path.is_file() and (not is_above or (folder / _JOURNAL).is_file()):
             if _owner(path) not in (_owner(start), _user()):
                 return None, f"{path} belongs to another user: it is not read"
             return path, ""
-        if (folder / ".git").exists() or folder == home:
+        is_above = is_above or (folder / ".git").exists()
+        if folder == home:
             break
     return None, ""
 

@@ -174,6 +174,8 @@ def _patch(args: argparse.Namespace) -> int:
     text = settings_text(root, settings)
     writes = bool(settings) or not (root / SETTINGS_FILE).exists()  # else the user's, or an earlier run's, stays
     found = plan(root, args.exclude, [_site(root, text) for text in args.site], ssim=args.ssim, masks=args.masks)
+    for elsewhere in found.unsearched:
+        say(f"legs-patch: warning: {elsewhere.text(args.folder)}", sys.stderr)
     problems, is_decided = found.findings.problems, bool(found.findings.sites or found.findings.patched)
     if not is_decided or (problems and args.strict):
         _show(args, found)

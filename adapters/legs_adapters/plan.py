@@ -18,6 +18,7 @@ from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_adapters.rules.find import find
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.terms.findings import Findings
+from legs_adapters.unsearched import Unsearched, unsearched
 from legs_loss import LegsError
 
 __all__ = ["Plan", "plan", "write"]
@@ -31,6 +32,7 @@ class Plan(NamedTuple):
         findings: what was found in it.
         edits: by path, the edits of each file.
         after: by path, the bytes that each file would have.
+        unsearched: what may be the loss in folders that are not searched.
         settings: the text of legs.toml, where one is to be written.
     """
 
@@ -38,6 +40,7 @@ class Plan(NamedTuple):
     findings: Findings
     edits: Dict[str, List[Edit]]
     after: Dict[str, bytes]
+    unsearched: Sequence[Unsearched] = ()
     settings: Optional[str] = None
 
     def source(self, path: str) -> bytes:
@@ -113,11 +116,12 @@ def plan(
                 edits[name] = rewrite(findings.program, name, sites, unweighted, in_place)
             except RecursionError:
                 _give_up(findings, name, "is nested too deeply")
+        elsewhere = tuple(unsearched(root, exclude))
     findings.unreadable[:0] = unreadable
     for name, line in by_hand:
         _check_named(root, findings, name, line, exclude)
     after = {name: apply_edits(findings.program.sources[name].data, made) for name, made in edits.items()}
-    return Plan(root, findings, edits, after)
+    return Plan(root, findings, edits, after, elsewhere)
 
 
 def _check_named(root: Path, findings: Findings, name: str, line: int, exclude: Sequence[str]) -> None:

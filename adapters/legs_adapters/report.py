@@ -70,6 +70,10 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
         "problems": [line(entry, reason=entry.reason, advice=entry.advice) for entry in found.problems],
         "doubts": [line(entry, reason=entry.reason, advice=entry.advice) for entry in found.doubts],
         "unreadable": [{"file": entry.path, "reason": entry.reason} for entry in found.unreadable],
+        "unsearched": [
+            {"folder": at.folder, "reason": at.why, "file": at.path, "line": at.line, "advice": at.text(plan.root)}
+            for at in plan.unsearched
+        ],
         "would_change": sorted(plan.after),
         "wrote": list(wrote),
     }

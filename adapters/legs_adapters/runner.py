@@ -73,6 +73,8 @@ def run_script(
     find_config(path, argv=[])  # report wrong settings now, not at the first training step
     root = check_root(checkout_of(path))
     found = plan(root, in_place=True, ssim=ssim, masks=masks)
+    for elsewhere in found.unsearched:
+        _say(f"not weighted: {elsewhere.text(root)}")
     for problem in found.findings.problems:
         text = f"{problem.path}:{problem.line}: {problem.reason}; edit it by hand: {problem.advice}"
         if not found.after and not found.findings.patched:

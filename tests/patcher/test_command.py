@@ -9,6 +9,7 @@ import subprocess
 import pytest
 from legs_adapters.cli import main
 
+from legs_loss.config import find_config
 from tests.patcher.support import PATCHED, SITE, checkout, files, legs_patch, run_git, snapshot, without_marks
 from tests.support import ROOT
 
@@ -225,21 +226,62 @@ class TestCommandLine:
         assert run("--undo", root).returncode == 0
         assert snapshot(root) == before
 
+    def test_a_nested_checkout_is_patched_with_the_codebase_and_asked_by_its_own_git(self, tmp_path, run, monkeypatch):
+        """As FasterGS is installed: cloned into a folder of NeRFICG that NeRFICG's git does not know."""
+        inner = {path: without_marks(text) for path, text in files("registered_callable_weighted").items()}
+        (loss,) = [path for path in inner if path.endswith("Loss.py")]
+        root = checkout(tmp_path / "outer", {loss: inner[loss], "scripts/train.py": "import torch\n"}, git=True)
+        nested = root / "src" / "Methods" / "FasterThing"
+        checkout(nested, {"Loss.py": inner[loss], "Model.py": "import gaussian_splatting\n"}, git=True)
+        before = snapshot(root)
+        done = run(root, "--beta", "4")
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "src/Methods/FasterThing/Loss.py:" in done.stdout
+        for folder in (nested, (root / loss).parent):
+            assert "legs_loss.l1_loss(input, target, own=" in (folder / "Loss.py").read_text()
+        assert [path.name for path in root.rglob(".legs-patch.json")] == [".legs-patch.json"]
+        assert run_git(nested, "status", "--short") == " M Loss.py\n"
+        settings = find_config(nested / "Loss.py", environ={}, argv=[])  # past the nested .git, beside the journal
+        assert settings.spec.beta == 4
+        assert run("--undo", root).returncode == 0
+        assert snapshot(root) == before
+        (nested / "Loss.py").write_text("# mine\n" + inner[loss])
+        refused = run(root)
+        assert refused.returncode == 2
+        assert "uncommitted changes in what would be patched (src/Methods/FasterThing/Loss.py)" in refused.stderr
+        run_git(nested, "commit", "-q", "-a", "-m", "mine")
+        assert run(root).returncode == 0
+
+    def test_what_may_be_the_loss_in_folders_that_are_not_entered_is_said(self, tmp_path, run):
+        other = {f"{at}/{path}": text for at in ("sub/gs", "third_party/x") for path, text in files("inria").items()}
+        other = {path: without_marks(text) for path, text in other.items()}
+        root = checkout(tmp_path, {**files("inria"), "third_party/plain/a.py": "l1_loss(a, b)\n", **other})
+        (root / ".gitmodules").write_text("[submodule]\n\tpath = sub/gs\n[submodule]\n\tpath = third_party/x\n")
+        (root / "third_party" / "x" / ".git").write_text("gitdir: ../../.git/modules/x\n")
+        line = other["sub/gs/train.py"].splitlines().index(SITE.rstrip("\n")) + 1
+        said = [
+            f"legs-patch: warning: {at}/train.py:{line} may be the loss, and {at} is not searched (a submodule): "
+            f"legs-patch {root}/{at}\n"
+            for at in ("sub/gs", "third_party/x")
+        ]
+        for options in (["--check"], ["--check", "--json"], ["--diff"]):
+            assert set(said) <= set(run(root, *options).stderr.splitlines(True))
+        entries = json.loads(run(root, "--check", "--json").stdout)["unsearched"]
+        assert [(each["file"], each["line"]) for each in entries] == [
+            ("sub/gs/train.py", line),
+            ("third_party/x/train.py", line),
+        ]
+        assert run(root, "--check", "--exclude", "sub", "--exclude", "third_party").stderr == ""
+        assert run(root / "sub" / "gs").returncode == 0
+
     def test_folders_that_are_not_entered_are_named_where_nothing_was_found(self, tmp_path, run):
-        vendored = {f"inner/gaussian-splatting/{path}": text for path, text in files("inria").items()}
-        root = checkout(tmp_path, {"run.py": "import os\n", "venv/x.py": "", **vendored})
-        (root / "inner" / "gaussian-splatting" / ".git").write_text("gitdir: elsewhere\n")
-        found = run(root)
-        assert (found.returncode, found.stderr.count("\n")) == (2, 1)
-        named = "inner/gaussian-splatting (a nested checkout)"
-        assert found.stderr.endswith(f"; not searched: {named}: run legs-patch on the one that trains\n")
-        assert "not searched" not in run(root, "--exclude", "inner").stderr
-        checkout(root, {"submodules/a.py": "", "extern/a.py": "", "tests/a.py": ""})
+        texts = {"run.py": "import os\n", "venv/x.py": "", "submodules/a.py": "", "extern/a.py": "", "tests/a.py": ""}
+        root = checkout(tmp_path, texts)
         assert run(root).stderr.endswith(
-            f"; not searched: extern (third-party code), {named}, submodules (third-party code) and 1 more: "
+            "; not searched: extern (third-party code), submodules (third-party code), tests (a folder of tests): "
             "run legs-patch on the one that trains\n"
         )
-        assert run(root / "inner" / "gaussian-splatting").returncode == 0
+        assert "extern" not in run(root, "--exclude", "extern").stderr
 
     @pytest.mark.parametrize(
         ("path", "message"),

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 from legs_adapters.checkout import replace as replace_module
-from legs_adapters.code.folders import walk
+from legs_adapters.code.folders import walk, why_left_out
 from legs_adapters.code.sources import Source, decode
 from legs_adapters.journal import JOURNAL
 from legs_adapters.plan import plan, write
@@ -170,7 +170,8 @@ class TestWhereItLooks:
             "sub/module/train.py",
             "venv/lib/train.py",
             "my_env/train.py",
-            "nested_checkout/train.py",
+            "worktree/train.py",
+            "modules/train.py",
             "tests/test_train.py",
             "test_train.py",
             "third_party/train.py",
@@ -180,8 +181,18 @@ class TestWhereItLooks:
         root = checkout(tmp_path, {name: "x = 1\n" for name in [*foreign, "train.py", "scripts/train.py"]})
         (root / ".gitmodules").write_text('[submodule "m"]\n\tpath = sub/module\n\turl = x\n')
         (root / "my_env" / "pyvenv.cfg").write_text("")
-        (root / "nested_checkout" / ".git").write_text("gitdir: elsewhere\n")
+        (root / "worktree" / ".git").write_text(f"gitdir: {root}/.git/worktrees/worktree\n")
+        (root / "modules" / ".git").write_text("gitdir: ../.git/modules/modules\n")
         assert list(walk(root)) == ["train.py", "scripts/train.py"]
+
+    def test_a_nested_checkout_belongs_to_it_and_its_own_submodules_do_not(self, tmp_path):
+        texts = {"nested/.git/config": "", "nested/.gitmodules": "[submodule]\n\tpath = part\n", "nested/part/a.py": ""}
+        root = checkout(tmp_path, {"train.py": "", "nested/loss.py": "", "kept/loss.py": "", **texts})
+        (root / "kept" / ".git").write_text("gitdir: /elsewhere/modules/kept.git\n")  # git clone --separate-git-dir
+        assert sorted(walk(root)) == ["kept/loss.py", "nested/loss.py", "train.py"]
+        assert why_left_out(root, "nested/part/a.py") == (
+            "nested/part is not searched (a submodule): run legs-patch on that folder"
+        )
 
     @pytest.mark.parametrize(
         ("script", "root"),

@@ -10,8 +10,8 @@ import hashlib
 import os
 import shutil
 import subprocess
-from pathlib import Path
-from typing import List, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Dict, List, Mapping
 
 from legs_loss import LegsError
 
@@ -28,14 +28,25 @@ _ENVIRONMENT = {
 def changed_files(root: Path, files: Mapping[str, bytes]) -> List[str]:
     """Return which of these files differ from the last commit, in more than their line ends.
 
-    A file that was never committed counts as unchanged; so do all outside of git, where git is missing, and where it
-    does not trust the checkout's owner.
+    The git of a nested checkout is asked about its files. A file that was never committed counts as unchanged; so do
+    all outside of git, where git is missing, and where it does not trust the checkout's owner.
 
     Raises:
         LegsError: git times out.
     """
+    by_checkout: Dict[str, Dict[str, bytes]] = {}
+    for path, data in files.items():
+        above = [folder.as_posix() for folder in PurePosixPath(path).parents][:-1]
+        nested = next((folder for folder in above if os.path.lexists(str(root / folder / ".git"))), "")
+        by_checkout.setdefault(nested, {})[path[len(nested) :].lstrip("/")] = data
+    found = ((PurePosixPath(at), _changed(root, root / at, inner)) for at, inner in by_checkout.items())
+    return [(at / name).as_posix() for at, names in found for name in names]
+
+
+def _changed(outer: Path, root: Path, files: Mapping[str, bytes]) -> List[str]:
+    """Return which files of one checkout differ from its last commit."""
     program = shutil.which("git")
-    if not files or program is None or root in Path(os.path.realpath(program)).parents:
+    if program is None or outer in Path(os.path.realpath(program)).parents:
         return []  # a "." on the path, or Windows, finds programs in the folder one is in
     command = [program, "--no-pager", "-c", "safe.bareRepository=explicit", "-C", str(root), "ls-tree", "-z", "HEAD"]
     try:

@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 VENDORED, SUBMODULE = "third-party code", "a submodule"
-_TESTS, _CHECKOUT = "a folder of tests", "a nested checkout"
+_TESTS, _WORKTREE = "a folder of tests", "another worktree of this checkout"
 _FOREIGN = {
     name: why
     for why, names in (
@@ -38,8 +38,8 @@ _FOREIGN = {
     )
     for name in names.split()
 }
-PATCHABLE = (VENDORED, _TESTS, SUBMODULE, _CHECKOUT)
-_LARGEST = 1 << 20  # bytes of a .gitmodules
+PATCHABLE = (VENDORED, _TESTS, SUBMODULE, _WORKTREE)
+_LARGEST = 1 << 20  # bytes of a .gitmodules, or of a .git that is a file
 _TEST_FILE = re.compile(r"^(test_.*|conftest)\.py$")
 
 
@@ -53,9 +53,9 @@ class Skipped(NamedTuple):
 def walk(root: Path, exclude: Sequence[str] = ()) -> Iterator[str]:
     """Yield the paths of the checkout's own Python files, relative, posix separators, a folder's own files first.
 
-    Links are not followed, whether to files or to folders; skipped are ``.git``, submodules, virtual environments,
-    vendored folders, tests, and what ``exclude`` names: globs on the relative path or, without a slash, on the name of
-    the file or of a folder above it.
+    A nested checkout belongs to it. Links are not followed, whether to files or to folders; skipped are ``.git``,
+    submodules, other worktrees, virtual environments, vendored folders, tests, and what ``exclude`` names: globs on the
+    relative path or, without a slash, on the name of the file or of a folder above it.
     """
     for files, _ in folders_of(root, exclude):
         yield from files
@@ -74,10 +74,11 @@ def why_left_out(root: Path, path: str, exclude: Sequence[str] = ()) -> Optional
 
 def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
     """Return the skipped folder that a file is in, below third_party the inner one; None without one."""
-    submodules = _submodules(root)
+    submodules = _submodules(root, "")
     folders = [folder.as_posix() for folder in reversed(PurePosixPath(path).parents)][1:]
     for folder, inner in zip(folders, [*folders[1:], ""]):
         why = "a link" if os.path.islink(str(root / folder)) else _why_foreign(root, folder, submodules)
+        submodules += _submodules(root, folder)
         if why == VENDORED and inner:
             return Skipped(inner, _why_foreign(root, inner, submodules) or why)
         if why is not None:
@@ -87,9 +88,10 @@ def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
 
 def folders_of(root: Path, exclude: Sequence[str]) -> Iterator[Tuple[List[str], List[Skipped]]]:
     """Yield, a folder at a time, the Python files in it, and the folders in it that are not entered."""
-    submodules = _submodules(root)
+    submodules: List[str] = []
     for here, folders, names in os.walk(str(root), followlinks=False):
         relative = Path(here).relative_to(root)
+        submodules += _submodules(root, relative.as_posix()) if ".gitmodules" in names else []
         paths = {(relative / name).as_posix(): name for name in sorted([*folders, *names])}
         own = [path for path in paths if not _excluded(path, exclude) and not os.path.islink(str(root / path))]
         why = {path: _why_foreign(root, path, submodules) for path in own if paths[path] in folders}
@@ -106,7 +108,19 @@ def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[s
         return SUBMODULE if path in submodules else _FOREIGN[name]
     if (root / path / "pyvenv.cfg").exists():
         return "a virtual environment"
-    return _CHECKOUT if os.path.lexists(str(root / path / ".git")) else None
+    return _why_not_own(root / path)
+
+
+def _why_not_own(folder: Path) -> Optional[str]:
+    """Return why a folder with a ``.git`` is no nested checkout; None where it is one, or has none."""
+    try:
+        text = read_regular(folder / ".git", _LARGEST).decode("utf-8", "replace")
+    except OSError:  # a folder, of a checkout of its own; or there is none
+        return None
+    kept = Path(os.path.normpath(str(folder / text.partition("gitdir:")[2].strip())))
+    inside = kept.parts[kept.parts.index(".git") :] if ".git" in kept.parts else ()
+    outer = any(above / ".git" in kept.parents for above in folder.parents)
+    return SUBMODULE if "modules" in inside else _WORKTREE if outer else None
 
 
 def _excluded(path: str, patterns: Sequence[str]) -> bool:
@@ -115,12 +129,14 @@ def _excluded(path: str, patterns: Sequence[str]) -> bool:
     return any(fnmatch.fnmatch(name, pattern.rstrip("/")) for pattern in patterns for name in names)
 
 
-def _submodules(root: Path) -> List[str]:
+def _submodules(root: Path, folder: str) -> List[str]:
+    """Return the submodules that a folder's ``.gitmodules`` names."""
     try:
-        text = read_regular(root / ".gitmodules", _LARGEST).decode("utf-8", "replace")
+        text = read_regular(root / folder / ".gitmodules", _LARGEST).decode("utf-8", "replace")
     except OSError:
         return []
-    return [match.strip().rstrip("/") for match in re.findall(r"^\s*path\s*=\s*(.+)$", text, re.M)]
+    found = re.findall(r"^\s*path\s*=\s*(.+)$", text, re.M)
+    return [(PurePosixPath(folder) / match.strip()).as_posix() for match in found]
 
 
 def check_name(path: str) -> None:

@@ -1,0 +1,57 @@
+"""Find what may be the loss in the folders of a checkout that are not searched: submodules and third-party code."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any, Dict, Iterator, List, NamedTuple, Sequence, Tuple
+
+from legs_adapters.code.folders import SUBMODULE, VENDORED, folders_of
+from legs_adapters.code.sources import Source, read_files
+from legs_adapters.lexicon.words import SPLATS
+from legs_adapters.rules.find import find
+from legs_loss import LegsError
+
+__all__ = ["Unsearched", "unsearched"]
+
+
+class Unsearched(NamedTuple):
+    """A codebase that is not searched, with the first line in it that may be the loss; relative to the root."""
+
+    folder: str
+    why: str
+    path: str
+    line: int
+
+    def text(self, root: object) -> str:
+        """Return what to run there."""
+        where = f"{self.path}:{self.line} may be the loss"
+        command = f"legs-patch {shlex.quote(f'{root}/{self.folder}')}"
+        return f"{where}, and {self.folder} is not searched ({self.why}): {command}"
+
+
+def unsearched(root: Path, exclude: Sequence[str] = ()) -> Iterator[Unsearched]:
+    """Yield the submodules and the folders of third-party code that draw Gaussians and have a term of their own."""
+    for folder, why in sorted(_skipped(root, "", exclude)):
+        by_codebase: Dict[str, List[Source]] = {}
+        try:
+            sources = read_files(root / folder, exclude)[0]
+        except LegsError:  # larger than a codebase
+            continue
+        for source in sources:
+            inner = source.path.split("/")[0] if why == VENDORED and "/" in source.path else ""
+            by_codebase.setdefault(f"{folder}/{inner}".rstrip("/"), []).append(source)
+        for codebase, sources in by_codebase.items():
+            if any(SPLATS.search(source.text) for source in sources):
+                found = find(sources)
+                hits: List[Any] = [*found.sites, *found.problems]
+                yield from (Unsearched(codebase, why, f"{folder}/{hit.path}", hit.line) for hit in hits[:1])
+
+
+def _skipped(root: Path, below: str, exclude: Sequence[str]) -> Iterator[Tuple[str, str]]:
+    """Yield the folders below one that are not searched, and those in them, each with the reason."""
+    skipped = [folder for _, inner in folders_of(root / below, exclude) for folder in inner]
+    for path, why in [each for each in skipped if each.why in (SUBMODULE, VENDORED)]:
+        path = f"{below}/{path}".lstrip("/")
+        yield path, why
+        yield from _skipped(root, path, exclude)

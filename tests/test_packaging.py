@@ -139,5 +139,4 @@ def test_every_type_of_the_public_face_is_known(package, tmp_path):
     public = [one for one in found["symbols"] if one["isExported"]]
     assert len(public) > 500
     unknown = [one["name"] for one in public if not one["isTypeKnown"] or one["isTypeAmbiguous"]]
-    # This one's base class is NerfBaselines', which is not installed here.
-    assert set(unknown) <= {"legs_adapters.upstreams.nerfbaselines.SplatfactoLegs"}
+    assert unknown == []

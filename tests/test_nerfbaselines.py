@@ -15,6 +15,7 @@ import torch
 
 from tests.support import ROOT
 
+EXAMPLE = ROOT / "examples" / "nerfbaselines"
 FAKE = {
     "nerfbaselines/__init__.py": "specs = []\nregister = specs.append",
     "nerfbaselines/methods/__init__.py": "",
@@ -68,16 +69,15 @@ def method(tmp_path, monkeypatch):
     for path, text in FAKE.items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(textwrap.dedent(text))
+    monkeypatch.syspath_prepend(str(EXAMPLE))
     monkeypatch.syspath_prepend(str(tmp_path))
     before = {name: module for name, module in sys.modules.items() if name.split(".")[0] == "nerfbaselines"}
     for name in before:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delitem(sys.modules, "legs_adapters.upstreams.nerfbaselines", raising=False)
-    yield importlib.import_module("legs_adapters.upstreams.nerfbaselines").SplatfactoLegs
+    yield importlib.import_module("splatfacto_legs").SplatfactoLegs
     for name in [name for name in sys.modules if name.split(".")[0] == "nerfbaselines"]:
         del sys.modules[name]
-    sys.modules.pop("legs_adapters.upstreams.nerfbaselines", None)
-    vars(importlib.import_module("legs_adapters.upstreams")).pop("nerfbaselines", None)
+    sys.modules.pop("splatfacto_legs", None)
 
 
 class Photographs:
@@ -171,24 +171,18 @@ def test_nerfbaselines_lists_it(tmp_path):
     pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     if subprocess.run([*pip, "nerfbaselines==1.2.12"], capture_output=True).returncode:
         pytest.skip("NerfBaselines could not be installed")
-    site = next((tmp_path / "venv").glob("lib/python*/site-packages"))
-    (site / "legs_adapters").symlink_to(ROOT / "adapters" / "legs_adapters")
-    (site / "legs_loss-0.dist-info").mkdir()
-    (site / "legs_loss-0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: legs-loss\nVersion: 0\n")
-    section = (ROOT / "pyproject.toml").read_text().split('[project.entry-points."nerfbaselines.specs"]')[1]
-    points = section.split("\n[")[0].strip().replace('"', "")
-    (site / "legs_loss-0.dist-info" / "entry_points.txt").write_text(f"[nerfbaselines.specs]\n{points}\n")
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    places = {"PYTHONPATH": str(EXAMPLE), "NERFBASELINES_REGISTER": str(EXAMPLE / "splatfacto_legs_spec.py")}
+    environment = dict(os.environ, **places)
     program = (
         "import nerfbaselines, sys\n"
         "from nerfbaselines.backends import get_implemented_backends\n"
         "spec = nerfbaselines.get_method_spec('splatfacto-legs')\n"
-        "print(spec['method_class'], spec['backends_order'], get_implemented_backends(spec))\n"
+        "print(spec['method_class'], get_implemented_backends(spec))\n"
         "assert 'torch' not in sys.modules\n"
     )
     found = subprocess.run([str(python), "-c", program], env=environment, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr
-    assert found.stdout.startswith("legs_adapters.upstreams.nerfbaselines:SplatfactoLegs ['python']")
+    assert found.stdout == "splatfacto_legs:SplatfactoLegs ['python']\n"
     listed = subprocess.run(
         [str(python), "-m", "nerfbaselines", "train", "--help"], env=environment, capture_output=True, text=True
     )

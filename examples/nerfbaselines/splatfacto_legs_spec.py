@@ -1,6 +1,7 @@
-"""NerfBaselines: what it reads of the method ``splatfacto-legs``, through its entry point ``nerfbaselines.specs``.
+"""NerfBaselines: what it reads of the method ``splatfacto-legs``, from the file that NERFBASELINES_REGISTER names.
 
-Only NerfBaselines is imported, so that ``nerfbaselines train --help`` lists the method where nerfstudio is missing.
+The folder has to be on PYTHONPATH. Only NerfBaselines is imported, so that ``nerfbaselines train --help`` lists the
+method where nerfstudio is missing.
 """
 
 from nerfbaselines import register
@@ -8,7 +9,7 @@ from nerfbaselines import register
 register(
     {
         "id": "splatfacto-legs",
-        "method_class": "legs_adapters.upstreams.nerfbaselines:SplatfactoLegs",
+        "method_class": "splatfacto_legs:SplatfactoLegs",
         "metadata": {
             "name": "Splatfacto with the LEGS loss",
             "description": "nerfstudio's splatfacto, its L1 weighted towards contours and thin structures.",

@@ -13,8 +13,7 @@ Source: this project's own; the median as an estimate of noise, subtracted, is D
 from __future__ import annotations
 
 import math
-from collections import deque
-from typing import Deque, Iterable, Optional
+from typing import Iterable, Optional
 
 import torch
 from torch import Tensor
@@ -22,9 +21,12 @@ from torch import Tensor
 from legs_loss.responses import response
 from legs_loss.spec import WeightSpec
 
-__all__ = ["RunningLevels", "levels_of", "over_scene", "percentile", "response_levels", "scene_levels"]
+__all__ = ["NEEDS_LEVELS", "levels_of", "over_scene", "percentile", "response_levels", "scene_levels"]
 
-_REMEMBERED = 4096  # views; a target that is a new tensor at each step is counted again
+NEEDS_LEVELS = (
+    "weights that are normalised over the scene need the levels of all its views, which {where}: run legs precompute "
+    "SCENE --preset legs-robust, with the training's -r, {then}; or take a preset of single images, as legs"
+)
 
 
 def response_levels(strength: Tensor, spec: WeightSpec) -> Tensor:
@@ -85,34 +87,6 @@ def over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor] = Non
     floor = spec.noise_floor * torch.maximum(percentile(strength, 50.0), scene[0])
     floor = floor.reshape(*floor.shape, 1, 1, 1)
     return ((strength - floor).clamp(min=0.0) / (scene[1] + spec.eps)).clamp(max=1.0)
-
-
-class RunningLevels:
-    """The levels of a scene, over the views seen so far.
-
-    Examples:
-        >>> seen = RunningLevels()
-        >>> seen.scene() is None
-        True
-        >>> seen.add(torch.tensor([1.0, 8.0]))
-        >>> seen.scene()
-        tensor([1., 8.])
-    """
-
-    def __init__(self) -> None:
-        self._views: Deque[Tensor] = deque(maxlen=_REMEMBERED)
-        self._scene: Optional[Tensor] = None
-
-    def add(self, levels: Tensor) -> None:
-        """Add a view, by its :func:`response_levels`."""
-        self._views.append(levels)
-        self._scene = None
-
-    def scene(self) -> Optional[Tensor]:
-        """Return the scene's levels, None as long as no view was seen."""
-        if self._scene is None and self._views:
-            self._scene = scene_levels(levels.to(self._views[-1]) for levels in self._views)
-        return self._scene
 
 
 def percentile(values: Tensor, share: float) -> Tensor:

@@ -12,6 +12,7 @@ from legs_loss.errors import LegsError
 from legs_loss.images import read_pair
 from legs_loss.kernels.backends import fused_loss, fused_ssim
 from legs_loss.kernels.contract import Weights
+from legs_loss.levels import NEEDS_LEVELS
 from legs_loss.similarity import WINDOW_SIZE, d_ssim, ssim_map
 from legs_loss.spec import Spec, as_spec
 from legs_loss.weights import weight_map
@@ -141,8 +142,8 @@ def legs_loss(
     Args:
         prediction: the rendering, floats in [0, 1], in a shape that :func:`weighted_l1` takes.
         target: the photograph of the same view, the same shape.
-        spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own, bit-identical. A spec that is normalised
-            over the scene uses the images of this call as the scene; ``LEGSLoss`` and ``l1_loss`` use all so far.
+        spec: a preset's name or a spec. With beta 0 the loss is 3DGS's own, bit-identical. One that is normalised over
+            the scene needs ``weight``: one call does not know the scene.
         weight: the target's weight map, if known; the spec is not used then.
         mask: zeroes the L1 weight where it is 0. SSIM is not masked, as in 3DGS's code.
         lambda_dssim: in [0, 1], the share of D-SSIM; 3DGS's name and value.
@@ -169,6 +170,8 @@ def legs_loss(
     spec = as_spec(spec)
     if not 0.0 <= lambda_dssim <= 1.0:
         raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
+    if weight is None and spec.over == "scene" and not spec.unweighted:
+        raise LegsError(NEEDS_LEVELS.format(where="one call does not know", then="and give LEGSLoss that store="))
     layout, prediction, target = read_pair(prediction, target, channels_last)
     weight, mask = layout.map_first(weight, target, "weight"), layout.map_first(mask, target, "mask")
     prediction, target = layout.channels_first(prediction), layout.channels_first(target)

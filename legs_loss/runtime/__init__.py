@@ -90,8 +90,8 @@ def _compiled(call: Call) -> Tensor:
         return call.plain()
     if spec.over == "scene":
         raise LegsError(
-            "weights that are normalised over the scene are kept from step to step, which a compiled graph cannot do: "
-            "leave the loss out of torch.compile, or set LEGS_PRESET=legs"
+            "weights that are normalised over the scene are made of a store's levels, which a compiled graph cannot "
+            "read: leave the loss out of torch.compile, or set LEGS_PRESET=legs"
         )
     call = call.aligned()
     return call.weighted(Weights(map=weight_map(call.target, spec, False)))

@@ -10,9 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from legs_loss.config import find_config
-from legs_loss.levels import RunningLevels, response_levels
 from legs_loss.loss import legs_loss
-from legs_loss.responses import response
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.state import Run, counted
 from legs_loss.spec import Spec, WeightSpec, as_spec
@@ -24,8 +22,7 @@ __all__ = ["LEGSLoss"]
 class LEGSLoss(nn.Module):
     """:func:`~legs_loss.legs_loss` as a Module: settings at construction, images at each call.
 
-    For a spec that is normalised over the scene, the targets of all calls so far are the scene. Repeated targets count
-    repeatedly, which changes a median little.
+    A spec that is normalised over the scene needs the store that has its levels.
 
     Args:
         spec: as for :func:`~legs_loss.legs_loss`, like the others.
@@ -62,7 +59,6 @@ class LEGSLoss(nn.Module):
         self.padding = padding
         self.renormalise = renormalise
         self.channels_last = channels_last
-        self._seen = RunningLevels()
         self._run: Optional[Run] = None
         if store is not None:
             config = find_config(None, argv=[])
@@ -78,8 +74,6 @@ class LEGSLoss(nn.Module):
         """Return the loss; see :func:`~legs_loss.legs_loss`."""
         if self._run is not None and weight is None:
             return self._by_store(self._run, prediction, target, mask)
-        if weight is None and self.spec.over == "scene" and not self.spec.unweighted:
-            weight = self._over_scene(target)
         return legs_loss(
             prediction,
             target,
@@ -111,12 +105,6 @@ class LEGSLoss(nn.Module):
         return legs_loss(
             prediction, target, self.spec, weight, mask, self.lambda_dssim, self.padding, renormalise, False
         )
-
-    def _over_scene(self, target: Tensor) -> Tensor:
-        strength = response(target, self.spec.operator, self.spec.p, self.channels_last, self.spec.smooth)
-        for levels in response_levels(strength, self.spec).reshape(-1, 2):
-            self._seen.add(levels)
-        return weight_map(target, self.spec, self.channels_last, self._seen.scene())
 
     def extra_repr(self) -> str:
         """Return the settings, for ``print(module)``."""

@@ -16,16 +16,13 @@ from torch import Tensor
 
 from legs_loss.config import Config
 from legs_loss.errors import LegsError
-from legs_loss.images import check_values
 from legs_loss.kernels.available import is_capturing
 from legs_loss.kernels.backends import fused_range
 from legs_loss.kernels.contract import Weights
-from legs_loss.levels import RunningLevels, response_levels
-from legs_loss.responses import response
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.memo import WeightMemo
 from legs_loss.runtime.stored import Stored
-from legs_loss.weights import weight_map, weight_over_scene
+from legs_loss.weights import weight_map
 
 __all__ = ["MASK", "NOT_IN_A_GRAPH", "WEIGHTS", "Counts", "WeightSource"]
 
@@ -77,7 +74,6 @@ class WeightSource:
         self._counts = counts
         self._say_once = say_once
         self.stored: Stored = Stored(config, say_once)
-        self._seen: RunningLevels = RunningLevels()
 
     def weights(self, call: Call) -> Weights:
         """Return the weights of a call's target, with the user's own, and count their sources."""
@@ -120,24 +116,18 @@ class WeightSource:
         images = _images(call.target)
         found = [self._weight(image, name, call) for image, name in zip(images, names)]
         spec = self.config.spec
-        if spec.over == "scene":
-            strength = found[0] if call.target.dim() == 3 else torch.stack(found)
-            return Weights(map=weight_over_scene(strength, spec, self._scene_levels(found[0].numel())))
         if all(map(_is_range, found)):
             return Weights(spec=spec, range=torch.cat(found))
         maps = [weight_map(image, spec, False) if _is_range(weight) else weight for image, weight in zip(images, found)]
         return Weights(map=maps[0] if call.target.dim() == 3 else torch.stack(maps))
 
     def _weight(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
-        """Return an image's weight map [1, H, W], or the range that makes it, [1, 2].
-
-        For weights normalised over the scene it is E, since the scene's levels change with each new view.
-        """
+        """Return an image's weight map [1, H, W], or the range that makes it, [1, 2]."""
         counts = self._counts
         if is_capturing(image.device):
             # A CUDA graph is replayed with other pixels in the target's memory: their weight is part of the graph.
             counts.computed += 1
-            return self._computed(image, call, again=True)
+            return self._computed(image, call)
         if call.is_mean() and image.device.type == "cpu" and self.config.store is None:
             # Here a SHA-256 of an image's bytes takes longer than its range.
             found = fused_range(image, self.config.spec)
@@ -157,32 +147,12 @@ class WeightSource:
         self._counts.computed += 1
         return self._computed(image, call)
 
-    def _computed(self, image: Tensor, call: Call, again: bool = False) -> Tensor:
-        """Return what :meth:`_weight` returns of an image; ``again`` where it will be computed at each step."""
+    def _computed(self, image: Tensor, call: Call) -> Tensor:
         spec = self.config.spec
         if spec.over == "scene":
-            if image.device.type == "cpu":
-                check_values(image, "target")
-            strength = response(image, spec.operator, spec.p, False, spec.smooth)
-            if not again:
-                self._seen.add(response_levels(strength, spec))
-            return strength
+            return weight_map(image, spec, False, self.stored.scene_levels(image.shape[-2] * image.shape[-1]))
         found = fused_range(image, spec) if call.is_mean() else None
         return weight_map(image, spec, False) if found is None else found
-
-    def _scene_levels(self, pixels: int) -> Optional[Tensor]:
-        """Return the levels of the scene: of all the store's views of this size, else of those seen so far."""
-        levels = self.stored.scene_levels(pixels)
-        if levels is not None:
-            return levels
-        self._say_once("running", _RUNNING)
-        return self._seen.scene()
-
-
-_RUNNING = (
-    "weights are normalised over the views seen so far, a running estimate; legs precompute --preset legs-robust knows "
-    "all views from the first step"
-)
 
 
 def _images(target: Tensor) -> List[Tensor]:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from legs_loss.config import Config
 from legs_loss.errors import LegsError
-from legs_loss.weights import weight_from_response
+from legs_loss.levels import NEEDS_LEVELS
+from legs_loss.weights import weight_from_response, weight_over_scene
 
 if TYPE_CHECKING:
     from legs_loss.store import Found, WeightStore
@@ -75,8 +76,6 @@ class Stored:
     def weight(self, image: Tensor, view: Optional[str]) -> Optional[Tensor]:
         """Return an image's weight map [1, H, W], None if no map was made from this image.
 
-        Where weights are normalised over the scene it is E.
-
         Args:
             image: [C, H, W].
             view: its name, if the call gave one, for messages.
@@ -87,14 +86,19 @@ class Stored:
         found = self._find(store, image, view)
         if found is None or found.response is None:
             return None
-        over_scene = self._config.spec.over == "scene"
+        spec = self._config.spec
+        over_scene = spec.over == "scene"
         try:
             values = store.response(found.response) if over_scene else store.normalised_response(found.response)
         except LegsError as error:
             self._say_once("damaged", f"{error}; the weights of such views are computed")
             return None
         known = torch.from_numpy(values).to(image.device).unsqueeze(0)
-        return known.float() if over_scene else weight_from_response(known, self._config.spec)
+        return (
+            weight_over_scene(known, spec, self.scene_levels(known.numel()))
+            if over_scene
+            else weight_from_response(known, spec)
+        )
 
     def has(self, kind: str) -> bool:
         """Return whether the store has maps of the user's own of a kind."""
@@ -125,12 +129,22 @@ class Stored:
             return torch.empty(0)
         return torch.from_numpy(store.own_map(entry)).to(image.device).unsqueeze(0)
 
-    def scene_levels(self, pixels: int) -> Optional[Tensor]:
-        """Return the levels of all the store's views of this size, None where it lacks them."""
+    def scene_levels(self, pixels: int) -> Tensor:
+        """Return the levels of all the store's views of a number of pixels, [2].
+
+        Raises:
+            LegsError: there is no store, or it lacks the levels of views of this size.
+        """
         store = self._open()
         if store is not None and pixels not in self._levels:
             self._levels[pixels] = store.scene_levels(self._config.spec, pixels)
-        return self._levels.get(pixels)
+        levels = self._levels.get(pixels)
+        if levels is None:
+            where = "no store of this run has" if store is None else f"{store.path} does not have for {pixels} pixels"
+            raise LegsError(
+                NEEDS_LEVELS.format(where=where, then="and let the run find its store (-s SCENE, LEGS_STORE)")
+            )
+        return levels
 
     def _find(self, store: WeightStore, image: Tensor, view: Optional[str]) -> Optional[Found]:
         """Return what the store has of an image [C, H, W]; with masks or weights of the user's it is always asked."""

@@ -32,12 +32,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 FOX = Path(os.environ.get("LEGS_TEST_SCENE", Path(__file__).resolve().parents[2] / "shared" / "scenes" / "fox"))
 
 
-@pytest.fixture(scope="session", autouse=True)
-def state_home(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Send the user's state, such as keys, to a folder of the tests' own, in processes that they start too."""
-    os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
-
-
 @pytest.fixture(scope="session")
 def fox() -> Path:
     """The real COLMAP capture; a test that asks for it is skipped where the folder is absent."""

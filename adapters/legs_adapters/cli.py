@@ -64,9 +64,7 @@ def _parser() -> Parser:
 
 def _run(args: argparse.Namespace) -> int:
     if args.undo and (args.check or args.verify):
-        raise LegsError("--undo can be combined with --diff, --force and --trust only")
-    if args.trust is not None and not args.undo:
-        raise LegsError("--trust requires --undo")
+        raise LegsError("--undo can be combined with --diff and --force only")
     check_libcst()
     args.before = _journal(args.folder)
     if args.undo:
@@ -124,8 +122,6 @@ _GROUPS = {
     "advanced: safety and scripts": {
         "--force": "patch files with uncommitted changes, too; with --undo: restore the patched lines of files that "
         "were edited since, and keep the edits",
-        "--trust NAME": "with --undo: accept a journal that you did not write on this machine; the error message gives "
-        "its NAME",
         "--json": "report as JSON",
     },
     "advanced: with --verify": {
@@ -168,6 +164,7 @@ def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.report import as_diff
     from legs_adapters.settings import SETTINGS_FILE, settings_text
     from legs_adapters.terms.instead import trained_instead
+    from legs_adapters.undo import unrecorded
 
     root = check_root(args.folder)
     settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
@@ -193,12 +190,16 @@ def _patch(args: argparse.Namespace) -> int:
     _quote(found.findings.doubts, "warning: a possible loss was not weighted")
     wrote = [] if args.diff or args.check else write(found, args.force)
     _show(args, found, wrote)
+    bare = unrecorded(root) if found.findings.patched else []
+    for name, why in bare:
+        say(f"legs-patch: {name} is weighted, and --undo leaves it so: {why}", sys.stderr)
     if args.diff and not args.json:
         say(as_diff(found.changes()), end="", lines=True)
     elif args.check and not args.json:
         say("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
     elif wrote and not args.json:
-        say(f"\nwrote {', '.join(wrote)}; undo it with: legs-patch --undo {shlex.quote(args.folder)}", lines=True)
+        how = "" if bare else f"; undo it with: legs-patch --undo {shlex.quote(args.folder)}"
+        say(f"\nwrote {', '.join(wrote)}{how}", lines=True)
     elif not args.json:
         say("\nnothing to do: it is patched", lines=True)
     _quote(problems, "error")
@@ -237,23 +238,27 @@ def _verify(args: argparse.Namespace, script: str) -> int:
 
 
 def _undo(args: argparse.Namespace) -> int:
+    from legs_adapters.journal import JOURNAL
     from legs_adapters.report import as_diff
+    from legs_adapters.settings import SETTINGS_FILE
     from legs_adapters.undo import undo
 
-    changes, kept = undo(args.folder, args.force, args.trust, look=args.diff)
+    changes, kept = undo(args.folder, args.force, look=args.diff)
     removed = [name for name, (_, after) in changes.items() if after is None]
     restored = [name for name in changes if name not in removed]
+    is_weighted = any(name != SETTINGS_FILE for name, _ in kept)
     if args.json:
         say(json.dumps({"restored": restored, "removed": removed, "kept": kept}, indent=2), lines=True)
-        return 0
-    if args.diff:
+    elif args.diff:
         say(as_diff(changes), end="", lines=True)
     else:
         for line in [f"restored {name}" for name in restored] + [f"removed {name}" for name in removed]:
             say(line)
-    for name, reason in kept:
+    for name, reason in kept if not args.json else ():
         say(f"kept {name}: {reason}", stream=sys.stderr if args.diff else sys.stdout)
-    return 0
+    if is_weighted and not args.diff:
+        say(f"legs-patch: {JOURNAL} and legs.toml stay: put those lines back, and undo again", sys.stderr)
+    return int(is_weighted)
 
 
 def _journal(folder: str) -> bytes:

@@ -1,7 +1,7 @@
 """The journal of a patch, from which it is undone: the exact bytes from before, and the edits.
 
-The journal is one file in the root of the checkout. A checkout and its journal may come from somebody else:
-a journal names only files that legs-patch writes, and it is sealed (:mod:`legs_adapters.checkout.seal`).
+The journal is one file in the root of the checkout. A checkout and its journal may come from somebody else: a journal
+names only files that legs-patch writes. What is read and what is about to be written pass the same checks.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence
 
 from legs_adapters.checkout.replace import MAX_FILE_BYTES, read_file
-from legs_adapters.checkout.seal import is_sealed, seal
 from legs_adapters.code.folders import check_name
 from legs_adapters.code.limits import MAX_BYTES
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.terms.text import Edit
+from legs_adapters.terms.writing import PACKAGE
 from legs_loss import LegsError
 
 __all__ = ["JOURNAL", "Journal", "Layer", "digest"]
@@ -28,6 +28,7 @@ JOURNAL = ".legs-patch.json"
 MAX_EDITS, MAX_LAYERS = 100_000, 100  # of the journal, and patches of one file
 _VERSION = 1
 _NOTE = "What legs-patch changed here, and the bytes from before. legs-patch --undo needs it; do not edit it."
+_ESCAPED, _QUOTED = re.compile(rb"\\.", re.S), re.compile(rb'"[^"]*"')
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -44,15 +45,13 @@ class Journal(NamedTuple):
 
     Attributes:
         files: for each patched path its layers, the oldest first.
-        created: files that a patch created, with the checksum of what it wrote.
+        created: files that a patch created, with the checksums of what it wrote, and of what it wrote before.
         data: the file's bytes as they were read; None where there was no journal.
-        is_own: whether this user wrote it; an empty journal is.
     """
 
     files: Dict[str, List[Layer]]
-    created: Dict[str, str]
+    created: Dict[str, List[str]]
     data: Optional[bytes] = None
-    is_own: bool = True
 
     @classmethod
     def read(cls, root: Path) -> Journal:
@@ -65,50 +64,63 @@ class Journal(NamedTuple):
         if data is None:
             return cls({}, {})
         try:
-            if data.count(b"[") + data.count(b"{") > MAX_EDITS:  # before any of it is an object in memory
+            return cls._parsed(data)
+        except ValueError as error:
+            advice = "nothing was changed; restore the files from git, and remove it"
+            raise LegsError(f"{root / JOURNAL} cannot be read ({error}): {advice}") from None
+
+    @classmethod
+    def _parsed(cls, data: bytes) -> Journal:
+        """Check a journal's bytes, which are read or about to be written; a ValueError says what is wrong."""
+        try:
+            if len(data) > MAX_FILE_BYTES:
+                raise ValueError(f"larger than {MAX_FILE_BYTES >> 20} MiB")
+            outside = _QUOTED.sub(b"", _ESCAPED.sub(b"", data))  # before any of it is an object in memory
+            if outside.count(b"[") + outside.count(b"{") > MAX_EDITS:
                 raise ValueError(f"more than {MAX_EDITS} edits")
             content = json.loads(data.decode("utf-8"))
             if content["version"] != _VERSION:
                 raise ValueError("written by another version of legs-patch: undo with that version")
-            claimed = content.pop("seal", None)
-            is_own = is_sealed(_canonical(content), claimed, root)
             files = _read_files(content["files"])
-            created = {_only(name, name == SETTINGS_FILE): _checksum(at) for name, at in content["created"].items()}
-        except (LegsError, ValueError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
-            advice = "nothing was changed; restore the files from git, and remove it"
-            raise LegsError(f"{root / JOURNAL} cannot be read ({error}): {advice}") from None
-        return cls(files, created, data, is_own)
+            created = {_only(name, name == SETTINGS_FILE): _checksums(at) for name, at in content["created"].items()}
+        except (LegsError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
+            raise ValueError(str(error)) from None
+        return cls(files, created, data)
 
-    def dump(self, root: Path) -> bytes:
-        """Return the file's content, sealed; without a seal where this machine keeps no key."""
+    def add(self, path: str, layer: Layer) -> None:
+        """Add a patch of a file; of a file that is as before an earlier patch, that and later ones are dropped."""
+        layers = self.files.setdefault(path, [])
+        is_bare = PACKAGE.encode() not in layer.original  # another version of the file, which no patch is in
+        first = next((i for i, each in enumerate(layers) if is_bare or each.original == layer.original), len(layers))
+        layers[first:] = [layer]
+
+    def dump(self) -> bytes:
+        """Return the file's content.
+
+        Raises:
+            LegsError: it would be refused where it is read.
+        """
         files = {path: [_written(layer) for layer in layers] for path, layers in sorted(self.files.items())}
         content: Dict[str, Any] = {"note": _NOTE, "version": _VERSION, "files": files, "created": self.created}
-        content["seal"] = seal(_canonical(content), root)
         data = (json.dumps(content, indent=1) + "\n").encode("utf-8")
-        if len(data) > MAX_FILE_BYTES:
+        try:
+            self._parsed(data)
+        except ValueError as error:
             raise LegsError(
-                f"{JOURNAL} would be larger than {MAX_FILE_BYTES >> 20} MiB: undo the earlier patches first"
-            )
+                f"{JOURNAL} could not be read again ({error}), so nothing was written: undo the earlier patches first, "
+                "or leave large files out by --exclude"
+            ) from None
         return data
 
     def is_as_written(self, path: str, data: bytes) -> bool:
         """Return whether a file's bytes are as the patch left them."""
         layers = self.files.get(path)
-        return (layers[-1].after if layers else self.created.get(path)) == digest(data)
-
-    @property
-    def name(self) -> str:
-        """The name by which ``--trust`` accepts this journal: the start of its checksum."""
-        return digest(self.data or b"")[:16]
+        return digest(data) in ([layers[-1].after] if layers else self.created.get(path, ()))
 
 
 def digest(data: bytes) -> str:
     """Return the checksum that the journal keeps of a file."""
     return hashlib.sha256(data).hexdigest()
-
-
-def _canonical(content: Dict[str, Any]) -> bytes:
-    return json.dumps(content, sort_keys=True, separators=(",", ":")).encode("ascii")
 
 
 def _written(layer: Layer) -> Dict[str, Any]:
@@ -151,6 +163,10 @@ def _only(name: str, is_written: bool) -> str:
     if not is_written:
         raise ValueError(f"{name!r} is not a Python file or {SETTINGS_FILE}, and legs-patch writes no others")
     return name
+
+
+def _checksums(value: Any) -> List[str]:
+    return [_checksum(each) for each in (value[-2:] if isinstance(value, list) else [value])]
 
 
 def _checksum(value: Any) -> str:

@@ -153,8 +153,8 @@ def write(plan: Plan, force: bool = False) -> List[str]:
     """Write a plan; return the paths that were written.
 
     Raises:
-        LegsError: a file of it has uncommitted changes that are not the patch's own, and not ``force``; another user
-            patched this checkout; or a file cannot be written. Nothing is written then.
+        LegsError: a file of it has uncommitted changes that are not the patch's own, and not ``force``; or a
+            file or the journal cannot be written. Nothing is written then.
     """
     root = plan.root
     if not plan.after and plan.settings is None:
@@ -166,14 +166,10 @@ def write(plan: Plan, force: bool = False) -> List[str]:
             current = changes[SETTINGS_FILE][0]
             if current is not None and not journal.is_as_written(SETTINGS_FILE, current):
                 raise LegsError(f"{SETTINGS_FILE} exists and is not as legs-patch wrote it: change the settings in it")
-            journal.created[SETTINGS_FILE] = digest(plan.settings.encode("utf-8"))
+            known = [] if current is None else [digest(current)]
+            journal.created[SETTINGS_FILE] = [*known, digest(plan.settings.encode("utf-8"))]
         if not changes:
             return []
-        if not journal.is_own:
-            raise LegsError(
-                f"{root / JOURNAL} is not yours: this checkout was patched by someone else, or on another machine; "
-                f"nothing was changed. Undo that patch first: see legs-patch --undo {root}"
-            )
         own = {path: plan.source(path) for path in plan.after if not journal.is_as_written(path, plan.source(path))}
         changed = [] if force else changed_files(root, own)
         if changed:
@@ -181,7 +177,7 @@ def write(plan: Plan, force: bool = False) -> List[str]:
                 f"uncommitted changes in what would be patched ({first_of(changed, 5)}): commit them, or use --force"
             )
         for path, data in plan.after.items():
-            journal.files.setdefault(path, []).append(Layer(plan.source(path), plan.edits[path], digest(data)))
+            journal.add(path, Layer(plan.source(path), plan.edits[path], digest(data)))
         # The journal is written first, so that --undo works whatever happens next.
-        replace_files(root, {JOURNAL: (journal.data, journal.dump(root)), **changes})
+        replace_files(root, {JOURNAL: (journal.data, journal.dump()), **changes})
     return list(changes)

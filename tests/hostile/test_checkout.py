@@ -27,7 +27,6 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in t
 def stranger(tmp_path, monkeypatch):
     """A checkout with all of these files in it."""
     root = checkout(tmp_path / "stranger", files("inria"))
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for name in ("pipe.py", "data", ".gitmodules", "arguments/pipe.py"):
         (root / name).parent.mkdir(exist_ok=True)
         os.mkfifo(str(root / name))
@@ -93,7 +92,6 @@ def test_verify_beside_another(other, number, tmp_path, monkeypatch):
     """A whole patch is compared with a whole original, or the message says that there is none any more."""
     from tests.hostile.test_two_at_once import SOURCES, together
 
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     root = checkout(tmp_path / "root", {**SOURCES, "train.py": SOURCES["one.py"]})
     assert main([str(root)]) == 0
     monkeypatch.setattr(verifying, "check_imports", lambda *_: None)

@@ -79,7 +79,6 @@ def test_patch_and_undo(room, disk, tmp_path, capsys, monkeypatch):
 
     from tests.patcher.support import checkout, files
 
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     root = checkout(disk.path / "checkout", files("inria"))
     before = disk.state()
     with disk.full(room):
@@ -96,23 +95,6 @@ def test_patch_and_undo(room, disk, tmp_path, capsys, monkeypatch):
             assert disk.state() == patched
     assert disk.state() == before or legs_patch(["--undo", str(root)]) == 0
     assert disk.state() == before
-
-
-def test_the_journal_s_key(disk, tmp_path, monkeypatch):
-    """Without room for a key a patch is made without a seal, as without a home; no half of a key stays."""
-    pytest.importorskip("libcst")
-    from legs_adapters.cli import main as legs_patch
-
-    from tests.patcher.support import checkout, files
-
-    (disk.path / "legs-loss").mkdir()
-    monkeypatch.setenv("XDG_STATE_HOME", str(disk.path))
-    root = checkout(tmp_path / "checkout", files("inria"))
-    with disk.full():
-        assert legs_patch([str(root)]) == 0
-        assert os.listdir(str(disk.path / "legs-loss")) == []
-    assert legs_patch(["--undo", str(root)]) == 2
-    assert "legs_loss" in (root / "train.py").read_text()
 
 
 def test_precompute(disk, tmp_path, capsys):

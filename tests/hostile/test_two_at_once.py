@@ -345,7 +345,6 @@ def as_nobody(arguments):
             os.setgroups([])
             os.setgid(NOBODY)
             os.setuid(NOBODY)
-            os.environ["XDG_STATE_HOME"] = str(Path(arguments[-1]).parent / "state")
             code = main([str(word) for word in arguments])
         finally:
             sys.stdout.flush()

@@ -11,7 +11,7 @@ import re
 from collections import Counter
 from typing import List
 
-__all__ = ["MAX_BYTES", "MAX_FILE_BYTES", "Budget", "over_the_limits", "parsing_steps"]
+__all__ = ["MAX_BYTES", "MAX_FILE_BYTES", "STRING", "Budget", "over_the_limits", "parsing_steps"]
 
 MAX_FILE_BYTES = 1 << 20
 MAX_BYTES = 32 << 20  # of all files
@@ -24,9 +24,9 @@ MAX_LAMBDAS = 660  # in a file: LibCST's parser takes memory quadratic in lambda
 _TOKEN_STEPS = 20
 _WHY_OVER = f"its analysis takes more than {MAX_FILE_STEPS} steps"
 _PIECE = re.compile(r"\w+|[^\w\s]|\n")
-_STRING = r"""\'\'\'(?:[^\\]|\\.)*?\'\'\'|\"\"\"(?:[^\\]|\\.)*?\"\"\"|'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*\""""
+STRING = r"""\'\'\'(?:[^\\]|\\.)*?\'\'\'|\"\"\"(?:[^\\]|\\.)*?\"\"\"|'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*\""""
 _TOKEN = re.compile(
-    rf"(?P<string>{_STRING})|\#[^\n]*|\\\r?\n|(?P<end>[\r\n;]+)|(?P<open>[(\[{{])|(?P<close>[)\]}}])|(?P<comma>,)"
+    rf"(?P<string>{STRING})|\#[^\n]*|\\\r?\n|(?P<end>[\r\n;]+)|(?P<open>[(\[{{])|(?P<close>[)\]}}])|(?P<comma>,)"
     r"|\b(?P<word>if|else|and|or|not|in|is|await|for|yield)\b|(?P<signs>[-+*/%@&|^~<>=!.]+)",
     re.S,
 )

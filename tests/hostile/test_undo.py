@@ -1,0 +1,217 @@
+"""Undo after anything: journals are read as written, formatted files restored, what stays weighted keeps its own."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from legs_adapters import journal as journals
+from legs_adapters.cli import main
+from legs_adapters.edit import apply_edits
+from legs_adapters.journal import JOURNAL, Journal, Layer, digest
+from legs_adapters.plan import plan, write
+from legs_adapters.terms.text import Edit
+from legs_adapters.undo import undo
+
+from legs_loss import LegsError
+from tests.patcher.support import NAMES, PATCHED, SITE, checkout, files, options, snapshot
+
+TEXTS = st.text(st.sampled_from("ab \n\r\t[]{}\"'\\#é\u2028\U0001f600\0"), max_size=60)
+
+
+@st.composite
+def layers(draw):
+    original = draw(TEXTS).encode()
+    ends = sorted(draw(st.lists(st.integers(0, len(original)), max_size=6)))
+    whole = [at for at in ends if original[at : at + 1] < b"\x80"]
+    edits = [Edit(a, b, original[a:b], draw(TEXTS).encode()) for a, b in zip(whole[::2], whole[1::2])]
+    return Layer(original, sorted(edits), digest(apply_edits(original, edits)))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    added=st.lists(st.tuples(st.sampled_from(["a.py", "b/c.py", "train.txt", "../d.py"]), layers()), max_size=9),
+    limits=st.tuples(st.integers(1, 40), st.integers(1, 4), st.integers(10, 500)),
+)
+def test_what_can_be_written_is_read_back(added, limits, tmp_path_factory):
+    root = tmp_path_factory.mktemp("checkout")
+    kept = Journal({}, {"legs.toml": [digest(b"")]})
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in zip(("MAX_EDITS", "MAX_LAYERS", "MAX_BYTES"), limits):
+            patch.setattr(journals, name, value)
+        for path, layer in added:
+            kept.add(path, layer)
+        try:
+            data = kept.dump()
+        except LegsError:
+            return
+        (root / JOURNAL).write_bytes(data)
+        again = Journal.read(root)
+    assert (again.files, again.created) == (kept.files, kept.created)
+
+
+class TestJournalsThatUndoReads:
+    def test_120_000_brackets_in_a_comment(self, tmp_path):
+        term = SITE.replace("(image, gt_image)", "(image, # " + "[" * 120_000 + "\n            gt_image)")
+        root = checkout(tmp_path, {**files("inria"), "train.py": files("inria")["train.py"].replace(SITE, term)})
+        before = snapshot(root)
+        write(plan(root))
+        assert "legs_loss.l1_loss" in (root / "train.py").read_text()
+        undo(root)
+        assert snapshot(root) == before
+
+    def test_a_patch_of_what_git_took_back_101_times(self, tmp_path):
+        root = checkout(tmp_path, files("inria"))
+        before, original = snapshot(root), (root / "train.py").read_bytes()
+        plans = []
+        for night in range(101):  # every other one upstream has another version
+            (root / "train.py").write_bytes(original + b"# new\n" * (night % 2))
+            plans += [plan(root)] if night < 2 else []
+            assert "train.py" in write(plans[night % 2])
+        assert len(Journal.read(root).files["train.py"]) == 1
+        undo(root)
+        assert snapshot(root) == before
+
+    def test_what_would_be_too_large_to_read_is_not_written(self, tmp_path, monkeypatch):
+        texts = files("inria")
+        line = (
+            texts["train.py"].splitlines().index("            l1_test += l1_loss(image, gt_image).mean().double()") + 2
+        )
+        root = checkout(tmp_path, texts)
+        write(plan(root))
+        before = snapshot(root)
+        monkeypatch.setattr(journals, "MAX_BYTES", 2 * len(texts["train.py"]))
+        with pytest.raises(LegsError, match=r"could not be read again .* so nothing was written"):
+            write(plan(root, by_hand=[("train.py", line)]))
+        assert snapshot(root) == before
+        undo(root)
+        assert (root / "train.py").read_text() == texts["train.py"]
+
+
+def crlf(text):
+    return text.replace("\n", "\r\n")
+
+
+def tabs(text):
+    return re.sub(r"^(?:    )+", lambda found: "\t" * (len(found.group()) // 4), text, flags=re.M)
+
+
+def split(text):
+    """Split every call of two names over lines, with a comma behind the last, as formatters do."""
+    return re.sub(r"(?m)^((?!.*#).*l1_loss)\((\w+), (\w+)\)", r"\1(\n            \2,\n            \3,\n        )", text)
+
+
+def unquoted(text):
+    return re.sub(r"'([^'\"\n\\#]*)'", r'"\1"', text)
+
+
+def ruff(text, width="50"):
+    command = [sys.executable, "-m", "ruff", "format", "--isolated", "--line-length", width, "-"]
+    return subprocess.run(command, input=text.encode(), stdout=subprocess.PIPE, check=True).stdout.decode()
+
+
+FORMATS = {each.__name__: each for each in (crlf, tabs, split, unquoted)}
+
+
+@pytest.mark.parametrize("how", FORMATS)
+@pytest.mark.parametrize("name", [name for name in NAMES if name.endswith(("weighted", "call", "masked", "fused"))])
+def test_a_formatted_file_is_restored(name, how, tmp_path):
+    """The formatted patch, undone, is the tree of the formatted original."""
+    check_restored(name, FORMATS[how], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_a_file_that_ruff_formatted_is_restored(name, tmp_path):
+    check_restored(name, ruff, tmp_path)
+
+
+def check_restored(name, formatted, folder):
+    texts = files(name)
+    root = checkout(folder, texts)
+    if not write(plan(root, **options(name))):
+        return
+    for path in root.rglob("*.py"):
+        path.write_bytes(formatted(path.read_bytes().decode()).encode())
+    assert undo(root, force=True)[1] == []
+    assert not (root / JOURNAL).exists()
+    for path, text in texts.items():
+        if path.endswith(".py"):
+            assert ast.dump(ast.parse((root / path).read_bytes())) == ast.dump(ast.parse(formatted(text).encode())), (
+                path
+            )
+
+
+class TestWhatStaysWeighted:
+    def test_keeps_its_journal_and_settings(self, tmp_path, capsys):
+        root = checkout(tmp_path, files("inria"))
+        original = (root / "train.py").read_text()
+        assert main([str(root)]) == 0
+        edited = (
+            (root / "train.py").read_text().replace(PATCHED, PATCHED.replace("(image, gt_image)", "(gt_image, image)"))
+        )
+        (root / "train.py").write_text(edited)
+        before = snapshot(root)
+        capsys.readouterr()
+        for _ in range(2):
+            assert main(["--undo", "--force", str(root)]) == 1
+            said = capsys.readouterr()
+            assert "Ll1 = legs_loss.l1_loss(gt_image, image)" in said.out
+            assert "put back line 66: Ll1 = l1_loss(image, gt_image)" in re.sub(
+                r"line \d+: Ll1 = l1", "line 66: Ll1 = l1", said.out
+            )
+            assert "stay: put those lines back" in said.err and "restored" not in said.out
+            assert snapshot(root) == before
+        by_hand = edited.replace(PATCHED.replace("(image, gt_image)", "(gt_image, image)"), SITE)
+        (root / "train.py").write_text(by_hand)
+        assert main(["--undo", "--force", str(root)]) == 0
+        assert (root / "train.py").read_text() == original
+        assert not (root / "legs.toml").exists() and not (root / JOURNAL).exists()
+
+    def test_other_files_are_restored_once(self, tmp_path):
+        texts = files("gui_train_step_weighted")
+        root = checkout(tmp_path, texts)
+        wrote = [name for name in write(plan(root)) if name.endswith(".py")]
+        first, *others = wrote
+        text = (root / first).read_text()
+        (root / first).write_text(re.sub(r"legs_loss\.l1_loss\((\w+)", r"legs_loss.l1_loss(0 + \1", text))
+        changes, kept = undo(root, force=True)
+        assert (sorted(changes), [name for name, _ in kept]) == (sorted(others), [first])
+        assert list(Journal.read(root).files) == [first]
+
+    def test_a_changed_argument_in_brackets_is_an_edit(self, tmp_path):
+        """Words are the same there; the tree is another."""
+        line = "        Ll1 = l1_loss((image + 1) * 2, gt_image)\n"
+        text = files("inria")["train.py"].replace(SITE, line)
+        root = checkout(tmp_path, {**files("inria"), "train.py": text})
+        write(plan(root))
+        now = (root / "train.py").read_text()
+        assert "legs_loss.l1_loss((image + 1) * 2" in now
+        (root / "train.py").write_text(now.replace("(image + 1) * 2", "image + (1 * 2)"))
+        assert [name for name, _ in undo(root, force=True)[1]] == ["train.py"]
+
+    def test_a_patch_whose_journal_is_gone_is_named(self, tmp_path, capsys):
+        root = checkout(tmp_path, files("inria"))
+        assert main([str(root)]) == 0
+        for name in (JOURNAL, "legs.toml"):
+            (root / name).unlink()
+        capsys.readouterr()
+        assert main(["--undo", str(root)]) == 2
+        assert "(before: l1_loss(image, gt_image), or the mean difference)" in capsys.readouterr().err
+        assert main([str(root)]) == 0
+        said = capsys.readouterr()
+        assert "undo it with" not in said.out
+        assert "train.py is weighted, and --undo leaves it so" in said.err
+        before = snapshot(root)
+        assert main(["--undo", str(root)]) == 1
+        said = capsys.readouterr().out
+        assert (
+            "removed" not in said
+            and "Ll1 = legs_loss.l1_loss(image, gt_image) (before: l1_loss(image, gt_image)" in said
+        )
+        assert snapshot(root) == before

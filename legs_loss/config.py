@@ -13,7 +13,7 @@ from typing import Any, Dict, List, Mapping, Optional, Tuple
 
 from legs_loss.errors import LegsError, did_you_mean
 from legs_loss.spec import PRESETS, WeightSpec, as_spec
-from legs_loss.system.files import read_regular
+from legs_loss.system.files import read_text
 
 __all__ = ["CONFIG_FILE", "STORE_FOLDER", "Config", "find_config", "is_off"]
 
@@ -213,7 +213,7 @@ def _read_toml(path: Path) -> Dict[str, Any]:
     else:
         import tomli as tomllib
     try:
-        return tomllib.loads(read_regular(path, _LARGEST).decode("utf-8"))
+        return tomllib.loads(read_text(path, _LARGEST))
     except OSError as error:
         raise LegsError(f"{path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # everything that a TOML parser raises, for numbers and texts too

@@ -80,8 +80,8 @@ def _without_store(path: Path) -> str:
 
     try:
         views = read_scene(path).views
-    except LegsError:
-        return f"{path} is neither a store of weight maps (it has no {MANIFEST}) nor a scene"
+    except LegsError as error:
+        return f"{path} is neither a store of weight maps (it has no {MANIFEST}) nor a scene that can be read: {error}"
     return (
         f"{path} has {len(views)} photograph(s) and no weight maps yet: legs precompute {shlex.quote(str(path))} makes "
         "them; if the store is elsewhere, give its folder"

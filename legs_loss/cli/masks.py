@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 HELP = "make masks of photographs: alpha, exposure, sharpness"
 
-_KINDS = ("alpha", "saturated", "dark", "sharpness")
+_COMPUTED = ("saturated", "dark", "sharpness")
 _CLIPPED = 5  # of 255, from either end
 _BLUNT = 0.1  # of the contrast that a tenth of the photograph has
 
@@ -31,7 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", metavar="SCENE", type=Path, help="a scene, or a folder of photographs")
     parser.add_argument(
-        "--from", dest="kinds", nargs="+", required=True, metavar="WHAT", help=f"DIR, {', '.join(_KINDS)}"
+        "--from",
+        dest="kinds",
+        nargs="+",
+        required=True,
+        metavar="WHAT",
+        help=", ".join(("DIR", "FILE", "alpha", "mask_path", *_COMPUTED)),
     )
     parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
     parser.add_argument("--out", type=Path, metavar="DIR", help="an empty or new folder; default: SCENE/masks")
@@ -42,20 +47,21 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from legs_loss.cli.shared.checks import check_empty
+    from legs_loss.cli.shared.scene_arguments import read_noted
     from legs_loss.errors import LegsError
-    from legs_loss.precompute.own_maps import own_folder
-    from legs_loss.scenes import read_scene
+    from legs_loss.precompute.own_maps import OwnMaps, is_below
     from legs_loss.scenes.own_maps import file_names, find_maps, write_gray
 
     out = args.out or args.scene / "masks"
     check_empty(out)
-    views = read_scene(args.scene, args.images).views
+    views = read_noted(args.scene, args.images).views
     folders = {}
     for kind in args.kinds:
-        if kind not in _KINDS:
-            folder = own_folder(args.scene, kind)
-            views = tuple(view for view in views if folder.resolve() not in view.path.resolve().parents)
-            folders[kind] = find_maps(folder, views)
+        if kind not in _COMPUTED:
+            views = tuple(view for view in views if not is_below(view.path, args.scene, OwnMaps(kind)))
+            folders[kind], strays = find_maps(args.scene, kind, views)
+            if strays:
+                say(f"legs: note: {kind}: of no photograph: {', '.join(map(str, strays[:3]))}", sys.stderr)
     names = file_names(view.name for view in views)
     mostly: List[str] = []
     skipped = 0
@@ -82,23 +88,21 @@ def mask_of(view: View, kinds: List[str], folders: Dict[str, Dict[str, Path]]) -
     import numpy as np
 
     from legs_loss.scenes import load_training_image
-    from legs_loss.scenes.own_maps import averaged, has_alpha, read_alpha, read_map_file
+    from legs_loss.scenes.own_maps import averaged, read_mask
 
     photograph = load_training_image(view, 1)
     unit = photograph / np.float32(np.iinfo(photograph.dtype).max)
     height, width = unit.shape[:2]
     mask = np.ones((height, width), np.float32)
     for kind in kinds:
-        if kind == "alpha":
-            mask *= read_alpha(view.path) if has_alpha(view.path) else 1
-        elif kind == "saturated":
+        if kind == "saturated":
             mask *= unit.min(-1) <= 1 - _CLIPPED / 255
         elif kind == "dark":
             mask *= unit.max(-1) >= _CLIPPED / 255
         elif kind == "sharpness":
             mask *= _is_sharp(unit)
         elif view.name in folders[kind]:
-            mask *= averaged(read_map_file(folders[kind][view.name], (width, height)), (width, height)).clip(0, 1)
+            mask *= averaged(read_mask(folders[kind][view.name], kind, (width, height)), (width, height)).clip(0, 1)
     return mask
 
 

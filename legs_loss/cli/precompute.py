@@ -5,8 +5,8 @@ SCENE is a folder with a COLMAP model, with transforms.json, or just with images
 Give -r, -w and --images as for the training: a map is used only for exactly the image that it was made from. With
 --scheduler the workers of a dask cluster compute the scenes, which must have the same paths on all of them.
 
---masks and --weights take maps of your own: PNG or other images, gray, named as their photographs (0001.png or
-0001.jpg.png), averaged to the training's size. In a mask white counts and black does not.
+--masks and --weights take maps of your own: a folder of PNG or other images, gray, named as their photographs (0001.png
+or 0001.jpg.png), or one image for all; averaged to the training's size. In a mask white counts and black does not.
 """
 
 from __future__ import annotations
@@ -41,7 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_resolution(parser, default=-1)
     parser.add_argument("-w", "--white_background", action="store_true", help="as in 3DGS: lay alpha over white")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="whose operator to use; default: legs")
-    parser.add_argument("--masks", metavar="DIR|alpha", help="a folder of masks, or the photographs' own alpha")
+    parser.add_argument(
+        "--masks",
+        metavar="DIR|FILE|alpha|mask_path",
+        help="a folder of masks, one for all, the photographs' own alpha, or those that transforms.json names",
+    )
     parser.add_argument("--weights", metavar="DIR", help="a folder of weights, .npy too, that multiply the preset's")
     parser.add_argument(
         "--weight_scale", type=float, default=1.0, metavar="W", help="of --weights: what white stands for; default: 1"
@@ -92,7 +96,7 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     from legs_loss.cli.shared.checks import check_resolution, check_writable
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import SceneTask, find_scenes, stores_of
-    from legs_loss.precompute.own_maps import ALPHA, OwnMaps
+    from legs_loss.precompute.own_maps import OwnMaps
     from legs_loss.scenes import read_scene
 
     workers = args.workers if args.workers is not None else cores() if args.scheduler is None else 1
@@ -117,8 +121,8 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
             check_writable(store)
 
     def found(named: Optional[str], scene: Path) -> Optional[str]:
-        """Return a folder that is in the scene as it was named, and others with their whole path."""
-        if named is None or (scene / named).is_dir() or not os.path.isdir(named):
+        """Return a path that is in the scene as it was named, and others whole."""
+        if named is None or (scene / named).exists() or not os.path.exists(named):
             return named
         return os.path.abspath(str(named))
 
@@ -131,11 +135,7 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
             args.resolution,
             args.white_background,
             workers,
-            OwnMaps(
-                args.masks if args.masks == ALPHA else found(args.masks, scene),
-                found(args.weights, scene),
-                args.weight_scale,
-            ),
+            OwnMaps(found(args.masks, scene), found(args.weights, scene), args.weight_scale),
         ): store
         for scene, store in zip(scenes, stores)
     }
@@ -166,6 +166,8 @@ def _say(store: Path, done: SceneDone) -> int:
     report = done.report
     for view, reason in report.skipped.items():
         say(f"legs: skipped {view}: {reason}", sys.stderr)
+    for note in report.notes:
+        say(f"legs: note: {note}", sys.stderr)
     if done.alike:
         say(
             f"legs: note: {done.alike} views share a name in 3DGS, which drops folders and extensions; "

@@ -34,17 +34,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("path", metavar="SCENE|STORE|IMAGE", help="what to show")
     parser.add_argument("--views", nargs="+", metavar="VIEW", help=f"names of views; default: {_AT_MOST} spread evenly")
-    parser.add_argument("--masks", metavar="DIR|alpha", help="as of legs precompute; default: those of a store")
+    parser.add_argument("--masks", metavar="DIR|FILE|alpha", help="as of legs precompute; default: those of a store")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="default: legs")
     parser.add_argument("--out", default="sheet.png", metavar="PNG", help="default: sheet.png")
 
 
 def run(args: argparse.Namespace) -> int:
     """Draw and save the sheet."""
+    from legs_loss.cli.shared.scene_arguments import read_noted
     from legs_loss.cli.shared.sheet import save_sheet
     from legs_loss.errors import LegsError
     from legs_loss.precompute.own_maps import OwnMaps, is_below
-    from legs_loss.scenes import View, read_scene
+    from legs_loss.scenes import View
     from legs_loss.spec import as_spec
     from legs_loss.store import MANIFEST
 
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
             raise LegsError("--masks is for a scene or a photograph: a store has the masks that it was made with")
         shown = _stored(path, spec)
     else:
-        views = (View(path.name, path),) if path.is_file() else read_scene(path).views
+        views = (View(path.name, path),) if path.is_file() else read_noted(path).views
         views = tuple(view for view in views if not is_below(view.path, path, OwnMaps(args.masks)))
         masks, scene = _masks(path, views, args.masks), _levels(views, spec)
         shown = {view.name: partial(_computed, view, spec, scene, masks.get(view.name)) for view in views}
@@ -71,17 +72,14 @@ def run(args: argparse.Namespace) -> int:
 def _masks(path: Path, views: Sequence[View], named: Optional[str]) -> Dict[str, Callable[[], np.ndarray]]:
     """Return what reads the mask of each view that has one: of a folder, its alpha, or of the scene's store."""
     from legs_loss.config import STORE_FOLDER
-    from legs_loss.precompute.own_maps import ALPHA, own_folder
     from legs_loss.scenes import image_size
-    from legs_loss.scenes.own_maps import find_maps, has_alpha, read_alpha, read_map_file
+    from legs_loss.scenes.own_maps import find_maps, read_mask
     from legs_loss.store import MANIFEST, MASK, WeightStore
 
-    if named == ALPHA:
-        return {view.name: partial(read_alpha, view.path) for view in views if has_alpha(view.path)}
     if named is not None:
-        sizes = {view.name: image_size(view.path) for view in views}
-        found = find_maps(own_folder(path, named), views)
-        return {name: partial(read_map_file, file, sizes[name]) for name, file in found.items()}
+        files = {view.name: view.path for view in views}
+        found, _ = find_maps(path, named, views)
+        return {name: partial(read_mask, file, named, image_size(files[name])) for name, file in found.items()}
     if not (path / STORE_FOLDER / MANIFEST).is_file():
         return {}
     store = WeightStore(path / STORE_FOLDER)

@@ -16,6 +16,12 @@ from legs_loss.system import read_regular, write_whole
 __all__ = ["read_ply", "write_ply"]
 
 _COUNT = re.compile("[0-9]{1,20}")
+_END = re.compile(rb"^end_header\r?\n", re.MULTILINE)
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
+    **{"double": "f8", "float64": "f8"},
+}
 _LARGEST = 64 << 30  # bytes: some 270 million Gaussians
 
 
@@ -43,54 +49,66 @@ def write_ply(path: Union[str, Path], gaussians: Gaussians) -> None:
 
 
 def read_ply(path: Union[str, Path]) -> Gaussians:
-    """Read a .ply that 3DGS or :func:`write_ply` wrote; the properties may stand in any order.
+    """Read a .ply of 3D Gaussians as 3DGS, its forks and gsplat write it, or viewers save it.
+
+    The properties may stand in any order and be any numbers; normals and what else is not needed are left out.
 
     Raises:
-        LegsError: not a binary little-endian .ply of Gaussians, or its size is not what the header says.
+        LegsError: not a binary .ply of Gaussians, the message names the property that is missing; or its size is not
+            what the header says.
     """
     try:
         data = read_regular(path, _LARGEST)
     except OSError as error:
         raise LegsError(f"{path}: cannot be read ({error.strerror})") from None
-    head, end, body = data.partition(b"end_header\n")
-    lines = head.decode("ascii", errors="replace").splitlines()
-    if not end or lines[:2] != ["ply", "format binary_little_endian 1.0"]:
-        raise LegsError(f"{path}: not a binary little-endian .ply")
-    count, names = _parse_header(path, lines[2:])
-    kind = {len(_properties((degree + 1) ** 2)): (degree + 1) ** 2 for degree in range(4)}
-    coefficients = kind.get(len(names), 0)
-    if sorted(names) != sorted(_properties(coefficients or 1)):
+    end = _END.search(data)
+    lines = data[: end.start() if end else 0].decode("ascii", errors="replace").splitlines()
+    if lines[:1] != ["ply"] or lines[1:2] not in (
+        ["format binary_little_endian 1.0"],
+        ["format binary_big_endian 1.0"],
+    ):
+        what = "a text; save it as a binary" if lines[1:2] == ["format ascii 1.0"] else "not a binary"
+        raise LegsError(f"{path}: {what} .ply")
+    count, kind = _parse_header(path, lines[2:], "<" if "little" in lines[1] else ">")
+    names = kind.names or ()
+    rest = sum(name.startswith("f_rest_") for name in names)
+    coefficients = {3 * (k - 1): k for k in (1, 4, 9, 16)}.get(rest, 0)
+    needed = [name for name in _properties(coefficients or 1) if not name.startswith("n")]
+    missing = [name for name in needed if name not in names]
+    if missing or not coefficients:
+        what = f"property {missing[0]} is missing" if missing else f"{rest} properties f_rest_* are not 0, 9, 24 or 45"
+        raise LegsError(f"{path}: not a .ply of 3D Gaussians: {what} (a point cloud, or a compressed .ply?)")
+    body = memoryview(data)[end.end() if end else 0 :]
+    if len(body) != count * kind.itemsize:
         raise LegsError(
-            f"{path}: not a .ply of 3D Gaussians: its properties must be those of 3DGS (x, y, z, nx, ny, nz, f_dc_*, "
-            "f_rest_*, opacity, scale_*, rot_*)"
-        )
-    if len(body) != 4 * count * len(names):
-        raise LegsError(
-            f"{path}: the header says {count} Gaussians of {4 * len(names)} bytes, but {len(body)} bytes follow: "
+            f"{path}: the header says {count} Gaussians of {kind.itemsize} bytes, but {len(body)} bytes follow: "
             "the file is cut off or damaged"
         )
-    table = torch.from_numpy(np.frombuffer(body, "<f4").reshape(count, len(names)).astype(np.float32))
-    order = [names.index(name) for name in _properties(coefficients)]
-    sizes = [3, 3, 3, 3 * (coefficients - 1), 1, 3, 4]
-    means, _, dc, rest, logits, log_scales, quaternions = (
-        part.contiguous() for part in table[:, order].split(sizes, dim=1)
-    )
-    rest = rest.reshape(count, 3, coefficients - 1).transpose(1, 2)
-    return Gaussians(means, log_scales, quaternions, logits, torch.cat([dc[:, None], rest], dim=1).contiguous())
+    table = np.frombuffer(body, kind)
+    columns = np.empty((count, len(needed)), np.float32)
+    for i, name in enumerate(needed):
+        columns[:, i] = table[name]
+    parts = torch.from_numpy(columns).split([3, 3, 3 * (coefficients - 1), 1, 3, 4], dim=1)
+    means, dc, rests, logits, log_scales, quaternions = (part.contiguous() for part in parts)
+    rests = rests.reshape(count, 3, coefficients - 1).transpose(1, 2)
+    return Gaussians(means, log_scales, quaternions, logits, torch.cat([dc[:, None], rests], dim=1).contiguous())
 
 
-def _parse_header(path: Union[str, Path], lines: List[str]) -> Tuple[int, List[str]]:
-    count, names = -1, []
+def _parse_header(path: Union[str, Path], lines: List[str], order: str) -> Tuple[int, np.dtype]:
+    """Return the number of Gaussians and the layout of one: of the header's only element, its vertices."""
+    count, fields = -1, {}
     for line in lines:
         words = line.split()
         if words[:1] in (["comment"], ["obj_info"], []):
             continue
         if words[:2] == ["element", "vertex"] and len(words) == 3 and _COUNT.fullmatch(words[2]) and count < 0:
             count = int(words[2])
-        elif words[0] == "property" and len(words) == 3 and words[1] in ("float", "float32") and count >= 0:
-            names.append(words[2])
+        elif (
+            words[0] == "property" and len(words) == 3 and words[1] in _TYPES and words[2] not in fields and count >= 0
+        ):
+            fields[words[2]] = order + _TYPES[words[1]]
         else:
             raise LegsError(f"{path}: cannot read the header line {line[:80]!r} of a .ply of 3D Gaussians")
     if count < 0:
         raise LegsError(f"{path}: the header has no `element vertex`")
-    return count, names
+    return count, np.dtype(list(fields.items()))

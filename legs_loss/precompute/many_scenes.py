@@ -14,7 +14,7 @@ from legs_loss.errors import LegsError
 from legs_loss.precompute import OwnMaps, Report, precompute
 from legs_loss.scenes import read_scene
 from legs_loss.spec import Spec
-from legs_loss.system import read_regular
+from legs_loss.system import read_text
 from legs_loss.system.executors import Listener
 
 __all__ = ["SceneDone", "SceneTask", "find_scenes", "precompute_scene", "stores_of"]
@@ -75,11 +75,9 @@ def _find(given: Sequence[str], lists: Sequence[Path]) -> List[Path]:
 
 def _listed(path: Path) -> List[str]:
     try:
-        lines = [line.strip() for line in read_regular(path, _LARGEST).decode("utf-8-sig").splitlines()]
-    except OSError as error:
-        raise LegsError(f"cannot read {path}: {error.strerror or error}") from None
-    except UnicodeDecodeError as error:
-        raise LegsError(f"cannot read {path}: {error}") from None
+        lines = [line.strip() for line in read_text(path, _LARGEST).splitlines()]
+    except (OSError, ValueError) as error:
+        raise LegsError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from None
     scenes = [str(path.parent / line) for line in lines if line and not line.startswith("#")]
     if not scenes:
         raise LegsError(f"{path} names no scene: it should have a folder a line")

@@ -30,7 +30,8 @@ _COMMIT_SECONDS = 1.0
 class Report:
     """The result of :func:`precompute`, by names of views: maps made, maps kept, views skipped with the reason.
 
-    ``own`` are the numbers of the user's own maps, a kind each; ``unmasked`` has no mask where other views have.
+    ``own`` are the numbers of the user's own maps, a kind each; ``unmasked`` has no mask where other views have;
+    ``notes`` are sentences for the user.
     """
 
     store: Path
@@ -39,6 +40,7 @@ class Report:
     skipped: Dict[str, str] = field(default_factory=dict)
     own: Dict[str, int] = field(default_factory=dict)
     unmasked: List[str] = field(default_factory=list)
+    notes: List[str] = field(default_factory=list)
 
 
 def precompute(
@@ -88,6 +90,7 @@ def precompute(
         if mine.added:  # all at once, before any response: what is found in the store is never without its mask
             writer.commit(mine.added, mine.dropped)
         report.own, report.unmasked = Counter(entry.operator for entry in mine.added), mine.unmasked
+        report.notes += [*scene.notes, *mine.notes]
         job = Job(spec, resolution, white_background, out, writer.staging)
         known: Dict[str, List[Entry]] = {}
         for entry in writer.entries():

@@ -11,22 +11,23 @@ import numpy as np
 from legs_loss.errors import LegsError
 from legs_loss.scenes import View, image_size, training_size
 from legs_loss.scenes.folder import SUFFIXES
-from legs_loss.scenes.own_maps import averaged, find_maps, has_alpha, read_alpha, read_map_file
+from legs_loss.scenes.own_maps import ALPHA, MASK_PATH, averaged, find_maps, own_path, read_map_file, read_mask
 from legs_loss.store import MASK, WEIGHTS, Entry, stage
 
-__all__ = ["ALPHA", "NO_MAPS", "OwnMaps", "is_below", "own_folder", "stage_own"]
+__all__ = ["NO_MAPS", "OwnMaps", "is_below", "stage_own"]
 
-ALPHA = "alpha"
 _LARGEST = 1e6  # weight
+_OF_THE_SCENE = (None, ALPHA, MASK_PATH)
 _OPTIONS = {MASK: "--masks", WEIGHTS: "--weights"}
 _SUFFIXES = {MASK: SUFFIXES, WEIGHTS: (*SUFFIXES, ".npy")}
 
 
 class OwnMaps(NamedTuple):
-    """The places of the user's own maps: folders, in the scene or paths; None without.
+    """The places of the user's own maps: folders, or a file for all views, in the scene or paths; None without.
 
     Attributes:
-        masks: or "alpha", for that of the photographs. White counts, black does not.
+        masks: or "alpha", for that of the photographs, or "mask_path", for those that transforms.json names. White
+            counts, black does not.
         weights: W of a pixel is the map's value, of an image in [0, 1], times the scale.
         scale: of the weights.
     """
@@ -40,22 +41,18 @@ NO_MAPS: OwnMaps = OwnMaps()
 
 
 class Staged(NamedTuple):
-    """Entries to add to a store and to remove from it, and the views without a mask where others have one."""
+    """Entries to add to a store and to remove from it, views without a mask where others have one, and notes."""
 
     added: List[Entry]
     dropped: List[Entry]
     unmasked: List[str]
-
-
-def own_folder(root: Path, named: str) -> Path:
-    """Return the folder of maps that was named: in the scene, or a path."""
-    return root / named if (root / named).is_dir() else Path(named)
+    notes: List[str]
 
 
 def is_below(path: Path, root: Path, maps: OwnMaps) -> bool:
-    """Return whether a file lies in one of the folders of the user's maps, and so is no photograph."""
-    folders = [own_folder(root, named).resolve() for named in (maps.masks, maps.weights) if named not in (None, ALPHA)]
-    return any(folder in path.resolve().parents for folder in folders)
+    """Return whether a file is one of the user's maps or lies in one of their folders, and so is no photograph."""
+    places = [own_path(root, named).resolve() for named in (maps.masks, maps.weights) if named not in _OF_THE_SCENE]
+    return any(place in (path.resolve(), *path.resolve().parents) for place in places)
 
 
 def stage_own(
@@ -76,7 +73,10 @@ def stage_own(
     """
     if not 0.0 < maps.scale <= _LARGEST:
         raise LegsError(f"--weight_scale must be above 0 and at most {_LARGEST:g}, got {maps.scale:g}")
-    result = Staged([], [], [])
+    result = Staged([], [], [], [])
+    masked = sum(view.mask is not None for view in views)
+    if masked and maps.masks is None:
+        result.notes.append(f"transforms.json names masks of {masked} photograph(s): with --masks mask_path they count")
     given = {kind: named for kind, named in ((MASK, maps.masks), (WEIGHTS, maps.weights)) if named is not None}
     for entry in known:
         if entry.is_own and entry.operator not in given:
@@ -95,25 +95,22 @@ def stage_own(
         if not entry.is_own and entry.view in trained:
             trained[entry.view].add((entry.width, entry.height))
     for kind, named in given.items():
-        is_alpha = kind == MASK and named == ALPHA
-        files = _with_alpha(views) if is_alpha else find_maps(own_folder(root, named), views, _SUFFIXES[kind])
+        files, strays = find_maps(root, named, views, _SUFFIXES[kind])
+        if strays:
+            result.notes.append(
+                f"{_OPTIONS[kind]}: {len(strays)} file(s) are left out, which have the name of no photograph of the "
+                f"scene, such as {strays[0]} (COLMAP leaves out photographs whose camera it did not find)"
+            )
         for view in views:
             if view.name in files:
-                file = files[view.name]
-                values = read_alpha(file) if is_alpha else read_map_file(file, sizes[view.name])
+                file, size = files[view.name], sizes[view.name]
+                values = read_mask(file, named, size) if kind == MASK else read_map_file(file, size)
                 for size in sorted(trained[view.name]):
                     result.added.append(_staged(kind, view, file, averaged(values, size), maps.scale, staging))
             elif kind == MASK:
                 result.unmasked.append(view.name)
         result.dropped.extend(entry for entry in known if entry.operator == kind)
     return result
-
-
-def _with_alpha(views: Sequence[View]) -> Dict[str, Path]:
-    found = {view.name: view.path for view in views if has_alpha(view.path)}
-    if not found:
-        raise LegsError(f"--masks alpha: none of the {len(views)} photographs has an alpha channel")
-    return found
 
 
 def _staged(kind: str, view: View, file: Path, values: np.ndarray, scale: float, staging: Path) -> Entry:

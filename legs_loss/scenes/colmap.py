@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Tuple
@@ -12,28 +13,36 @@ import numpy as np
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
-from legs_loss.system import open_regular, read_regular, write_whole
+from legs_loss.system import open_regular, read_text, write_whole
 
 __all__ = ["find_model", "read_colmap", "read_points", "write_colmap"]
 
-# COLMAP's camera models in the order of their ids, each with its number of parameters.
-MODELS = (
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-)
+# COLMAP's camera models in the order of their ids, each with its number of parameters and of focal lengths among them,
+# which come first.
+MODELS = {
+    "SIMPLE_PINHOLE": (3, 1),
+    "PINHOLE": (4, 2),
+    "SIMPLE_RADIAL": (4, 1),
+    "RADIAL": (5, 1),
+    "OPENCV": (8, 2),
+    "OPENCV_FISHEYE": (8, 2),
+    "FULL_OPENCV": (12, 2),
+    "FOV": (5, 2),
+    "SIMPLE_RADIAL_FISHEYE": (4, 1),
+    "RADIAL_FISHEYE": (5, 1),
+    "THIN_PRISM_FISHEYE": (12, 2),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (16, 2),
+    "SIMPLE_DIVISION": (4, 1),
+    "DIVISION": (5, 2),
+    "SIMPLE_FISHEYE": (3, 1),
+    "FISHEYE": (4, 2),
+    "EUCM": (6, 2),
+    "EQUIRECTANGULAR": (2, 0),
+}
 
-
-_TWO_FOCAL_LENGTHS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")
+_CAMERA_LINE = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
+_IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+_POINT_LINE = "POINT3D_ID X Y Z R G B ERROR TRACK..."
 _LARGEST = 2 << 30  # bytes of a text, which is read whole; of a binary file as much is read as its counts say
 _LONGEST = 4096  # bytes of an image's name
 _SIDE = 1 << 20  # pixels
@@ -73,9 +82,8 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
     model = find_model(root)
     if model is None:
         raise LegsError(f"{root} has no COLMAP model: there is no sparse/0/images.bin or .txt")
-    kind = "bin" if (model / "images.bin").is_file() else "txt"
+    entries, kind = _entries(model)
     cameras = _parse(model / f"cameras.{kind}", _cameras_bin if kind == "bin" else _cameras_txt)
-    entries = _parse(model / f"images.{kind}", _images_bin if kind == "bin" else _images_txt)
     views = []
     for image in entries:
         if image.camera_id not in cameras:
@@ -91,7 +99,30 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
         views.append(View(f"{prefix}{name}", path, _pinhole(lens, image), camera_model=lens.model))
     points = model / f"points3D.{kind}"
     read = partial(read_points, points) if points.is_file() else None
-    return Scene(root, "colmap", tuple(sorted(views, key=lambda view: view.name)), read)
+    views.sort(key=lambda view: view.name)
+    return Scene(root, "colmap", tuple(views), read, notes=_larger_models(root, model, len(views)))
+
+
+def _entries(model: Path) -> Tuple[List[_Image], str]:
+    """Return the images that a model lists, and the kind of its files, bin or txt."""
+    kind = "bin" if (model / "images.bin").is_file() else "txt"
+    return _parse(model / f"images.{kind}", _images_bin if kind == "bin" else _images_txt), kind
+
+
+def _larger_models(root: Path, model: Path, count: int) -> Tuple[str, ...]:
+    """Return a note where another of the models that COLMAP made has more images than the one that is read."""
+    sizes = {}
+    for folder in sorted((root / "sparse").iterdir()):
+        if folder.name.isdigit() and folder != model:
+            with suppress(LegsError):
+                sizes[folder.name] = len(_entries(folder)[0])
+    name = max(sizes, key=lambda name: sizes[name], default="")
+    if sizes.get(name, 0) <= count:
+        return ()
+    return (
+        f"{root / 'sparse' / name} has {sizes[name]} images, and {model.name}, which is read here as by 3DGS, {count}: "
+        f"COLMAP made several models; for the larger one rename it to 0",
+    )
 
 
 def read_points(path: Path) -> PointCloud:
@@ -129,13 +160,13 @@ def write_colmap(root: Path, cameras: Mapping[str, Camera], points: PointCloud) 
 def _parse(path: Path, parser: Callable[[Any], Any]) -> Any:
     try:
         if path.suffix == ".txt":
-            return parser(read_regular(path, _LARGEST))
+            return parser(read_text(path, _LARGEST))
         with open_regular(path) as file:
             return parser(file)
     except OSError as error:
         raise LegsError(f"cannot read {path}: {error.strerror}") from None
     except (struct.error, ValueError, IndexError, OverflowError) as error:
-        raise LegsError(f"{path} is damaged or is not a COLMAP file: {error}") from None
+        raise LegsError(f"{path} is not as COLMAP writes it: {error}") from None
 
 
 def _pinhole(lens: _Intrinsics, image: _Image) -> Optional[Camera]:
@@ -192,7 +223,10 @@ class _Cursor:
             if not letter or len(name) > _LONGEST:
                 raise ValueError("a name does not end")
             name += letter
-        return name[:-1].decode()
+        try:
+            return name[:-1].decode()
+        except UnicodeDecodeError:
+            raise ValueError(f"the name {str(bytes(name[:-1]))[1:]} of an image is not in UTF-8") from None
 
     def skip(self, size: int) -> None:
         left = self.size - self.file.tell()
@@ -210,9 +244,13 @@ def _cameras_bin(file: BinaryIO) -> Dict[int, _Intrinsics]:
     for _ in range(cursor.take("Q")[0]):
         number, model, width, height = cursor.take("iiQQ")
         if not 0 <= model < len(MODELS):
-            raise ValueError(f"camera {number} has the unknown model {model}")
-        name, count = MODELS[model]
-        cameras[number] = _intrinsics(name, width, height, cursor.take(f"{count}d"))
+            known = f"0 to {len(MODELS) - 1}"
+            raise ValueError(
+                f"camera {number} has model {model}, and known here are {known}; as text (colmap model_converter) it "
+                "can be read"
+            )
+        name = list(MODELS)[model]
+        cameras[number] = _intrinsics(name, width, height, cursor.take(f"{MODELS[name][0]}d"))
     cursor.finish()
     return cameras
 
@@ -239,42 +277,69 @@ def _points_bin(file: BinaryIO) -> PointCloud:
     return _cloud(xyz, rgb)
 
 
-def _lines(data: bytes) -> Iterator[str]:
-    return (line for line in data.decode().splitlines() if not line.startswith("#"))
+Lines = Iterator[Tuple[int, str]]  # with their numbers
 
 
-def _cameras_txt(data: bytes) -> Dict[int, _Intrinsics]:
-    cameras = {}
-    for words in (line.split() for line in _lines(data) if line.strip()):
+def _rows(text: str, layout: str, read: Callable[[str, Lines], Any]) -> List[Any]:
+    """Return what is read of the lines that are no comments and not empty; ``read`` may take further ones."""
+    lines = ((n, line) for n, line in enumerate(text.split("\n"), 1) if not line.startswith("#"))
+    rows = []
+    for number, line in lines:
+        if line.strip():
+            try:
+                rows.append(read(line, lines))
+            except (ValueError, IndexError) as error:
+                why = "too few values" if isinstance(error, IndexError) else error
+                raise ValueError(f"line {number}, {line.strip()[:80]!r}: {why} (expected: {layout})") from None
+    return rows
+
+
+def _cameras_txt(text: str) -> Dict[int, _Intrinsics]:
+    def camera(line: str, _: Lines) -> Tuple[int, _Intrinsics]:
+        words = line.split()
         params = tuple(float(word) for word in words[4:])
-        cameras[int(words[0])] = _intrinsics(words[1], int(words[2]), int(words[3]), params)
-    return cameras
+        return int(words[0]), _intrinsics(words[1], int(words[2]), int(words[3]), params)
+
+    return dict(_rows(text, _CAMERA_LINE, camera))
 
 
-def _images_txt(data: bytes) -> List[_Image]:
-    lines, images = _lines(data), []
-    for line in lines:
-        if not line.strip():
-            continue
+def _images_txt(text: str) -> List[_Image]:
+    def image(line: str, lines: Lines) -> _Image:
         words = line.split(None, 9)  # the name comes last and may have spaces
         numbers = tuple(float(word) for word in words[1:8])
-        images.append(_image(words[9].rstrip(), int(words[8]), numbers[:4], numbers[4:]))
-        next(lines, None)  # the image's points, possibly an empty line
-    return images
+        found = _image(words[9].rstrip(), int(words[8]), numbers[:4], numbers[4:])
+        number, points = next(lines, (0, ""))
+        if not _are_points(points.split()):
+            raise ValueError(
+                f"line {number} should have its points, X Y POINT3D_ID each: an image has two lines, and the second "
+                f"may be empty, but is {points.strip()[:80]!r}"
+            )
+        return found
+
+    return _rows(text, f"{_IMAGE_LINE}, then a line of points", image)
 
 
-def _points_txt(data: bytes) -> PointCloud:
-    rows = [line.split(None, 7) for line in _lines(data) if line.strip()]
-    return _cloud(
-        [[float(word) for word in row[1:4]] for row in rows],
-        [[int(word) for word in row[4:7]] for row in rows],
-    )
+def _are_points(words: List[str]) -> bool:
+    try:
+        return len([float(word) for word in words]) % 3 == 0
+    except ValueError:
+        return False
+
+
+def _points_txt(text: str) -> PointCloud:
+    def point(line: str, _: Lines) -> Tuple[List[float], List[int]]:
+        words = line.split(None, 7)
+        return [float(word) for word in words[1:4]], [int(word) for word in words[4:7]]
+
+    rows = _rows(text, _POINT_LINE, point)
+    return _cloud([xyz for xyz, _ in rows], [rgb for _, rgb in rows])
 
 
 def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) -> _Intrinsics:
-    if len(params) != dict(MODELS).get(model, len(params)):
+    count, focal_lengths = MODELS.get(model, (len(params), 0))
+    if len(params) != count:
         raise ValueError(f"a camera of model {model} has {len(params)} parameters")
-    focal = params[: 2 if model in _TWO_FOCAL_LENGTHS else 1]
+    focal = params[:focal_lengths]
     if not (
         0 < width <= _SIDE and 0 < height <= _SIDE and _is_within(params, _LONGEST_FOCAL) and min(focal, default=1) > 0
     ):

@@ -4,14 +4,39 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import List
+from typing import Iterator, List, Sequence
 
 from legs_loss.errors import LegsError
+from legs_loss.scenes.images import is_readable
 from legs_loss.scenes.model import Scene, View
 
-__all__ = ["SUFFIXES", "read_folder"]
+__all__ = ["PHOTOGRAPHS", "SUFFIXES", "files_below", "left_out", "read_folder"]
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+# The formats of legs_loss.scenes.images; those that every decoder of photographs knows come first.
+SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".jfif", ".jpe", ".gif", ".tga", ".ppm", ".pgm"),
+    *(".jp2", ".j2k", ".jpf", ".jpx", ".avif", ".heic", ".heif", ".hif"),
+)
+# And photographs that are not read: raw ones, floats, layers.
+PHOTOGRAPHS = (
+    *SUFFIXES,
+    *(".jxl", ".exr", ".hdr", ".pfm", ".psd", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"),
+)
+
+
+def files_below(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
+    """Yield the files with one of these endings in a folder and below, but nothing hidden."""
+    for above, folders, files in os.walk(str(folder)):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for file in files:
+            if os.path.splitext(file)[1].lower() in suffixes and not file.startswith("."):
+                yield Path(above, file)
+
+
+def left_out(names: Sequence[str]) -> str:
+    """Return the sentence that names photographs whose format is not read."""
+    named = ", ".join(sorted(names)[:4]) + (", ..." if len(names) > 4 else "")
+    return f"{len(names)} file(s) in a format that is not read here are left out: {named}; convert them to PNG or JPEG"
 
 
 def read_folder(root: Path, images: Path, prefix: str) -> Scene:
@@ -20,15 +45,15 @@ def read_folder(root: Path, images: Path, prefix: str) -> Scene:
     ``prefix`` goes before a view's name. Raises :class:`LegsError` where there is no image.
     """
     views: List[View] = []
-    for folder, folders, files in os.walk(str(images)):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for file in files:
-            path = Path(folder, file)
-            if path.suffix.lower() in SUFFIXES and not file.startswith("."):
-                views.append(View(f"{prefix}{path.relative_to(images).as_posix()}", path))
+    left: List[str] = []
+    for path in files_below(images, PHOTOGRAPHS):
+        name = f"{prefix}{path.relative_to(images).as_posix()}"
+        if is_readable(path):
+            views.append(View(name, path))
+        else:
+            left.append(name)
+    notes = (left_out(left),) if left else ()
     if not views:
-        raise LegsError(
-            f"{images} is not a scene: it has no sparse/ of COLMAP, no transforms.json and "
-            f"no images ({', '.join(SUFFIXES)})"
-        )
-    return Scene(root, "folder", tuple(sorted(views, key=lambda view: view.name)))
+        why = notes[0] if notes else f"no images ({', '.join(SUFFIXES)})"
+        raise LegsError(f"{images} is not a scene: it has no sparse/ of COLMAP, no transforms.json and {why}")
+    return Scene(root, "folder", tuple(sorted(views, key=lambda view: view.name)), notes=notes)

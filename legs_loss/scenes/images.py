@@ -22,6 +22,7 @@ __all__ = [
     "colour_mode",
     "image_size",
     "image_tensor",
+    "is_readable",
     "load_training_image",
     "open_image",
     "resized_pixels",
@@ -156,6 +157,14 @@ def _formats() -> Tuple[str, ...]:
 
     Image.init()
     return tuple(name for name in FORMATS if name in Image.OPEN)
+
+
+def is_readable(path: Path) -> bool:
+    """Return whether a file's ending is one of :data:`FORMATS` that this Pillow decodes; of floats none is."""
+    from PIL import Image
+
+    formats, suffix = _formats(), path.suffix.lower()  # the formats first: their endings are known then
+    return suffix != ".pfm" and Image.registered_extensions().get(suffix) in formats
 
 
 def row_strips(height: int, width: int) -> Iterator[slice]:

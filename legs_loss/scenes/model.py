@@ -47,7 +47,8 @@ class View:
     ``name`` is the image's path relative to the scene, with forward slashes. ``camera`` is None
     where the scene has none or where ``camera_model`` is not a pinhole; ``split`` is "train",
     "test" or "val" where the scene says so. ``composited``: the field's loader lays this image's
-    alpha on the background before it resizes (see :func:`load_training_image`).
+    alpha on the background before it resizes (see :func:`load_training_image`). ``mask`` is the file that the scene
+    itself names as this image's mask.
     """
 
     name: str
@@ -56,6 +57,7 @@ class View:
     split: Optional[str] = None
     camera_model: Optional[str] = None
     composited: bool = False
+    mask: Optional[Path] = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,8 @@ class PointCloud:
 class Scene:
     """A scene on disk: ``kind`` is "colmap", "transforms" or "folder"; views are sorted by name.
 
-    ``images`` is the folder of the photographs, where the scene was read with one.
+    ``images`` is the folder of the photographs, where the scene was read with one; ``notes`` are
+    sentences for the user: what was left out, and why.
     """
 
     root: Path
@@ -78,6 +81,7 @@ class Scene:
     views: Tuple[View, ...]
     read_points: Optional[Callable[[], PointCloud]] = None
     images: Optional[str] = None
+    notes: Tuple[str, ...] = ()
 
     @property
     def points(self) -> Optional[PointCloud]:

@@ -9,63 +9,118 @@ from typing import Any, Dict, Iterable, List, Sequence, Tuple, Type
 import numpy as np
 
 from legs_loss.errors import LegsError
-from legs_loss.scenes.folder import SUFFIXES
+from legs_loss.scenes.folder import SUFFIXES, files_below
 from legs_loss.scenes.images import colour_mode, open_image
 from legs_loss.scenes.model import View
 from legs_loss.system import open_regular, write_whole
 
-__all__ = ["averaged", "dimmed", "file_names", "find_maps", "has_alpha", "read_alpha", "read_map_file", "write_gray"]
+__all__ = [
+    "ALPHA",
+    "MASK_PATH",
+    "averaged",
+    "dimmed",
+    "file_names",
+    "find_maps",
+    "own_path",
+    "read_map_file",
+    "read_mask",
+    "write_gray",
+]
 
+ALPHA, MASK_PATH = "alpha", "mask_path"  # in place of a path: the photographs' own, those that transforms.json names
 _GRAY = 32  # of 255: the colours of a pixel of a gray JPEG differ less
 _LARGEST = 1 << 29  # values of a .npy
+_DARK = 0.1  # of white: a mask whose lightest pixel is darker shows something else
 _BOX = 4  # Image.BOX, whose home differs between versions of Pillow
 
 
-def find_maps(folder: Path, views: Iterable[View], suffixes: Sequence[str] = SUFFIXES) -> Dict[str, Path]:
-    """Return the map's file of each view that has one, by the view's name.
+def own_path(root: Path, named: str) -> Path:
+    """Return the file or folder of maps that was named: in the scene, or a path."""
+    return root / named if (root / named).exists() else Path(named)
 
-    A file is a view's by the last parts of its path in the folder: ``0001.png`` or ``cam/0001.png`` for the photograph
-    ``images/cam/0001.jpg``, and ``0001.jpg.png`` as COLMAP names masks. Hidden files and folders are left out.
+
+def find_maps(
+    root: Path, named: str, views: Sequence[View], suffixes: Sequence[str] = SUFFIXES
+) -> Tuple[Dict[str, Path], List[Path]]:
+    """Return the map's file of each view that has one, by the view's name, and the files that are of no view.
+
+    Args:
+        root, views: of the scene.
+        named: a folder, a file for all views, :data:`ALPHA` or :data:`MASK_PATH`. In a folder a file is a view's by the
+            last parts of its path: ``0001.png`` or ``cam/0001.png`` for the photograph ``images/cam/0001.jpg``, and
+            ``0001.jpg.png`` as COLMAP names masks. Hidden files and folders are left out.
+        suffixes: of the files.
 
     Raises:
-        LegsError: there is no folder or no map in it; a map fits no photograph, or several; a photograph has two maps.
+        LegsError: there is no such path, or no map; a map fits several photographs; a photograph has two maps.
     """
-    if not folder.is_dir():
-        raise LegsError(f"there is no folder {folder}")
-    named: Dict[str, List[str]] = {}
+    path, missing = own_path(root, named), f"no map of a photograph ({', '.join(suffixes)})"
+    strays: List[Path] = []
+    if named == ALPHA:
+        found = {view.name: view.path for view in views if _has_alpha(view.path)}
+        missing = f"none of the {len(views)} photographs has an alpha channel"
+    elif named == MASK_PATH:
+        found = {view.name: view.mask for view in views if view.mask is not None}
+        missing = "no transforms.json names one for a photograph"
+    elif path.is_file():
+        return {view.name: path for view in views}, []
+    elif path.is_dir():
+        found, strays = _in_folder(path, views, suffixes)
+    else:
+        raise LegsError(f"there is no folder or file {path}")
+    if strays and not found:
+        missing = f"{strays[0]} is the map of no photograph; maps have the name of theirs, 0001.png or 0001.jpg.png"
+    if not found:
+        raise LegsError(f"{named}: {missing}")
+    return found, strays
+
+
+def _in_folder(folder: Path, views: Sequence[View], suffixes: Sequence[str]) -> Tuple[Dict[str, Path], List[Path]]:
+    of: Dict[str, List[str]] = {}
     for view in views:
         parts = view.name.split("/")
         for start in range(len(parts)):
             last = "/".join(parts[start:])
             for name in {last, os.path.splitext(last)[0]}:
-                named.setdefault(name, []).append(view.name)
+                of.setdefault(name, []).append(view.name)
     found: Dict[str, Path] = {}
-    for path in sorted(_files(folder, suffixes)):
-        fits = named.get(os.path.splitext(path.relative_to(folder).as_posix())[0], [])
-        if len(fits) != 1:
-            what = f"fits {len(fits)} photographs: {', '.join(fits[:3])}" if fits else "is the map of no photograph"
-            raise LegsError(f"{path} {what}; maps have the name of their photograph: 0001.png or 0001.jpg.png")
-        if fits[0] in found:
+    strays = []
+    for path in sorted(files_below(folder, suffixes)):
+        fits = of.get(os.path.splitext(path.relative_to(folder).as_posix())[0], [])
+        if len(fits) > 1:
+            raise LegsError(f"{path} fits {len(fits)} photographs: {', '.join(fits[:3])}; put it into their folder")
+        if not fits:
+            strays.append(path)
+        elif fits[0] in found:
             raise LegsError(f"{found[fits[0]]} and {path} are both maps of {fits[0]}: remove one of them")
-        found[fits[0]] = path
-    if not found:
-        raise LegsError(f"{folder} has no maps ({', '.join(suffixes)})")
-    return found
+        else:
+            found[fits[0]] = path
+    return found, strays
 
 
-def _files(folder: Path, suffixes: Sequence[str]) -> Iterable[Path]:
-    for above, folders, files in os.walk(str(folder)):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for file in files:
-            if os.path.splitext(file)[1].lower() in suffixes and not file.startswith("."):
-                yield Path(above, file)
+def read_mask(path: Path, named: str, size: Tuple[int, int]) -> np.ndarray:
+    """Return a mask that :func:`find_maps` found by the same name, float32 [H, W] in [0, 1].
+
+    Raises:
+        LegsError: as :func:`read_map_file`; or it is nearly black everywhere, as an image of labels is.
+    """
+    if named == ALPHA:
+        with open_image(path) as image:
+            return (np.asarray(image.convert("RGBA"))[..., 3] / 255.0).astype(np.float32)
+    mask = read_map_file(path, size)
+    if 0 < mask.max() < _DARK:
+        raise LegsError(
+            f"{path}: no pixel is lighter than {mask.max() * 255:.3g} of 255: in a mask white counts and black does "
+            "not; an image of labels is no mask"
+        )
+    return mask
 
 
 def read_map_file(path: Path, size: Tuple[int, int]) -> np.ndarray:
     """Return a map float32 [H, W]: of an image in [0, 1] (white is 1), of a .npy as it is.
 
-    Palettes, 1 bit, 8 and 16 bits are gray values; what is transparent is black. As of photographs, EXIF's orientation
-    is not applied.
+    Palettes, 1 bit, 8 and 16 bits are gray values; what is transparent is black. Where the largest value is 1, all are
+    0 or 1, and 1 is white. As of photographs, EXIF's orientation is not applied.
 
     Args:
         path: the file.
@@ -83,27 +138,28 @@ def read_map_file(path: Path, size: Tuple[int, int]) -> np.ndarray:
             deep = np.asarray(image).astype(np.int64)
             if deep.min() < 0 or deep.max() > 65535:
                 raise LegsError("more than 16 bits: save it with 8 or 16 bits")
-            return (deep / 65535.0).astype(np.float32)
+            return _unit(deep, 65535)
         mode = colour_mode(image)
         pixels = np.asarray(image.convert(mode)).astype(np.int16)
         if mode == "L":
-            return (pixels / 255.0).astype(np.float32)
+            return _unit(pixels, 255)
         opacity = pixels[..., 3] if mode == "RGBA" else np.full(pixels.shape[:2], 255, np.int16)
         if (np.ptp(pixels[..., :3], -1)[opacity > 0] > _GRAY).any():
             raise LegsError("in colour, and a map is gray (for a photograph's own alpha: --masks alpha)")
-        return (pixels[..., :3].mean(-1) / 255.0 * (opacity / 255.0)).astype(np.float32)
+        return (_unit(pixels[..., :3], 255).mean(-1) * (opacity / 255.0)).astype(np.float32)
 
 
-def has_alpha(path: Path) -> bool:
-    """Return whether a photograph has an alpha channel, from its header."""
-    with open_image(path) as image:
-        return not image.mode.startswith(("I", "F")) and colour_mode(image) == "RGBA"
+def _unit(values: np.ndarray, white: int) -> np.ndarray:
+    return (values / (1 if values.max() == 1 else white)).astype(np.float32)
 
 
-def read_alpha(path: Path) -> np.ndarray:
-    """Return the alpha of a photograph that has one, float32 [H, W] in [0, 1]."""
-    with open_image(path) as image:
-        return (np.asarray(image.convert("RGBA"))[..., 3] / 255.0).astype(np.float32)
+def _has_alpha(path: Path) -> bool:
+    """Return whether a photograph has an alpha channel, from its header; one that cannot be read has none."""
+    try:
+        with open_image(path) as image:
+            return not image.mode.startswith(("I", "F")) and colour_mode(image) == "RGBA"
+    except LegsError:
+        return False
 
 
 def file_names(views: Iterable[str]) -> Dict[str, str]:

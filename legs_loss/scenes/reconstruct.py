@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any, Callable, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
+from legs_loss.scenes.folder import PHOTOGRAPHS, files_below, left_out
 from legs_loss.scenes.images import open_image
 
-__all__ = ["PHOTOGRAPHS", "Reconstructed", "reconstruct"]
+__all__ = ["Reconstructed", "reconstruct"]
 
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+_READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 FEWEST = 3  # photographs that a scene needs
 
 
@@ -60,7 +61,9 @@ def reconstruct(
         LegsError: pycolmap is missing, there are too few photographs, or no scene can be made of them.
     """
     pycolmap = _pycolmap()
-    names = _photographs(photographs)
+    names, left = _photographs(photographs)
+    if left:
+        tell(left_out(left))
     if out.exists():
         raise LegsError(f"{out} exists already: choose another folder, or remove it")
     try:
@@ -97,17 +100,15 @@ def _pycolmap() -> Any:
     return pycolmap
 
 
-def _photographs(folder: Path) -> List[str]:
+def _photographs(folder: Path) -> Tuple[List[str], List[str]]:
+    """Return the names of the photographs in a folder and below, and of those in formats that COLMAP does not read."""
     if not folder.is_dir():
         raise LegsError(f"there is no folder {folder}: give the folder of the photographs")
-    names = sorted(
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if path.suffix.lower() in PHOTOGRAPHS and path.is_file()
-    )
+    found = sorted(path.relative_to(folder).as_posix() for path in files_below(folder, PHOTOGRAPHS))
+    names = [name for name in found if name.lower().endswith(_READ)]
     if len(names) < FEWEST:
-        raise LegsError(f"{folder}: {len(names)} photographs ({', '.join(PHOTOGRAPHS)}); at least {FEWEST} are needed")
-    return names
+        raise LegsError(f"{folder}: {len(names)} photographs ({', '.join(_READ)}); at least {FEWEST} are needed")
+    return names, [name for name in found if name not in names]
 
 
 def _one_camera(folder: Path, names: Sequence[str]) -> bool:

@@ -16,7 +16,7 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.folder import SUFFIXES
 from legs_loss.scenes.images import image_size
 from legs_loss.scenes.model import Camera, Scene, View
-from legs_loss.system import read_regular
+from legs_loss.system import read_text
 
 __all__ = ["find_transforms", "read_transforms"]
 
@@ -59,7 +59,7 @@ def read_transforms(root: Path) -> Scene:
 
 
 def _read_file(root: Path, file: Path) -> List[View]:
-    common = json.loads(read_regular(file, _LARGEST).decode("utf-8"))
+    common = json.loads(read_text(file, _LARGEST))
     one_split = file.stem.partition("_")[2] or None
     splits = {
         _image_name(root, name): split
@@ -72,7 +72,9 @@ def _read_file(root: Path, file: Path) -> List[View]:
         intrinsics = {**common, **frame}
         model = _model(intrinsics)
         camera = _camera(intrinsics, root / name) if model in ("PINHOLE", "SIMPLE_PINHOLE") else None
-        views.append(View(name, root / name, camera, one_split or splits.get(name), model, composited=True))
+        mask = intrinsics.get("mask_path")
+        mask = None if mask is None else root / _image_name(root, mask)
+        views.append(View(name, root / name, camera, one_split or splits.get(name), model, True, mask))
     return views
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from legs_loss.system.entry_points import plugins as plugins
     from legs_loss.system.files import open_regular as open_regular
     from legs_loss.system.files import read_regular as read_regular
+    from legs_loss.system.files import read_text as read_text
     from legs_loss.system.files import write_whole as write_whole
     from legs_loss.system.locks import FileLock as FileLock
     from legs_loss.system.locks import HeldError as HeldError
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "children": ["Child"],
     "ctrl_c": ["held_back", "noted"],
-    "files": ["open_regular", "read_regular", "write_whole"],
+    "files": ["open_regular", "read_regular", "read_text", "write_whole"],
     "locks": ["FileLock", "HeldError", "is_held"],
     "memory": ["keep_freed_memory"],
     "entry_points": ["plugins"],

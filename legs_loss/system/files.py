@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
 import os
@@ -13,7 +14,7 @@ from typing import BinaryIO, Callable, Optional, Union
 
 from legs_loss.errors import LegsError
 
-__all__ = ["open_regular", "read_regular", "write_whole"]
+__all__ = ["open_regular", "read_regular", "read_text", "write_whole"]
 
 PathLike = Union[str, "os.PathLike[str]"]
 _ABANDONED = 3600.0  # seconds since the last byte
@@ -61,6 +62,26 @@ def read_regular(path: PathLike, limit: int, folder: Optional[int] = None) -> by
         if size > limit:
             raise OSError(errno.EFBIG, f"{size} bytes, and no file of its kind has more than {limit}", os.fspath(path))
         return file.read(size)
+
+
+def read_text(path: PathLike, limit: int) -> str:
+    """Read a text of UTF-8, or of UTF-16 with its byte order mark, which is left out.
+
+    Args:
+        path, limit: as for :func:`read_regular`.
+
+    Raises:
+        OSError: as :func:`read_regular`.
+        ValueError: it has another encoding; the message has the first such line.
+    """
+    data = read_regular(path, limit)
+    is_16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        return data.decode("utf-16" if is_16 else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        number = data.count(b"\n", 0, error.start)
+        line = data.split(b"\n")[number].strip()
+        raise ValueError(f"line {number + 1} is not in UTF-{16 if is_16 else 8}: {str(line[:100])[2:-1]}") from None
 
 
 def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]], folders: bool = False) -> None:

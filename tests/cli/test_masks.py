@@ -60,7 +60,9 @@ def test_a_folder_of_masks_and_what_masks_everything(scene, tmp_path):
     said = legs("masks", scene, "--from", tmp_path / "mine", "dark", code=1)
     assert "skipped images/cam/b.png: nothing of it would count" in said and "1 masks, 1 skipped" in said
     assert made(scene)[0].tolist() == [255] * 10 + [0] * 10 + [255] * 40
-    assert "there is no folder nowhere" in legs("masks", scene, "--from", "nowhere", "--out", tmp_path / "new", code=2)
+    assert "there is no folder or file nowhere" in legs(
+        "masks", scene, "--from", "nowhere", "--out", tmp_path / "new", code=2
+    )
 
 
 def test_from_masks_to_images_for_other_programs(scene, tmp_path):

@@ -89,18 +89,47 @@ def test_it_is_the_very_file_that_3dgs_writes(tmp_path: Path) -> None:
     assert (tmp_path / "theirs.ply").read_bytes() == (tmp_path / "ours.ply").read_bytes()
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_other_programs_files_by_plyfile(tmp_path: Path, order: str) -> None:
+    """Without normals as gsplat's exporter and SuperSplat, with mip-splatting's filter, 8-bit colours, a float64."""
+    plyfile = pytest.importorskip("plyfile")
+    gaussians = some(5, 1)
+    names = ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(9)), "opacity"]
+    names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    sh = gaussians.sh.transpose(1, 2)
+    columns = [gaussians.means, sh[..., 0], sh[..., 1:].flatten(1), gaussians.opacity_logits]
+    columns += [gaussians.log_scales, gaussians.quaternions]
+    values = torch.cat(columns, 1).numpy()
+    types = [("red", "u1"), *((name, "f8" if name == "z" else "f4") for name in names), ("filter_3D", "f4")]
+    rows = np.zeros(5, types)
+    rows["red"], rows["filter_3D"] = 200, 0.25
+    for i, name in enumerate(names):
+        rows[name] = values[:, i]
+    element = plyfile.PlyElement.describe(rows, "vertex")
+    plyfile.PlyData([element], byte_order=order, comments=["end_header is near"]).write(str(tmp_path / "a.ply"))
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
+    (tmp_path / "crlf.ply").write_bytes(head.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)
+    for file in ("a.ply", "crlf.ply"):
+        again = read_ply(tmp_path / file)
+        for name in FIELDS:
+            assert torch.equal(getattr(again, name), getattr(gaussians, name)), name
+
+
 def test_damage_and_foreign_files_are_refused(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", some(3, 1))
     good = (tmp_path / "a.ply").read_bytes()
     damaged = {
-        "not a binary little-endian": b"",
-        "not a binary": good.replace(b"binary_little_endian", b"ascii"),
-        "not a binary little": b"\x89PNG" + good,
+        "not a binary .ply": b"",
+        "a text; save it as a binary": good.replace(b"binary_little_endian", b"ascii"),
+        "not a binary": b"\x89PNG" + good,
         "cut off or damaged": good[:-1],
         "or damaged": good + b"\0",
         "the header says 4": good.replace(b"vertex 3", b"vertex 4"),
-        "not a .ply of 3D Gaussians": good.replace(b"property float opacity", b"property float opaqueness"),
-        "a .ply of 3D Gaussians: its": good.replace(b"property float nx\n", b""),
+        "property opacity is missing": good.replace(b"property float opacity", b"property float opaqueness"),
+        "property scale_2 is missing": good.replace(b"property float scale_2\n", b""),
+        "8 properties f_rest_* are not": good.replace(b"property float f_rest_8\n", b"property float other\n"),
+        "header line 'property float y'": good.replace(b"property float x\n", b"property float y\n"),
+        "the header says 3": good.replace(b"property float nx\n", b""),
         "cannot read the header line": good.replace(b"property float x\n", b"property list uchar int x\n"),
         "header line 'element vertex -3'": good.replace(b"vertex 3", b"vertex -3"),
         "has no `element vertex`": b"ply\nformat binary_little_endian 1.0\nend_header\n",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 import subprocess
@@ -99,6 +100,39 @@ class TestReading:
         with pytest.raises(LegsError, match="all black"):
             mask_of(scene)
 
+    @pytest.mark.parametrize(("kind", "mode"), [(np.uint8, None), (np.uint16, None), (np.uint8, "RGB")])
+    def test_zeros_and_ones_are_black_and_white(self, scene, kind, mode):
+        image = Image.fromarray(third(kind, 1))
+        replace_mask(scene, image if mode is None else image.convert(mode))
+        np.testing.assert_array_equal(mask_of(scene), third() / 255)
+
+    def test_those_of_no_photograph_are_named_and_left_out(self, scene):
+        Image.fromarray(third()).save(scene / "masks/z.png")
+        report = precompute(read_scene(scene), maps=OwnMaps("masks"))
+        assert report.own == {MASK: 1} and len(report.notes) == 1
+        assert "1 file(s) are left out" in report.notes[0] and str(scene / "masks/z.png") in report.notes[0]
+
+    def test_one_for_all(self, scene):
+        os.replace(scene / "masks/a.png", scene / "all.png")
+        for name in ("a", "b", "c"):
+            np.testing.assert_array_equal(mask_of(scene, f"images/{name}.png", masks="all.png"), third() / 255)
+
+    def test_one_for_all_beside_the_photographs_is_none_of_them(self, scene):
+        Image.fromarray(third()).save(scene / "images/all.png")
+        report = precompute(read_scene(scene), maps=OwnMaps("images/all.png"))
+        assert (len(report.made), report.own) == (3, {MASK: 3})
+
+    def test_those_that_transforms_json_names_are_used_or_spoken_of(self, scene):
+        pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+        frames = [{"file_path": f"images/{name}.png", "transform_matrix": pose} for name in ("a", "b")]
+        frames[0]["mask_path"] = "masks/a.png"
+        (scene / "transforms.json").write_text(json.dumps({"fl_x": 9, "w": 12, "h": 8, "frames": frames}))
+        report = precompute(read_scene(scene))
+        assert "masks of 1 photograph(s): with --masks mask_path they count" in report.notes[0]
+        report = precompute(read_scene(scene), maps=OwnMaps("mask_path"))
+        assert (report.own, report.unmasked, report.notes) == ({MASK: 1}, ["images/b.png"], [])
+        np.testing.assert_array_equal(mask_of(scene, masks="mask_path"), third() / 255)
+
     def test_gray_counts_in_part(self, scene):
         replace_mask(scene, Image.fromarray(np.full((8, 12), 51, np.uint8)))
         np.testing.assert_allclose(mask_of(scene), 0.2, atol=1e-4)
@@ -170,6 +204,13 @@ class TestRefused:
         Image.fromarray(0 * third()).save(scene / "masks/b.png")
         self.refuse(scene, r"b\.png: all black: nothing of its photograph would count")
 
+    def test_labels_are_no_mask(self, scene):
+        Image.fromarray(third(white=3)).save(scene / "masks/b.png")
+        self.refuse(scene, r"b\.png: no pixel is lighter than 3 of 255: in a mask white counts")
+
+    def test_mask_path_of_a_scene_without(self, scene):
+        self.refuse(scene, r"mask_path: no transforms\.json names one", masks="mask_path")
+
     def test_in_colour(self, scene):
         Image.open(scene / "images/b.png").save(scene / "masks/b.png")
         self.refuse(scene, r"b\.png: in colour, and a map is gray")
@@ -193,7 +234,7 @@ class TestRefused:
         self.refuse(scene, r"b\.png: 8x12 pixels do not have the ratio of sides of its photograph, 12x8")
 
     def test_of_no_photograph(self, scene):
-        Image.fromarray(third()).save(scene / "masks/z.png")
+        os.replace(scene / "masks/a.png", scene / "masks/z.png")
         self.refuse(scene, r"z\.png is the map of no photograph; maps have the name")
 
     def test_two_of_one_photograph(self, scene):
@@ -207,8 +248,8 @@ class TestRefused:
 
     def test_without_any(self, scene):
         (scene / "masks/a.png").unlink()
-        self.refuse(scene, r"masks has no maps \(\.png")
-        self.refuse(scene, "there is no folder nowhere", masks="nowhere")
+        self.refuse(scene, r"masks: no map of a photograph \(\.png")
+        self.refuse(scene, "there is no folder or file nowhere", masks="nowhere")
 
     def test_damaged_files(self, scene):
         whole = (scene / "masks/a.png").read_bytes()

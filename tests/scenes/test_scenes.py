@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from legs_loss.errors import LegsError
-from legs_loss.scenes import Camera, PointCloud, colmap, read_scene, write_colmap
+from legs_loss.scenes import Camera, PointCloud, colmap, image_size, read_scene, write_colmap
 from tests.support import colmap_scene, photograph, save
 
 CAMERAS_TXT = """# a comment
@@ -84,8 +84,115 @@ class TestColmapText:
         with pytest.raises(LegsError, match=file):
             read_scene(root).points  # noqa: B018 (reading it is the test)
 
+    def test_a_lost_line_of_points_is_named(self, tmp_path):
+        root = text_scene(tmp_path)
+        lines = IMAGES_TXT.splitlines(True)
+        for lost in (2, 4):  # of the first and of the second image; the other one still has its own
+            text = "".join(line for i, line in enumerate(lines) if i != lost)
+            (root / "sparse" / "0" / "images.txt").write_text(text)
+            with pytest.raises(LegsError, match=rf"line {lost + 1} should have its points.*an image has two lines"):
+                read_scene(root)
+
+    def test_a_name_of_spaces_and_numbers_is_no_line_of_points(self, tmp_path):
+        root = text_scene(tmp_path)
+        line = "{} 1 0 0 0 0 0 0 1 my photo {}.png\n"
+        (root / "sparse" / "0" / "images.txt").write_text(line.format(1, 1) + line.format(2, 2))
+        with pytest.raises(LegsError, match="line 2 should have its points"):
+            read_scene(root)
+
+    @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+    def test_a_byte_order_mark(self, tmp_path, encoding):
+        root = text_scene(tmp_path)
+        for file in (root / "sparse" / "0").iterdir():
+            file.write_text(file.read_text(), encoding=encoding)
+        scene = read_scene(root)
+        assert [view.path.name for view in scene.views] == ["b.png", "c.png", "a.png"]
+        assert scene.views[0].camera.fx == 50 and scene.points.xyz.shape == (2, 3)
+
+    def test_another_encoding_is_named_with_its_line(self, tmp_path):
+        root = text_scene(tmp_path)
+        (root / "sparse" / "0" / "images.txt").write_bytes(b"# \xc3\xa9\n1 0 1 0 0 1 2 3 1 caf\xe9.png\n\n")
+        with pytest.raises(LegsError, match=r"line 2 is not in UTF-8: .*caf\\xe9\.png"):
+            read_scene(root)
+
+
+class TestModels:
+    """Every camera model of COLMAP 4.2, with the parameters that pycolmap's Camera.params_info lists."""
+
+    NAMES = {
+        "SIMPLE_PINHOLE": "f, cx, cy",
+        "PINHOLE": "fx, fy, cx, cy",
+        "SIMPLE_RADIAL": "f, cx, cy, k",
+        "RADIAL": "f, cx, cy, k1, k2",
+        "OPENCV": "fx, fy, cx, cy, k1, k2, p1, p2",
+        "OPENCV_FISHEYE": "fx, fy, cx, cy, k1, k2, k3, k4",
+        "FULL_OPENCV": "fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6",
+        "FOV": "fx, fy, cx, cy, omega",
+        "SIMPLE_RADIAL_FISHEYE": "f, cx, cy, k",
+        "RADIAL_FISHEYE": "f, cx, cy, k1, k2",
+        "THIN_PRISM_FISHEYE": "fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1",
+        "RAD_TAN_THIN_PRISM_FISHEYE": "fx, fy, cx, cy, k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3",
+        "SIMPLE_DIVISION": "f, cx, cy, k",
+        "DIVISION": "fx, fy, cx, cy, k",
+        "SIMPLE_FISHEYE": "f, cx, cy",
+        "FISHEYE": "fx, fy, cx, cy",
+        "EUCM": "fx, fy, cx, cy, alpha, beta",
+        "EQUIRECTANGULAR": "w, h",
+    }
+
+    def test_their_parameters(self):
+        for name, (count, focal) in colmap.MODELS.items():
+            params = self.NAMES[name].split(", ")
+            assert (len(params), sum(p.startswith("f") for p in params)) == (count, focal), name
+        assert list(colmap.MODELS) == list(self.NAMES)
+
+    def test_against_pycolmap(self, tmp_path):
+        pycolmap = pytest.importorskip("pycolmap", minversion="4.2")
+        model = tmp_path / "sparse" / "0"
+        model.mkdir(parents=True)
+        (tmp_path / "images").mkdir()
+        made = pycolmap.Reconstruction()
+        for number, name in enumerate(colmap.MODELS, start=1):
+            camera = pycolmap.Camera.create_from_model_name(number, name, 50.0, 40, 30)
+            assert (camera.model.value, len(camera.params)) == (number - 1, colmap.MODELS[name][0])
+            made.add_camera_with_trivial_rig(camera)
+            image = pycolmap.Image(f"{number:02}.png", [], number, number)
+            made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        made.write_binary(model)
+        binary = read_scene(tmp_path).views
+        assert [view.camera_model for view in binary] == list(colmap.MODELS)
+        for file in model.iterdir():
+            file.unlink()
+        made.write_text(model)
+        assert [view.camera_model for view in read_scene(tmp_path).views] == list(colmap.MODELS)
+
+    def test_an_unknown_one_is_named(self, tmp_path):
+        root = colmap_scene(tmp_path)
+        camera = struct.pack("<IiQQ4d", 3, 18, 40, 30, 50, 51, 20, 15)
+        (root / "sparse" / "0" / "cameras.bin").write_bytes(struct.pack("<Q", 1) + camera)
+        with pytest.raises(LegsError, match=r"cameras\.bin .*camera 3 has model 18, and known here are 0 to 17"):
+            read_scene(root)
+
 
 class TestColmapBinary:
+    def test_a_name_in_another_encoding_is_named(self, tmp_path):
+        root = colmap_scene(tmp_path)
+        file = root / "sparse" / "0" / "images.bin"
+        file.write_bytes(file.read_bytes().replace(b"0002.png", b"000\xe9.png"))
+        with pytest.raises(LegsError, match=r"the name '000\\xe9\.png' of an image is not in UTF-8"):
+            read_scene(root)
+
+    def test_a_larger_model_beside_it_is_spoken_of(self, tmp_path):
+        root = colmap_scene(tmp_path / "scene")  # of three images
+        larger = colmap_scene(tmp_path / "larger", names=["1.png", "2.png", "3.png", "4.png"])
+        (larger / "sparse" / "0").rename(root / "sparse" / "1")
+        scene = read_scene(root)
+        assert len(scene.views) == 3
+        assert "1 has 4 images, and 0, which is read here as by 3DGS, 3" in scene.notes[0]
+        (root / "sparse" / "1").rename(root / "sparse" / "2")
+        (root / "sparse" / "2" / "images.bin").write_bytes(b"damaged")
+        assert read_scene(root).notes == ()
+
     def test_against_bytes_packed_by_hand(self, tmp_path):
         model = tmp_path / "sparse" / "0"
         model.mkdir(parents=True)
@@ -263,6 +370,13 @@ class TestTransforms:
         )
         assert [view.split for view in read_scene(tmp_path).views] == ["train", "test", "train"]
 
+    @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+    def test_a_byte_order_mark(self, tmp_path, encoding):
+        transforms(tmp_path, fl_x=9, w=8, h=8, frames=[frame("é.png")])
+        file = tmp_path / "transforms.json"
+        file.write_text(file.read_text(), encoding=encoding)
+        assert [view.name for view in read_scene(tmp_path).views] == ["é.png"]
+
     @pytest.mark.parametrize(
         ("more", "model"), [({"k1": 0.1}, "OPENCV"), ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE")]
     )
@@ -306,6 +420,27 @@ class TestFolder:
         assert scene.kind == "folder"
         assert [view.name for view in scene.views] == ["a.png", "b.JPG", "sub/Ünï cödé.webp", "x.tiff"]
         assert scene.points is None
+
+    def test_every_format_that_the_decoder_knows(self, tmp_path):
+        features = pytest.importorskip("PIL.features")
+        names = ["a.gif", "b.jp2", "c.tga", "d.ppm", "e.jfif"] + ["f.avif"] * features.check("avif")
+        for name in names:
+            save(tmp_path / name, photograph(16, 16))
+        scene = read_scene(tmp_path)
+        assert ([view.name for view in scene.views], scene.notes) == (names, ())
+        assert [image_size(view.path) for view in scene.views] == [(16, 16)] * len(names)
+
+    def test_what_is_not_read_is_named(self, tmp_path):
+        for name in ("a.jxl", "b.NEF", "c.exr", "notes.txt", "d.pfm"):
+            (tmp_path / name).write_bytes(b"")
+        with pytest.raises(
+            LegsError, match=r"4 file\(s\) in a format that is not read here are left out: a\.jxl, b\.NEF"
+        ):
+            read_scene(tmp_path)
+        save(tmp_path / "e.png", photograph(8, 8))
+        scene = read_scene(tmp_path)
+        assert len(scene.views) == 1
+        assert "left out: a.jxl, b.NEF, c.exr, d.pfm; convert" in scene.notes[0]
 
     def test_a_folder_named_images_is_the_scenes(self, tmp_path):
         for name in ("images/a.png", "images_2/a.png"):

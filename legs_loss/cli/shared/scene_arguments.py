@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
-from typing import TYPE_CHECKING, Any
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Optional, Union
 
-from legs_loss.system import cores
+from legs_loss.system import cores, say
 
 if TYPE_CHECKING:
     from legs_loss.scenes import Scene
 
-__all__ = ["add_images", "add_resolution", "add_scene_arguments", "default_resolution"]
+__all__ = ["add_images", "add_resolution", "add_scene_arguments", "default_resolution", "read_noted"]
 
 AFFORDABLE = 70_000  # pixels a photograph
 
@@ -35,6 +37,16 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one a core"
     )
+
+
+def read_noted(path: Union[str, Path], images: Optional[str] = None) -> Scene:
+    """Read a scene, and say on stderr what was left out of it; see :func:`~legs_loss.scenes.read_scene`."""
+    from legs_loss.scenes import read_scene
+
+    scene = read_scene(path, images)
+    for note in scene.notes:
+        say(f"legs: note: {note}", sys.stderr)
+    return scene
 
 
 def default_resolution(scene: Scene) -> int:

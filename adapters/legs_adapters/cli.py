@@ -275,8 +275,7 @@ def _quote(terms: Sequence[Problem], what: str) -> None:
     for term in terms:
         say(f"legs-patch: {what}: {term.path}:{term.line}: {term.reason}", sys.stderr)
         say(f"    {term.text}", sys.stderr)
-        say(f"  if this is the loss between rendering and photograph, edit it by hand: {term.advice}", sys.stderr)
-        say("  (rendering first), and import legs_loss at the top", sys.stderr)
+        say(f"  if this is the loss between rendering and photograph: {term.way}", sys.stderr)
 
 
 def _site(root: Path, text: str) -> Tuple[str, int]:

@@ -22,24 +22,14 @@ from legs_adapters.code.module import Module
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import dotted
 from legs_adapters.terms.findings import Site, Use
-from legs_adapters.terms.text import Edit, Text, on_one_line
-from legs_adapters.terms.writing import PACKAGE, Writing
+from legs_adapters.terms.text import Edit, Text, apply_edits
+from legs_adapters.terms.writing import PACKAGE
 from legs_loss import LegsError
 
 __all__ = ["PACKAGE", "Edit", "apply_edits", "rewrite", "why_not_compiled"]
 
 _STRINGS = (cst.SimpleString, cst.ConcatenatedString)
 _IMPORTS = (cst.Import, cst.ImportFrom)
-
-
-def apply_edits(data: bytes, edits: Sequence[Edit]) -> bytes:
-    """Return the file's bytes with the edits made."""
-    parts, at = [], 0
-    for edit in sorted(edits):
-        assert edit.start >= at and data[edit.start : edit.end] == edit.before
-        parts += [data[at : edit.start], edit.after]
-        at = edit.end
-    return b"".join([*parts, data[at:]])
 
 
 def rewrite(
@@ -61,8 +51,7 @@ def rewrite(
     is_imported = _is_imported(module)
     edits: List[Edit] = []
     for site in sites:
-        writing = Writing(site.swapped, on_one_line(site.selection), in_place)
-        edits += site.form.edits(Text(source, site.scope), writing)
+        edits += site.form.edits(Text(source, site.scope), site.writing(in_place))
     for use in unweighted:
         text = Text(source, use.caller)
         start, end = text.span(use.call.func, True)

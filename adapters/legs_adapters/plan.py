@@ -131,7 +131,7 @@ def _check_named(root: Path, findings: Findings, name: str, line: int, exclude: 
         return
     reasons = [why_left_out(root, name, exclude), *(one.reason for one in findings.unreadable if one.path == name)]
     reasons += [
-        f"{problem.reason}; write there: {problem.advice}"
+        f"{problem.reason}; {problem.way}"
         for problem in findings.problems
         if (problem.path, problem.line) == (name, line)
     ]

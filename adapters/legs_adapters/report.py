@@ -11,7 +11,7 @@ from legs_adapters.checkout.replace import Changes
 from legs_adapters.code.syntax import call_name, one_line
 from legs_adapters.plan import Plan
 from legs_adapters.rules.order import RULES
-from legs_adapters.terms.findings import Left
+from legs_adapters.terms.findings import Left, Problem
 from legs_adapters.terms.form import Form
 from legs_loss.system import printable
 
@@ -52,6 +52,10 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
     def line(entry: Any, code: Optional[str] = None, **more: object) -> Dict[str, object]:
         return {"file": entry.path, "line": entry.line, "code": entry.text if code is None else code, **more}
 
+    def problem(entry: Problem) -> Dict[str, object]:
+        site = f"{entry.path}:{entry.line}" if entry.by_site else None
+        return line(entry, reason=entry.reason, advice=entry.advice, site=site)
+
     content: Dict[str, object] = {
         "root": str(plan.root),
         "sites": [
@@ -67,8 +71,8 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
             for left in found.left
         ],
         "patched": [line(entry) for entry in found.patched],
-        "problems": [line(entry, reason=entry.reason, advice=entry.advice) for entry in found.problems],
-        "doubts": [line(entry, reason=entry.reason, advice=entry.advice) for entry in found.doubts],
+        "problems": [problem(entry) for entry in found.problems],
+        "doubts": [problem(entry) for entry in found.doubts],
         "unreadable": [{"file": entry.path, "reason": entry.reason} for entry in found.unreadable],
         "unsearched": [
             {"folder": at.folder, "reason": at.why, "file": at.path, "line": at.line, "advice": at.text(plan.root)}

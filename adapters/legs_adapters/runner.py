@@ -76,7 +76,7 @@ def run_script(
     for elsewhere in found.unsearched:
         _say(f"not weighted: {elsewhere.text(root)}")
     for problem in found.findings.problems:
-        text = f"{problem.path}:{problem.line}: {problem.reason}; edit it by hand: {problem.advice}"
+        text = f"{problem.path}:{problem.line}: {problem.reason}; if this is the loss: {problem.way}"
         if not found.after and not found.findings.patched:
             raise LegsError(text)
         _say(f"not weighted: {text}")

@@ -131,7 +131,7 @@ class TestCommandLine:
         assert refused.returncode == 2
         assert "train.py:11: cannot tell which of image_a and image_b" in refused.stderr
         assert "loss = loss + l1_loss(image_a, image_b)" in refused.stderr
-        assert "edit it by hand: legs_loss.l1_loss(image_a, image_b)" in refused.stderr
+        assert "--site train.py:11 takes your word and writes legs_loss.l1_loss(image_a, image_b)\n" in refused.stderr
         assert snapshot(root) == before
         assert run("--diff", root).returncode == 1
         partial = run(root)
@@ -160,7 +160,7 @@ class TestCommandLine:
         assert "+        Ll1 = legs_loss.l1_loss(image, gt_image, own=opt.criterion)\n" in diff
         told = run("--site", f"train.py:{line + 1}", root)
         assert told.returncode == 2
-        assert "write there: torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))" in told.stderr
+        assert "edit it by hand: as one absolute difference times the photograph's weight map" in told.stderr
         assert (
             "train.py:1: there is no difference, absolute value or call of two images"
             in run("--site", "train.py:1", root).stderr
@@ -348,7 +348,7 @@ class TestCommandLine:
         ("# mse_loss(image, gt)\nloss = F.mse_loss(image, gt_image)\n", 2, "the image loss is squared"),
         ("delta = image - photo\nloss = (delta**2).mean()\n", 2, "the image loss is squared"),
         ("loss += self.guidance(images, prompts)['loss_sds']\n", 1, "the gradient is a diffusion model's (SDS)"),
-        ("loss = fused_ssim.fused_l1_ssim_loss(img, gt)\n", 1, "legs_loss.d_ssim(image, gt)"),
+        ("loss = fused_ssim.fused_l1_ssim_loss(img, gt)\n", 1, "take both apart"),
         (
             "class M(S):\n    def get_loss_dict(self, *a):\n        return super().get_loss_dict(*a)\n",
             3,

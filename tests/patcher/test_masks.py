@@ -199,7 +199,7 @@ def test_a_line_that_has_to_be_written_by_hand(tmp_path):
     done = legs_patch("--masks", root)
     assert done.returncode == 1 and "wrote train.py" in done.stdout
     assert "not masked: the images have no names here" in done.stderr
-    assert 'image = legs_loss.masked(image, gt_image.to("cpu")) before every term' in done.stderr
+    assert "hand: give both images names, and mask the rendering on a line of its own before every term" in done.stderr
     strict = legs_patch("--masks", "--strict", checkout(tmp_path / "strict", {**FILES, "train.py": text}))
     assert strict.returncode == 2 and "nothing was changed" in strict.stderr
 

@@ -178,7 +178,7 @@ def test_a_script_that_trains_without_a_site_is_named_beside_the_sites_of_others
     assert "warning: a possible loss was not weighted: refine.py:8" in done.stderr
 
 
-def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path):
+def test_the_advice_for_a_body_that_serves_two_purposes_is_no_line_to_copy(tmp_path):
     texts = {
         "losses.py": (
             "from torch import nn\n\n\n"
@@ -195,7 +195,10 @@ def test_the_advice_keeps_what_the_codebase_s_own_function_makes_of_it(tmp_path)
         ),
     }
     (problem,) = plan(checkout(tmp_path, texts)).findings.problems
-    assert problem.advice == "legs_loss.l1_loss(pred, target, own=self.l1_loss)"
+    assert (problem.by_site, problem.advice) == (
+        False,
+        "give the loss a function of its own, and weight the L1 in that one",
+    )
 
 
 def test_a_difference_that_is_filtered_before_its_absolute_value_is_quoted(tmp_path):
@@ -210,7 +213,8 @@ def test_a_difference_that_is_filtered_before_its_absolute_value_is_quoted(tmp_p
     [problem] = plan(checkout(tmp_path, texts)).findings.problems
     assert problem.text == "Ll1 = delta.abs().mean()"
     assert problem.reason == "image - gt_image may change before its absolute value is taken"
-    assert problem.advice == "torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))"
+    assert not problem.by_site
+    assert "legs_loss" not in problem.advice
 
 
 def test_a_method_is_not_resolved_by_its_bare_name(tmp_path):

@@ -62,13 +62,14 @@ class _Pair(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The line to write."""
-        name = one_line(self.prediction) if isinstance(self.prediction, cst.Name) else "image"
-        return f"{name} = {_MASKED}({one_line(self.prediction)}, {one_line(self.target)})"
+        """The line to write, of a rendering that has a name."""
+        return f"{one_line(self.prediction)} = {_MASKED}({one_line(self.prediction)}, {one_line(self.target)})"
 
     def problem(self, function: Function, node: cst.CSTNode, why: str) -> Problem:
         """Return the line as one to be written by hand, with the expression that is the reason."""
-        advice = f"{self.text} before every term that gets the rendering"
+        is_named = path_of(self.prediction) is not None and path_of(self.target) is not None
+        line = self.text if is_named else "give both images names, and mask the rendering on a line of its own"
+        advice = f"{line} before every term that gets the rendering"
         return Problem.at(function, function.place(node), f"not masked: {why}", advice)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Optional
+from typing import NamedTuple, Optional
 
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
@@ -17,11 +17,22 @@ from legs_adapters.terms.error_maps import is_measured, reads_of
 from legs_adapters.terms.findings import Evidence, Left, Problem, Site
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import PassedByName
+from legs_adapters.terms.kinds.indirect import Indirect
 from legs_adapters.terms.kinds.reread import Reread
 from legs_adapters.terms.sides import is_role, same_root
-from legs_adapters.terms.writing import Writing
+from legs_adapters.terms.text import Text
 
 __all__ = ["Verdicts"]
+
+
+_OF_DIFFERENCE = "as one absolute difference times the photograph's weight map, with each mask and threshold as it is"
+
+
+class _ByHand(NamedTuple):
+    """Why a term is not edited, and what to do in words; none where the user's word would settle it."""
+
+    reason: str
+    advice: str = ""
 
 
 class Verdicts:
@@ -33,12 +44,17 @@ class Verdicts:
     def decide(self, function: Function, form: Form, place: Place, by_hand: bool) -> Site | Left | Problem:
         """Return the verdict on a form; ``by_hand`` where the user named it as the loss."""
         term = Term(self.analysis, function, form)
+        verdict = self._verdict(term, place, by_hand)
+        return self._problem(term, place, verdict.reason) if isinstance(verdict, _ByHand) else verdict
+
+    def _verdict(self, term: Term, place: Place, by_hand: bool) -> Site | Left | _ByHand:
+        function, form = term.function, term.form
         evidence = None if by_hand else first(term)
         if evidence is not None:
             return Left.at(function, place, evidence)
         why = self._why_by_hand(term, by_hand)
-        if why:
-            return self.problem(term, place, why)
+        if why is not None:
+            return why
         uses = uses_of(self.analysis, function, term.prediction, term.target)
         others = [use for use in uses if use.other is not None]
         if others and len(others) == len(uses):
@@ -46,15 +62,16 @@ class Verdicts:
         unknown = [use for use in uses if not use.is_known]
         if unknown and len(unknown) < len(uses):  # one body serves both
             call, where = one_line(unknown[0].call), unknown[0].left
-            why = f"nothing shows that {call} at {where.path}:{where.line} is the loss, as other calls are"
-            return self.problem(term, place, why)
+            reason = f"nothing shows that {call} at {where.path}:{where.line} is the loss, as other calls are"
+            return _ByHand(reason, "give the loss a function of its own, and weight the L1 in that one")
         loss, others_read = reads_of(self.analysis.training, function, form)
         if others_read and not loss:
             return Left.at(function, place, Evidence("untrained", "untrained", term.here))
         if others_read:
             alone = len(loss) == 1 and loss[0] not in others_read and len(function.flow.reaching(loss[0])) == 1
             if not alone or not function.flow.unchanged(form.first, form.second):
-                return self.problem(term, place, f"{one_line(form.node)} has other uses than the loss")
+                reason = f"{one_line(form.node)} has other uses than the loss"
+                return _ByHand(reason, "weight a second error map, for the loss, and leave this one to its other uses")
             form = Reread(loss[0], form.call, form.first, form.second)
         is_swapped = term.target is term.pair.first
         site = Site.at(function, form, self._why_photograph(term), is_swapped, term.pair.selection)
@@ -87,28 +104,34 @@ class Verdicts:
         pictures = "image" in kinds or (function.name in CALLED and all(map(is_role, term.sides)))
         if other or not pictures or TRACKING & {*words(function.name)} or (rule.needs_target and "target" not in roles):
             return None
-        return self.problem(term, place, f"nothing shows that this is the loss: {rule.sentence()}")
+        return self._problem(term, place, f"nothing shows that this is the loss: {rule.sentence()}")
 
-    def problem(self, term: Term, place: Place, reason: str) -> Problem:
-        """Return a term as a problem, with the advice for the manual edit."""
-        advice = term.form.advice(Writing(swapped=term.target is term.pair.first))
-        if term.has_rows:
-            advice = "legs_loss.l1_loss(rendering, photograph), on the images before they are flattened"
-        return Problem.at(term.function, place, reason, advice)
+    def _problem(self, term: Term, place: Place, reason: str) -> Problem:
+        """Return a term as a problem, with the advice: what ``--site`` writes there, or words."""
+        named = self._verdict(term, place, by_hand=True)
+        if isinstance(named, Site) and named.line == place.line:
+            text = Text(self.analysis.program.sources[named.path], named.scope)
+            return Problem.at(term.function, place, reason, named.form.advice(text, named.writing()), by_site=True)
+        words = named.advice if isinstance(named, _ByHand) else "weight the calls of it that are the loss"
+        return Problem.at(term.function, place, reason, words)
 
-    def _why_by_hand(self, term: Term, by_hand: bool) -> str:
-        """Return why no edit gives the images their weights; empty where one may."""
+    def _why_by_hand(self, term: Term, by_hand: bool) -> Optional[_ByHand]:
+        """Return why no edit gives the images their weights; None where one may."""
         pair = term.pair
         if swapped(pair.a, pair.b) is None and not by_hand:
             sides = f"{one_line(pair.first)} and {one_line(pair.second)}"
-            return f"cannot tell which of {sides} is the rendering and which the photograph"
+            return _ByHand(f"cannot tell which of {sides} is the rendering and which the photograph")
         if "target" not in (pair.a.role, pair.b.role) and not by_hand:
-            return f"nothing shows that {one_line(term.target)} is a photograph"
+            return _ByHand(f"nothing shows that {one_line(term.target)} is a photograph")
         if UNKNOWN in (pair.a, pair.b) and not by_hand:
-            return f"nothing shows that {one_line(term.prediction)} is a rendering"
+            return _ByHand(f"nothing shows that {one_line(term.prediction)} is a rendering")
         if term.has_rows:
-            return "the sides are lists of pixels: a weight map needs whole images"
-        return term.form.why_by_hand()
+            why = "the sides are lists of pixels: a weight map needs whole images"
+            return _ByHand(why, "weight the L1 of the whole images, before pixels are picked or flattened")
+        if isinstance(term.form, Indirect) and term.form.difference is not None:
+            why = f"{one_line(term.form.difference)} may change before its absolute value is taken"
+            return _ByHand(why, _OF_DIFFERENCE)
+        return None
 
     def _why_photograph(self, term: Term) -> str:
         """Return what shows that a side is the photograph."""

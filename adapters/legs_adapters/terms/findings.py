@@ -12,6 +12,8 @@ from legs_adapters.code.parsing import Place
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Unreadable
 from legs_adapters.terms.form import Form
+from legs_adapters.terms.text import on_one_line
+from legs_adapters.terms.writing import Writing
 
 __all__ = ["Decider", "Evidence", "Findings", "Left", "Line", "Problem", "Site", "Use"]
 
@@ -115,6 +117,10 @@ class Site(NamedTuple):
     scope: Function
     unweighted: Tuple[Use, ...] = ()
 
+    def writing(self, in_place: bool = False) -> Writing:
+        """Return how its weighted call is written."""
+        return Writing(self.swapped, on_one_line(self.selection), in_place)
+
     @classmethod
     def at(cls, function: Function, form: Form, why: str, swapped: bool = False, selection: str = "") -> Site:
         """Return a form in a function as a site."""
@@ -124,18 +130,25 @@ class Site(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """A term that needs a manual edit: its place, its text, and the advice."""
+    """A term that needs a manual edit: its place, its text, and the advice, in words or as ``--site`` writes it."""
 
     path: str
     line: int
     text: str
     reason: str
     advice: str
+    by_site: bool = False
 
     @classmethod
-    def at(cls, function: Function, place: Place, reason: str, advice: str) -> Problem:
+    def at(cls, function: Function, place: Place, reason: str, advice: str, by_site: bool = False) -> Problem:
         """Return the term at a place of a function as a problem."""
-        return cls(function.module.path, place.line, function.module.lines.text(place.line), reason, advice)
+        return cls(function.module.path, place.line, function.module.lines.text(place.line), reason, advice, by_site)
+
+    @property
+    def way(self) -> str:
+        """What to do, if it is the loss."""
+        written = f"legs-patch --site {self.path}:{self.line} takes your word and writes {self.advice}"
+        return written if self.by_site else f"edit it by hand: {self.advice}"
 
 
 class Findings(NamedTuple):

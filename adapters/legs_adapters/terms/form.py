@@ -8,9 +8,8 @@ from typing import ClassVar, List, Optional, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import one_line
 from legs_adapters.terms.functions import L1Functions
-from legs_adapters.terms.text import Edit, Text
+from legs_adapters.terms.text import Edit, Text, apply_edits, on_one_line
 from legs_adapters.terms.writing import Writing
 
 __all__ = ["Form"]
@@ -60,22 +59,16 @@ class Form:
         """Return whether the term is the plain mean."""
         return self.makes == "mean"
 
-    def why_by_hand(self) -> str:
-        """Return why the form cannot be edited, empty where it can."""
-        return ""
-
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
-        """Return the edits that weight the term.
-
-        Raises:
-            LegsError: the term has to be weighted by hand.
-        """
+        """Return the edits that weight the term."""
         raise NotImplementedError(type(self).__name__)
 
-    def advice(self, writing: Writing) -> str:
-        """Return what to write by hand."""
-        prediction, target = writing.ordered(one_line(self.first), one_line(self.second))
-        return writing.call(prediction, target, self.is_map, self._own(writing))
+    def advice(self, text: Text, writing: Writing) -> str:
+        """Return what the edits write in the place of ``node``, on one line."""
+        start, end = text.span(self.node)
+        after = apply_edits(text.source.data, self.edits(text, writing))
+        before, behind = len(text.source.data) - len(text.bytes) + start, len(text.bytes) - end
+        return on_one_line(after[before : len(after) - behind].decode("utf-8"))
 
     def _own(self, writing: Writing) -> str:
         return writing.own(self.callee, self.extras) if self.callee is not None and self.makes == "own" else ""

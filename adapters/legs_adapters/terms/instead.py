@@ -16,8 +16,7 @@ _INSTEAD = (
     (r"\bsuper\(\)\.get_loss_dict\(", "the loss is nerfstudio's own: its hook is `ns-train splatfacto-legs`"),
     (
         r"\b\w*(l1\w*ssim|ssim\w*l1)\w*\(",
-        "one function computes L1 and SSIM, perhaps a compiled kernel: write (1 - w) * legs_loss.l1_loss(image, gt) "
-        "+ w * legs_loss.d_ssim(image, gt) in its place",
+        "one function computes L1 and SSIM, perhaps a compiled kernel: take both apart, and weight the L1",
     ),
     (r"mse_loss\w*\(|\bMSELoss\(|\bimg2mse\(|\bl2_loss\(|\) ?\*\* ?2\b|delta ?\*\* ?2", _SQUARED),
     (

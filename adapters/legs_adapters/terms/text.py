@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import NamedTuple, Tuple
+from typing import NamedTuple, Sequence, Tuple
 
 import libcst as cst
 
@@ -11,7 +11,7 @@ from legs_adapters.code.module import Function, Module
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import code
 
-__all__ = ["Edit", "Text", "flat", "names_for_two", "on_one_line", "residue"]
+__all__ = ["Edit", "Text", "apply_edits", "flat", "names_for_two", "on_one_line", "residue"]
 
 _STRING = r"""("(?:\\.|[^"\\\r\n])*"|'(?:\\.|[^'\\\r\n])*')"""  # no comment begins inside
 _GAP = re.compile(_STRING + r"|(?:\s|\\(?=[\r\n])|#[^\r\n]*)+")
@@ -25,6 +25,16 @@ class Edit(NamedTuple):
     end: int
     before: bytes
     after: bytes
+
+
+def apply_edits(data: bytes, edits: Sequence[Edit]) -> bytes:
+    """Return the file's bytes with the edits made."""
+    parts, at = [], 0
+    for edit in sorted(edits):
+        assert edit.start >= at and data[edit.start : edit.end] == edit.before
+        parts += [data[at : edit.start], edit.after]
+        at = edit.end
+    return b"".join([*parts, data[at:]])
 
 
 class Text:

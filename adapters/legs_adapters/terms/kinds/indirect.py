@@ -8,11 +8,9 @@ from typing import Iterator, Optional
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import one_line
 from legs_adapters.tensors.absolute import absolute_value, is_difference
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
-from legs_adapters.terms.writing import PACKAGE, Writing
 
 __all__ = ["Indirect"]
 
@@ -25,7 +23,7 @@ class Indirect(Form):
 
     Examples:
         before: diff = image - gt_image; diff = diff[diff ** 2 < 0.1]; loss = diff.abs().mean()
-        advice: torch.abs(legs_loss.weight_map(gt_image) * (image - gt_image))
+        advice: as one absolute difference times the photograph's weight map, with each mask and threshold as it is
 
     Attributes:
         difference: the ``a - b``.
@@ -41,18 +39,6 @@ class Indirect(Form):
         if found is None or made is None:
             return None
         return cls(call, found.call, made.left, made.right, makes=found.makes, difference=made)
-
-    def why_by_hand(self) -> str:
-        """Return that the difference stands elsewhere."""
-        assert self.difference is not None
-        return f"{one_line(self.difference)} may change before its absolute value is taken"
-
-    def advice(self, writing: Writing) -> str:
-        """Return the absolute value of the weighted difference."""
-        assert self.difference is not None
-        _, target = writing.ordered(self.first, self.second)
-        made = one_line(self.difference.with_changes(lpar=[], rpar=[]))
-        return f"torch.abs({PACKAGE}.weight_map({one_line(target)}) * ({made}))"
 
 
 def _differences(function: Function, node: cst.CSTNode, depth: int) -> Iterator[cst.BinaryOperation]:

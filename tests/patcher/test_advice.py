@@ -11,6 +11,7 @@ from legs_adapters.plan import plan
 
 import legs_loss
 from tests.patcher.support import NAMES, checkout, files, options
+from tests.support import start_run
 
 STEP = """import torch
 import torch.nn.functional as F
@@ -71,6 +72,7 @@ def test_an_advised_line_has_the_value_and_gradient_of_the_original(term, tmp_pa
     taken = plan(tmp_path, by_hand=[site])
     line = next(at for at in taken.after["train.py"].decode().splitlines() if at.startswith("        loss = "))
     assert problem.advice in line  # the same code writes both
+    start_run(monkeypatch, tmp_path)
     monkeypatch.setenv("LEGS_BETA", "0")
     for one, other in zip(value_and_gradient(term), value_and_gradient(line.partition(" = ")[2])):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-7)

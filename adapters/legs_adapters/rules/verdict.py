@@ -29,7 +29,7 @@ _OF_DIFFERENCE = "as one absolute difference times the photograph's weight map, 
 
 
 class _ByHand(NamedTuple):
-    """Why a term is not edited, and what to do in words; none where the user's word would settle it."""
+    """The reason that a term is not edited, and what to do in words; none where the user's word would settle it."""
 
     reason: str
     advice: str = ""

@@ -146,7 +146,7 @@ class Problem(NamedTuple):
 
     @property
     def way(self) -> str:
-        """What to do, if it is the loss."""
+        """The advice as a clause, for the case that it is the loss."""
         written = f"legs-patch --site {self.path}:{self.line} takes your word and writes {self.advice}"
         return written if self.by_site else f"edit it by hand: {self.advice}"
 

@@ -41,7 +41,7 @@ from legs_loss.lab.embedded import write_embedded_scene
 from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import read_ply, write_ply
 from legs_loss.lab.training.checkpoint import read_state, write_checkpoint
-from legs_loss.lab.viewer.splats import splats
+from legs_loss.lab.viewer.server import splats
 from legs_loss.precompute import precompute
 from legs_loss.scenes import View, load_training_image, read_scene
 from legs_loss.store import Entry, WeightStore

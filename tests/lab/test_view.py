@@ -19,7 +19,7 @@ from legs_loss.cli import main
 from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import write_ply
 from legs_loss.lab.viewer.content import find_content
-from legs_loss.lab.viewer.splats import left_of, splats
+from legs_loss.lab.viewer.server import left_of, splats
 from legs_loss.scenes import read_scene
 from tests.support import legs_command, legs_environment
 

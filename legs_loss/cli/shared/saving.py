@@ -1,4 +1,4 @@
-"""Write pictures atomically: a truncated sheet would look complete."""
+"""Write pictures atomically, since a truncated sheet would look complete, and names on them as they are."""
 
 from __future__ import annotations
 
@@ -8,9 +8,18 @@ from typing import Any, Union
 import numpy as np
 
 from legs_loss.errors import LegsError
-from legs_loss.system import write_whole
+from legs_loss.system import printable, write_whole
 
-__all__ = ["save_figure", "save_png"]
+__all__ = ["label", "save_figure", "save_png"]
+
+
+def label(name: str) -> str:
+    r"""Return a name escaped for matplotlib, which draws it literally.
+
+    >>> print(label("a$b\x07.png"))
+    a\$b\x07.png
+    """
+    return printable(name, lines=True).replace("$", r"\$")
 
 
 def save_figure(figure: Any, path: Union[str, Path], dpi: int) -> None:

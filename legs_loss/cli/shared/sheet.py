@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, Optional, Sequence, Union
 import numpy as np
 import torch
 
-from legs_loss.cli.shared.labels import label
-from legs_loss.cli.shared.saving import save_figure
+from legs_loss.cli.shared.saving import label, save_figure
 from legs_loss.curves import curve, curve_names
 from legs_loss.errors import LegsError
 from legs_loss.spec import WeightSpec

@@ -35,10 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--arms", nargs="+", metavar="ARM", help="default: those of --study")
     what.add_argument(
-        "--study",
-        choices=STUDIES,
-        default="main",
-        help=f"a built-in list of arms; default: main. {'; '.join(studies)}",
+        "--study", choices=STUDIES, default="main", help=f"a built-in list of arms; default: main. {'; '.join(studies)}"
     )
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="of each arm; default: 3")
     parser.add_argument("--iterations", type=int, default=2000, metavar="N", help="of each training; default: 2000")

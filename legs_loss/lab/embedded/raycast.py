@@ -175,14 +175,7 @@ class Sphere(_Curved):
 class Tube(_Curved):
     """An open cylinder between two points: a wire, a stick, a mug. u runs around it, v along it."""
 
-    def __init__(
-        self,
-        start: Vector,
-        end: Vector,
-        radius: float,
-        texture: np.ndarray,
-        gloss: float = 0.0,
-    ) -> None:
+    def __init__(self, start: Vector, end: Vector, radius: float, texture: np.ndarray, gloss: float = 0.0) -> None:
         self.start: np.ndarray = np.asarray(start, float)
         self.radius: float = radius
         self.texture: np.ndarray = texture

@@ -76,9 +76,7 @@ def _pictures(random: np.random.RandomState) -> List[Quad]:
     textures.framed(board, 5, (0.35, 0.22, 0.12))
 
     rug = textures.stripes(
-        (8, 360),
-        (24, 4, 8, 4),
-        ((0.50, 0.16, 0.18), (0.90, 0.82, 0.66), (0.20, 0.22, 0.36), (0.90, 0.82, 0.66)),
+        (8, 360), (24, 4, 8, 4), ((0.50, 0.16, 0.18), (0.90, 0.82, 0.66), (0.20, 0.22, 0.36), (0.90, 0.82, 0.66))
     )
     tiles = textures.checker((160, 160), 8, (0.16, 0.30, 0.28), (0.86, 0.84, 0.70), random)
     textures.framed(tiles, 8, (0.20, 0.14, 0.10))
@@ -92,10 +90,7 @@ def _pictures(random: np.random.RandomState) -> List[Quad]:
 
 
 def _box(
-    centre: Tuple[float, float, float],
-    size: Tuple[float, float, float],
-    turn: float,
-    faces: List[np.ndarray],
+    centre: Tuple[float, float, float], size: Tuple[float, float, float], turn: float, faces: List[np.ndarray]
 ) -> List[Quad]:
     """Return a box turned about the vertical: four sides (front, right, back, left) and the top."""
     c, s = np.cos(turn), np.sin(turn)
@@ -209,11 +204,7 @@ def _pose(index: int, count: int) -> np.ndarray:
 
 
 def _sparse_points(
-    picture: np.ndarray,
-    depth: np.ndarray,
-    camera: Camera,
-    count: int,
-    random: np.random.RandomState,
+    picture: np.ndarray, depth: np.ndarray, camera: Camera, count: int, random: np.random.RandomState
 ) -> Tuple[np.ndarray, np.ndarray]:
     """Return points as structure from motion finds them, on texture and edges: float [N, 3] and uint8 [N, 3]."""
     gray = picture.mean(axis=2)

@@ -74,12 +74,10 @@ class Drawn:
 
     def centres(self) -> Tuple[Tensor, Tensor]:
         """Return pixels [N, 2] and depths [N] of what is drawn, 0 for what is not; no gradient."""
-        drawn = self.radii > 0
+        drawn, none = self.radii > 0, torch.zeros(())
         pixels = torch.from_numpy(self._drawing.splats[:, :2]).to(torch.float32)
         depth = depths(self._tensors.means.detach(), self._view)
-        return torch.where(drawn[:, None], pixels, torch.zeros_like(pixels)), torch.where(
-            drawn, depth, torch.zeros_like(depth)
-        )
+        return torch.where(drawn[:, None], pixels, none), torch.where(drawn, depth, none.to(depth.dtype))
 
     def features(self, values: Tensor) -> Tensor:
         """Blend any values [N, C] as colours are, on black: [C, H, W]."""

@@ -101,14 +101,8 @@ def _check_shapes(tensors: Any, sh_degree: int, viewspace: Optional[Tensor]) -> 
     count = tensors["means"].shape[0] if tensors["means"].dim() else 0
     sh = tensors["sh"]
     coefficients = sh.shape[1] if sh.dim() == 3 else 0
-    expected = {
-        "means": (count, 3),
-        "scales": (count, 3),
-        "quaternions": (count, 4),
-        "opacities": (count, 1),
-        "sh": (count, coefficients, 3),
-    }
-    wrong = [name for name, shape in expected.items() if tuple(tensors[name].shape) != shape]
+    sides = {"means": (3,), "scales": (3,), "quaternions": (4,), "opacities": (1,), "sh": (coefficients, 3)}
+    wrong = [name for name, side in sides.items() if tuple(tensors[name].shape) != (count, *side)]
     if wrong:
         raise LegsError(
             f"{' and '.join(wrong)} of the wrong shape among {shapes}; "

@@ -65,15 +65,7 @@ _LOG2E = 1 / math.log(2)
 UNIT = math.sqrt(_LOG2E / 2)  # of the entries' own coordinates: log2(alpha) falls by the sum of their squares
 # 2^f on [-1/2, 1/2]: least relative error, 2e-7 with float32's rounding.
 _P0, _P1, _P2, _P3, _P4, _P5 = (
-    np.float32(p)
-    for p in (
-        1.0000000555094926,
-        0.693146891996,
-        0.2402215426512,
-        0.05550837614390,
-        0.009674739176515,
-        0.001324088770716,
-    )
+    np.float32(p) for p in (1.0, 0.693146892, 0.240221543, 0.0555083761, 0.00967473918, 0.00132408877)
 )
 _UNDERFLOW = np.float32(-32)
 _MANTISSA = np.int32(23)

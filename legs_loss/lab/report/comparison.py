@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.cli.shared.labels import label
-from legs_loss.cli.shared.saving import save_figure, save_png
+from legs_loss.cli.shared.saving import label, save_figure, save_png
 from legs_loss.errors import LegsError
+from legs_loss.lab.report.html_pictures import as_bytes
 from legs_loss.lab.training.metrics import strongest
 from legs_loss.responses import normalise_response, response
 
@@ -48,11 +48,11 @@ def save_pictures(folder: Path, title: str, photograph: Tensor, arms: Sequence[C
     errors = [(arm.rendering.clamp(0, 1) - photograph).abs().mean(0).numpy() for arm in arms]
     most_error = float(np.quantile(np.stack(errors), 0.995)) or 1.0
     most_weight = max(2.0, *(float(arm.weight.max()) for arm in arms))
-    save_png(_bytes(photograph), folder / "photograph.png")
+    save_png(as_bytes(photograph), folder / "photograph.png")
     for arm, error in zip(arms, errors):
         weight = (arm.weight[0].numpy() - 1) / (most_weight - 1)
         pictures = {
-            "rendering": _bytes(arm.rendering),
+            "rendering": as_bytes(arm.rendering),
             "error": colormaps["magma"](error / most_error, bytes=True)[..., :3],
             "weight": colormaps["viridis"](weight, bytes=True)[..., :3],
         }
@@ -84,16 +84,16 @@ def _sheet(
         axes.set(xticks=[], yticks=[], frame_on=False)
     detail = _detail(photograph)
     normalised = normalise_response(response(photograph))[0].numpy()
-    grid[0, 0].imshow(_bytes(photograph))
-    grid[0, 1].imshow(_bytes(photograph)[detail], interpolation="nearest")
+    grid[0, 0].imshow(as_bytes(photograph))
+    grid[0, 1].imshow(as_bytes(photograph)[detail], interpolation="nearest")
     grid[0, 2].imshow(strongest(photograph).numpy(), cmap="gray")
     grid[0, 3].imshow(normalised, cmap="magma", vmax=float(np.quantile(normalised, 0.99)) or 1.0)
     grid[0, 0].set_ylabel("photograph", fontsize=11, color=_INK)
     for axes, heading in zip(grid[0], ("", "detail", "strongest 10% of the response", r"response  $\hat{E}$")):
         axes.set_title(heading, fontsize=11, color=_INK)
     for row, (arm, error) in zip(grid[1:], zip(arms, errors)):
-        row[0].imshow(_bytes(arm.rendering))
-        row[1].imshow(_bytes(arm.rendering)[detail], interpolation="nearest")
+        row[0].imshow(as_bytes(arm.rendering))
+        row[1].imshow(as_bytes(arm.rendering)[detail], interpolation="nearest")
         shown_error = row[2].imshow(error, cmap="magma", vmin=0, vmax=most_error)
         shown_weight = row[3].imshow(arm.weight[0].numpy(), cmap="viridis", vmin=1, vmax=most_weight)
         row[0].set_ylabel(arm.name, fontsize=11, color=_INK)
@@ -113,7 +113,3 @@ def _detail(photograph: Tensor) -> Tuple[slice, slice]:
     strength = torch.nn.functional.avg_pool2d(response(photograph)[None], size, stride=1)[0, 0]
     row, column = divmod(int(strength.argmax()), strength.shape[1])
     return slice(row, row + size[0]), slice(column, column + size[1])
-
-
-def _bytes(image: Tensor) -> np.ndarray:
-    return (image.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()

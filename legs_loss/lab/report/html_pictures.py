@@ -21,7 +21,7 @@ from legs_loss.scenes import image_tensor, open_image
 from legs_loss.scenes.own_maps import dimmed
 from legs_loss.weights import weight_map
 
-__all__ = ["KINDS", "Drawn", "Pictures", "differing", "draw_row", "encode", "read_picture"]
+__all__ = ["KINDS", "Drawn", "Pictures", "as_bytes", "differing", "draw_row", "encode", "read_picture"]
 
 KINDS = ("rendering", "error", "weight")
 CROPS = 3  # of each pair of arms and each view
@@ -98,10 +98,10 @@ def encode(view: TrainingView, drawn: Mapping[str, Drawn], form: Mapping[str, An
     errors = {arm: (view.hidden(one.rendering) - view.image).abs().mean(0) for arm, one in drawn.items()}
     most_error = float(np.quantile(torch.stack(list(errors.values())).numpy(), 0.995)) or 1.0
     most_weight = max(2.0, *(float(one.weight.max()) for one in drawn.values()))
-    images = {"photograph": {"rendering": _uri(_bytes(dimmed(view.image, view.mask)), form)}}
+    images = {"photograph": {"rendering": _uri(as_bytes(dimmed(view.image, view.mask)), form)}}
     for arm, one in drawn.items():
         images[arm] = {
-            "rendering": _uri(_bytes(one.rendering), form),
+            "rendering": _uri(as_bytes(one.rendering), form),
             "error": _uri(colormaps["magma"](errors[arm].numpy() / most_error, bytes=True)[..., :3], form),
             "weight": _uri(colormaps["viridis"](one.weight[0].numpy() / most_weight, bytes=True)[..., :3], form),
         }
@@ -138,7 +138,8 @@ def differing(difference: Tensor, count: int = CROPS) -> List[List[int]]:
     return found
 
 
-def _bytes(image: Tensor) -> np.ndarray:
+def as_bytes(image: Tensor) -> np.ndarray:
+    """Return an image [C, H, W] in [0, 1], clipped, as bytes [H, W, C]."""
     return (image.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
 
 

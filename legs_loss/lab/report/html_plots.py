@@ -15,7 +15,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 _INK = "#222222"  # replaced by currentColor, so no colour of an arm may be the same
 # Tableau's, in the order that keeps neighbours apart; a tenth and more arms differ by their markers.
-_COLOURS = (
+_COLOURS = [
     "#7f7f7f",
     "#1f77b4",
     "#ff7f0e",
@@ -26,7 +26,7 @@ _COLOURS = (
     "#e377c2",
     "#17becf",
     "#bcbd22",
-)
+]
 _MARKERS = "osD^vPX*<>"
 
 

@@ -7,27 +7,78 @@ import sys
 import time
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any, Dict, Tuple
+from typing import Any, Dict, NamedTuple, Tuple
 
 import numpy as np
 
 from legs_loss.errors import LegsError
+from legs_loss.lab.conventions import SH_C0
+from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import read_ply
+from legs_loss.lab.rasterizer import rotations
 from legs_loss.lab.training.dataset import open_store
 from legs_loss.lab.viewer.content import Content
 from legs_loss.lab.viewer.guard import Guard, check_address
-from legs_loss.lab.viewer.splats import Splats, left_of, splats
 from legs_loss.scenes import View, image_tensor, load_training_image
 from legs_loss.scenes.own_maps import averaged, dimmed
 from legs_loss.spec import as_spec
 from legs_loss.store import MASK
 from legs_loss.system import say
 
-__all__ = ["serve"]
+__all__ = ["Drawable", "left_of", "serve", "splats"]
 
 _CAMERAS = 40  # shown at most, spread evenly
 _PICTURE = 160  # pixels: the width of a camera's picture
 _WIPE_SECONDS = 0.15
+_FARTHEST = 1e9
+_LARGEST = float(np.finfo(np.float16).max)  # viser sends covariances as float16
+
+
+class Drawable(NamedTuple):
+    """Arguments of viser, float32: centers [N, 3], covariances [N, 3, 3], rgbs [N, 3], opacities [N, 1] in [0, 1]."""
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    rgbs: np.ndarray
+    opacities: np.ndarray
+
+
+def splats(gaussians: Gaussians) -> Drawable:
+    """Return Gaussians for viser. Colours are of degree 0: they do not depend on the direction.
+
+    Those that are nowhere, or too far or too large to be drawn (infinite in float16), are left out.
+    """
+    axes = rotations(gaussians.quaternions) * gaussians.scales[:, None, :]
+    colours = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
+    parts = (gaussians.means, axes @ axes.transpose(1, 2), colours, gaussians.opacities)
+    found = [part.detach().float().numpy() for part in parts]
+    drawn = np.abs(found[0]).max(axis=1) < _FARTHEST
+    for part in found[1:]:
+        drawn &= np.abs(part).reshape(len(part), -1).max(axis=1) < _LARGEST  # of NaN, too, this is false
+    return Drawable(*(part[drawn] for part in found))
+
+
+def left_of(
+    centers: np.ndarray, rotation: np.ndarray, position: np.ndarray, fov: float, aspect: float, share: float
+) -> np.ndarray:
+    """Return which points lie left of a vertical line on the screen, bool [N].
+
+    Args:
+        centers: [N, 3].
+        rotation: [3, 3], of the camera's axes (x right, y down, z forward) in the world.
+        position: of the camera, [3].
+        fov: vertical, in radians.
+        aspect: width by height.
+        share: of the screen's width that is left of the line, in [0, 1].
+
+    Examples:
+        >>> points = np.array([[-1.0, 0.0, 2.0], [1.0, 0.0, 2.0]])
+        >>> left_of(points, np.eye(3), np.zeros(3), 1.0, 1.0, 0.5).tolist()
+        [True, False]
+    """
+    seen = (centers - position) @ rotation
+    edge = (2 * share - 1) * np.tan(fov / 2) * aspect
+    return seen[:, 0] < edge * np.maximum(seen[:, 2], 1e-6)
 
 
 def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port: int = 8080) -> Tuple[Any, str]:
@@ -43,7 +94,7 @@ def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port:
             of this machine's.
     """
     check_address(host, port)
-    loaded = {name: _drawable(path) for name, path in content.methods.items()}
+    loaded = {name: _read(path) for name, path in content.methods.items()}
     server, address = _start(host, port)
     server.gui.add_markdown(f"### {content.title}")
     _Methods(server, loaded)
@@ -55,7 +106,7 @@ def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port:
     return server, address
 
 
-def _drawable(path: Path) -> Splats:
+def _read(path: Path) -> Drawable:
     """Read a .ply's Gaussians for viser; say how many of them are left out."""
     gaussians = read_ply(path)
     drawn = splats(gaussians)
@@ -103,7 +154,7 @@ def _add_dark_mode(server: Any) -> None:
 class _Methods:
     """The splats of each method: shown or not, or two of them on either side of a line."""
 
-    def __init__(self, server: Any, loaded: Dict[str, Splats]) -> None:
+    def __init__(self, server: Any, loaded: Dict[str, Drawable]) -> None:
         self.server, self.loaded = server, loaded
         names = list(loaded)
         self.handles = {
@@ -254,7 +305,7 @@ def _look_through(client: Any, wxyz: np.ndarray, position: np.ndarray) -> None:
             client.camera.wxyz, client.camera.position = wxyz, position
 
 
-def _look_at_all(server: Any, loaded: Dict[str, Splats]) -> None:
+def _look_at_all(server: Any, loaded: Dict[str, Drawable]) -> None:
     """Look from outside towards the middle of what is opaque, where there are no cameras."""
     points = np.concatenate([one.centers[one.opacities[:, 0] > 0.1] for one in loaded.values()])
     if not len(points):

@@ -64,7 +64,9 @@ def emulate() -> None:
     from tests.cuda_emulation import emulated
 
     BACKENDS._known = {"cuda": Known("tests.cuda_emulation", "cpu")}
-    BACKENDS._found = {("cuda", torch.device("cpu")): Availability(emulated(), True, "emulated on the CPU")}
+    backend = emulated()
+    known = Availability(backend, True, "emulated on the CPU", backend.offers)
+    BACKENDS._found = {("cuda", torch.device("cpu")): known}
 
 
 def first_line(error: Any) -> str:

@@ -1,8 +1,9 @@
 """Choose backends: one is available on a device where it is installed and gave torch's own results in a trial.
 
-The trial runs once before a device's first use, on a small image. A backend that is not installed is skipped silently;
-one that fails, then or later, is reported once on stderr, and torch is used instead. ``LEGS_BACKEND=torch|numba|cuda``
-forces one; images that it does not support are computed by torch.
+The trial of an operation runs once before its first use on a device, on a small image: what is not used is not
+compiled. A backend that is not installed is skipped silently; one that fails, then or later, is reported once on
+stderr, and torch is used instead. ``LEGS_BACKEND=torch|numba|cuda`` forces one; images that it does not support are
+computed by torch.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import importlib.util
 import os
 import sys
 import threading
-from typing import Dict, List, NamedTuple, Optional, Tuple
+from typing import Dict, FrozenSet, List, NamedTuple, Optional, Tuple
 
 import torch
 
@@ -26,11 +27,10 @@ _NAMES = ("torch", "numba", "cuda")
 
 
 class Known(NamedTuple):
-    """A backend: the module whose BACKEND it is, the type of its devices, and whether a forked process may use it."""
+    """A backend: the module whose BACKEND it is, and the type of its devices."""
 
     module: str
     device: str
-    survives_fork: bool = True
 
 
 class Availability(NamedTuple):
@@ -40,11 +40,13 @@ class Availability(NamedTuple):
         backend: None where it is not.
         installed: whether its package is installed.
         reason: why it is, or is not, available.
+        tried: the operations whose trial it passed.
     """
 
     backend: Optional[Backend]
     installed: bool
     reason: str
+    tried: FrozenSet[str] = frozenset()
 
 
 class Backends:
@@ -57,86 +59,98 @@ class Backends:
     def __init__(self, known: Dict[str, Known]) -> None:
         self._known = known
         self._found: Dict[Tuple[str, torch.device], Availability] = {}
-        self._lock = threading.RLock()
-        self._forked = False
+        self.after_fork()
 
     def names(self, device: torch.device) -> List[str]:
         """Return the names of the backends for a device."""
         return [name for name, known in self._known.items() if known.device == device.type]
 
-    def chosen(self, device: torch.device) -> str:
-        """Return which backend the loss uses for images on a device: "torch" or the name of another.
+    def chosen(self, device: torch.device, operation: Optional[str] = None) -> str:
+        """Return which backend computes an operation for images on a device: "torch" or the name of another.
 
         Raises:
             LegsError: LEGS_BACKEND is none of these.
         """
         forced, names = forced_backend(), self.names(device)
         name = forced or (names[0] if names else "torch")
-        return name if name in names and self.availability(name, device).backend is not None else "torch"
+        usable = name in names and self.availability(name, device, operation).backend is not None
+        return name if usable else "torch"
 
-    def ready(self, device: torch.device) -> Optional[Backend]:
-        """Return the backend for images on a device, None where that is torch: also where its trial may not run now."""
-        if is_capturing(device) and not all((name, _indexed(device)) in self._found for name in self.names(device)):
+    def ready(self, device: torch.device, operation: Optional[str] = None) -> Optional[Backend]:
+        """Return the backend of an operation on a device, None where that is torch: also where no trial may run now."""
+        if is_capturing(device) and any(
+            self._known_already(name, device, operation) is None for name in self.names(device)
+        ):
             return None  # a trial waits for the device, which would break a capture
-        name = self.chosen(device)
-        return None if name == "torch" else self.availability(name, device).backend
+        name = self.chosen(device, operation)
+        return None if name == "torch" else self.availability(name, device, operation).backend
 
-    def availability(self, name: str, device: torch.device) -> Availability:
-        """Return whether a backend is available on a device, by a trial that runs once for each device.
+    def availability(self, name: str, device: torch.device, operation: Optional[str] = None) -> Availability:
+        """Return whether a backend is available on a device for an operation ("loss", "l1", "ssim"; None: all it has).
 
-        On a card that is full it is not available now, and the next call tries it again.
+        A trial of the operation runs once for each device. On a card that is full it is not available now, and the next
+        call tries it again.
 
         Raises:
             DeviceFault: the device computes nothing any more, since a kernel has failed before.
         """
-        key = name, _indexed(device)
-        if key not in self._found:
+        found = self._known_already(name, device, operation)
+        if found is None:
             with self._lock:
-                if key not in self._found:
+                found = self._known_already(name, device, operation)
+                if found is None:
                     try:
-                        self._record(key, self._tried(name, device))
+                        found = self._tried(name, device, operation)
                     except (NotNow, MemoryError, OUT_OF_MEMORY) as error:
                         return Availability(None, True, _in_words(error))
-        return self._found[key]
+                    self._record((name, _indexed(device)), found)
+        return found
+
+    def _known_already(self, name: str, device: torch.device, operation: Optional[str]) -> Optional[Availability]:
+        found = self._found.get((name, _indexed(device)))
+        if found is None or found.backend is None:
+            return found
+        wanted = found.backend.offers if operation is None else found.backend.offers & {operation}
+        return found if wanted <= found.tried else None
 
     def give_up(self, name: str, device: torch.device, error: Exception) -> None:
         """Leave a backend that failed after its trial."""
         self._record((name, _indexed(device)), Availability(None, True, _in_words(error)))
 
     def after_fork(self) -> None:
-        """Forget, in a forked process, the backends that it may not use."""
-        self._lock, self._forked = threading.RLock(), True
-        self._found = {key: found for key, found in self._found.items() if self._known[key[0]].survives_fork}
+        """Take a lock that no thread holds."""
+        self._lock = threading.RLock()
 
-    def _tried(self, name: str, device: torch.device) -> Availability:
-        if self._forked and not self._known[name].survives_fork:
-            return Availability(None, True, "its threads do not exist in a forked process")
+    def _tried(self, name: str, device: torch.device, operation: Optional[str]) -> Availability:
         missing = _why_missing(name)
         if missing:
             return Availability(None, False, missing)
         try:
-            return self._trial(name, device)
+            return self._trial(name, device, operation)
         except (NotNow, OUT_OF_MEMORY):  # torch's allocator holds what is free
             if device.type == "cuda":
                 torch.cuda.empty_cache()
-            return self._trial(name, device)
+            return self._trial(name, device, operation)
 
-    def _trial(self, name: str, device: torch.device) -> Availability:
+    def _trial(self, name: str, device: torch.device, operation: Optional[str]) -> Availability:
         from legs_loss.kernels.trial import difference_from_torch
 
         try:
             backend = importlib.import_module(self._known[name].module).BACKEND
-            threads = torch.get_num_threads()
+            before = self._found.get((name, _indexed(device)))
+            tried = frozenset() if before is None else before.tried
+            wanted = backend.offers if operation is None else backend.offers & {operation}
             with torch.inference_mode(False):  # the first call may be in an evaluation; the trial needs gradients
-                problem = difference_from_torch(backend, device)
-            torch.set_num_threads(threads)  # numba's first parallel loop sets OpenMP's number, which is torch's too
+                problem = difference_from_torch(backend, device, wanted - tried)
         except (NotNow, MemoryError, OUT_OF_MEMORY, DeviceFault):
             raise
         except Exception as error:  # anything that a broken install, compiler or driver raises
             if "CUDA error" in str(error):
                 raise DeviceFault(str(error)) from error  # torch's own: it computes nothing on this device either
             return Availability(None, True, _in_words(error))
-        return Availability(None if problem else backend, True, problem or "its trial agreed with torch")
+        return Availability(
+            None if problem else backend, True, problem or "its trial agreed with torch", tried | wanted
+        )
 
     def _record(self, key: Tuple[str, torch.device], found: Availability) -> None:
         self._found[key] = found
@@ -146,7 +160,7 @@ class Backends:
 
 BACKENDS = Backends(
     {
-        "numba": Known("legs_loss.kernels.numba_loss", "cpu", survives_fork=False),
+        "numba": Known("legs_loss.kernels.numba_loss", "cpu"),
         "cuda": Known("legs_loss.kernels.cuda.backend", "cuda"),
     }
 )

@@ -72,7 +72,7 @@ def _fused(
 ) -> Optional[Tensor]:
     if is_compiling() or not _plain_tensors(prediction, target, weights.map, weights.mask, weights.range):
         return None
-    backend = BACKENDS.ready(prediction.device)
+    backend = BACKENDS.ready(prediction.device, operation)
     if backend is None or operation not in backend.offers:
         return None
     channels, height, width = prediction.shape[-3:]

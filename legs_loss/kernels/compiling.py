@@ -1,12 +1,14 @@
-"""`compiled` and `inlined`: numba's njit as the package uses it; a multiply-add; the threads of a parallel call."""
+"""`compiled`, `part` and `inlined`: numba's njit as the package uses it; a multiply-add; the threads of a call."""
 
 from __future__ import annotations
 
-import threading
-from contextlib import contextmanager
-from typing import Any, Callable, Iterator
+import os
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from typing import Any, Callable, List, Optional
 
 import numba
+import numpy as np
 import torch
 from llvmlite import ir
 from numba import types
@@ -20,7 +22,7 @@ FAST = {"nnan", "ninf", "nsz"}
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function on its first call, and keep the machine code on disk where a cache can be written."""
-    options = {"fastmath": FAST, "error_model": "numpy", **options}
+    options = {"fastmath": FAST, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, **options}
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
@@ -29,6 +31,14 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             return numba.njit(**options)(function)
 
     return decorate
+
+
+def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function that only compiled functions call: Python must not, since it gets no entry for Python.
+
+    The machine code of all that a function calls is made once more with it, so few of them lie one within the other.
+    """
+    return compiled(no_cpython_wrapper=True, **options)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
@@ -48,17 +58,56 @@ def _multiply_add(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
 
 multiply_add: Any = extending.intrinsic(_multiply_add)
 
-# Of numba's three ways to run threads, one ends the process when two of Python's threads use it at a time.
-ONE_AT_A_TIME = threading.Lock()
+
+def _claimed(typingctx: Any, counter: Any) -> Any:
+    """Return the number in int64 [1] and add one to it, in one step for all threads."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", data, ir.Constant(ir.IntType(64), 1), "monotonic")
+
+    return types.int64(counter), generate
 
 
-@contextmanager
-def threads_of_torch() -> Iterator[None]:
-    """Run parallel loops on as many threads as torch would, one call at a time."""
-    with ONE_AT_A_TIME:
-        before = numba.get_num_threads()
-        numba.set_num_threads(min(torch.get_num_threads(), before))
-        try:
-            yield
-        finally:
-            numba.set_num_threads(before)
+claimed: Any = extending.intrinsic(_claimed)
+
+_MOST: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # a user's, or the processor's cores
+
+
+class _Helpers:
+    """The threads beside the one that calls, begun when they are first needed, and anew in a forked process."""
+
+    def __init__(self) -> None:
+        self.pool: Optional[ThreadPoolExecutor] = None
+
+    def forget(self) -> None:
+        self.pool = None
+
+    def begin(self, count: int, function: Callable[..., Any], *given: Any) -> List[Future[Any]]:
+        """Have up to so many of them call a function."""
+        begun: List[Future[Any]] = []
+        with suppress(RuntimeError):  # the interpreter is shutting down, or no thread can be started
+            while len(begun) < min(count, _MOST - 1):
+                self.pool = self.pool or ThreadPoolExecutor(_MOST - 1, "legs-loss")
+                begun.append(self.pool.submit(function, *given))
+        return begun
+
+
+_HELPERS = _Helpers()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_HELPERS.forget)
+
+
+def in_threads(function: Callable[..., Any], tasks: int, *given: Any) -> None:
+    """Call a compiled function on as many threads as torch would use.
+
+    It is given a counter, the number of tasks, and the rest. Each thread claims a task after the other from the
+    counter, so one that comes late, or never, leaves its share to the others. (numba's own parallel loops compile each
+    function that they call two times more, and one of their three kinds ends the process when two threads use it.)
+    """
+    counter = np.zeros(1, np.int64)
+    helpers = _HELPERS.begin(min(torch.get_num_threads(), tasks) - 1, function, counter, tasks, *given)
+    function(counter, tasks, *given)
+    for helper in helpers:
+        if not helper.cancel():
+            helper.result()

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import claimed, compiled, part
 from legs_loss.kernels.numba_tiles import error_row
 from legs_loss.kernels.numba_weights import weights_of_row
 
@@ -14,23 +13,26 @@ __all__ = ["ROWS", "all_strips"]
 ROWS = 16  # of a strip
 
 
-@compiled(parallel=True, fastmath=False)
-def all_strips(images, source, scale, gradient, sums):  # type: ignore[no-untyped-def]
+@compiled(fastmath=False)
+def all_strips(counter, tasks, images, source, scale, gradient, sums):  # type: ignore[no-untyped-def]
     """Compute the weighted L1 strip by strip, and its gradient if that has a size.
 
     Args:
+        counter, tasks: of `in_threads`; a task is a strip.
         images: an Images.
         source: a WeightSource.
         scale: of the gradient.
         gradient: float32 [B * C * H * W], or empty.
         sums: float64 [B * strips]: the weighted absolute error of each strip is written.
     """
-    strips, width = sums.size // images.views, images.width
-    for task in prange(sums.size):
+    strips, width = tasks // images.views, images.width
+    weights, errors = np.empty(width, np.float32), np.empty(width, np.float32)
+    task = claimed(counter)
+    while task < tasks:
         view, strip = task // strips, task % strips
-        weights, errors = np.empty(width, np.float32), np.zeros(width, np.float32)
+        errors[:] = np.float32(0)
         for row in range(strip * ROWS, min((strip + 1) * ROWS, images.height)):
-            weights_of_row(images, source, view, row, 0, width, weights)
+            weights_of_row(images, source, view, row, np.int64(0), width, weights)
             for channel in range(images.channels):
                 at = ((view * images.channels + channel) * images.height + row) * width
                 x, y = images.x[at : at + width], images.y[at : at + width]
@@ -41,9 +43,10 @@ def all_strips(images, source, scale, gradient, sums):  # type: ignore[no-untype
         for j in range(width):
             total += errors[j]
         sums[task] = total
+        task = claimed(counter)
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _gradient_row(x, y, weight, scale, out):  # type: ignore[no-untyped-def]
     for j in range(x.size):
         out[j] = scale * weight[j] * (np.float32(x[j] > y[j]) - np.float32(x[j] < y[j]))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.kernels.compiling import threads_of_torch
+from legs_loss.kernels.compiling import in_threads
 from legs_loss.kernels.contract import Backend, Weights
 from legs_loss.kernels.differentiable import differentiable
 from legs_loss.kernels.numba_l1 import ROWS, all_strips
@@ -94,16 +94,14 @@ def _l1_and_ssim(images: Images, source: WeightSource, share: float, covered: fl
         np.float32((1.0 - share) / size / covered),
         np.float32(-2.0 * share / size),
     )  # SSIM's, of halves of slopes
-    with threads_of_torch():
-        all_tiles(images, down, across, scales, source, gradient, sums)
+    in_threads(all_tiles, len(sums), images, down, across, scales, source, gradient, sums)
     absolute_error, similarity = sums.sum(0) / size
     return float((1.0 - share) * absolute_error / covered + share * (1.0 - similarity))
 
 
 def _l1_alone(images: Images, source: WeightSource, share: float, covered: float, gradient: np.ndarray) -> float:
     sums, size = np.empty(images.views * -(-images.height // ROWS)), images.x.size
-    with threads_of_torch():
-        all_strips(images, source, np.float32(1.0 / size / covered), gradient, sums)
+    in_threads(all_strips, len(sums), images, source, np.float32(1.0 / size / covered), gradient, sums)
     return float(sums.sum()) / size / covered
 
 

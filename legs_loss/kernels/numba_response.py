@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import Dict, NamedTuple, Tuple
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled, inlined, threads_of_torch
+from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined, part
 from legs_loss.spec import WeightSpec
 
 __all__ = ["NORMS", "STENCILS", "Operator", "Shape", "extremes", "operator_of", "photograph_response", "response_row",
@@ -83,7 +82,7 @@ def photograph_response(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
 @compiled(fastmath=False)
 def _response_rows(image, shape, operator, first, out):  # type: ignore[no-untyped-def]
     for i in range(out.shape[0]):
-        response_row(image, shape, operator, 0, first + i, 0, shape.width, out[i])
+        response_row(image, shape, operator, np.int64(0), first + i, np.int64(0), shape.width, out[i])
 
 
 def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
@@ -94,36 +93,42 @@ def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
     views, channels, height, width = image.shape
     strips = -(-height // _ROWS)
     found = np.empty((views * strips, 3), np.float32)
-    with threads_of_torch():
-        _strips(image.reshape(-1), Shape(views, channels, height, width), operator_of(spec), strips, found)
+    shape = Shape(views, channels, height, width)
+    in_threads(_strips, views * strips, image.reshape(-1), shape, operator_of(spec), strips, found)
     low, high, excess = found.reshape(views, strips, 3).transpose(2, 0, 1)
     return np.stack([low.min(1), high.max(1), excess.sum(1)], 1)
 
 
-@compiled(parallel=True, fastmath=False)
-def _strips(image, shape, operator, strips, found):  # type: ignore[no-untyped-def]
-    channels, height, width = shape.channels, shape.height, shape.width
-    for task in prange(shape.views * strips):
-        view, strip = task // strips, task % strips
-        row, excess = np.empty(width, np.float32), np.zeros(width, np.float32)
-        low, high = np.full(width, np.float32(np.inf)), np.zeros(width, np.float32)
-        for i in range(strip * _ROWS, min((strip + 1) * _ROWS, height)):
-            response_row(image, shape, operator, view, i, 0, width, row)
-            _join_extremes(row, low, high)
-            for channel in range(channels):
-                at = ((view * channels + channel) * height + i) * width
-                _add_excess(image[at : at + width], excess)
-        found[task, 0], found[task, 1], found[task, 2] = low.min(), high.max(), excess.sum()
-
-
 @compiled(fastmath=False)
+def _strips(counter, tasks, image, shape, operator, strips, found):  # type: ignore[no-untyped-def]
+    height, width = shape.height, shape.width
+    row = np.empty(width, np.float32)
+    low, high, excess = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+    task = claimed(counter)
+    while task < tasks:
+        view, strip = task // strips, task % strips
+        low[:], high[:], excess[:] = np.float32(np.inf), _ZERO, _ZERO
+        for i in range(strip * _ROWS, min((strip + 1) * _ROWS, height)):
+            response_row(image, shape, operator, view, i, np.int64(0), width, row)
+            _join_extremes(row, low, high)
+            for channel in range(shape.channels):
+                at = ((view * shape.channels + channel) * height + i) * width
+                _add_excess(image[at : at + width], excess)
+        found[task, 0], found[task, 1], found[task, 2] = np.float32(np.inf), _ZERO, _ZERO
+        for j in range(width):
+            found[task, 0], found[task, 1] = min(found[task, 0], low[j]), max(found[task, 1], high[j])
+            found[task, 2] += excess[j]
+        task = claimed(counter)
+
+
+@part(fastmath=False)
 def _join_extremes(row, low, high):  # type: ignore[no-untyped-def]
     for j in range(row.size):
         low[j] = min(low[j], row[j])
         high[j] = max(high[j], row[j])
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _add_excess(row, excess):  # type: ignore[no-untyped-def]
     for j in range(row.size):
         excess[j] += abs(row[j]) - min(abs(row[j]), _ONE)
@@ -139,7 +144,7 @@ def _folded(index, size):  # type: ignore[no-untyped-def]
     return max(index, 0)
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def response_row(image, shape, operator, view, row, left, right, out):  # type: ignore[no-untyped-def]
     """Write the response of the pixels left <= j < right of a row of a view to out."""
     channels, height, width = shape.channels, shape.height, shape.width
@@ -167,7 +172,7 @@ def response_row(image, shape, operator, view, row, left, right, out):  # type: 
             out[j] = np.sqrt(out[j])
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _join_inner(above, here, below, count, operator, out):  # type: ignore[no-untyped-def]
     for j in range(count):
         out[j] = _joined(out[j], above, here, below, j, j + 1, j + 2, operator)

@@ -17,9 +17,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled, inlined, multiply_add
+from legs_loss.kernels.compiling import claimed, compiled, inlined, multiply_add, part
 from legs_loss.kernels.numba_weights import weights_of_row
 from legs_loss.similarity import C1, C2, SIGMA, WINDOW_SIZE
 
@@ -72,11 +71,12 @@ class Rows(NamedTuple):
     sums: np.ndarray
 
 
-@compiled(parallel=True, fastmath=False)
-def all_tiles(images, down, across, scales, source, gradient, sums):  # type: ignore[no-untyped-def]
+@compiled(fastmath=False)
+def all_tiles(counter, tasks, images, down, across, scales, source, gradient, sums):  # type: ignore[no-untyped-def]
     """Compute the weighted L1 and SSIM tile by tile, and the gradient of the loss if that has a size.
 
     Args:
+        counter, tasks: of `in_threads`; a task is a tile.
         images: an Images.
         down, across: how many tiles there are each way.
         scales: of the gradients of the weighted absolute errors and of SSIM.
@@ -84,39 +84,42 @@ def all_tiles(images, down, across, scales, source, gradient, sums):  # type: ig
         gradient: float32 [B * C * H * W], or empty.
         sums: float64 [B * down * across, 2], zeros: the weighted absolute error and SSIM of each tile are added.
     """
-    views, channels, height, width = images.views, images.channels, images.height, images.width
+    channels, height, width = images.channels, images.height, images.width
     tile_width = (width + across - 1) // across
-    for task in prange(views * down * across):
+    weights = np.empty((-(-height // down), tile_width), np.float32)
+    rows = Rows(
+        np.empty((4, _PITCH), np.float32),
+        np.empty((4, (_HALO + _STEP) * _PITCH), np.float32),
+        np.empty((3, (_HALO + _STEP) * _PITCH), np.float32),
+        np.empty((4, _GROUP * _PITCH), np.float32),
+        np.empty((4, _GROUP * _PITCH), np.float32),
+        np.empty((2, _PITCH), np.float32),
+    )
+    task = claimed(counter)
+    while task < tasks:
         view, place = task // (down * across), task % (down * across)
         top, bottom = height * (place // across) // down, height * (place // across + 1) // down
         left = tile_width * (place % across)
         right = min(left + tile_width, width)
         if left < right:
-            weights = np.empty((bottom - top, tile_width), np.float32)
+            rows.plain[:], rows.sums[:] = _ZERO, _ZERO
             for row in range(top, bottom):
                 weights_of_row(images, source, view, row, left, right, weights[row - top])
-            rows = Rows(
-                np.zeros((4, _PITCH), np.float32),
-                np.empty((4, (_HALO + _STEP) * _PITCH), np.float32),
-                np.empty((3, (_HALO + _STEP) * _PITCH), np.float32),
-                np.empty((4, _GROUP * _PITCH), np.float32),
-                np.empty((4, _GROUP * _PITCH), np.float32),
-                np.zeros((2, _PITCH), np.float32),
-            )
             for channel in range(channels):
                 tile = Tile((view * channels + channel) * height * width, top, bottom, left, right)
                 _tile(images, tile, scales, weights, rows, gradient)
             _collect(rows.sums, sums[task])
+        task = claimed(counter)
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _collect(rows, sums):  # type: ignore[no-untyped-def]
     for k in range(2):
         for j in range(_PITCH):
             sums[k] += rows[k, j]
 
 
-@compiled(fastmath=False)
+@inlined
 def _tile(images, tile, scales, weights, rows, gradient):  # type: ignore[no-untyped-def]
     for base in range(tile.top - _HALO - _STEP, tile.bottom, _STEP):
         # The gradient's rows from `base` see SSIM's up to base + 5, and these see the image's up to base + 10.
@@ -131,7 +134,7 @@ def _tile(images, tile, scales, weights, rows, gradient):  # type: ignore[no-unt
             _shift_up(rows.slopes[quantity])
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _moments_of_step(images, tile, base, rows):  # type: ignore[no-untyped-def]
     """Blur the moments of the image's rows from `base` along the row."""
     first, last = max(0, tile.left - _HALO), min(images.width, tile.right + _HALO)
@@ -151,7 +154,7 @@ def _moments_of_step(images, tile, base, rows):  # type: ignore[no-untyped-def]
             rows.moments[:, at : at + _PITCH] = _ZERO
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _similarity_of_group(images, tile, base, group, rows, wanted):  # type: ignore[no-untyped-def]
     """Add the SSIM of a group of the rows from `base`; blur its slopes along the row."""
     top, bottom = tile.top - _REACH, tile.bottom + _REACH
@@ -178,7 +181,7 @@ def _similarity_of_group(images, tile, base, group, rows, wanted):  # type: igno
             rows.slopes[:, at : at + _PITCH] = _ZERO
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _gradient_of_group(images, tile, base, group, scales, weights, rows, gradient):  # type: ignore[no-untyped-def]
     """Add the weighted errors of a group of the rows from `base`; write their gradient."""
     if base + group + _GROUP <= tile.top or base + group >= tile.bottom:
@@ -197,19 +200,19 @@ def _gradient_of_group(images, tile, base, group, scales, weights, rows, gradien
             _gradient_row(x, y, weight, slopes[0, here:], slopes[1, here:], slopes[2, here:], scales, out)
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _shift_up(rows):  # type: ignore[no-untyped-def]
     for j in range(_HALO * _PITCH):
         rows[j] = rows[j + _STEP * _PITCH]
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _add(row, sums, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         sums[j] += row[j]
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _moments(x, y, first, second, squares, product):  # type: ignore[no-untyped-def]
     for j in range(x.size):
         u, v = x[j], y[j]
@@ -226,7 +229,7 @@ def _window(a, b, c, d, e, f, g, h, i, j, k):  # type: ignore[no-untyped-def]
     return (outer + between) + middle
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _blur_along(row, out, count):  # type: ignore[no-untyped-def]
     """Blur a row to the values whose windows lie in it."""
     for j in range(count):
@@ -236,7 +239,7 @@ def _blur_along(row, out, count):  # type: ignore[no-untyped-def]
         )  # fmt: skip
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _blur_across(rows, out, count):  # type: ignore[no-untyped-def]
     """Blur fourteen rows to a group of four."""
     for j in range(count):
@@ -251,7 +254,7 @@ def _blur_across(rows, out, count):  # type: ignore[no-untyped-def]
         out[j + 3 * _PITCH] = _window(d, e, f, g, h, i, k, l, m, n, o)
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _similarity(means1, means2, squares, products, slope1, slope2, slope3, values):  # type: ignore[no-untyped-def]
     """Write the halves of SSIM's three slopes, the second one negated, and its values."""
     for j in range(means1.size):
@@ -268,14 +271,14 @@ def _similarity(means1, means2, squares, products, slope1, slope2, slope3, value
         values[j] = similarity
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def error_row(x, y, weight, sums):  # type: ignore[no-untyped-def]
     """Add the weighted absolute errors of a row to the sums of its columns."""
     for j in range(x.size):
         sums[j] = multiply_add(weight[j], abs(x[j] - y[j]), sums[j])
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _gradient_row(x, y, weight, slope1, slope2, slope3, scales, out):  # type: ignore[no-untyped-def]
     l1, ssim = scales
     for j in range(x.size):

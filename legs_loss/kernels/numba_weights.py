@@ -14,7 +14,7 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, shape_of
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import part
 from legs_loss.kernels.contract import Weights
 from legs_loss.kernels.numba_response import Operator, Shape, extremes, operator_of, response_row
 from legs_loss.spec import WeightSpec
@@ -108,7 +108,7 @@ def response_range(target: Tensor, spec: WeightSpec) -> Tensor:
     return torch.from_numpy(np.stack([found[:, 0], found[:, 1] - found[:, 0]], 1))
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def weights_of_row(images, source, view, row, left, right, out):  # type: ignore[no-untyped-def]
     """Write the weights of the pixels left <= j < right of a row of a view to out."""
     height, width, count = images.height, images.width, right - left
@@ -126,7 +126,7 @@ def weights_of_row(images, source, view, row, left, right, out):  # type: ignore
             _multiply(out, factor[at:], count)
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _weigh(out, count, curve, beta, low, scale):  # type: ignore[no-untyped-def]
     for j in range(count):
         x = (out[j] - low) * scale
@@ -139,7 +139,7 @@ def _weigh(out, count, curve, beta, low, scale):  # type: ignore[no-untyped-def]
         out[j] = _ONE + beta * x
 
 
-@compiled(fastmath=False)
+@part(fastmath=False)
 def _multiply(out, factor, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         out[j] *= factor[j]

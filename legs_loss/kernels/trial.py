@@ -1,8 +1,8 @@
-"""The trial of a backend: each operation that it offers on a small image, value and gradient, against torch."""
+"""The trial of a backend: operations that it offers on a small image, value and gradient, against torch."""
 
 from __future__ import annotations
 
-from typing import Callable, Iterator, Optional, Tuple
+from typing import Callable, Collection, Iterator, Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -18,8 +18,8 @@ _SHARE = 0.2
 _Loss = Callable[[Tensor], Tensor]
 
 
-def difference_from_torch(backend: Backend, device: torch.device) -> Optional[str]:
-    """Run each operation of a backend on a small image; describe the first wrong result.
+def difference_from_torch(backend: Backend, device: torch.device, operations: Collection[str]) -> Optional[str]:
+    """Run operations of a backend ("loss", "l1", "ssim") on a small image; describe the first wrong result.
 
     The image has two tiles each way, where tiles are small. The reference is in float64, since a GPU's convolutions in
     float32 may be tf32's.
@@ -27,7 +27,7 @@ def difference_from_torch(backend: Backend, device: torch.device) -> Optional[st
     rows, columns = torch.arange(50.0).reshape(1, 50, 1), torch.arange(60.0).reshape(1, 1, 60)
     channels = torch.arange(1.0, 4.0).reshape(3, 1, 1)
     target = (0.5 + 0.4 * torch.sin(channels * (0.3 * rows + 0.2 * columns))).to(device)
-    for name, function, reference in _operations(backend, target):
+    for name, function, reference in _operations(backend, target, operations):
         results = []
         for loss_of, dtype in ((function, torch.float32), (reference, torch.float64)):
             image = (0.9 * target + 0.02).to(dtype).requires_grad_()
@@ -45,8 +45,8 @@ def difference_from_torch(backend: Backend, device: torch.device) -> Optional[st
     return None
 
 
-def _operations(backend: Backend, target: Tensor) -> Iterator[Tuple[str, _Loss, _Loss]]:
-    """Yield of each operation with each kind of weight: its name, the backend's function, and the reference."""
+def _operations(backend: Backend, target: Tensor, operations: Collection[str]) -> Iterator[Tuple[str, _Loss, _Loss]]:
+    """Yield of operations with each kind of weight: its name, the backend's function, and the reference."""
     exact = target.double()
     spec = WeightSpec()
     weights = weight_map(target, spec)
@@ -62,9 +62,9 @@ def _operations(backend: Backend, target: Tensor) -> Iterator[Tuple[str, _Loss, 
         return lambda image: operation(image, target, *rest)
 
     for kind, weight in kinds:
-        if "loss" in backend.offers:
+        if "loss" in operations:
             yield "loss", of_backend(backend.loss, kind, _SHARE), whole(weight)
-        if "l1" in backend.offers:
+        if "l1" in operations:
             yield "weighted L1", of_backend(backend.weighted_l1, kind), l1(weight)
-    if "ssim" in backend.offers:
+    if "ssim" in operations:
         yield "SSIM", of_backend(backend.ssim), lambda image: 1.0 - d_ssim(image, exact)

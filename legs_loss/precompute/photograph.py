@@ -38,7 +38,7 @@ def normalised_map_and_levels(image: np.ndarray, spec: WeightSpec) -> Tuple[np.n
 
 def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
-    if image.size >= _WORTH_COMPILING and BACKENDS.chosen(torch.device("cpu")) == "numba":
+    if image.size >= _WORTH_COMPILING and BACKENDS.chosen(torch.device("cpu"), "l1") == "numba":
         from legs_loss.kernels.numba_response import photograph_response, supports_response
 
         if supports_response(spec):

@@ -55,7 +55,8 @@ def backend():
 def chosen(monkeypatch):
     """Make the backend under test the one for images on the device, and return it and its driver."""
     driver = new_driver()
-    found = Availability(new_backend(driver), True, "")
+    backend = new_backend(driver)
+    found = Availability(backend, True, "", backend.offers)
     device = torch.empty(0, device=DEVICE).device
     monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", DEVICE.type)})
     monkeypatch.setattr(BACKENDS, "_found", {("cuda", device): found})
@@ -341,7 +342,7 @@ class TestAutograd:
 
 class TestSelection:
     def test_its_trial_agrees_with_torch(self, backend):
-        assert difference_from_torch(backend, DEVICE) is None
+        assert difference_from_torch(backend, DEVICE, backend.offers) is None
 
     @pytest.mark.parametrize("channels_last", [False, True])
     def test_the_front_ends_mean_the_same_as_torch(self, chosen, channels_last):

@@ -75,7 +75,7 @@ class Watched(TorchDispatchMode):
 @pytest.fixture
 def on_meta(monkeypatch, parts):
     """The backend for tensors on torch's meta device, which have no values that could be read."""
-    known = Availability(CudaBackend(lambda _: parts[2]), True, "")
+    known = Availability(CudaBackend(lambda _: parts[2]), True, "", CudaBackend.offers)
     monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "meta")})
     monkeypatch.setattr(BACKENDS, "_found", {("cuda", torch.device("meta")): known})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
@@ -178,7 +178,8 @@ class TestCapture:
         driver = FakeDriver()
         backend = CudaBackend(lambda _: Modules(driver, FakeCompiler(), BinaryCache(tmp_path)))
         monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "cpu")})
-        monkeypatch.setattr(BACKENDS, "_found", {("cuda", torch.device("cpu")): Availability(backend, True, "")})
+        known = Availability(backend, True, "", backend.offers)
+        monkeypatch.setattr(BACKENDS, "_found", {("cuda", torch.device("cpu")): known})
         prediction, target = images((3, 20, 30))
         driver.captures = True
         assert used(legs_loss(prediction, target)) == "torch" and not driver.launches

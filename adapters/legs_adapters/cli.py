@@ -22,6 +22,7 @@ from legs_loss.system import never_fail_to_print, say
 if TYPE_CHECKING:
     from legs_adapters.plan import Plan
     from legs_adapters.terms.findings import Problem
+    from legs_adapters.terms.traced import Trace
 
 __all__ = ["main"]
 
@@ -119,6 +120,11 @@ _GROUPS = {
         "--masks": "also write the line that hides masked pixels from every other term of the step",
         "--explain RULE": "explain a rule, or list the rules, and exit",
     },
+    "advanced: with --trace": {
+        "--steps N": "end the script after N steps that move what is rendered; default: 30",
+        "--cpu": "run it without a GPU, with shims for CUDA modules; without a scene on the embedded one",
+        "--photos DIR": "the folder of the photographs; default: those that the scene's model lists",
+    },
     "advanced: safety and scripts": {
         "--force": "patch files with uncommitted changes, too; with --undo: restore the patched lines of files that "
         "were edited since, and keep the edits",
@@ -137,6 +143,7 @@ _KINDS: Dict[str, Dict[str, Any]] = {  # of those that are more than a text or a
     "--exclude": {"action": "append", "default": []},
     "--explain": {"action": _Explain, "nargs": "?"},
     "--iterations": {"type": int, "default": 40},
+    "--steps": {"type": int, "default": 30},
 }
 
 
@@ -145,6 +152,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EXIT_CODES
     parser.add_argument("folder", metavar="FOLDER", help="the checkout")
     _declare(parser.add_mutually_exclusive_group(), _MODES)
+    text = "run this command in FOLDER for a few steps, and let what it compares decide which term is weighted"
+    _declare(parser, {"--trace COMMAND": text})
     _declare(parser, {"--undo": "undo the patch, byte for byte; with --diff: show what would change"})
     for title, options in _GROUPS.items():
         _declare(parser.add_argument_group(title), options)
@@ -166,11 +175,15 @@ def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.terms.instead import trained_instead
     from legs_adapters.undo import unrecorded
 
+    if not args.trace and (args.cpu or args.photos):
+        raise LegsError('--cpu and --photos belong to --trace "SCRIPT ARGUMENTS"')
     root = check_root(args.folder)
     settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
     text = settings_text(root, settings)
     writes = bool(settings) or not (root / SETTINGS_FILE).exists()  # else the user's, or an earlier run's, stays
-    found = plan(root, args.exclude, [_site(root, text) for text in args.site], ssim=args.ssim, masks=args.masks)
+    seen = _trace(args, root) if args.trace else None
+    by_hand = [_site(root, text) for text in args.site]
+    found = plan(root, args.exclude, by_hand, ssim=args.ssim, masks=args.masks, trace=seen)
     for elsewhere in found.unsearched:
         say(f"legs-patch: warning: {elsewhere.text(args.folder)}", sys.stderr)
     problems, is_decided = found.findings.problems, bool(found.findings.sites or found.findings.patched)
@@ -204,6 +217,18 @@ def _patch(args: argparse.Namespace) -> int:
         say("\nnothing to do: it is patched", lines=True)
     _quote(problems, "error")
     return 1 if problems or (args.check and found.after) else 0
+
+
+def _trace(args: argparse.Namespace, root: Path) -> Trace:
+    from legs_adapters.trace.running import ScriptFailed, trace
+
+    if args.steps < 1:
+        raise LegsError(f"--steps must be at least 1, got {args.steps}")
+    try:
+        return trace(root, args.trace, args.steps, args.cpu, args.photos)
+    except ScriptFailed as error:
+        say(f"legs-patch: error: {error}", sys.stderr)
+        sys.exit(error.code)
 
 
 def _show(args: argparse.Namespace, found: Plan, wrote: Sequence[str] = ()) -> None:

@@ -18,6 +18,7 @@ from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_adapters.rules.find import find
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.terms.findings import Findings
+from legs_adapters.terms.traced import Trace
 from legs_adapters.unsearched import Unsearched, unsearched
 from legs_loss import LegsError
 
@@ -86,6 +87,7 @@ def plan(
     in_place: bool = False,
     ssim: bool = False,
     masks: bool = False,
+    trace: Optional[Trace] = None,
 ) -> Plan:
     """Compute a patch, and write nothing.
 
@@ -96,6 +98,7 @@ def plan(
         in_place: keep every line's number (for running in memory).
         ssim: rewrite the SSIM terms, too.
         masks: mask the renderings of every term, too.
+        trace: what a run of the training script showed.
 
     Raises:
         LegsError: no such folder; a site named by hand is not there; an expression that is nested too deeply.
@@ -104,7 +107,7 @@ def plan(
     readable, unreadable = read_files(root, exclude)
     edits: Dict[str, List[Edit]] = {}
     with _large_trees():
-        findings = find(readable, by_hand, ssim, masks)
+        findings = find(readable, by_hand, ssim, masks, trace)
         for name in _files_to_edit(findings):
             why = why_not_compiled(findings.program.sources[name].data)
             if why:

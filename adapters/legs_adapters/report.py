@@ -11,8 +11,9 @@ from legs_adapters.checkout.replace import Changes
 from legs_adapters.code.syntax import call_name, one_line
 from legs_adapters.plan import Plan
 from legs_adapters.rules.order import RULES
-from legs_adapters.terms.findings import Left, Problem
+from legs_adapters.terms.findings import Findings, Left, Problem
 from legs_adapters.terms.form import Form
+from legs_adapters.terms.traced import Trace
 from legs_loss.system import printable
 
 __all__ = ["as_diff", "as_json", "as_table"]
@@ -21,18 +22,38 @@ __all__ = ["as_diff", "as_json", "as_table"]
 def as_table(plan: Plan) -> str:
     """Return one line for every L1 term: its place, the verdict, and the reason."""
     found = plan.findings
-    rows: List[Tuple[str, int, str, str]] = [(site.path, site.line, "patched", site.why) for site in found.sites]
+    rows: List[Tuple[str, int, str, str]] = []
+    rows += [(site.path, site.line, "patched", site.why + _unseen(found, site)) for site in found.sites]
     for use, site in found.unweighted:
         path, line, _, reason, *_ = use.left
         why = f"{reason}: {call_name(use.call)} is weighted at {site.path}:{site.line}, in this call it is not"
         rows.append((path, line, "plain", why))
     rows += [(entry.path, entry.line, "already patched", "") for entry in found.patched]
-    rows += [(entry.path, entry.line, "skipped", _why_left(entry)) for entry in found.left]
-    rows += [(entry.path, entry.line, "ERROR", entry.reason) for entry in found.problems]
+    rows += [(entry.path, entry.line, "skipped", _why_left(entry) + _unseen(found, entry)) for entry in found.left]
+    rows += [(entry.path, entry.line, "ERROR", entry.reason + _unseen(found, entry)) for entry in found.problems]
     table = [(printable(f"{path}:{line}"), what, printable(why)) for path, line, what, why in sorted(rows)]
     table += [(printable(entry.path), "not read", printable(entry.reason)) for entry in found.unreadable]
     wide, wider = (max((len(row[column]) for row in table), default=0) for column in (0, 1))
     return "".join(f"{where:<{wide}}  {what:<{wider}}  {why}".rstrip() + "\n" for where, what, why in table)
+
+
+def _unseen(found: Findings, entry: Any) -> str:
+    """Return the words of a term that a trace did not run; nothing without a trace."""
+    return "" if found.trace is None or (entry.path, entry.line) in found.ran else "; not run in the trace"
+
+
+def _traced(trace: Trace) -> List[Dict[str, object]]:
+    """Return the terms of a trace for a script, each at the innermost line of the checkout."""
+    names = ("kind", "share", "gaussians", "parameters", "stepped", "shape", "steps")
+    return [
+        {
+            "file": term.frames[0][0], "line": term.frames[0][1], "is_photometric": term.is_photometric,
+            "why": term.text(""), "image": term.match if term.is_known else None, "nearest": term.match,
+            "through": [f"{path}:{line}" for path, line, *_ in term.frames],
+            **{name: getattr(term, name) for name in names},
+        }
+        for term in trace.terms
+    ]  # fmt: skip
 
 
 def _why_left(left: Left) -> str:
@@ -81,6 +102,8 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
         "would_change": sorted(plan.after),
         "wrote": list(wrote),
     }
+    if found.trace is not None:
+        content["traced"] = _traced(found.trace)
     return json.dumps(content, indent=2) + "\n"
 
 

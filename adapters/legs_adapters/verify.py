@@ -2,7 +2,7 @@
 
 Three runs of copies of the checkout, on the embedded scene, from the same seed: unpatched, patched, and patched with
 LEGS_OFF=1; of a patch with --ssim also a fourth, patched with beta 0, where nothing but the SSIM differs. Each is a
-process of its own, see :mod:`legs_adapters.watched`.
+process of its own, see :mod:`legs_adapters.trace.child`.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL
 from legs_adapters.plan import plan
 from legs_adapters.shims.packages import check_imports
+from legs_adapters.trace.running import CHILD, child_environment
 from legs_adapters.undo import undo
 from legs_loss import LegsError
 
-__all__ = ["Run", "Verdict", "check_verifiable", "verify"]
+__all__ = ["Run", "Verdict", "check_verifiable", "embedded_arguments", "verify"]
 
 SCENE = {"views": 12, "width": 96, "height": 64, "points": 800, "samples": 1}  # the embedded one
 SECONDS = 1800  # that a run may take
@@ -202,19 +203,36 @@ def _text(path: Path) -> str:
 
 
 def _arguments(script: Path, given: Optional[str], iterations: int, **places: Path) -> List[str]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
     if given is None:
-        source = "\n".join(_text(path) for path in (script, *script.parent.glob("arguments/*.py")))
-        given = " ".join(words for word, words in ARGUMENTS if word in source)
-    values = {"iterations": iterations, "port": port, **places}
+        given = _words_of(script)
+    values = {"iterations": iterations, "port": _free_port(), **places}
     try:
         return [word.format(**values) for word in shlex.split(given)]
     except (KeyError, IndexError, ValueError) as error:
         raise LegsError(
             f"--arguments {given!r}: only {{scene}}, {{output}}, {{iterations}}, {{port}}: {error}"
         ) from None
+
+
+def embedded_arguments(script: Path, given: Sequence[str], work: Path, iterations: int) -> List[str]:
+    """Write the embedded scene to a folder, and return the arguments that name it, of those that are not given."""
+    from legs_loss.lab.embedded import write_embedded_scene
+
+    words = shlex.split(_words_of(script))
+    pairs = [pair for pair in zip(words[::2], words[1::2]) if pair[0] not in given]
+    places = {"scene": write_embedded_scene(work / "scene", **SCENE), "output": work / "output"}
+    return _arguments(script, " ".join(f"{name} {value}" for name, value in pairs), iterations, **places)
+
+
+def _words_of(script: Path) -> str:
+    source = "\n".join(_text(path) for path in (script, *script.parent.glob("arguments/*.py")))
+    return " ".join(words for word, words in ARGUMENTS if word in source)
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
 
 
 def _unneeded(folder: str, names: List[str]) -> List[str]:
@@ -225,10 +243,9 @@ def _unneeded(folder: str, names: List[str]) -> List[str]:
 
 
 def _run(root: Path, words: Sequence[str], iterations: int, report: Path, settings: Dict[str, str]) -> Run:
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
-    environment.update(CUDA_VISIBLE_DEVICES="", PYTHONHASHSEED="0", **settings)
-    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
-    command = [sys.executable, "-m", "legs_adapters.watched", str(report), str(iterations), str(root), *words]
+    spec = {"report": str(report), "root": str(root), "cpu": True, "iterations": iterations}
+    command = [sys.executable, "-m", CHILD, json.dumps(spec), *words]
+    environment = child_environment(True, PYTHONHASHSEED="0", **settings)
     with tempfile.TemporaryFile() as errors:
         try:
             code = subprocess.run(

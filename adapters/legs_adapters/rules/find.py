@@ -7,7 +7,7 @@ the syntax tree; a term that cannot be decided becomes a problem that needs a ma
 from __future__ import annotations
 
 import re
-from typing import Any, Dict, Iterable, Iterator, List, Sequence, Tuple, Union
+from typing import Any, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
@@ -18,11 +18,13 @@ from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.masks import with_masks
 from legs_adapters.rules.order import RULES
 from legs_adapters.rules.ssim import with_ssims
+from legs_adapters.rules.traced import with_trace
 from legs_adapters.rules.verdict import Verdicts
 from legs_adapters.terms.findings import Findings, Left, Problem, Site
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.patched import patched_nodes
+from legs_adapters.terms.traced import Trace
 from legs_adapters.upstreams import registered
 
 __all__ = ["find"]
@@ -38,6 +40,7 @@ def find(
     by_hand: Sequence[Tuple[str, int]] = (),
     ssim: bool = False,
     masks: bool = False,
+    trace: Optional[Trace] = None,
 ) -> Findings:
     """Find the photometric terms of a checkout.
 
@@ -46,9 +49,11 @@ def find(
         by_hand: (path, line) of the L1 terms that the user named as sites; nothing else is a site then.
         ssim: find the SSIM terms, too.
         masks: find where their renderings are masked, too.
+        trace: what a run of the training script showed, which decides on the terms that ran.
     """
     analysis = Analysis.of_files(sources)
     found = _Finder(analysis, by_hand).run()
+    found = with_trace(found, analysis, trace) if trace is not None and not by_hand else found
     found = with_ssims(found, analysis, by_hand) if ssim else found
     return with_masks(found, analysis) if masks else found
 

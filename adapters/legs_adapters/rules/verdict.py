@@ -45,7 +45,7 @@ class Verdicts:
         """Return the verdict on a form; ``by_hand`` where the user named it as the loss."""
         term = Term(self.analysis, function, form)
         verdict = self._verdict(term, place, by_hand)
-        return self._problem(term, place, verdict.reason) if isinstance(verdict, _ByHand) else verdict
+        return self.problem(term, place, verdict.reason) if isinstance(verdict, _ByHand) else verdict
 
     def _verdict(self, term: Term, place: Place, by_hand: bool) -> Site | Left | _ByHand:
         function, form = term.function, term.form
@@ -104,9 +104,9 @@ class Verdicts:
         pictures = "image" in kinds or (function.name in CALLED and all(map(is_role, term.sides)))
         if other or not pictures or TRACKING & {*words(function.name)} or (rule.needs_target and "target" not in roles):
             return None
-        return self._problem(term, place, f"nothing shows that this is the loss: {rule.sentence()}")
+        return self.problem(term, place, f"nothing shows that this is the loss: {rule.sentence()}")
 
-    def _problem(self, term: Term, place: Place, reason: str) -> Problem:
+    def problem(self, term: Term, place: Place, reason: str) -> Problem:
         """Return a term as a problem, with the advice: what ``--site`` writes there, or words."""
         named = self._verdict(term, place, by_hand=True)
         if isinstance(named, Site) and named.line == place.line:

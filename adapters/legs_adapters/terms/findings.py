@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import TYPE_CHECKING, Any, Dict, FrozenSet, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
 
@@ -14,6 +14,9 @@ from legs_adapters.code.sources import Unreadable
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.text import on_one_line
 from legs_adapters.terms.writing import Writing
+
+if TYPE_CHECKING:
+    from legs_adapters.terms.traced import Trace
 
 __all__ = ["Decider", "Evidence", "Findings", "Left", "Line", "Problem", "Site", "Use"]
 
@@ -154,7 +157,8 @@ class Problem(NamedTuple):
 class Findings(NamedTuple):
     """All findings, in the order of the files.
 
-    ``doubts`` are skipped terms that may be the loss: of files that train and have no weighted term.
+    ``doubts`` are skipped terms that may be the loss: of files that train and have no weighted term. ``trace`` is what
+    a run showed, and ``ran`` the (path, line) of the terms that it met.
     """
 
     sites: List[Site]
@@ -164,6 +168,8 @@ class Findings(NamedTuple):
     patched: List[Left]
     unreadable: List[Unreadable]
     program: Program
+    trace: Optional[Trace] = None
+    ran: FrozenSet[Tuple[str, int]] = frozenset()
 
     def with_more(self, **more: Sequence[Any]) -> Findings:
         """Return findings with further ones, ``sites=...``, each kind in the order of the files."""

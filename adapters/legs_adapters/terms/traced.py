@@ -1,0 +1,111 @@
+"""The terms that a trace saw under a loss, and what decides of each whether it is photometric."""
+
+from __future__ import annotations
+
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
+
+__all__ = ["Trace", "Traced"]
+
+
+class Traced(NamedTuple):
+    """A difference that lies under a loss, as it ran.
+
+    Attributes:
+        frames: (path, line, function, its names of the two sides) of the checkout, innermost first.
+        kind: "l1", "squared", "robust", "signed", or "compiled: NAME".
+        target: which operand is the side that wants no gradient; -1: both want one.
+        shape: of that side.
+        share: its part of the loss.
+        match: the image file that side is most like: "path", "correlation", "is_photograph"; None: there is no file, or
+            the side is no picture of three or four channels.
+        is_known: whether it is that file.
+        gaussians: how many Gaussians are stepped after it; 0 where that cannot be told.
+        parameters, stepped: names and shapes of what is stepped after it.
+        steps, poses: how many steps moved more than poses, exposures and embeddings; and how many only those.
+        is_picture: whether that side is a picture of three or four channels.
+    """
+
+    frames: Tuple[Tuple[str, int, str, Tuple[str, ...]], ...]
+    kind: str
+    target: int
+    shape: Tuple[int, ...]
+    share: float
+    match: Optional[Dict[str, Any]]
+    is_known: bool
+    gaussians: int
+    parameters: Sequence[str]
+    stepped: Sequence[Sequence[int]]
+    steps: int
+    poses: int
+    is_picture: bool
+
+    @classmethod
+    def read(cls, term: Dict[str, Any], sure: float) -> Traced:
+        """Return a term from a report of the traced process."""
+        frames = tuple((path, line, name, tuple(names)) for path, line, name, names in term["frames"])
+        shares, match = term["shares"] or [0.0], term["match"]
+        known = match is not None and match["correlation"] >= sure
+        own = {name: term[name] for name in ("kind", "target", "gaussians", "parameters", "stepped", "steps", "poses")}
+        rest = {"shape": tuple(term["shape"]), "share": sum(shares) / len(shares), "is_picture": term["is_picture"]}
+        return cls(frames=frames, match=match, is_known=known, **own, **rest)
+
+    @property
+    def is_photometric(self) -> bool:
+        """Return whether it is the L1 of a trained rendering and a photograph."""
+        return self.kind == "l1" and not self.why_other
+
+    @property
+    def is_unknown(self) -> bool:
+        """Return whether only its picture is unknown: it is of no image file."""
+        return self.kind == "l1" and self.is_picture and self.steps > 0 and not self.is_known
+
+    @property
+    def why_other(self) -> str:
+        """Return why it is not of a trained rendering and a photograph, in words; empty where it is."""
+        if self.target < 0:
+            return "both sides are trained"
+        if not self.steps:
+            return (
+                "only poses, exposures or embeddings are stepped after it" if self.poses else "nothing is stepped by it"
+            )
+        if not self.is_picture:
+            channels = [side for side in self.shape if side > 1]
+            what = "1 channel" if len(channels) < 3 else "not of 3 or 4 channels"
+            return f"{{target}} is no photograph ({what}: {'x'.join(map(str, self.shape))})"
+        if self.match is None:
+            return "{target} cannot be compared with photographs: no image files are known (--photos DIR)"
+        if not self.is_known:
+            like = f"the nearest, {self.match['path']}, correlates at {self.match['correlation']:.2f}"
+            return f"{{target}} is of no image file ({like})"
+        if not self.match["is_photograph"]:
+            return f"{{target}} is {self.match['path']}, no photograph"
+        return ""
+
+    def text(self, target: str) -> str:
+        """Return what was seen, in words; ``target`` is the name of the side that wants no gradient."""
+        parts = [f"{100 * self.share:.0f}% of the loss"]
+        why = self.why_other
+        if why:
+            parts.append(why.format(target=target or "the other side"))
+        else:
+            assert self.match is not None
+            parts.append(f"{target or 'the other side'} is {self.match['path']}")
+        if self.kind != "l1":
+            what = {
+                "robust": "a Huber, Charbonnier or other bent loss",
+                "signed": "a signed difference",
+            }
+            parts.append(f"{what.get(self.kind, f'a {self.kind} loss')}, no L1")
+        elif not why and self.gaussians:
+            parts.append(f"{self.gaussians:,} Gaussians are stepped after it")
+        elif not why:
+            parts.append(f"{', '.join(self.parameters) or len(self.stepped)} are stepped after it")
+        return "; ".join(parts)
+
+
+class Trace(NamedTuple):
+    """The terms that a traced run saw, its count of steps, and of image files."""
+
+    terms: List[Traced]
+    steps: int
+    files: int

@@ -1,0 +1,198 @@
+"""Tell which image file a picture is, by thumbnails: whatever resizing, mask, exposure or layout came between."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any, List, NamedTuple, Optional, Sequence, Set, Tuple
+
+from legs_loss import LegsError
+
+__all__ = ["SIDE", "SURE", "Match", "Photographs", "thumbnail"]
+
+SIDE = 16  # pixels of a thumbnail
+SURE = 0.98  # the correlation from which on a picture is a file's
+MAX_FILES = 4000
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm")
+_OTHER = re.compile(  # the words of a folder, or of a file's name, whose pictures are no photographs
+    r"(?i)(^|[^a-z])(normals?|nrm|depths?|disp|disparity|masks?|seg|segmentations?|semantics?|labels?|flow|edges?|"
+    r"renders?|renderings?|features?|albedo|alpha|matte|monodepth|omnidata|dsine|teacher|pseudo|generated)([^a-z]|$)"
+)
+
+
+class Match(NamedTuple):
+    """The image file that a picture is most like, the correlation of the two, and whether it is a photograph."""
+
+    path: str
+    correlation: float
+    is_photograph: bool
+
+
+class Photographs:
+    """The image files under some folders: those that the scenes' models list, and all others.
+
+    Args:
+        folders: the folders that the command names.
+        photos: a folder of photographs by the user's word; the models are not asked then.
+    """
+
+    def __init__(self, folders: Sequence[str], photos: Optional[str] = None) -> None:
+        roots = [photos] if photos else list(folders)
+        self.root = os.path.commonpath([os.path.realpath(root) for root in roots]) if roots else ""
+        files = [path for root in roots for path in _image_files(root)][:MAX_FILES]
+        listed = set() if photos else {key for root in roots for key in _listed(root)}
+        self._tiers: List[List[str]] = [[], []]
+        for path in dict.fromkeys(files):
+            inside = os.path.relpath(path, self.root)
+            is_photograph = bool(photos) or (_is_listed(path, listed) if listed else not _OTHER.search(inside))
+            self._tiers[not is_photograph].append(path)
+        self._known: List[Any] = [None, None]
+
+    def __len__(self) -> int:
+        return sum(map(len, self._tiers))
+
+    def match(self, picture: Tuple[Any, Any]) -> Optional[Match]:
+        """Return the file that a picture's thumbnail is most like: a photograph first; None without files."""
+        best: Optional[Match] = None
+        for tier, files in enumerate(self._tiers):
+            found = self._best(tier, picture) if files else None
+            if found is not None and (best is None or found[1] > best.correlation):
+                best = Match(os.path.relpath(files[found[0]], self.root), found[1], not tier)
+            if best is not None and best.correlation >= SURE:
+                break
+        return best
+
+    def _best(self, tier: int, picture: Tuple[Any, Any]) -> Optional[Tuple[int, float]]:
+        import numpy as np
+
+        if self._known[tier] is None:
+            self._known[tier] = _thumbnails(self._tiers[tier])
+        files, stack = self._known[tier]  # [F], [F, 3, 256]
+        thumb, kept = picture
+        if not len(files) or kept.sum() < 16:
+            return None
+        one = _standardised(thumb[:, kept])
+        others = _standardised(stack[:, :, kept])
+        scores = np.maximum(others @ one.ravel(), others @ one[::-1].ravel())  # RGB, BGR
+        at = int(np.argmax(scores))
+        return int(files[at]), float(scores[at])
+
+
+def _standardised(thumbs: Any) -> Any:
+    """Return thumbnails [..., 3, K] without their channels' means, of norm 1; several as rows."""
+    import numpy as np
+
+    centred = thumbs - thumbs.mean(-1, keepdims=True)
+    norm = np.sqrt((centred**2).sum((-1, -2), keepdims=True))
+    found = centred / np.maximum(norm, 1e-3)
+    return found.reshape(len(found), -1) if found.ndim == 3 else found
+
+
+def thumbnail(picture: Any) -> Optional[Tuple[Any, Any]]:
+    """Return a picture's thumbnail [3, 256] in [0, 1] or so, and which of its pixels are not flat background.
+
+    Args:
+        picture: a tensor, [3, H, W], [H, W, 3], or of such a batch; of one of four channels the first three. Of a batch
+            the first.
+
+    Returns:
+        None for what is no picture of three or four channels.
+    """
+    import numpy as np
+    import torch
+
+    image = as_planes(picture.detach())
+    if image is None:
+        return None
+    with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
+        image = torch.nan_to_num(image[:3].float())
+        rows, columns = (torch.as_tensor(_areas(n), dtype=image.dtype, device=image.device) for n in image.shape[1:])
+        pool = rows @ image @ columns.t()
+        high = torch.nn.functional.adaptive_max_pool2d(image[None], SIDE)[0]
+        low = -torch.nn.functional.adaptive_max_pool2d(-image[None], SIDE)[0]
+        flat = ((high - low).amax(0) < 1e-6).cpu().numpy().ravel()
+        thumb = pool.reshape(3, -1).cpu().numpy().astype(np.float64)
+    kept = ~flat if 0 < flat.sum() <= 0.9 * flat.size else np.ones_like(flat)
+    return thumb, kept
+
+
+def _areas(count: int) -> Any:
+    """Return the weights [SIDE, count] of the means over equal parts of a row of pixels, exact at their borders."""
+    import numpy as np
+
+    edges = np.linspace(0, count, SIDE + 1)
+    pixels = np.arange(count)
+    low, high = np.maximum(edges[:-1, None], pixels), np.minimum(edges[1:, None], pixels + 1)
+    return (np.maximum(high - low, 0) * (SIDE / count)).astype(np.float32)
+
+
+def as_planes(tensor: Any) -> Optional[Any]:
+    """Return the first picture of a tensor as [C, H, W], C three or four; None where it has none."""
+    while tensor.dim() > 3:
+        tensor = tensor[0]
+    if tensor.dim() != 3 or not tensor.is_floating_point() or min(tensor.shape) < 1:
+        return None
+    if tensor.shape[0] in (3, 4) and min(tensor.shape[1:]) > 4:
+        return tensor
+    return tensor.permute(2, 0, 1) if tensor.shape[-1] in (3, 4) and min(tensor.shape[:2]) > 4 else None
+
+
+def _image_files(root: str) -> List[str]:
+    found: List[str] = []
+    for folder, folders, names in os.walk(root):
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and name != "legs_weights")
+        found += [os.path.join(folder, name) for name in sorted(names) if name.lower().endswith(_SUFFIXES)]
+        if len(found) > MAX_FILES:
+            break
+    return found
+
+
+def _listed(root: str) -> Set[Tuple[str, str]]:
+    """Return the photographs that a scene's model lists, each as its folder without `_4` and its stem."""
+    from legs_loss.scenes import read_scene
+
+    if not any((Path(root) / name).exists() for name in ("sparse", *_transforms(root))):
+        return set()
+    try:
+        return {_key(str(view.path)) for view in read_scene(root).views}
+    except LegsError:
+        return set()
+
+
+def _transforms(root: str) -> List[str]:
+    return [name for name in os.listdir(root) if name.startswith("transforms") and name.endswith(".json")]
+
+
+def _key(path: str) -> Tuple[str, str]:
+    folder, name = os.path.split(os.path.realpath(path))
+    return re.sub(r"_\d+$", "", folder), os.path.splitext(name)[0]
+
+
+def _is_listed(path: str, listed: Set[Tuple[str, str]]) -> bool:
+    return _key(path) in listed
+
+
+def _thumbnails(files: Sequence[str]) -> Tuple[Any, Any]:
+    """Return the indices of the files that could be read, and thumbnails; of one with alpha on black and white too."""
+    import numpy as np
+    from PIL import Image
+
+    indices, thumbs = [], []
+    for at, path in enumerate(files):
+        try:
+            with Image.open(path) as image:
+                image.draft("RGB", (16 * SIDE, 16 * SIDE))  # of a JPEG: decoded smaller
+                pictures = [image.convert("RGB")]
+                if image.mode in ("RGBA", "LA", "PA"):
+                    pixels = image.convert("RGBA")
+                    for colour in ((0, 0, 0, 255), (255, 255, 255, 255)):
+                        ground = Image.new("RGBA", pixels.size, colour)
+                        pictures.append(Image.alpha_composite(ground, pixels).convert("RGB"))
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            continue
+        for picture in pictures:
+            values = np.asarray(picture, np.float32).transpose(2, 0, 1) / 255
+            indices.append(at)
+            thumbs.append((_areas(values.shape[1]) @ values @ _areas(values.shape[2]).T).reshape(3, -1))
+    return np.asarray(indices, int), np.asarray(thumbs).reshape(-1, 3, SIDE * SIDE)

@@ -1,0 +1,252 @@
+"""legs-patch --trace: what a run of the training script shows decides, on losses that cannot be read off the text."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.patcher.support import legs_patch, snapshot
+from tests.patcher.traced import write, write_scene
+from tests.support import legs_environment
+
+pytestmark = pytest.mark.slow
+
+LOOP = """
+for step in range(100):
+    camera = views[step % len(views)]
+    gt_image = camera.values["images"]
+"""
+END = """
+    loss.backward()
+    splats.optimizer.step()
+    splats.optimizer.zero_grad()
+"""
+
+
+def body(*lines, head=""):
+    """Return a training script: these lines between the camera and the backward pass."""
+    return head + LOOP + "".join(f"    {line}\n" for line in lines) + END
+
+
+def traced(tmp_path, train, *options, steps=8, scene=None, **more):
+    """Trace a codebase with this train.py; return the report, and the line that must be weighted."""
+    scene = scene or write_scene(tmp_path / "scene")
+    line = write(tmp_path / "code", train, **more)
+    command = f"train.py -s {scene}"
+    before = snapshot(tmp_path / "code")
+    done = legs_patch("--trace", command, "--json", "--check", "--steps", str(steps), *options, tmp_path / "code")
+    assert done.stdout, done.stderr
+    assert snapshot(tmp_path / "code") == before  # nothing is written, no bytecode either
+    return json.loads(done.stdout), line, done
+
+
+def weighted(report):
+    return [(site["file"], site["line"]) for site in report["sites"]]
+
+
+CASES = {
+    "called by its name": body('image = splats.draw(camera)["rgb"]', "loss = F.l1_loss(image, gt_image)  # <- here"),
+    "losses from a dictionary": body(
+        'image = splats.draw(camera)["rgb"]',
+        'loss = LOSSES["l" + "1"](image, gt_image)  # <- here',
+        head="def absolute(a, b):\n    return (a - b).abs().mean()\n\n\nLOSSES = {'l1': absolute, 'l2': F.mse_loss}\n",
+    ),
+    "losses from a dictionary in a loop": body(
+        'image = splats.draw(camera)["rgb"]',
+        "loss = sum(LOSSES[name](image, gt_image) for name in ('l1', 'l2'))",
+        head="def absolute(a, b):\n    return (a - b).abs().mean()  # <- here\n\n\n"
+        "LOSSES = {'l1': absolute, 'l2': F.mse_loss}\n",
+    ),
+    "names that say nothing, target first": body(
+        'x = splats.draw(camera)["rgb"]',
+        "loss = torch.abs(gt_image[None] * 1.0 - x[None]).mean()  # <- here",
+    ),
+    "normals stored as pictures": body(
+        "drawn = splats.draw(camera)",
+        'loss = F.l1_loss(drawn["rgb"], gt_image)  # <- here',
+        'target = camera.values["normals"]',
+        'loss = loss + 0.1 * F.l1_loss(drawn["normal"], target)',
+    ),
+    "a teacher's rendering": body(
+        'image = splats.draw(camera)["rgb"]',
+        'with torch.no_grad():\n        gt = teacher.draw(camera)["rgb"]',
+        "loss = F.l1_loss(image, gt_image)  # <- here",
+        "loss = loss + 0.2 * F.l1_loss(image, gt)",
+        head="teacher = Splats(90)\n",
+    ),
+    "features": body(
+        'image = splats.draw(camera)["rgb"]',
+        "loss = F.l1_loss(image, gt_image)  # <- here",
+        "image, target = net(image[None]), net(gt_image[None]).detach()",
+        "loss = loss + 0.2 * F.l1_loss(image, target)",
+        head="net = torch.nn.Conv2d(3, 8, 3)\n",
+    ),
+    "a term that begins later": body(
+        'image = splats.draw(camera)["rgb"]',
+        "loss = F.mse_loss(image, gt_image)",
+        "if step >= 4:",
+        "    loss = F.l1_loss(image, gt_image)  # <- here",
+    ),
+    "channels last, resized, in a batch": body(
+        'image = splats.draw(camera)["rgb"]',
+        "small = [F.interpolate(x[None], scale_factor=0.75, mode='area') for x in (image, gt_image)]",
+        "small = [each.permute(0, 2, 3, 1) for each in small]",
+        "loss = F.l1_loss(small[0], small[1])  # <- here",
+    ),
+}
+
+
+class TestWhichTerm:
+    @pytest.mark.parametrize("name", sorted(CASES))
+    def test_the_photographs_line_and_no_other(self, tmp_path, name):
+        report, line, done = traced(tmp_path, CASES[name])
+        assert weighted(report) == [line], done.stderr
+        known = [term for term in report["traced"] if term["is_photometric"]]
+        assert known and all(term["image"]["path"].startswith("images") for term in known)
+        assert all(term["gaussians"] == 150 and term["parameters"] for term in known)
+
+    def test_one_loop_for_colour_and_depth_is_quoted(self, tmp_path):
+        lines = body(
+            "drawn, loss = splats.draw(camera), 0",
+            'targets = {"rgb": gt_image, "depth": gt_image[:1]}',
+            "for key in targets:",
+            "    loss = loss + (drawn[key] - targets[key]).abs().mean()  # <- here",
+        )
+        report, line, done = traced(tmp_path, lines)
+        assert weighted(report) == []
+        assert [(each["file"], each["line"]) for each in report["problems"]] == [line]
+        assert "serves other terms of the trace, too" in done.stderr
+
+    def test_tracking_and_mapping_through_one_function(self, tmp_path):
+        train = """
+        def compare(a, b):
+            return (a * 1.0 - b).abs().mean()  # <- here
+
+
+        def follow(camera):
+            image = splats.draw(camera)["rgb"]
+            loss = compare(image, camera.values["images"])
+            loss.backward()
+            moves.step()
+            moves.zero_grad()
+
+
+        def improve(camera):
+            image = splats.draw(camera)["rgb"]
+            loss = compare(image, camera.values["images"])
+            loss.backward()
+            splats.optimizer.step()
+            splats.optimizer.zero_grad()
+
+
+        moves = torch.optim.Adam([view.pose for view in views], lr=1e-3)
+        for step in range(100):
+            for leaf in (splats.xy, splats.colour, splats.opacity):
+                leaf.requires_grad_(False)
+            follow(views[step % 6])
+            for leaf in (splats.xy, splats.colour, splats.opacity):
+                leaf.requires_grad_(True)
+            improve(views[step % 6])
+        """
+        report, line, done = traced(tmp_path, train)
+        text = (tmp_path / "code" / "train.py").read_text().splitlines()
+        tracking = next(at for at, line in enumerate(text, 1) if "compare(image" in line)
+        assert weighted(report) == [line], done.stderr
+        assert [each["line"] for each in report["plain"]] == [tracking]
+
+    def test_a_squared_loss_of_a_photograph_is_said(self, tmp_path):
+        train = body('image = splats.draw(camera)["rgb"]', "loss = F.mse_loss(image, gt_image)  # <- here")
+        report, line, _ = traced(tmp_path, train)
+        assert weighted(report) == []
+        assert [each["line"] for each in report["left"]] == [line[1]]
+        assert "is images/00" in report["left"][0]["reason"] and "a squared loss, no L1" in report["left"][0]["reason"]
+
+    @pytest.mark.parametrize(
+        "lines",
+        [
+            ["with torch.autocast('cpu', dtype=torch.bfloat16):", "    loss = F.l1_loss(image, gt_image)  # <- here"],
+            [
+                "loss = F.l1_loss(image, gt_image)  # <- here",
+                "(loss * 0.5).backward(retain_graph=True)",
+                "loss = loss / 2",
+            ],
+        ],
+        ids=["autocast", "two backward passes a step"],
+    )
+    def test_other_ways_to_train(self, tmp_path, lines):
+        report, line, _ = traced(tmp_path, body('image = splats.draw(camera)["rgb"]', *lines))
+        assert weighted(report) == [line]
+
+    def test_gradients_by_autograd_grad(self, tmp_path):
+        train = LOOP + (
+            '    image = splats.draw(camera)["rgb"]\n'
+            "    loss = F.l1_loss(image, gt_image)  # <- here\n"
+            "    leaves = [splats.xy, splats.colour, splats.opacity]\n"
+            "    for leaf, gradient in zip(leaves, torch.autograd.grad(loss, leaves)):\n"
+            "        leaf.grad = gradient\n"
+            "    splats.optimizer.step()\n"
+        )
+        report, line, _ = traced(tmp_path, train)
+        assert weighted(report) == [line]
+
+
+class TestHarmless:
+    def test_a_script_that_fails_keeps_its_traceback_and_exit_code(self, tmp_path):
+        scene = write_scene(tmp_path / "scene")
+        write(tmp_path / "code", "raise SystemExit(7)\n")
+        done = legs_patch("--trace", f"train.py -s {scene}", tmp_path / "code")
+        assert done.returncode == 7
+        write(tmp_path / "other", "1 / 0\n")
+        done = legs_patch("--trace", f"train.py -s {scene}", tmp_path / "other")
+        assert done.returncode == 1
+        assert done.stderr.count("ZeroDivisionError") == 1
+        assert "By reading: legs-patch" in done.stderr
+
+    def test_a_script_without_a_step(self, tmp_path):
+        scene = write_scene(tmp_path / "scene")
+        write(tmp_path / "code", "print(len(views))\n")
+        done = legs_patch("--trace", f"train.py -s {scene}", tmp_path / "code")
+        assert done.returncode == 2
+        assert "ended before an optimiser moved what it renders" in done.stderr
+
+    def test_usage(self, tmp_path):
+        write(tmp_path / "code", "pass\n")
+        for options, message in [
+            (["--trace", "train"], "names no script"),
+            (["--trace", "other.py -s x"], "there is no other.py"),
+            (["--trace", "train.py", "--steps", "0"], "--steps must be at least 1"),
+            (["--trace", "train.py", "--photos", "nowhere"], "there is no such folder"),
+            (["--cpu"], "belong to --trace"),
+        ]:
+            done = legs_patch(*options, tmp_path / "code")
+            assert done.returncode == 2 and message in done.stderr, done.stderr
+
+    @pytest.mark.skipif(os.name != "posix", reason="sends a signal")
+    def test_ctrl_c_ends_both(self, tmp_path):
+        scene = write_scene(tmp_path / "scene")
+        write(tmp_path / "code", "import time, os\nprint('pid', os.getpid(), flush=True)\ntime.sleep(60)\n")
+        command = [sys.executable, "-m", "legs_adapters.cli", "--trace", f"train.py -s {scene}", str(tmp_path / "code")]
+        process = subprocess.Popen(
+            command,
+            env=legs_environment(),
+            stderr=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        pid = next(int(line.split()[1]) for line in process.stderr if line.startswith("pid"))
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(timeout=30) in (130, -signal.SIGINT)
+        for _ in range(100):
+            try:
+                os.kill(pid, 0)
+            except ProcessLookupError:
+                return
+            time.sleep(0.1)
+        pytest.fail("the script runs on")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 from typing import Iterable
 
-__all__ = ["LegsError", "did_you_mean"]
+__all__ = ["LegsError", "did_you_mean", "require"]
 
 
 class LegsError(ValueError):
@@ -28,3 +29,17 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
     if wanted in known:  # in another case
         near = [wanted]
     return f"; did you mean {known[near[0]]!r}?" if near else ""
+
+
+def require(what: str, extra: str, *packages: str) -> None:
+    """Check that the packages of an extra can be imported.
+
+    Raises:
+        LegsError: the first that cannot, and how to install it: by its name, or all of the extra from a checkout.
+    """
+    for package in packages:
+        try:
+            importlib.import_module(package)
+        except ImportError:
+            how = f"pip install {package}, or, in the checkout of legs-loss, pip install '.[{extra}]'"
+            raise LegsError(f"{what} needs {package}: {how}") from None

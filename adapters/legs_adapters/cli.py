@@ -7,7 +7,6 @@ scoring and every other L1 are not changed. Writes legs.toml to FOLDER, and a jo
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import shlex
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Dict, Mapping, Optional, Sequence, Tuple
 
 from legs_loss import OPERATORS, LegsError, __version__
 from legs_loss.cli import Parser, exit_code
+from legs_loss.errors import require
 from legs_loss.system import never_fail_to_print, say
 
 if TYPE_CHECKING:
@@ -50,8 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
 def check_libcst() -> None:
     """Raise a LegsError that says how to install LibCST where it is missing."""
-    if importlib.util.find_spec("libcst") is None:
-        raise LegsError("LibCST is missing: pip install 'legs-loss[patch]'")
+    require("legs-patch", "patch", "libcst")
 
 
 def _parser() -> Parser:
@@ -67,6 +66,8 @@ def _run(args: argparse.Namespace) -> int:
     if args.undo and (args.check or args.verify):
         raise LegsError("--undo can be combined with --diff and --force only")
     check_libcst()
+    if args.verify:
+        require("legs-patch --verify", "cpu", "numba", "scipy")
     args.before = _journal(args.folder)
     if args.undo:
         return _undo(args)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 
 from legs_adapters.cli import check_libcst
+from legs_loss.errors import require
 
 HELP = "run a training script with the LEGS loss, without changing its files"
 
@@ -26,6 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the script and return its exit code."""
     check_libcst()
+    if args.cpu:
+        require("legs run --cpu", "cpu", "numba", "scipy")
     from legs_adapters.runner import run_script
 
     return run_script(args.script, args.arguments, args.cpu, args.ssim, args.masks)

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, Callable, List, NamedTuple, Optional, Sequence, Tuple
 
-from legs_loss.errors import LegsError
+from legs_loss.errors import LegsError, require
 from legs_loss.scenes.folder import PHOTOGRAPHS, files_below, left_out
 from legs_loss.scenes.images import open_image
 
@@ -89,12 +89,11 @@ def reconstruct(
 
 
 def _pycolmap() -> Any:
-    try:
-        import pycolmap
-    except ImportError:
-        raise LegsError('reconstruction needs pycolmap: pip install "legs-loss[colmap]"') from None
+    require("reconstruction", "colmap", "pycolmap")
+    import pycolmap
+
     if not hasattr(pycolmap, "FeatureMatchingOptions"):
-        raise LegsError('this pycolmap is too old: pip install --upgrade "legs-loss[colmap]"')
+        raise LegsError("this pycolmap is too old: pip install --upgrade pycolmap")
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # failures are reported by this module
     pycolmap.set_random_seed(0)
     return pycolmap

@@ -14,7 +14,7 @@ from concurrent.futures import CancelledError
 from typing import Any, Callable, Iterable, Iterator, Optional, Tuple
 
 from legs_loss._version import __version__
-from legs_loss.errors import LegsError
+from legs_loss.errors import LegsError, require
 
 __all__ = ["Listener", "Task", "outcomes"]
 
@@ -49,10 +49,9 @@ def outcomes(
 
 
 def _on_cluster(task: Task, arguments: Iterable[Any], scheduler: str, listen: Listener) -> Iterator[Tuple[Any, Any]]:
-    try:
-        from distributed import Client, as_completed
-    except ImportError:
-        raise LegsError("--scheduler needs dask: pip install 'legs-loss[cluster]'") from None
+    require("--scheduler", "cluster", "distributed")
+    from distributed import Client, as_completed
+
     try:
         client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -245,6 +245,35 @@ class TestFirstQuarterOfAnHour:
         extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
         assert {"legs-loss[cpu]", "matplotlib>=3.5", "jinja2>=3"} <= set(extras["report"])
         assert any(one.startswith("numba") for one in extras["cpu"])
+        users = set(extras) - {"all", "test", "docs", "lint"}
+        assert set(re.findall(r"\w+", extras["all"][0][len("legs-loss") :])) == users
+
+    @pytest.mark.parametrize(
+        ("package", "extra", "arguments"),
+        [
+            ("numba", "cpu", ["run", "--cpu", "train.py"]),
+            ("numba", "cpu", ["patch", "--verify", "."]),
+            ("libcst", "patch", ["run", "train.py"]),
+            ("libcst", "patch", ["patch", "."]),
+            ("numba", "cpu", ["compare"]),
+            ("matplotlib", "report", ["demo"]),
+            ("jinja2", "report", ["report", "."]),
+            ("matplotlib", "report", ["show", "train.png"]),
+            ("pycolmap", "colmap", ["scene", ".", "out"]),
+            ("shtab", "completion", ["--print-completion", "bash"]),
+        ],
+    )
+    def test_a_missing_extra_is_one_line(self, capsys, monkeypatch, tmp_path, package, extra, arguments):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "train.py").write_text("print(1)")
+        save(tmp_path / "train.png", photograph(16, 16))
+        monkeypatch.setitem(sys.modules, package, None)
+        code, text = says(capsys, *arguments)
+        lines = text.strip().splitlines()
+        assert code == 2 and len(lines) == 1, text
+        assert lines[0].endswith(
+            f"needs {package}: pip install {package}, or, in the checkout of legs-loss, pip install '.[{extra}]'"
+        )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
@@ -335,7 +364,7 @@ class TestCompletion:
         monkeypatch.setitem(sys.modules, "shtab", None)
         code, text = says(capsys, "--print-completion", "bash", main=command)
         assert code == 2
-        assert "pip install 'legs-loss[completion]'" in text
+        assert "pip install shtab, or, in the checkout of legs-loss, pip install '.[completion]'" in text
 
 
 class TestWhatIsOffered:

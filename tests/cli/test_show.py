@@ -100,4 +100,4 @@ class TestShow:
         environment["PYTHONPATH"] = f"{tmp_path}:{environment['PYTHONPATH']}"
         done = legs("show", scene, "--out", tmp_path / "sheet.png", env=environment)
         assert done.returncode == 2
-        assert "legs-loss[report]" in done.stderr
+        assert "pip install matplotlib, or" in done.stderr

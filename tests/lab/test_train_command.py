@@ -224,5 +224,5 @@ def test_missing_numba_is_one_clear_error(tiny_scene: Path, tmp_path: Path) -> N
         arguments_of("train", tiny_scene, "--out", tmp_path / "run"), env=env, capture_output=True, text=True
     )
     assert failed.returncode == 2
-    assert "pip install 'legs-loss[cpu]'" in failed.stderr
+    assert "pip install numba, or, in the checkout of legs-loss, pip install '.[cpu]'" in failed.stderr
     assert "Traceback" not in failed.stderr

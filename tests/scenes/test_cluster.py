@@ -90,7 +90,10 @@ class TestHere:
         environment["PYTHONPATH"] = f"{tmp_path}:{environment['PYTHONPATH']}"
         done = legs("precompute", scenes[0], "--scheduler", "tcp://127.0.0.1:1", env=environment)
         assert done.returncode == 2
-        assert done.stderr == "legs: error: --scheduler needs dask: pip install 'legs-loss[cluster]'\n"  # and no bar
+        assert done.stderr == (
+            "legs: error: --scheduler needs distributed: pip install distributed, or, in the checkout of legs-loss, "
+            "pip install '.[cluster]'\n"
+        )  # and no bar
 
     @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="mounting needs root")
     def test_a_full_disk_is_one_error(self, tmp_path):

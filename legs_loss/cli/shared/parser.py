@@ -6,7 +6,7 @@ import argparse
 import re
 from typing import Any, Iterator, NoReturn, Optional, Sequence
 
-from legs_loss.errors import did_you_mean
+from legs_loss.errors import did_you_mean, require
 from legs_loss.system import printable
 
 __all__ = ["Parser"]
@@ -55,10 +55,9 @@ class Parser(argparse.ArgumentParser):
 
 class _PrintCompletion(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *given: Any) -> None:
-        try:
-            import shtab
-        except ImportError:
-            parser.error("completion needs shtab: pip install 'legs-loss[completion]'")
+        require("completion", "completion", "shtab")
+        import shtab
+
         for action in _actions(parser):
             words = set(re.findall(r"[A-Z]+", action.metavar)) if isinstance(action.metavar, str) else set()
             if words & (_FILES | _FOLDERS):

@@ -10,7 +10,7 @@ import torch
 
 from legs_loss.cli.shared.saving import label, save_figure
 from legs_loss.curves import curve, curve_names
-from legs_loss.errors import LegsError
+from legs_loss.errors import require
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import curved, weight_from_response
 
@@ -41,10 +41,8 @@ def save_sheet(path: Union[str, Path], views: Sequence[Shown], spec: WeightSpec,
     Raises:
         LegsError: matplotlib is missing, or the file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise LegsError("pictures need matplotlib: pip install 'legs-loss[report]'") from None
+    require("a picture", "report", "matplotlib")
+    from matplotlib.figure import Figure
 
     many = len(views) > 1
     rows = 4 if any(view.mask is not None for view in views) else 3

@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     )
     say(f"Scenes: {out}{os.sep}METHOD{os.sep}point_cloud{os.sep}...{os.sep}point_cloud.ply")
     moved = "" if args.scene is None else f" -s {shlex.quote(args.scene)}"
-    say(f"Look at them in the browser: legs view {shlex.quote(str(out))}{moved} (pip install 'legs-loss[view]')")
+    say(f"Look at them in the browser: legs view {shlex.quote(str(out))}{moved} (it needs viser: pip install viser)")
     say(f"{time.perf_counter() - started:.0f} s in all")
     return 0
 

@@ -25,12 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the page and print where it is."""
-    from legs_loss.lab.commands.train import set_threads
-    from legs_loss.lab.report.comparison import check_matplotlib
+    from legs_loss.errors import require
+
+    require("legs report", "report", "numba", "matplotlib", "jinja2")
     from legs_loss.lab.report.html import write_report
 
-    set_threads(None)  # it draws with the CPU rasterizer: fail now if numba is missing
-    check_matplotlib()
     path = write_report(args.folder, args.output or args.folder / "report.html", args.views, args.arms, args.scene)
     say(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
     return 0

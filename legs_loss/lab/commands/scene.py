@@ -2,7 +2,7 @@
 
 PHOTOS is a folder of photographs of one static scene, each overlapping its neighbours. OUT gets the undistorted
 photographs in images/ and COLMAP's cameras, poses and points in sparse/0/, as 3DGS, its forks and this package's
-commands read them. Needs pycolmap: pip install "legs-loss[colmap]".
+commands read them. Needs pycolmap: pip install pycolmap.
 """
 
 from __future__ import annotations

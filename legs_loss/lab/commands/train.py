@@ -114,12 +114,10 @@ def set_threads(count: Optional[int]) -> None:
     Raises:
         LegsError: not between 1 and the number of cores; or numba is missing.
     """
-    from legs_loss.errors import LegsError
+    from legs_loss.errors import LegsError, require
 
-    try:
-        import numba
-    except ImportError:
-        raise LegsError("this command needs numba: pip install 'legs-loss[cpu]'") from None
+    require("this command", "cpu", "numba")
+    import numba
     import torch
 
     if count is None:

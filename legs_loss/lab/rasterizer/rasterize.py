@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.errors import LegsError
+from legs_loss.errors import LegsError, require
 from legs_loss.lab.conventions import View
 
 __all__ = ["Rendering", "rasterize"]
@@ -82,12 +82,7 @@ def rasterize(
         raise LegsError(f"no rasterizer backend {backend!r}; choose one of numba, torch")
     if means.dtype != torch.float32:
         raise LegsError(f"the numba rasterizer computes in float32, not {means.dtype}; convert, or use backend='torch'")
-    try:
-        import numba  # noqa: F401
-    except ImportError as error:
-        raise LegsError(
-            "the numba rasterizer needs numba: pip install 'legs-loss[cpu]', or use backend='torch'"
-        ) from error
+    require("the rasterizer (but for backend='torch')", "cpu", "numba")
     from legs_loss.lab.rasterizer import compiled
 
     given = compiled.Tensors(means, scales, quaternions, opacities, sh, None, viewspace)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.cli.shared.saving import label, save_figure, save_png
-from legs_loss.errors import LegsError
+from legs_loss.errors import require
 from legs_loss.lab.report.html_pictures import as_bytes
 from legs_loss.lab.training.metrics import strongest
 from legs_loss.responses import normalise_response, response
@@ -31,10 +31,7 @@ class Compared(NamedTuple):
 
 def check_matplotlib() -> None:
     """Raise a LegsError now, and not after minutes of training, if pictures cannot be drawn."""
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError:
-        raise LegsError("pictures need matplotlib: pip install 'legs-loss[report]'") from None
+    require("a picture", "report", "matplotlib")
 
 
 def save_pictures(folder: Path, title: str, photograph: Tensor, arms: Sequence[Compared]) -> Path:

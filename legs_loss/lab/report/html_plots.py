@@ -7,7 +7,7 @@ from typing import Any, Dict, List, Mapping, Sequence, Tuple
 
 import numpy as np
 
-from legs_loss.errors import LegsError
+from legs_loss.errors import require
 
 __all__ = ["by_gaussians", "by_iterations", "colours"]
 
@@ -92,10 +92,9 @@ def by_gaussians(rows: Rows, arms: Sequence[str]) -> List[str]:
 
 def _figure(arms: int) -> Tuple[Any, Any]:
     """Return a figure that a telephone shows whole, with room below for the names of the arms."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise LegsError("plots need matplotlib: pip install 'legs-loss[report]'") from None
+    require("a plot", "report", "matplotlib")
+    from matplotlib.figure import Figure
+
     figure: Any = Figure(figsize=(4.6, 3.4 + 0.2 * -(-arms // 3)), constrained_layout=True)
     panel = figure.subplots()
     panel.set_facecolor("none")

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
 
-from legs_loss.errors import LegsError
+from legs_loss.errors import LegsError, require
 
 if TYPE_CHECKING:
     from legs_loss.lab.training.trainer import Progress
@@ -28,10 +28,9 @@ def tensorboard_log(folder: Optional[Path]) -> Iterator[Callable[[str, Progress]
     if folder is None:
         yield lambda name, progress: None
         return
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise LegsError("--tensorboard needs TensorBoard: pip install 'legs-loss[tensorboard]'") from None
+    require("--tensorboard", "tensorboard", "tensorboard")
+    from torch.utils.tensorboard import SummaryWriter
+
     writers: Dict[str, Any] = {}
 
     def log(name: str, progress: Progress) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Dict, NamedTuple, Tuple
 
 import numpy as np
 
-from legs_loss.errors import LegsError
+from legs_loss.errors import LegsError, require
 from legs_loss.lab.conventions import SH_C0
 from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import read_ply
@@ -121,10 +121,8 @@ def _read(path: Path) -> Drawable:
 
 def _start(host: str, port: int) -> Tuple[Any, str]:
     """Start an empty server that answers the address returned and nothing else."""
-    try:
-        import viser
-    except ImportError:
-        raise LegsError("legs view needs viser: pip install 'legs-loss[view]'") from None
+    require("legs view", "view", "viser")
+    import viser
 
     class Unshared(viser.ViserServer):
         """viser without its public tunnel, for which any client may ask."""
@@ -137,7 +135,7 @@ def _start(host: str, port: int) -> Tuple[Any, str]:
         server = Unshared(host=host, port=port, verbose=False)
     if not guard.on:
         server.stop()
-        raise LegsError(f"viser {viser.__version__} would answer requests of any page: pip install 'legs-loss[view]'")
+        raise LegsError(f"viser {viser.__version__} would answer requests of any page: pip install --upgrade viser")
     return server, guard.address(server.get_port())
 
 

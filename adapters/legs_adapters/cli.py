@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -192,7 +193,7 @@ def _patch(args: argparse.Namespace) -> int:
         _show(args, found)
         if not problems:
             raise LegsError(
-                f"no photometric L1 term was found in {args.folder}: if there is one, name it with --site FILE:LINE"
+                f"no photometric L1 term was found in {args.folder}: {_offered(found)}"
                 + _elsewhere(root, args.exclude, found),
                 *trained_instead(found.findings.program.sources.values()),
             )
@@ -238,6 +239,19 @@ def _show(args: argparse.Namespace, found: Plan, wrote: Sequence[str] = ()) -> N
 
     text = as_json(found, wrote) if args.json else as_table(found)
     say(text, sys.stderr if args.diff and not args.json else None, end="", lines=True)
+
+
+def _offered(found: Plan) -> str:
+    """Say how to name the term: by its line where one that was skipped speaks of images."""
+    from legs_adapters.code.folders import first_of
+    from legs_adapters.lexicon.names import kind_of_words
+
+    skipped = [left for left in found.findings.left if left.rule not in ("", "definition")]
+    named = [left for left in skipped if "image" in map(kind_of_words, re.findall(r"\w+", left.text))]
+    if not named:
+        return "if there is one, name it with --site FILE:LINE"
+    lines = [f"--site {left.path}:{left.line}" for left in named]
+    return f"if a skipped line is the loss, take it with {first_of(lines, 3, ' or ')}"
 
 
 def _elsewhere(root: Path, exclude: Sequence[str], found: Plan) -> str:

@@ -38,7 +38,7 @@ class TestCommandLine:
         assert "\033[" not in diff.stdout
         rows = legs_patch("--check", root).stdout.partition("would change")[0]
         assert rows in diff.stderr
-        assert "train.py:32            skipped  No backward pass reaches the term, and it is under" in rows
+        assert "train.py:32            skipped  No backward pass was found that reaches it, and it is under" in rows
         assert legs_patch("--check", root).returncode == 1
         assert snapshot(root) == before
 
@@ -273,6 +273,12 @@ class TestCommandLine:
         ]
         assert run(root, "--check", "--exclude", "sub", "--exclude", "third_party").stderr == ""
         assert run(root / "sub" / "gs").returncode == 0
+
+    def test_a_skipped_line_that_speaks_of_images_is_offered_where_nothing_was_found(self, tmp_path, run):
+        step = "def train_texture(image, gt_image):\n    l1_loss(image.depth, gt_image.depth).backward()\n"
+        done = run(checkout(tmp_path, {"a.py": "from gaussian_renderer import render\n\n\n" + step}))
+        assert done.returncode == 2
+        assert "if a skipped line is the loss, take it with --site a.py:5" in done.stderr
 
     def test_folders_that_are_not_entered_are_named_where_nothing_was_found(self, tmp_path, run):
         texts = {"run.py": "import os\n", "venv/x.py": "", "submodules/a.py": "", "extern/a.py": "", "tests/a.py": ""}

@@ -268,3 +268,48 @@ def test_depth_by_another_name_is_left(tmp_path):
     found = plan(checkout(tmp_path, texts)).findings
     assert [(site.path, site.form.callee is not None) for site in found.sites] == [("train.py", True)]
     assert found.problems == []
+
+
+CLASS = """import torch.nn.functional as F
+from torch import nn
+from gaussian_renderer import render
+
+
+class {name}(nn.Module):
+    def forward(self, {a}, {b}):
+        return F.l1_loss({a}, {b}) + 0.1 * {a}.mean()
+
+
+def training(cams, gaussians):
+    loss_fn = {name}()
+    for cam in cams:
+        package = render(cam, gaussians, None, None)
+        loss = loss_fn({given})
+        loss.backward()
+        gaussians.optimizer.step()
+"""
+
+
+@pytest.mark.parametrize("name", ["DepthGuidedLoss", "RateDistortionLoss", "NormalLoss"])
+@pytest.mark.parametrize("sides", [("rendered_image", "gt_image"), ("a", "b")])
+def test_the_name_of_a_class_outweighs_neither_its_parameters_nor_what_they_are_given(name, sides, tmp_path):
+    text = CLASS.format(name=name, a=sides[0], b=sides[1], given='package["render"], cam.original_image')
+    found = plan(checkout(tmp_path, {"train.py": text})).findings
+    assert [(site.line, site.why) for site in found.sites] == [(8, f"{sides[1]} is the photograph")]
+
+
+def test_a_reason_by_the_name_of_a_class_quotes_the_class(tmp_path):
+    text = CLASS.format(name="DepthLoss", a="a", b="b", given="package.one, cam.other")
+    found = plan(checkout(tmp_path, {"train.py": text})).findings
+    because = [line.text for left in found.left if left.rule == "depth" for line in left.because]
+    assert found.sites == []
+    assert because == ["class DepthLoss(nn.Module):"]
+
+
+def test_a_product_with_the_photograph_is_not_said_to_be_the_photograph(tmp_path):
+    texts = files("inria")
+    texts["train.py"] = texts["train.py"].replace(
+        "l1_loss(image, gt_image)\n        loss", "l1_loss(image * attention, gt_image * attention)\n        loss"
+    )
+    whys = [site.why for site in plan(checkout(tmp_path, texts)).findings.sites]
+    assert whys == ["gt_image * attention is made from the photograph"]

@@ -20,7 +20,7 @@ from legs_adapters.code.syntax import arguments, call_name, constant, dotted, ke
 from legs_adapters.lexicon.calls import CallReading, MeaningOf, meaning_of_call
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
-from legs_adapters.lexicon.words import BACKGROUND, DATA, LOSS, RENDERERS
+from legs_adapters.lexicon.words import BACKGROUND, DATA, KIND_OF, LOSS, RENDER, RENDERERS
 from legs_adapters.tensors.backward import Training
 
 __all__ = ["Meanings"]
@@ -221,6 +221,12 @@ class Meanings:
         meaning = mix([meaning for meaning in found if meaning.kind == "image"] or found)
         owner = function.owner.name if function.owner is not None else ""
         says_kind = LOSS & set(words(owner)) and kind_of_words(owner) in ("depth", "normal", "flow")
+        # What is nearer outweighs it: the parameter's name, or what one method is given that no other overrides.
+        is_named = any(KIND_OF.get(word) == "image" and word not in RENDER for word in words(definition.place))
+        is_given = meaning.kind == "image" and not any(
+            (dotted(call.func) or "").startswith("self.") for _, call in calls
+        )
+        says_kind = says_kind and not (is_named or is_given)
         return meaning._replace(kind=kind_of_words(owner)) if says_kind else meaning
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple, Optional
 
+import libcst as cst
+
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.syntax import one_line, words, words_in
@@ -137,6 +139,7 @@ class Verdicts:
         """Return what shows that a side is the photograph."""
         name = one_line(term.target)
         if self.analysis.meanings.origin(term.function, term.target).role == "target":
-            return f"{name} is the photograph"
+            is_place = isinstance(term.target, (cst.Name, cst.Attribute, cst.Subscript, cst.Call))
+            return f"{name} is {'' if is_place else 'made from '}the photograph"
         where = "a parameter, " if term.function.is_parameter(term.target) else ""
         return f"{name} is {where}the photograph by its name"

@@ -34,7 +34,7 @@ class OtherKind(Rule):
         self.id: str = id
         self.kind: str = kind
         self.reason: str = reason or id
-        self.__doc__ = f"One side is {what}."
+        self.__doc__ = f"By its name, or that of what it comes from, one side is {what}."
         self.INVALID: List[str] = [f"loss = l1_loss({invalid})"]
 
     def evidence(self, term: Term) -> List[Decider]:
@@ -47,7 +47,8 @@ class OtherKind(Rule):
 
     def _shown(self, term: Term, side: cst.CSTNode) -> List[Decider]:
         shown = source_of(term.function, side, lambda text: kind_of_words(text) == self.kind)
-        return [shown or source_of(term.function, side) or term.here[0]]
+        around = next((decider for name, decider in term.names_around if kind_of_words(name) == self.kind), None)
+        return [shown or around or source_of(term.function, side) or term.here[0]]
 
 
 KINDS = (

@@ -20,7 +20,7 @@ class _OtherStep(Rule):
 
 
 class PoseStep(_OtherStep):
-    """The optimiser updates camera poses, or an embedding, and no Gaussians."""
+    """By the names of what it is given, the optimiser updates camera poses, or an embedding, and no Gaussians."""
 
     id = "pose-step"
     reason = "tracking"
@@ -36,7 +36,7 @@ class PoseStep(_OtherStep):
 
 
 class NoStep(_OtherStep):
-    """No optimiser uses the gradients: they are read to score the Gaussians, then discarded."""
+    """No optimiser was found that uses the gradients: code that only reads them scores the Gaussians."""
 
     id = "no-step"
     reason = "scoring"

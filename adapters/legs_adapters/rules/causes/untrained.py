@@ -18,7 +18,7 @@ MAX_CALLERS = 8
 
 
 class Scoring(Rule):
-    """No backward pass reaches the term, and a name says that it is for densification or pruning."""
+    """No backward pass was found that reaches the term, and a name says that it is for densification or pruning."""
 
     id = reason = "scoring"
     INVALID = ["def importance_score(camera, image):\n    return l1_loss(image, camera.original_image)"]
@@ -28,7 +28,7 @@ class Scoring(Rule):
 
 
 class Evaluation(Rule):
-    """No backward pass reaches the term, and it is under ``no_grad``, or in code that reports or tests."""
+    """No backward pass was found that reaches it, and it is under ``no_grad``, or in code that reports or tests."""
 
     id = reason = "evaluation"
     INVALID = ["with torch.no_grad():\n    error = l1_loss(image, gt)"]
@@ -45,7 +45,7 @@ class Evaluation(Rule):
 
 
 class Untrained(Rule):
-    """No backward pass reaches the term, and no name says what it is for."""
+    """No backward pass was found that reaches the term, and no name says what it is for."""
 
     id = reason = "untrained"
     INVALID = ["def compared(camera, image):\n    return l1_loss(image, camera.original_image)"]

@@ -55,6 +55,8 @@ _HOMES = {
 
 __all__ = [*_HOMES]
 
+importlib.import_module(f"{__name__}.counting")  # its last line is printed in every process that trains
+
 
 def __getattr__(name: str) -> object:
     if name.startswith("apply_to_"):  # legs_loss.apply_to_gsplat()

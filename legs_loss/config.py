@@ -13,7 +13,6 @@ from typing import Any, Dict, List, Mapping, Optional, Tuple
 
 from legs_loss.errors import LegsError, did_you_mean
 from legs_loss.spec import PRESETS, WeightSpec, as_spec
-from legs_loss.system.files import read_text
 
 __all__ = ["CONFIG_FILE", "STORE_FOLDER", "Config", "find_config", "is_off"]
 
@@ -212,6 +211,8 @@ def _read_toml(path: Path) -> Dict[str, Any]:
         import tomllib
     else:
         import tomli as tomllib
+    from legs_loss.system.files import read_text
+
     try:
         return tomllib.loads(read_text(path, _LARGEST))
     except OSError as error:

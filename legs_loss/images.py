@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 
-__all__ = ["Layout", "check_values", "is_compiling", "read_layout", "read_pair", "shape_of"]
+__all__ = ["Layout", "check_order", "check_values", "is_compiling", "read_layout", "read_pair", "shape_of"]
 
 # A rendering may overshoot 1 and an HDR photograph may exceed it; 8-bit values are far larger.
 _SURELY_NOT_UNIT_RANGE = 16.0
@@ -156,6 +156,20 @@ def read_pair(
     if prediction.device != target.device:
         raise LegsError(f"prediction is on {prediction.device} and target on {target.device}: move one of them first")
     return layout, prediction, target
+
+
+def check_order(prediction: Tensor, target: Tensor) -> None:
+    """Check that a loss whose weights come from its second image is not given the rendering there.
+
+    Raises:
+        LegsError: gradients are taken, and the second image alone requires one.
+    """
+    if target.requires_grad and not prediction.requires_grad and torch.is_grad_enabled():
+        raise LegsError(
+            "of the two images the second alone requires a gradient, so it seems to be the rendering, and the weights "
+            "would come from it: turn them round, loss(rendering, photograph). Where a photograph is learned from a "
+            "fixed rendering, call it by legs_loss.unweighted(l1_loss), or give legs_loss a weight="
+        )
 
 
 def check_values(image: Tensor, name: str = "target") -> None:

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from legs_loss.config import is_off
+from legs_loss.counting import note_graph, note_step
 from legs_loss.errors import LegsError
-from legs_loss.images import read_pair
+from legs_loss.images import check_order, is_compiling, read_pair
 from legs_loss.kernels.backends import fused_loss, fused_ssim
 from legs_loss.kernels.contract import Weights
 from legs_loss.levels import NEEDS_LEVELS
@@ -17,7 +18,7 @@ from legs_loss.similarity import WINDOW_SIZE, d_ssim, ssim_map
 from legs_loss.spec import Spec, as_spec
 from legs_loss.weights import weight_map
 
-__all__ = ["legs_loss", "ssim", "weighted_l1"]
+__all__ = ["legs_loss", "mean_error", "ssim", "weighted_l1"]
 
 
 def weighted_l1(
@@ -54,6 +55,19 @@ def weighted_l1(
         >>> weighted_l1(prediction, target, weight=torch.tensor([[1.0, 3.0]]))
         tensor(2.)
     """
+    _note(prediction, target, "" if weight is None else "the map given to weighted_l1")
+    return mean_error(prediction, target, weight, mask, renormalise, channels_last)
+
+
+def mean_error(
+    prediction: Tensor,
+    target: Tensor,
+    weight: Optional[Tensor] = None,
+    mask: Optional[Tensor] = None,
+    renormalise: bool = False,
+    channels_last: Optional[bool] = None,
+) -> Tensor:
+    """Return :func:`weighted_l1`, as a part of a loss that is counted already."""
     layout, prediction, target = read_pair(prediction, target, channels_last)
     weight, mask = layout.map_first(weight, target, "weight"), layout.map_first(mask, target, "mask")
     if weight is None and mask is None:
@@ -156,7 +170,8 @@ def legs_loss(
         installed and takes the images (docs/performance.md): equal up to rounding, differentiable once.
 
     Raises:
-        LegsError: shapes, ranges or names that do not fit, or a target with NaN or infinity (on the CPU).
+        LegsError: shapes, ranges or names that do not fit, or a target with NaN or infinity (on the CPU); or the
+            target alone requires a gradient, where the weights come from it: the two are swapped.
 
     Source: the LEGS paper, its total loss; 3D Gaussian Splatting (Kerbl et al. 2023), equation 7.
 
@@ -173,6 +188,10 @@ def legs_loss(
     if weight is None and spec.over == "scene" and not spec.unweighted:
         raise LegsError(NEEDS_LEVELS.format(where="one call does not know", then="and give LEGSLoss that store="))
     layout, prediction, target = read_pair(prediction, target, channels_last)
+    if weight is None and not spec.unweighted:
+        check_order(prediction, target)
+    made = "" if spec.unweighted else f"{spec.operator}, {spec.curve}, beta {spec.beta:g}, by legs_loss"
+    _note(prediction, target, made if weight is None else "the map given to legs_loss")
     weight, mask = layout.map_first(weight, target, "weight"), layout.map_first(mask, target, "mask")
     prediction, target = layout.channels_first(prediction), layout.channels_first(target)
     weights = Weights(spec if weight is None else None, None, weight, mask, renormalise)
@@ -181,7 +200,16 @@ def legs_loss(
         return fused
     if weight is None and not spec.unweighted:
         weight = weight_map(target, spec, False)
-    photometric = weighted_l1(prediction, target, weight, mask, renormalise, False)
+    photometric = mean_error(prediction, target, weight, mask, renormalise, False)
     if lambda_dssim == 0.0:
         return photometric
     return (1.0 - lambda_dssim) * photometric + lambda_dssim * d_ssim(prediction, target, padding, False)
+
+
+def _note(prediction: Tensor, target: Tensor, weights: str) -> None:
+    if not (torch.is_grad_enabled() and (prediction.requires_grad or target.requires_grad)):
+        return
+    if not is_compiling():
+        note_step(weights)
+    elif weights:
+        note_graph(0)

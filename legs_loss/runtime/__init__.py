@@ -12,12 +12,13 @@ from typing import Any, Callable, Optional, TypeVar
 import torch
 from torch import Tensor
 
+from legs_loss.counting import Counts, counted
 from legs_loss.errors import LegsError
-from legs_loss.images import is_compiling, read_pair
+from legs_loss.images import check_order, is_compiling, read_pair
 from legs_loss.kernels.contract import Weights
 from legs_loss.runtime.call import Call, Own, View
-from legs_loss.runtime.sources import MASK, Counts
-from legs_loss.runtime.state import active, configure, counted, counts, current_run, spec_to_compile, thread, version
+from legs_loss.runtime.sources import MASK
+from legs_loss.runtime.state import active, configure, counts, current_run, spec_to_compile, thread, version
 from legs_loss.weights import weight_map
 
 __all__ = ["Counts", "active", "configure", "counts", "l1_loss", "masked", "unweighted"]
@@ -59,8 +60,8 @@ def l1_loss(
 
     Raises:
         LegsError: shapes that do not fit (both are named), that may be read either way, or that contradict
-            ``channels_last``; on the CPU a target with NaN or infinity; a setting in legs.toml or LEGS_* that is out of
-            range.
+            ``channels_last``; the target alone requires a gradient: the two are swapped; on the CPU a target
+            with NaN or infinity; a setting in legs.toml or LEGS_* that is out of range.
 
     Examples:
         >>> target = torch.rand(3, 8, 8)
@@ -72,10 +73,17 @@ def l1_loss(
     call.check_options()
     if is_compiling():
         return _compiled(call)
-    if thread.unweighted or not call.trains() or not current_run().active:
+    trains = call.trains()
+    swapped = not trains and target.requires_grad and torch.is_grad_enabled()
+    run = None if thread.unweighted or not (trains or swapped) else current_run()
+    if run is None or not run.active:
         counted.plain += 1
+        counted.plain_steps += trains
+        if run is not None:
+            run.say_what_is_used()
         return call.plain()
-    run, call = current_run(), call.aligned()
+    check_order(prediction, target)
+    call = call.aligned()
     counted.weighted += 1
     with torch.no_grad():
         weights = run.source.weights(call)
@@ -87,6 +95,8 @@ def _compiled(call: Call) -> Tensor:
     """Return the loss for torch.compile: without a memo, the weight is part of the graph."""
     spec = None if thread.unweighted or not call.trains() else spec_to_compile(version[0])
     if spec is None:
+        if not thread.unweighted and call.target.requires_grad and not call.prediction.requires_grad:
+            check_order(call.prediction, call.target)
         return call.plain()
     if spec.over == "scene":
         raise LegsError(
@@ -122,11 +132,12 @@ def masked(prediction: Tensor, target: Tensor) -> Tensor:
     if is_compiling():
         spec_to_compile(version[0])  # raises where there are masks
         return prediction
-    if thread.unweighted or not (prediction.requires_grad and torch.is_grad_enabled()):
+    if thread.unweighted or not ((prediction.requires_grad or target.requires_grad) and torch.is_grad_enabled()):
         return prediction
     run = current_run()
     if run.config.off or not run.source.stored.has(MASK):
         return prediction
+    check_order(prediction, target)
     layout, _, aligned = read_pair(prediction, target)
     first = layout.channels_first(aligned)
     with torch.no_grad():

@@ -11,7 +11,7 @@ from legs_loss.errors import LegsError
 from legs_loss.images import Layout, read_pair
 from legs_loss.kernels.backends import fused_l1
 from legs_loss.kernels.contract import Weights
-from legs_loss.loss import weighted_l1
+from legs_loss.loss import mean_error
 from legs_loss.weights import weight_map
 
 __all__ = ["Call", "Own", "View"]
@@ -115,7 +115,7 @@ class Call(NamedTuple):
     def _with_map(self, weight: Optional[Tensor], mask: Optional[Tensor], renormalise: bool = False) -> Tensor:
         assert self.layout is not None
         if self.reduction == "mean" and self.own is None:
-            return weighted_l1(self.prediction, self.target, weight, mask, renormalise, False)
+            return mean_error(self.prediction, self.target, weight, mask, renormalise, False)
         if mask is not None:  # where a reduction of the codebase follows, its mean becomes the mean over what counts
             mask = mask.to(torch.float32)
             mask = mask / mask.mean().clamp(min=torch.finfo(torch.float32).tiny) if renormalise else mask

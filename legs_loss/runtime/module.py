@@ -10,9 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from legs_loss.config import find_config
+from legs_loss.counting import counted
+from legs_loss.images import check_order
 from legs_loss.loss import legs_loss
 from legs_loss.runtime.call import Call
-from legs_loss.runtime.state import Run, counted
+from legs_loss.runtime.state import Run
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.weights import weight_map
 
@@ -72,6 +74,8 @@ class LEGSLoss(nn.Module):
         mask: Optional[Tensor] = None,
     ) -> Tensor:
         """Return the loss; see :func:`~legs_loss.legs_loss`."""
+        if weight is None and (self._run is not None or not self.spec.unweighted):
+            check_order(prediction, target)
         if self._run is not None and weight is None:
             return self._by_store(self._run, prediction, target, mask)
         return legs_loss(

@@ -7,7 +7,6 @@ least response and the span; torch needs the map.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Callable, List, Optional, Sequence
 
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.config import Config
+from legs_loss.counting import Counts
 from legs_loss.errors import LegsError
 from legs_loss.kernels.available import is_capturing
 from legs_loss.kernels.backends import fused_range
@@ -24,38 +24,13 @@ from legs_loss.runtime.memo import WeightMemo
 from legs_loss.runtime.stored import Stored
 from legs_loss.weights import weight_map
 
-__all__ = ["MASK", "NOT_IN_A_GRAPH", "WEIGHTS", "Counts", "WeightSource"]
+__all__ = ["MASK", "NOT_IN_A_GRAPH", "WEIGHTS", "WeightSource"]
 
 MASK, WEIGHTS = "mask", "weights"  # the store's names of the user's own maps; it is imported only where there is one
 NOT_IN_A_GRAPH = (
     "the store has masks or weights of your own, which are found by the image, and a compiled or captured graph cannot "
     "look: leave the loss out of the graph, or name a store without them (LEGS_STORE)"
 )
-
-
-@dataclass
-class Counts:
-    """Counts of this process's calls of ``l1_loss``, and of the sources of the weights.
-
-    Attributes:
-        weighted: calls that trained with a weight.
-        plain: calls that returned the plain mean: no gradient asked for, beta 0, LEGS_OFF, or `unweighted`.
-        remembered: images whose weight was taken from the memo.
-        stored: images whose weight map was taken from the store.
-        computed: images whose weight was computed from them.
-        masked: images whose L1 was the mean over what a mask of the store counts.
-        unmasked: images of the L1 that were not found in a store with masks, and counted whole.
-        hidden: renderings whose masked pixels were hidden from the other terms, by `masked` or `LEGSLoss`.
-    """
-
-    weighted: int = 0
-    plain: int = 0
-    remembered: int = 0
-    stored: int = 0
-    computed: int = 0
-    masked: int = 0
-    unmasked: int = 0
-    hidden: int = 0
 
 
 class WeightSource:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import os
 import sys
 import threading
 from collections import deque
@@ -11,11 +12,12 @@ from pathlib import Path
 from typing import Deque, List, Optional, Set, Union
 
 from legs_loss.config import Config, find_config
+from legs_loss.counting import Counts, counted, note_graph, reset_counts, say_first
 from legs_loss.errors import LegsError
 from legs_loss.runtime.memo import DEFAULT_LIMIT
-from legs_loss.runtime.sources import MASK, NOT_IN_A_GRAPH, Counts, WeightSource
+from legs_loss.runtime.sources import MASK, NOT_IN_A_GRAPH, WeightSource
 from legs_loss.spec import Spec, WeightSpec, as_spec
-from legs_loss.system import is_first_process, say
+from legs_loss.system import say
 
 __all__ = [
     "Run",
@@ -53,18 +55,22 @@ class Run:
         return self.config.active or (not self.config.off and self.source.has_own())
 
     def say_once(self, kind: str, message: str) -> None:
-        """Print a line on stderr, once for each kind of message; "active" only on rank 0."""
+        """Print a line on stderr, once for each kind of message."""
         if kind not in self._said:
             self._said.add(kind)
-            if kind == "active" and not is_first_process():
-                return
             say(f"legs-loss: {message}", sys.stderr)
 
     def say_what_is_used(self) -> None:
-        """Print, once, the settings and the sources of the first step's weights, when they are known."""
+        """Print, once on rank 0, the settings and the sources of the first step's weights, when they are known."""
         if "active" in self._said:
             return
+        self._said.add("active")
         spec = self.config.spec
+        if not self.active:
+            off = f"LEGS_OFF={os.environ.get('LEGS_OFF', '')}"
+            beta = f"preset {self.config.preset}, beta {spec.beta:g}; settings from {self.config.source}"
+            say_first(f"L1 plain: {off if self.config.off else beta}")
+            return
         if spec.unweighted:
             weights = f"own maps from {self.config.store}"
         elif counted.stored == 0:
@@ -76,8 +82,7 @@ class Run:
         if self.source.stored.has(MASK):
             weights += f"; masks from {self.config.store}"
             self.tell_at_end()
-        self.say_once(
-            "active",
+        say_first(
             f"L1 weighted, preset {self.config.preset}: {spec.operator}, {spec.curve}, beta {spec.beta:g}; {weights}; "
             f"settings from {self.config.source}",
         )
@@ -95,7 +100,6 @@ class _Thread(threading.local):
         self.unweighted = 0  # on the instance: torch.compile does not read class attributes again
 
 
-counted: Counts = Counts()
 thread: _Thread = _Thread()
 version: List[int] = [0]  # how often the settings were replaced; compiled code is recompiled then
 _run: Optional[Run] = None
@@ -126,6 +130,9 @@ def spec_to_compile(version: int) -> Optional[WeightSpec]:
     run = current_run()
     if not run.config.off and run.source.has_own():
         raise LegsError(NOT_IN_A_GRAPH)
+    run.say_what_is_used()
+    if run.config.active:
+        note_graph(version)
     return run.config.spec if run.config.active else None
 
 
@@ -142,11 +149,6 @@ def reset() -> None:
         _masked.clear()
         version[0] += 1
         reset_counts()
-
-
-def reset_counts() -> None:
-    """Reset the counts."""
-    vars(counted).update(vars(Counts()))
 
 
 def configure(

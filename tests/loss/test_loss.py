@@ -88,8 +88,8 @@ class TestValue:
                 )
 
     def test_no_gradient_reaches_the_weight(self):
-        target = torch.rand(3, 8, 8, requires_grad=True)
-        prediction = torch.rand(3, 8, 8)
+        prediction, target = torch.rand(2, 3, 8, 8).requires_grad_().unbind()
+        target.retain_grad()
         legs_loss(prediction, target, lambda_dssim=0.0).backward()
         weight = weight_map(target.detach())
         torch.testing.assert_close(target.grad, weight * torch.sign(target - prediction).detach() / target.numel())

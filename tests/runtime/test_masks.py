@@ -258,7 +258,7 @@ class TestNoSilence:
             "legs-loss: masks: 2 view(s) masked, 1 without a mask counted whole, "
             "3 training image(s) were NOT FOUND in the store, so NOT MASKED"
         )
-        assert lines[-1] == whole + ("" if hidden else ", in the L1 alone: " + ALONE)
+        assert lines[-2] == whole + ("" if hidden else ", in the L1 alone: " + ALONE)
         assert sum("masks from" in line for line in lines) == 1
 
 

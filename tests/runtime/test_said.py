@@ -1,0 +1,116 @@
+"""The lines that a run says of itself: swapped images are an error; the first training step, the end."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from legs_loss import LegsError, LEGSLoss, configure, l1_loss, legs_loss, ssim, unweighted, weight_map, weighted_l1
+from tests.runtime.support import pair, plain
+from tests.support import legs_environment
+
+
+class TestSwapped:
+    @pytest.mark.parametrize("loss", [l1_loss, legs_loss, LEGSLoss(), LEGSLoss("legs-l"), torch.compile(l1_loss)])
+    def test_a_photograph_in_the_renderings_place_stops(self, loss):
+        image, target = pair(3, 9, 8)
+        with pytest.raises(LegsError, match="turn them round"):
+            loss(target, image)
+
+    @pytest.mark.parametrize("loss", [l1_loss, legs_loss, LEGSLoss()])
+    def test_a_photograph_that_is_learned_beside_the_rendering_is_none(self, loss):
+        image, target = pair(3, 9, 8)
+        exposure = torch.ones(1, requires_grad=True)
+        loss(image, exposure * target).backward()
+        assert image.grad is not None and image.grad.abs().sum() > 0
+
+    @pytest.mark.parametrize("loss", [l1_loss, legs_loss, LEGSLoss()])
+    def test_without_gradients_there_is_none(self, loss):
+        image, target = pair(3, 9, 8)
+        with torch.no_grad():
+            assert torch.isfinite(loss(target, image))
+
+    def test_what_does_not_depend_on_the_order_is_computed(self, monkeypatch):
+        image, target = pair(3, 16, 15)
+        weight = weight_map(target)
+        expected = (weight * (image - target).abs()).mean()
+        torch.testing.assert_close(weighted_l1(target, image, weight), expected)
+        torch.testing.assert_close(ssim(target, image), ssim(image, target))
+        torch.testing.assert_close(legs_loss(target, image, "3dgs"), legs_loss(image, target, "3dgs"))
+        torch.testing.assert_close(legs_loss(target, image, weight=weight), legs_loss(image, target, weight=weight))
+        assert torch.equal(unweighted(l1_loss)(target, image), plain(target, image))
+        configure("3dgs")
+        assert torch.equal(l1_loss(target, image), plain(target, image))
+
+
+TRAIN = """
+import torch
+import legs_loss
+image, target = torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8)
+optimizer = torch.optim.SGD([image], 0.1)
+for step in range(3):
+    loss = {loss}
+    loss.backward()
+    optimizer.step()
+with torch.no_grad():
+    legs_loss.l1_loss(image, target)
+"""
+EVALUATE = """
+import torch
+from legs_loss import l1_loss
+model, target = torch.nn.Linear(4, 4), torch.rand(3, 8, 4)
+with torch.no_grad():
+    l1_loss(model(target), target)
+"""
+ACTIVE = "L1 weighted, preset legs: laplacian, C3, beta 10; weights computed from the training images; settings from "
+BETA = ", beta 0; settings from environment variable "
+
+
+def said(code: str, folder, **variables: str):
+    """The lines on stderr of a process that runs a script."""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=folder, env={**legs_environment(), **variables}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    return done.stderr.splitlines()
+
+
+class TestALineAtEachEnd:
+    @pytest.mark.parametrize(
+        ("variables", "first", "last"),
+        [
+            ({}, ACTIVE + "defaults", "3 step(s) weighted, 0 plain with a gradient"),
+            ({"LEGS_OFF": "1"}, "L1 plain: LEGS_OFF=1", None),
+            ({"LEGS_BETA": "0"}, f"L1 plain: preset legs{BETA}LEGS_BETA", None),
+            ({"LEGS_PRESET": "3dgs"}, f"L1 plain: preset 3dgs{BETA}LEGS_PRESET", None),
+        ],
+        ids=lambda value: str(value)[:12],
+    )  # fmt: skip
+    def test_of_l1_loss(self, tmp_path, variables, first, last):
+        code = TRAIN.format(loss="legs_loss.l1_loss(image, target)")
+        last = last or "no L1 was weighted in this run: 3 plain step(s) with a gradient"
+        assert said(code, tmp_path, **variables) == [f"legs-loss: {first}", f"legs-loss: {last}"]
+        assert said(code, tmp_path, RANK="1", **variables) == []
+
+    @pytest.mark.parametrize(
+        ("loss", "first", "steps"),
+        [
+            ("legs_loss.legs_loss(image, target)", "L1 weighted: laplacian, C3, beta 10, by legs_loss", 3),
+            ("legs_loss.LEGSLoss()(image, target)", "L1 weighted: laplacian, C3, beta 10, by legs_loss", 3),
+            ("legs_loss.legs_loss(image, target, '3dgs')", "L1 plain: beta 0, or no weight is given", 0),
+            ("legs_loss.weighted_l1(image, target, legs_loss.weight_map(target))",
+             "L1 weighted: the map given to weighted_l1", 3),
+        ],
+    )  # fmt: skip
+    def test_of_the_other_losses(self, tmp_path, loss, first, steps):
+        plain = "no L1 was weighted in this run: 3 plain step(s) with a gradient"
+        last = f"{steps} step(s) weighted, 0 plain with a gradient" if steps else plain
+        assert said(TRAIN.format(loss=loss), tmp_path) == [f"legs-loss: {first}", f"legs-loss: {last}"]
+
+    def test_of_a_training_that_calls_none_and_of_an_evaluation(self, tmp_path):
+        code = TRAIN.format(loss="(image - target).abs().mean()")
+        assert said(code, tmp_path) == ["legs-loss: no L1 was weighted in this run"]
+        assert said(EVALUATE, tmp_path) == []

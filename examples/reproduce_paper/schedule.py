@@ -18,6 +18,7 @@ import torch
 
 from legs_loss.lab.experiments.arms import ArmSpec, needed, parse_arm, parse_arms
 from legs_loss.lab.training import TrainConfig, train
+from legs_loss.lab.training.perceptual import use_lpips
 from legs_loss.scenes import read_scene
 
 THRESHOLD = 2e-4  # 3DGS's own, at any size
@@ -29,7 +30,7 @@ def main() -> None:
     args = arguments(str(__doc__))
     torch.set_num_threads(1)  # one thread an arm: several scripts, each with arms of its own, use more cores
     numba.set_num_threads(1)
-    for milestone in (at for at in MILESTONES if at <= args.until):
+    for milestone in (at for at in args.milestones if at <= args.until):
         for arm in needed(parse_arms(args.arms)):
             path = args.out / arm.folder / f"metrics-{milestone}.json"
             if not path.is_file():
@@ -46,9 +47,13 @@ def arguments(description: str) -> argparse.Namespace:
     parser.add_argument("--arms", nargs="+", default=["3dgs", "legs", "3dgs@legs"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--until", type=int, default=7000, metavar="N")
+    parser.add_argument("--milestones", type=int, nargs="+", default=MILESTONES, metavar="N")
+    parser.add_argument("--lpips", type=Path, metavar="WEIGHTS", help="as of legs compare")
     parser.add_argument("-r", "--resolution", type=int, default=800)
     parser.add_argument("--iterations", type=int, default=30000, help="of the schedule")
-    return parser.parse_args()
+    args = parser.parse_args()
+    use_lpips(args.lpips)
+    return args
 
 
 def settings(arm: ArmSpec, args: argparse.Namespace) -> TrainConfig:

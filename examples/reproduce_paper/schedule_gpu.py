@@ -19,7 +19,7 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 from torch import Tensor
 
-from examples.reproduce_paper.schedule import MILESTONES, arguments, settings
+from examples.reproduce_paper.schedule import arguments, settings
 from legs_loss import legs_loss, ssim
 from legs_loss.lab.experiments.arms import ArmSpec, parse_arm, parse_arms
 from legs_loss.lab.gaussians import Gaussians
@@ -28,6 +28,7 @@ from legs_loss.lab.training.adam import COLOUR_RATE, RATES, position_rate
 from legs_loss.lab.training.dataset import TrainingView, extent, load_dataset
 from legs_loss.lab.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.lab.training.metrics import mean_scores, psnr, strongest
+from legs_loss.lab.training.perceptual import has_lpips, lpips
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.system import write_whole
 
@@ -41,7 +42,7 @@ def main() -> None:
     torch.set_default_device("cuda")
     for arm in parse_arms(args.arms):
         folder = args.out / f"seed-{args.seed}"
-        milestones = [at for at in MILESTONES if at <= args.until]
+        milestones = [at for at in args.milestones if at <= args.until]
         if not (folder / arm.folder / f"metrics-{milestones[-1]}.json").is_file():
             Run(read_scene(args.scene), arm, settings(arm, args), folder).go(milestones)
 
@@ -165,7 +166,8 @@ class Run:
         degree = min(self.config.sh_degree, iteration // self.schedule.sh_every)
         viewspace = torch.zeros_like(self.adam.values["means"], requires_grad=True)
         image, radii = self.draw(view, degree, viewspace)
-        legs_loss(image, view.image, weight=view.weight, lambda_dssim=self.config.lambda_dssim).backward()
+        weight = view.weight if self.config.weighted(iteration) else torch.ones_like(view.weight)
+        legs_loss(image, view.image, weight=weight, lambda_dssim=self.config.lambda_dssim).backward()
         steps = self.config.position_lr_max_steps or self.config.iterations
         self.adam.step(position_rate(min(1.0, iteration / steps), self.extent))
         if iteration < self.schedule.densify_until:
@@ -210,7 +212,9 @@ class Run:
         with torch.no_grad():
             image, _ = self.draw(view, self.config.sh_degree, torch.zeros_like(self.adam.values["means"]))
             image = image.clamp(0.0, 1.0)
+            perceptual = {"lpips": lpips(image, view.image)} if has_lpips() else {}
             return {
+                **perceptual,
                 "psnr": psnr(image, view.image),
                 "ssim": float(ssim(image, view.image)),
                 "psnr_strong": psnr(image, view.image, view.strong),

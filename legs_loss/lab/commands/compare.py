@@ -42,6 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-m", "--out", type=Path, default=Path("legs_compare"), metavar="DIR", help="default: legs_compare"
     )
+    parser.add_argument(
+        "--lpips",
+        type=Path,
+        metavar="WEIGHTS",
+        help="score LPIPS, too, by this state dict of torchvision's squeezenet1_1, alexnet or vgg16",
+    )
     advanced = parser.add_argument_group("advanced")
     advanced.add_argument(
         "--densify_grad_threshold", type=float, metavar="X", help="of all arms; default: as for legs train"
@@ -77,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     resolution = args.resolution
     if resolution is None:
         resolution = default_resolution(read_scene(root, args.images))
-    comparison = Comparison(root, replace(base, resolution=resolution), args.out, args.images)
+    comparison = Comparison(root, replace(base, resolution=resolution), args.out, args.images, args.lpips)
     proof = comparison.proof
     say(
         f"The baseline is unweighted: over {proof['views']} views its loss is {proof['loss']:.6f}, 3DGS's own "

@@ -31,6 +31,8 @@ CHANGES: Mapping[str, str] = {
     "mean1": "each map divided by its mean",
     "lambda=X": "the share X of D-SSIM in the loss",
     "threshold": "the densification threshold times the loss's mean weight",
+    "until=N": "weights to iteration N, the plain loss after it",
+    "from=N": "the plain loss to iteration N, weights after it",
 }
 
 # The built-in lists of arms.
@@ -53,7 +55,7 @@ class ArmSpec:
     spec: WeightSpec
     changes: Tuple[str, ...] = ()
     at: Optional[str] = None  # the arm whose numbers of Gaussians this one gets
-    lambda_dssim: Optional[float] = None
+    settings: Tuple[Tuple[str, float], ...] = ()  # of a training that the changes name
 
     @property
     def folder(self) -> str:
@@ -86,10 +88,9 @@ class ArmSpec:
             threshold *= LOOSE
         if "scale" in self.changes:
             return replace(base, spec="3dgs", l1_scale=base.l1_scale * mean_weight, densify_grad_threshold=threshold)
-        if self.lambda_dssim is not None:
-            base = replace(base, lambda_dssim=self.lambda_dssim)
         shuffled = "shuffled" in self.changes
-        return replace(base, spec=self.spec, shuffled=shuffled, densify_grad_threshold=threshold)
+        own: Dict[str, Any] = dict(self.settings)
+        return replace(base, spec=self.spec, shuffled=shuffled, densify_grad_threshold=threshold, **own)
 
 
 def parse_arm(name: str) -> ArmSpec:
@@ -106,9 +107,9 @@ def parse_arm(name: str) -> ArmSpec:
     """
     own, at_sign, at = name.partition("@")
     loss, *changes = own.split(":")
-    lambda_dssim = _lambda(name, changes)
+    settings = _settings(name, changes)
     for change in changes:
-        if change not in CHANGES and not change.startswith("lambda="):
+        if change not in CHANGES and ("=" not in change or change.partition("=")[0] not in _NUMBERS):
             raise LegsError(f"{name}: no change is named {change!r}: choose one of {', '.join(CHANGES)}")
     if len(set(changes)) < len(changes):
         raise LegsError(f"{name}: give each change once")
@@ -124,7 +125,7 @@ def parse_arm(name: str) -> ArmSpec:
     own_name = ":".join([preset, *changes])
     if "mean1" in changes:
         spec = replace(spec, normalise="mean")
-    return ArmSpec(own_name if leader is None else f"{own_name}@{leader}", spec, tuple(changes), leader, lambda_dssim)
+    return ArmSpec(own_name if leader is None else f"{own_name}@{leader}", spec, tuple(changes), leader, settings)
 
 
 def parse_arms(names: Sequence[str]) -> List[ArmSpec]:
@@ -152,17 +153,22 @@ def these_arms(names: Sequence[str]) -> List[str]:
     return [own.get(arm.name, arm.name) for arm in arms]
 
 
-def _lambda(name: str, changes: Sequence[str]) -> Optional[float]:
-    found = [change.partition("=")[2] for change in changes if change.startswith("lambda=")]
-    if len(found) > 1:
-        raise LegsError(f"{name}: give lambda once")
-    try:
-        value = float(found[0]) if found else None
-    except ValueError:
-        value = math.nan
-    if value is not None and not 0.0 <= value <= 1.0:
-        raise LegsError(f"{name}: lambda must be a number in [0, 1], got {found[0]!r}")
-    return value
+def _settings(name: str, changes: Sequence[str]) -> Tuple[Tuple[str, float], ...]:
+    found: Dict[str, float] = {}
+    for change in changes:
+        key, equals, text = change.partition("=")
+        if not equals or key not in _NUMBERS:
+            continue
+        setting, kind, fits, wanted = _NUMBERS[key]
+        if setting in found:
+            raise LegsError(f"{name}: give {key} once")
+        try:
+            found[setting] = kind(text)
+        except ValueError:
+            found[setting] = math.nan
+        if not fits(found[setting]):
+            raise LegsError(f"{name}: {key} must be {wanted}, got {text!r}")
+    return tuple(found.items())
 
 
 def _loss(name: str, loss: str) -> WeightSpec:
@@ -186,4 +192,10 @@ def _loss(name: str, loss: str) -> WeightSpec:
     return WeightSpec(**settings)
 
 
+# The changes that have a number: the setting of a training, its type, what it may be.
+_NUMBERS: Mapping[str, Tuple[str, Callable[[str], float], Callable[[float], bool], str]] = {
+    "lambda": ("lambda_dssim", float, lambda value: 0.0 <= value <= 1.0, "a number in [0, 1]"),
+    "until": ("weights_until", int, lambda value: value >= 1, "a whole number of at least 1"),
+    "from": ("weights_from", int, lambda value: value >= 1, "a whole number of at least 1"),
+}
 _FIELDS: Mapping[str, Callable[[str], Any]] = {field.name: type(field.default) for field in fields(WeightSpec)}

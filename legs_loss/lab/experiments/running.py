@@ -26,6 +26,7 @@ from legs_loss.lab.experiments.on_cluster import train_on_cluster
 from legs_loss.lab.experiments.schema import ROW, SETTINGS, what_is_wrong
 from legs_loss.lab.training.checkpoint import CHECKPOINT, alone_in
 from legs_loss.lab.training.dataset import Dataset, load_dataset
+from legs_loss.lab.training.perceptual import network_name, use_lpips
 from legs_loss.lab.training.side_by_side import Arm, train_arm, train_side_by_side
 from legs_loss.lab.training.trainer import Progress, TrainConfig, default_threshold
 from legs_loss.scenes import Scene, read_scene
@@ -59,12 +60,18 @@ class Comparison:
         base: the settings that all arms share; its spec does not count, each row has its own seed.
         out: the comparison's folder.
         images: the folder of the photographs, as :func:`~legs_loss.scenes.read_scene` takes it.
+        lpips: the weights of LPIPS's network, as :func:`~legs_loss.lab.training.perceptual.use_lpips` takes them.
 
     Raises:
-        LegsError: the scene cannot be trained on, the baseline is weighted, or the folder holds another comparison.
+        LegsError: the scene cannot be trained on, the baseline is weighted, the folder holds another comparison, or the
+            weights are not such a network's.
     """
 
-    def __init__(self, scene: Path, base: TrainConfig, out: Path, images: Optional[str] = None) -> None:
+    def __init__(
+        self, scene: Path, base: TrainConfig, out: Path, images: Optional[str] = None, lpips: Optional[Path] = None
+    ) -> None:
+        use_lpips(lpips)
+        self.lpips: Optional[Path] = None if lpips is None else Path(os.path.abspath(str(lpips)))
         self.root: Path = Path(os.path.abspath(str(scene)))
         self.images: Optional[str] = images
         self.out: Path = Path(os.path.abspath(str(out)))
@@ -153,7 +160,9 @@ class Comparison:
         every = max(1, config.iterations // EVALUATIONS)
         images = os.path.abspath(self.images) if self.images and os.path.isdir(self.images) else self.images
         folder = self.folder(arm, seed)
-        return Arm(name, self.root, config, folder, images, caps=caps, evaluate_every=every, resume=None)
+        return Arm(
+            name, self.root, config, folder, images, caps=caps, evaluate_every=every, resume=None, lpips=self.lpips
+        )
 
     def _config(self, arm: ArmSpec, seed: int) -> Tuple[TrainConfig, Optional[Dict[int, int]]]:
         mean_weight = self.mean_weight(arm.spec) if arm.needs_mean_weight else 1.0
@@ -176,7 +185,7 @@ class Comparison:
                 "seed": seed,
                 "config": config.as_dict(),
                 "caps": None if caps is None else sorted(caps.items()),
-                "versions": versions(),
+                "versions": {**versions(), **({"lpips": network_name()} if self.lpips is not None else {})},
                 "metrics": metrics,
             }
             write_json(folder / "row.json", row)

@@ -17,7 +17,8 @@ __all__ = ["TrainConfig", "default_threshold"]
 
 # What a spec had not when the first comparisons were written: absent where it is the default, so that they go on.
 ADDED_SETTINGS = ("over", "noise_floor", "smooth")
-SWITCHES = ("shuffled", "sparse_adam")  # for the same reason absent where they are off
+SWITCHES = ("shuffled", "sparse_adam")  # for the same reason absent where they are off, as are the next ones
+WINDOW = ("weights_from", "weights_until")
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ class TrainConfig:
         max_gaussians: a cap on their number, None for none.
         white_background: white in place of black.
         shuffled: each weight map's pixels in random order, the same weights displaced: for experiments.
+        weights_from, weights_until: the weights count after the one iteration and to the other; outside of them the
+            loss is plain. None: from the first, to the last. For experiments.
         sparse_adam: a step updates only the Gaussians that its view shows, which changes the results.
         seed: of the order of the views and of the places of split Gaussians.
     """
@@ -53,6 +56,8 @@ class TrainConfig:
     max_gaussians: Optional[int] = None
     white_background: bool = False
     shuffled: bool = False
+    weights_from: Optional[int] = None
+    weights_until: Optional[int] = None
     sparse_adam: bool = False
     seed: int = 0
 
@@ -74,6 +79,7 @@ class TrainConfig:
                 "above 0",
             ),
             *((name, type(getattr(self, name)) is bool, "True or False") for name in SWITCHES),
+            *((name, getattr(self, name) is None or getattr(self, name) >= 1, "at least 1") for name in WINDOW),
             ("max_gaussians", self.max_gaussians is None or self.max_gaussians >= 1, "at least 1"),
             ("seed", -(1 << 63) <= self.seed < 1 << 63, "an integer of 64 bits"),
         ):
@@ -87,7 +93,7 @@ class TrainConfig:
         for name in ADDED_SETTINGS:
             if values["spec"][name] == getattr(PRESETS["legs"], name):
                 del values["spec"][name]
-        for name in SWITCHES:
+        for name in SWITCHES + WINDOW:
             if not values[name]:
                 del values[name]
         return values
@@ -113,6 +119,10 @@ class TrainConfig:
     def weights(self) -> WeightSpec:
         """Return ``spec``, resolved."""
         return as_spec(self.spec)
+
+    def weighted(self, iteration: int) -> bool:
+        """Return whether the weights count in an iteration."""
+        return (self.weights_from or 0) < iteration <= (self.weights_until or iteration)
 
     @property
     def background(self) -> Tensor:

@@ -5,22 +5,17 @@ To add a metric, add a record. Rows that were trained before show it as missing.
 
 from __future__ import annotations
 
-import importlib.util
 import math
-from functools import lru_cache
-from pathlib import Path
-from typing import Any, Callable, Dict, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import Callable, Dict, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
+from legs_loss.lab.training.perceptual import NEEDS_LPIPS, has_lpips, lpips
 from legs_loss.responses import response
 
 __all__ = ["METRICS", "Metric", "left_out", "mean_scores", "psnr", "score", "strongest"]
-
-VGG = "vgg16-397923af.pth"  # as torchvision names its file
-NEEDS_LPIPS = f"pip install lpips torchvision, and {VGG} in torch's cache of checkpoints: nothing is downloaded here"
 
 
 class Metric(NamedTuple):
@@ -102,26 +97,6 @@ def _ssim(prediction: Tensor, target: Tensor) -> float:
     return 1.0 - float(fused_loss(prediction, target, None, 1.0))  # many times as fast as torch's
 
 
-@lru_cache(maxsize=None)
-def has_lpips() -> bool:
-    """Return whether LPIPS can be computed without a download."""
-    installed = all(importlib.util.find_spec(name) is not None for name in ("lpips", "torchvision"))
-    return installed and (Path(torch.hub.get_dir()) / "checkpoints" / VGG).is_file()
-
-
-def lpips(prediction: Tensor, target: Tensor) -> float:
-    """Return LPIPS with VGG of images [3, H, W] in [0, 1]: 0 is the same. Source: Zhang et al. 2018."""
-    with torch.no_grad():
-        return float(_network()(prediction.float()[None], target.float()[None], normalize=True))
-
-
-@lru_cache(maxsize=None)
-def _network() -> Any:
-    import lpips as package
-
-    return package.LPIPS(net="vgg", verbose=False)
-
-
 METRICS: Mapping[str, Metric] = {
     metric.key: metric
     for metric in (
@@ -144,7 +119,7 @@ METRICS: Mapping[str, Metric] = {
             lambda prediction, target, counts: psnr(prediction, target, _both(~strongest(target), counts)),
             by_pixel=True,
         ),
-        Metric("lpips", "LPIPS", ".4f", ("test",), lpips, ("test",), has_lpips, NEEDS_LPIPS),
+        Metric("lpips", "LPIPS", ".4f", ("train", "test"), lpips, ("test",), has_lpips, NEEDS_LPIPS),
     )
 }
 

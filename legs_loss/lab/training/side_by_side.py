@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
+from legs_loss.lab.training.perceptual import use_lpips
 from legs_loss.lab.training.trainer import Progress, TrainConfig, train
 from legs_loss.scenes import read_scene
 from legs_loss.system import Child
@@ -26,6 +27,7 @@ class Arm(NamedTuple):
     caps: Optional[Mapping[int, int]] = None
     evaluate_every: Optional[int] = None
     resume: Optional[bool] = False
+    lpips: Optional[Path] = None  # as use_lpips takes it
 
 
 def train_side_by_side(
@@ -82,6 +84,7 @@ def train_arm(arm: Arm, on_progress: Callable[[Progress], None]) -> Dict[str, An
 
     torch.set_num_threads(1)
     numba.set_num_threads(1)
+    use_lpips(arm.lpips)
     return train(
         read_scene(arm.scene, arm.images),
         arm.config,

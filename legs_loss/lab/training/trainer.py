@@ -270,7 +270,9 @@ class _Run:
         degree = min(self.config.sh_degree, self.iteration // self.schedule.sh_every)
         viewspace = torch.zeros(len(gaussians), 2, requires_grad=True)
         drawn = _rasterize(gaussians, view, self.config, degree, viewspace)
-        loss = step_loss(view.hidden(drawn.image), view.image, self.weights[index], self.config.lambda_dssim)
+        weighted = self.config.weighted(self.iteration)
+        weight = self.weights[index] if weighted else step_weight(None, view, self.config)
+        loss = step_loss(view.hidden(drawn.image), view.image, weight, self.config.lambda_dssim)
         loss.backward()
         if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
             self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image, view.counts))

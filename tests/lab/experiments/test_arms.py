@@ -18,6 +18,7 @@ pytest.importorskip("numba")
 pytest.importorskip("scipy")
 
 from legs_loss.lab.training import trainer
+from legs_loss.lab.training.config import TrainConfig
 from legs_loss.lab.training.dataset import TrainingView, load_dataset, shuffled
 from legs_loss.scenes import read_scene
 from tests.lab.experiments.support import BASE
@@ -45,6 +46,18 @@ def test_names_of_arms() -> None:
     assert [arm.name for arm in needed(parse_arms(["legs@3dgs", "eggs"]))] == ["3dgs", "legs@3dgs", "eggs"]
 
 
+def test_weights_of_a_part_of_the_schedule() -> None:
+    def weighted(name: str) -> List[int]:
+        config = parse_arm(name).config(BASE, 1.0, 1.0)
+        assert TrainConfig.from_dict(config.as_dict()) == config
+        return [iteration for iteration in range(1, 6) if config.weighted(iteration)]
+
+    assert weighted("legs") == [1, 2, 3, 4, 5]
+    assert weighted("legs:until=2") == [1, 2]
+    assert weighted("legs:from=2") == [3, 4, 5]
+    assert weighted("legs:from=1:until=3") == [2, 3]
+
+
 @pytest.mark.parametrize(
     ("name", "says"),
     [
@@ -54,6 +67,10 @@ def test_names_of_arms() -> None:
         ("legs:louder", "no change is named 'louder'"),
         ("legs:lambda=2", "lambda must be a number in"),
         ("legs:lambda=0.2:lambda=0.3", "give lambda once"),
+        ("legs:until=0", "until must be a whole number of at least 1, got '0'"),
+        ("legs:from=2.5", "from must be a whole number"),
+        ("3dgs:until=9", "no weights to change"),
+        ("legs:until", "no change is named 'until'"),
         ("legs:shuffled:shuffled", "give each change once"),
         ("legs:scale:mean1", "scale"),
         ("3dgs:shuffled", "no weights to change"),
@@ -71,7 +88,7 @@ def test_every_study_and_change_can_be_named() -> None:
         folders = [arm.folder for arm in parse_arms(names)]
         assert len(set(folders)) == len(folders) == len(names)
         assert all(folder.replace("-", "").replace(".", "").isalnum() for folder in folders)
-    for change in (name.replace("=X", "=0.3") for name in CHANGES):
+    for change in (name.replace("=X", "=0.3").replace("=N", "=9") for name in CHANGES):
         assert parse_arm(f"legs:{change}").changes == (change,)
 
 

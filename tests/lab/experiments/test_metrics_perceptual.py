@@ -1,26 +1,103 @@
-"""LPIPS as a metric of a comparison, and tables without it."""
+"""LPIPS as a metric of a comparison: its value by torchmetrics, its file, and tables without it."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any, Iterator, Tuple
+
 import pytest
 import torch
+from torch import Tensor
 
+from legs_loss import LegsError
+from legs_loss.cli import main
 from legs_loss.lab.experiments.tables import MISSING, with_values
+from legs_loss.lab.training import perceptual
 from legs_loss.lab.training.metrics import METRICS, left_out, score
+from legs_loss.lab.training.perceptual import network_name, use_lpips
 
 pytest.importorskip("numba")
+MAKERS = {"squeeze": perceptual._squeeze, "alex": perceptual._alex, "vgg": perceptual._vgg}
 
 
-def test_it_is_computed_of_held_out_views_where_it_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
-    image = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0))
-    difference = METRICS["lpips"]._replace(compute=lambda first, second: 0.25, available=lambda: True)
-    monkeypatch.setitem(METRICS, "lpips", difference)  # type: ignore[misc]
-    assert score(image, image)["lpips"] == 0.25
-    assert "lpips" not in score(image, image, "train")
+@pytest.fixture(autouse=True)
+def _no_network_stays() -> Iterator[None]:
+    yield
+    use_lpips(None)
+
+
+def images() -> Tuple[Tensor, Tensor]:
+    first, second = torch.rand(2, 3, 48, 64, generator=torch.Generator().manual_seed(0))
+    return first, second
+
+
+def state_dict(folder: Path, name: str = "squeeze") -> Path:
+    """Write random weights under torchvision's names, with a classifier's beside them."""
+    torch.manual_seed(1)
+    state = {f"features.{key}": value for key, value in MAKERS[name]().features.state_dict().items()}
+    torch.save({**state, "classifier.1.weight": torch.zeros(10, 4)}, str(folder / f"{name}.pth"))
+    return folder / f"{name}.pth"
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_it_is_torchmetrics_own_of_both_splits(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library: Any = pytest.importorskip("torchmetrics.functional.image.lpips")
+    use_lpips(state_dict(tmp_path, name))
+    assert network_name() == name
+    torch.manual_seed(1)
+    features = MAKERS[name]().features
+    monkeypatch.setattr(library, "_get_tv_model_features", lambda net, pretrained=False: features)
+    first, second = images()
+    with torch.no_grad():
+        expected = float(library._LPIPS(net=name, pnet_rand=True)(first[None], second[None], normalize=True))
+    assert expected > 0
+    for split in ("train", "test"):
+        assert score(first, second, split)["lpips"] == pytest.approx(expected, rel=1e-3)
+        assert score(first, first, split)["lpips"] == 0.0
     assert left_out() == ""
-    monkeypatch.setitem(METRICS, "lpips", difference._replace(available=lambda: False))  # type: ignore[misc]
-    assert "lpips" not in score(image, image)
-    assert left_out().startswith("Left out: LPIPS (pip install lpips") and "nothing is downloaded" in left_out()
+    use_lpips(None)
+    assert "lpips" not in score(first, second)
+    assert left_out().startswith("Left out: LPIPS (--lpips WEIGHTS")
+
+
+class _Harm:
+    def __reduce__(self) -> Tuple[Any, ...]:
+        return exec, ("raise SystemExit('a file ran')",)
+
+
+def test_a_wrong_file_is_one_line_and_is_never_run(tmp_path: Path) -> None:
+    path = tmp_path / "weights.pth"
+    with pytest.raises(LegsError, match="cannot read"):
+        use_lpips(path)
+    path.write_bytes(b"no weights")
+    with pytest.raises(LegsError, match="no file of tensors alone: give a state dict of torchvision's squeezenet1_1"):
+        use_lpips(path)
+    for wrong in ({"features.0.weight": torch.zeros(2)}, {1: 2}, [torch.zeros(2)], {"features.0.weight": "text"}):
+        torch.save(wrong, str(path))
+        with pytest.raises(LegsError, match="weights of another network"):
+            use_lpips(path)
+    torch.save({"features.0.weight": _Harm()}, str(path))
+    with pytest.raises(LegsError, match="no file of tensors alone"):
+        use_lpips(path)
+    use_lpips(state_dict(tmp_path))
+    with pytest.raises(LegsError, match="at least 32 pixels a side"):
+        score(torch.rand(3, 20, 64), torch.rand(3, 20, 64))
+
+
+def test_a_comparison_scores_it_in_every_process(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, words = tmp_path / "out", ["--arms", "legs", "--seeds", "1", "--iterations", "3", "-r", "1"]
+    assert main(["compare", str(tiny_scene), "-m", str(out), *words, "--lpips", str(state_dict(tmp_path))]) == 0
+    assert "held-out LPIPS" in capsys.readouterr().out
+    for row in out.glob("*/seed-0/row.json"):
+        found = json.loads(row.read_text(encoding="utf-8"))
+        assert found["versions"]["lpips"] == "squeeze"
+        assert 0 < found["metrics"]["train"]["lpips"] < 10 and 0 < found["metrics"]["test"]["lpips"] < 10
+    assert main(["compare", str(tiny_scene), "-m", str(tmp_path / "other"), *words, "--lpips", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert "cannot read" in said and "Traceback" not in said
 
 
 def test_a_column_that_no_row_has_is_left_out() -> None:

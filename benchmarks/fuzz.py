@@ -230,7 +230,7 @@ def read_comparison(folder: Path) -> None:
     from legs_loss.lab.experiments.running import read_rows
     from legs_loss.lab.experiments.tables import scores_table
     from legs_loss.lab.report import html
-    from legs_loss.lab.report.html_pictures import Pictures
+    from legs_loss.lab.report.html_pictures import ViewPictures
 
     settings, rows = read_rows(folder)
     for row in rows:
@@ -238,7 +238,9 @@ def read_comparison(folder: Path) -> None:
         assert folder.resolve() in place.parents, f"{place} is outside"
     arms = sorted({row["arm"] for row in rows})
     scores_table(rows, arms)
-    html._page(settings, rows, arms, [Pictures("a", 8, 6, {}, 1.0, 1.0, {})], {row["arm"]: row for row in rows}, folder)
+    html._page(
+        settings, rows, arms, [ViewPictures("a", 8, 6, {}, 1.0, 1.0, {})], {row["arm"]: row for row in rows}, folder
+    )
 
 
 def make_checkout(folder: Path) -> None:

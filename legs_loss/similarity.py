@@ -12,12 +12,12 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.images import is_compiling, read_pair, shape_of
 
-__all__ = ["C1", "C2", "SIGMA", "WINDOW_SIZE", "d_ssim", "ssim_map"]
+__all__ = ["SIGMA", "SSIM_C1", "SSIM_C2", "WINDOW_SIZE", "d_ssim", "ssim_map"]
 
 WINDOW_SIZE = 11
 SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
 
 
 def ssim_map(
@@ -59,7 +59,8 @@ def _ssim_map(first: Tensor, second: Tensor, padding: str, window_size: int) -> 
     variance1 = blur(first * first) - mean1_sq
     variance2 = blur(second * second) - mean2_sq
     covariance = blur(first * second) - mean12
-    return ((2 * mean12 + C1) * (2 * covariance + C2)) / ((mean1_sq + mean2_sq + C1) * (variance1 + variance2 + C2))
+    scale = (mean1_sq + mean2_sq + SSIM_C1) * (variance1 + variance2 + SSIM_C2)
+    return ((2 * mean12 + SSIM_C1) * (2 * covariance + SSIM_C2)) / scale
 
 
 _windows: Dict[Tuple[Any, ...], Tensor] = {}  # made on the CPU once, not uploaded at every call

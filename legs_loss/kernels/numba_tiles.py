@@ -20,7 +20,7 @@ import numpy as np
 
 from legs_loss.kernels.compiling import claimed, compiled, inlined, multiply_add, part
 from legs_loss.kernels.numba_weights import weights_of_row
-from legs_loss.similarity import C1, C2, SIGMA, WINDOW_SIZE
+from legs_loss.similarity import SIGMA, SSIM_C1, SSIM_C2, WINDOW_SIZE
 
 __all__ = ["TILE_HEIGHT", "TILE_WIDTH", "all_tiles", "error_row"]
 
@@ -28,7 +28,7 @@ _REACH = WINDOW_SIZE // 2
 _TAPS = np.exp(-((np.arange(WINDOW_SIZE) - _REACH) ** 2) / (2 * SIGMA**2))
 _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32)
 _T0, _T1, _T2, _T3, _T4, _T5 = (np.float32(tap) for tap in _TAPS[: _REACH + 1])
-_C1, _C2 = np.float32(C1), np.float32(C2)
+_C1, _C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 # A tile's inner size; it repeats ten rows and columns of its neighbours' work on each side.

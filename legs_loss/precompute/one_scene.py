@@ -12,7 +12,7 @@ from typing import Callable, Dict, List, Optional, Union
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
-from legs_loss.precompute.one_view import Job, Task, make
+from legs_loss.precompute.one_view import Job, ViewTask, make
 from legs_loss.precompute.own_maps import NO_MAPS, OwnMaps, is_below, stage_own
 from legs_loss.precompute.workers import in_processes
 from legs_loss.scenes import Scene, training_size
@@ -95,7 +95,7 @@ def precompute(
         known: Dict[str, List[Entry]] = {}
         for entry in writer.entries():
             known.setdefault(entry.view, []).append(entry)
-        tasks = [Task(view, known.get(name, [])) for name, view in views.items()]
+        tasks = [ViewTask(view, known.get(name, [])) for name, view in views.items()]
         results = in_processes(job, tasks, workers) if workers > 1 else (make(job, task) for task in tasks)
         staged: List[Entry] = []
         due = time.monotonic()  # the first at once, so that there is a store

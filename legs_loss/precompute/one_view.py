@@ -12,7 +12,7 @@ from legs_loss.scenes import View, image_size, load_training_image, training_siz
 from legs_loss.spec import WeightSpec
 from legs_loss.store import Entry, fingerprint, is_intact, sampled_fingerprint, stage
 
-__all__ = ["Job", "Result", "Task", "make"]
+__all__ = ["Job", "ViewResult", "ViewTask", "make"]
 
 
 class Job(NamedTuple):
@@ -25,14 +25,14 @@ class Job(NamedTuple):
     staging: Path
 
 
-class Task(NamedTuple):
+class ViewTask(NamedTuple):
     """A view to be made."""
 
     view: View
     known: Sequence[Entry]  # what the store has of this view
 
 
-class Result(NamedTuple):
+class ViewResult(NamedTuple):
     """Of one view: a staged entry, or a problem, or neither where the store's map is up to date.
 
     ``problem`` is the photograph's and costs the view; ``unwritable`` is the store's and ends the run.
@@ -44,7 +44,7 @@ class Result(NamedTuple):
     unwritable: Optional[str] = None
 
 
-def make(job: Job, task: Task) -> Result:
+def make(job: Job, task: ViewTask) -> ViewResult:
     """Make the map of a view; errors are in the result."""
     view = task.view
     try:
@@ -65,15 +65,15 @@ def make(job: Job, task: Task) -> Result:
         }
         known = [entry for entry in task.known if entry.sample and wanted.items() <= vars(entry).items()]
         if any(is_intact(job.store, entry) for entry in known):
-            return Result(view.name)
+            return ViewResult(view.name)
         image = load_training_image(view, job.resolution, job.white_background)
         made, levels = normalised_map_and_levels(image, job.spec)
         entry = Entry(fingerprint=fingerprint(image), sample=sampled_fingerprint(image), **wanted, **levels)
         try:
-            return Result(view.name, stage(job.staging, entry, made))
+            return ViewResult(view.name, stage(job.staging, entry, made))
         except OSError as error:  # a full disk, a missing folder: all later views would fail too
-            return Result(view.name, unwritable=error.strerror or str(error))
+            return ViewResult(view.name, unwritable=error.strerror or str(error))
     except LegsError as error:
-        return Result(view.name, problem=str(error))
+        return ViewResult(view.name, problem=str(error))
     except (OSError, MemoryError) as error:
-        return Result(view.name, problem=f"{view.path}: {error or 'not enough memory'}")
+        return ViewResult(view.name, problem=f"{view.path}: {error or 'not enough memory'}")

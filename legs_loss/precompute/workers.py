@@ -9,7 +9,7 @@ from typing import Any, Dict, Generator, Sequence, Tuple
 
 import torch
 
-from legs_loss.precompute.one_view import Job, Result, Task, make
+from legs_loss.precompute.one_view import Job, ViewResult, ViewTask, make
 from legs_loss.system import Child
 
 __all__ = ["in_processes"]
@@ -20,14 +20,14 @@ _PATIENCE = 5.0  # seconds; a process that is killed leaves numba's semaphore be
 _PILLOW = {"PILLOW_BLOCK_SIZE": "64m", "PILLOW_BLOCKS_MAX": "2"}
 
 
-def in_processes(job: Job, tasks: Sequence[Task], workers: int) -> Generator[Result, None, None]:
+def in_processes(job: Job, tasks: Sequence[ViewTask], workers: int) -> Generator[ViewResult, None, None]:
     """Yield the results of worker processes, in the order they come.
 
     Each worker has one task at a time and a pipe of its own: a worker that dies costs one view, and when this process
     dies, the workers find their pipes closed and end.
     """
     waiting = list(reversed(tasks))
-    crew: Dict[Any, Tuple[Child, Task]] = {}  # by this side's end of their pipes
+    crew: Dict[Any, Tuple[Child, ViewTask]] = {}  # by this side's end of their pipes
 
     def give(worker: Child) -> None:
         task = waiting.pop()
@@ -45,7 +45,7 @@ def in_processes(job: Job, tasks: Sequence[Task], workers: int) -> Generator[Res
                     result = worker.connection.recv()
                 except (EOFError, OSError):
                     reason = f"{task.view.path}: the process that read it was killed (out of memory?)"
-                    result = Result(task.view.name, problem=reason)
+                    result = ViewResult(task.view.name, problem=reason)
                     worker.end()
                     worker = Child(_work, job) if waiting else worker
                 if waiting:

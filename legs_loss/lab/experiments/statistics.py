@@ -14,6 +14,7 @@ __all__ = [
     "COLUMNS",
     "Column",
     "Difference",
+    "Rows",
     "Summary",
     "difference",
     "interval",

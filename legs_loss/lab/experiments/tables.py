@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any, List, Mapping, Optional, Sequence, Tuple, TypeVar
+from typing import List, Mapping, Optional, Sequence, Tuple, TypeVar
 
 from legs_loss.lab.experiments.arms import parse_arm
-from legs_loss.lab.experiments.statistics import COLUMNS, Difference, difference, summarise_all, times_gaussians
+from legs_loss.lab.experiments.statistics import COLUMNS, Difference, Rows, difference, summarise_all, times_gaussians
 from legs_loss.lab.training.metrics import METRICS
 
 __all__ = [
@@ -22,7 +22,6 @@ __all__ = [
     "with_values",
 ]
 
-Rows = Sequence[Mapping[str, Any]]
 Cell = TypeVar("Cell", str, Tuple[str, str])
 
 LABELS = [column.label for column in COLUMNS]

@@ -28,7 +28,7 @@ from legs_loss.lab.conventions import (
 )
 
 
-class Splats(NamedTuple):
+class Projections(NamedTuple):
     """Gaussians projected to the image."""
 
     centres: Tensor  # [N, 2] pixels; a pixel's centre has integer coordinates
@@ -53,7 +53,7 @@ def unit_rotations(quaternions: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
 
-def project(points: Tensor, scales: Tensor, quaternions: Tensor, view: View) -> Splats:
+def project(points: Tensor, scales: Tensor, quaternions: Tensor, view: View) -> Projections:
     """Project Gaussians by EWA; their centres `points` [N, 3] are in the camera's axes, beyond the near plane."""
     x, y, z = points.unbind(1)
     centres = torch.stack([view.fx * x / z + view.cx - 0.5, view.fy * y / z + view.cy - 0.5], 1)
@@ -81,7 +81,7 @@ def project(points: Tensor, scales: Tensor, quaternions: Tensor, view: View) -> 
     largest = middle + (middle**2 - determinant).clamp_min(0.1).sqrt()
     radii = (SQUARE * largest.sqrt()).ceil().clamp_max(FARTHEST).detach()
     radii = torch.where(determinant > 0, radii, torch.zeros_like(radii))
-    return Splats(centres, conics, z, radii.to(torch.int32))
+    return Projections(centres, conics, z, radii.to(torch.int32))
 
 
 def tile_bounds(centres: Tensor, radii: Tensor, tiles: Tuple[int, int]) -> Tensor:

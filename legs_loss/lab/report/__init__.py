@@ -1,1 +1,1 @@
-"""Pictures: contact sheets of weight maps and the curves, trainings side by side, a comparison as an HTML page."""
+"""Pictures: trainings side by side, a comparison as an HTML page, TensorBoard's log."""

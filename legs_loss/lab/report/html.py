@@ -15,11 +15,11 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.lab.experiments.arms import BASELINE, parse_arm
-from legs_loss.lab.experiments.running import read_rows, scene_of
+from legs_loss.lab.experiments.running import Row, read_rows, scene_of
 from legs_loss.lab.experiments.statistics import COLUMNS, Difference, difference, summarise_all, times_gaussians
 from legs_loss.lab.experiments.tables import LABELS, MISSING, difference_cell, score_cells, times_cell, with_values
 from legs_loss.lab.report.html_pictures import FORMATS as IMAGE_FORMATS
-from legs_loss.lab.report.html_pictures import Pictures, draw_row, encode
+from legs_loss.lab.report.html_pictures import ViewPictures, draw_row, encode
 from legs_loss.lab.report.html_plots import by_gaussians, by_iterations
 from legs_loss.lab.training.dataset import load_dataset, load_view, open_store, split_views, with_own_maps
 from legs_loss.lab.training.trainer import TrainConfig
@@ -31,8 +31,6 @@ __all__ = ["LIMIT", "write_report"]
 
 LIMIT = 10_000_000  # bytes of a page
 VIEWS = 3  # shown unless others are asked for
-
-Row = Mapping[str, Any]
 
 
 def write_report(
@@ -86,7 +84,7 @@ def _page(
     settings: Mapping[str, Any],
     rows: Sequence[Row],
     arms: Sequence[str],
-    views: Sequence[Pictures],
+    views: Sequence[ViewPictures],
     first: Mapping[str, Row],
     run: Path,
 ) -> str:

@@ -21,7 +21,7 @@ from legs_loss.scenes import image_tensor, open_image
 from legs_loss.scenes.own_maps import dimmed
 from legs_loss.weights import weight_map
 
-__all__ = ["KINDS", "Drawn", "Pictures", "as_bytes", "differing", "draw_row", "encode", "read_picture"]
+__all__ = ["KINDS", "DrawnView", "ViewPictures", "as_bytes", "differing", "draw_row", "encode", "read_picture"]
 
 KINDS = ("rendering", "error", "weight")
 CROPS = 3  # of each pair of arms and each view
@@ -33,14 +33,14 @@ FORMATS: Tuple[Mapping[str, Any], ...] = (
 )
 
 
-class Drawn(NamedTuple):
+class DrawnView(NamedTuple):
     """One arm's view: its rendering [3, H, W] in [0, 1], and the weight map [1, H, W] at the end of its run."""
 
     rendering: Tensor
     weight: Tensor
 
 
-class Pictures(NamedTuple):
+class ViewPictures(NamedTuple):
     """A view as a report shows it.
 
     images: data URIs by arm and kind of picture; the photograph is an arm named "photograph" with a rendering only,
@@ -58,7 +58,7 @@ class Pictures(NamedTuple):
     crops: Dict[str, List[List[int]]]
 
 
-def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView, scene: Optional[Tensor] = None) -> Drawn:
+def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView, scene: Optional[Tensor] = None) -> DrawnView:
     """Draw a view with a row's Gaussians, and make the weight map of its run there.
 
     ``scene`` are the levels of the training views, for weights that are normalised over the scene.
@@ -73,7 +73,7 @@ def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView, scene: Op
     if config.shuffled:
         view = shuffled([view], config.seed)[0]
     weight = step_weight(view.weight, view, config)
-    return Drawn(rendering.clamp(0, 1), torch.ones_like(view.image[:1]) if weight is None else weight)
+    return DrawnView(rendering.clamp(0, 1), torch.ones_like(view.image[:1]) if weight is None else weight)
 
 
 def _upstreams_own(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Tensor:
@@ -91,7 +91,7 @@ def read_picture(path: Path) -> Tensor:
         return image_tensor(np.asarray(image.convert("RGB")))
 
 
-def encode(view: TrainingView, drawn: Mapping[str, Drawn], form: Mapping[str, Any]) -> Pictures:
+def encode(view: TrainingView, drawn: Mapping[str, DrawnView], form: Mapping[str, Any]) -> ViewPictures:
     """Return a view's pictures. All error maps have one scale, and so have all weight maps (from 0)."""
     from matplotlib import colormaps
 
@@ -113,7 +113,7 @@ def encode(view: TrainingView, drawn: Mapping[str, Drawn], form: Mapping[str, An
         if first < second
     }
     height, width = view.image.shape[1:]
-    return Pictures(view.name, width, height, images, most_error, most_weight, crops)
+    return ViewPictures(view.name, width, height, images, most_error, most_weight, crops)
 
 
 def differing(difference: Tensor, count: int = CROPS) -> List[List[int]]:

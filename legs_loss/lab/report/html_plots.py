@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 import io
-from typing import Any, Dict, List, Mapping, Sequence, Tuple
+from typing import Any, Dict, List, Sequence, Tuple
 
 import numpy as np
 
 from legs_loss.errors import require
+from legs_loss.lab.experiments.statistics import Rows
 
 __all__ = ["by_gaussians", "by_iterations", "colours"]
 
-Rows = Sequence[Mapping[str, Any]]
-
 _INK = "#222222"  # replaced by currentColor, so no colour of an arm may be the same
 # Tableau's, in the order that keeps neighbours apart; a tenth and more arms differ by their markers.
-_COLOURS = [
-    "#7f7f7f",
-    "#1f77b4",
-    "#ff7f0e",
-    "#2ca02c",
-    "#d62728",
-    "#9467bd",
-    "#8c564b",
-    "#e377c2",
-    "#17becf",
-    "#bcbd22",
-]
+_COLOURS = (
+    *("#7f7f7f", "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728"),
+    *("#9467bd", "#8c564b", "#e377c2", "#17becf", "#bcbd22"),
+)
 _MARKERS = "osD^vPX*<>"
 
 

@@ -41,8 +41,8 @@ from legs_loss.system import keep_freed_memory, noted, write_whole
 
 __all__ = [
     "Progress",
-    "Result",
     "TrainConfig",
+    "TrainingResult",
     "check_trainable",
     "default_threshold",
     "draw",
@@ -66,7 +66,7 @@ class Progress(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
+class TrainingResult:
     """A finished training: the Gaussians, and what ``metrics.json`` holds."""
 
     gaussians: Gaussians
@@ -103,7 +103,7 @@ def train(
     caps: Optional[Mapping[int, int]] = None,
     evaluate_every: Optional[int] = None,
     stop: Optional[int] = None,
-) -> Result:
+) -> TrainingResult:
     """Train 3D Gaussians on a scene.
 
     Args:
@@ -156,7 +156,7 @@ def train(
             if run.iteration == config.iterations:
                 write_ply(point_cloud(folder, config), run.adam.gaussians)
             _write_json(folder / "metrics.json", metrics)
-        return Result(run.adam.gaussians, metrics)
+        return TrainingResult(run.adam.gaussians, metrics)
 
 
 def check_trainable(scene: Scene) -> None:

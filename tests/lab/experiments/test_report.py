@@ -26,7 +26,7 @@ pytest.importorskip("matplotlib")
 from legs_loss.lab.experiments.arms import parse_arms
 from legs_loss.lab.experiments.running import Comparison, read_rows
 from legs_loss.lab.report import html as report
-from legs_loss.lab.report.html_pictures import FORMATS, Drawn, differing, draw_row, encode
+from legs_loss.lab.report.html_pictures import FORMATS, DrawnView, differing, draw_row, encode
 from legs_loss.lab.training.dataset import TrainingView, load_view, split_views
 from legs_loss.lab.training.trainer import TrainConfig
 from legs_loss.scenes import read_scene
@@ -88,7 +88,7 @@ def test_a_mask_darkens_the_photograph_and_hides_errors(comparison: Path, tiny_s
     view = load_view(scene, split_views(scene)[1][0], 1)
     mask = torch.ones(1, *view.image.shape[1:])
     mask[..., :16] = 0
-    drawn = {"3dgs": Drawn((view.image + 0.5).clamp(0, 1), torch.ones_like(mask))}
+    drawn = {"3dgs": DrawnView((view.image + 0.5).clamp(0, 1), torch.ones_like(mask))}
 
     def pixels(view: TrainingView, arm: str, kind: str) -> np.ndarray:
         uri = encode(view, drawn, FORMATS[0]).images[arm][kind]
@@ -292,7 +292,7 @@ def test_what_a_stranger_named_is_shown_and_not_run(page_path: Path, comparison:
         row["config"]["spec"]["curve"] = row["versions"]["torch"] = f'"{attack}'
     first = {row["arm"]: dict(row, seed=attack) for row in rows}
     named = dict(settings, scene=dict(settings["scene"], name=attack))
-    view = report.Pictures(attack, 8, 6, {}, 1.0, 1.0, {})
+    view = report.ViewPictures(attack, 8, 6, {}, 1.0, 1.0, {})
     page = report._page(named, rows, ["3dgs"], [view], first, comparison)
     assert page.count("<script") == 2
     assert "<img src=x" not in page

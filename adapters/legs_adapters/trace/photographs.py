@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Any, List, NamedTuple, Optional, Sequence, Set, Tuple
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 from legs_loss import LegsError
 
 __all__ = ["SIDE", "SURE", "Match", "Photographs", "thumbnail"]
 
 SIDE = 16  # pixels of a thumbnail
-SURE = 0.98  # the correlation from which on a picture is a file's
+SURE = 0.94  # the correlation from which on a picture is a file's
+DETAIL = 0.6  # that of what thumbnails four times as large have beside it: less is a rendering, or another view
 MAX_FILES = 4000
+Picture = Tuple[Any, Any, Optional[Any]]
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm")
 _OTHER = re.compile(  # the words of a folder, or of a file's name, whose pictures are no photographs
     r"(?i)(^|[^a-z])(normals?|nrm|depths?|disp|disparity|masks?|seg|segmentations?|semantics?|labels?|flow|edges?|"
@@ -48,11 +50,12 @@ class Photographs:
             is_photograph = bool(photos) or (_is_listed(path, listed) if listed else not _OTHER.search(inside))
             self._tiers[not is_photograph].append(path)
         self._known: List[Any] = [None, None]
+        self._fine: Dict[Tuple[str, int], Any] = {}
 
     def __len__(self) -> int:
         return sum(map(len, self._tiers))
 
-    def match(self, picture: Tuple[Any, Any]) -> Optional[Match]:
+    def match(self, picture: Picture) -> Optional[Match]:
         """Return the file that a picture's thumbnail is most like: a photograph first; None without files."""
         best: Optional[Match] = None
         for tier, files in enumerate(self._tiers):
@@ -61,15 +64,34 @@ class Photographs:
                 best = Match(os.path.relpath(files[found[0]], self.root), found[1], not tier)
             if best is not None and best.correlation >= SURE:
                 break
-        return best
+        if best is None or best.correlation < SURE:
+            return best
+        detail = self._detail(os.path.join(self.root, best.path), picture)
+        return best if detail >= DETAIL else best._replace(correlation=min(best.correlation, SURE * max(detail, 0.0)))
 
-    def _best(self, tier: int, picture: Tuple[Any, Any]) -> Optional[Tuple[int, float]]:
+    def _detail(self, path: str, picture: Picture) -> float:
+        """Return the correlation with a file's detail; 1 where the picture is too small to have any."""
+        import numpy as np
+
+        _, kept, fine = picture
+        if fine is None:
+            return 1.0
+        scale = round((fine.shape[1] / kept.size) ** 0.5)
+        inside = kept.reshape(SIDE, SIDE).repeat(scale, 0).repeat(scale, 1).ravel()
+        one = _standardised(fine[:, inside]).ravel()
+        key = path, scale
+        if key not in self._fine:
+            self._fine[key] = _thumbnails([path], scale * SIDE)[1]
+        scores = [_standardised(_high(other, scale)[:, inside]) for other in self._fine[key]]
+        return max((float(np.dot(score[::way].ravel(), one)) for score in scores for way in (1, -1)), default=0.0)
+
+    def _best(self, tier: int, picture: Picture) -> Optional[Tuple[int, float]]:
         import numpy as np
 
         if self._known[tier] is None:
             self._known[tier] = _thumbnails(self._tiers[tier])
         files, stack = self._known[tier]  # [F], [F, 3, 256]
-        thumb, kept = picture
+        thumb, kept, _ = picture
         if not len(files) or kept.sum() < 16:
             return None
         one = _standardised(thumb[:, kept])
@@ -89,8 +111,8 @@ def _standardised(thumbs: Any) -> Any:
     return found.reshape(len(found), -1) if found.ndim == 3 else found
 
 
-def thumbnail(picture: Any) -> Optional[Tuple[Any, Any]]:
-    """Return a picture's thumbnail [3, 256] in [0, 1] or so, and which of its pixels are not flat background.
+def thumbnail(picture: Any) -> Optional[Picture]:
+    """Return a picture's thumbnail [3, 256] in [0, 1] or so, which pixels of it are no flat background, and its detail.
 
     Args:
         picture: a tensor, [3, H, W], [H, W, 3], or of such a batch; of one of four channels the first three. Of a batch
@@ -107,24 +129,42 @@ def thumbnail(picture: Any) -> Optional[Tuple[Any, Any]]:
         return None
     with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
         image = torch.nan_to_num(image[:3].float())
-        rows, columns = (torch.as_tensor(_areas(n), dtype=image.dtype, device=image.device) for n in image.shape[1:])
-        pool = rows @ image @ columns.t()
+        scale = min(4, min(image.shape[1:]) // SIDE)
+        pool, fine = _pooled(image, SIDE), _pooled(image, scale * SIDE) if scale > 1 else None
         high = torch.nn.functional.adaptive_max_pool2d(image[None], SIDE)[0]
         low = -torch.nn.functional.adaptive_max_pool2d(-image[None], SIDE)[0]
         flat = ((high - low).amax(0) < 1e-6).cpu().numpy().ravel()
-        thumb = pool.reshape(3, -1).cpu().numpy().astype(np.float64)
-    kept = ~flat if 0 < flat.sum() <= 0.9 * flat.size else np.ones_like(flat)
-    return thumb, kept
+    if flat.all():
+        return pool, ~flat, None
+    ground = flat.reshape(SIDE, SIDE)
+    wide = np.pad(ground, 1)  # the cells at its border have a part of it
+    near = np.any([wide[i : i + SIDE, j : j + SIDE] for i in range(3) for j in range(3)], 0).ravel()
+    kept = ~near if (~near).sum() >= 16 else ~flat
+    return pool, kept, None if fine is None else _high(fine, scale)
 
 
-def _areas(count: int) -> Any:
-    """Return the weights [SIDE, count] of the means over equal parts of a row of pixels, exact at their borders."""
+def _pooled(image: Any, side: int) -> Any:
+    """Return the means over equal parts of an image [3, H, W], as an array [3, side * side]."""
+    import torch
+
+    rows, columns = (torch.as_tensor(_areas(n, side), device=image.device) for n in image.shape[1:])
+    return (rows @ image @ columns.t()).reshape(3, -1).cpu().numpy().astype("float64")
+
+
+def _high(thumb: Any, scale: int) -> Any:
+    """Return a large thumbnail [3, n] without its means over cells of that many pixels."""
+    cells = thumb.reshape(3, SIDE, scale, SIDE, scale)
+    return (cells - cells.mean((2, 4), keepdims=True)).reshape(3, -1)
+
+
+def _areas(count: int, side: int = SIDE) -> Any:
+    """Return the weights [side, count] of the means over equal parts of a row of pixels, exact at their borders."""
     import numpy as np
 
-    edges = np.linspace(0, count, SIDE + 1)
+    edges = np.linspace(0, count, side + 1)
     pixels = np.arange(count)
     low, high = np.maximum(edges[:-1, None], pixels), np.minimum(edges[1:, None], pixels + 1)
-    return (np.maximum(high - low, 0) * (SIDE / count)).astype(np.float32)
+    return (np.maximum(high - low, 0) * (side / count)).astype(np.float32)
 
 
 def as_planes(tensor: Any) -> Optional[Any]:
@@ -173,7 +213,7 @@ def _is_listed(path: str, listed: Set[Tuple[str, str]]) -> bool:
     return _key(path) in listed
 
 
-def _thumbnails(files: Sequence[str]) -> Tuple[Any, Any]:
+def _thumbnails(files: Sequence[str], side: int = SIDE) -> Tuple[Any, Any]:
     """Return the indices of the files that could be read, and thumbnails; of one with alpha on black and white too."""
     import numpy as np
     from PIL import Image
@@ -194,5 +234,5 @@ def _thumbnails(files: Sequence[str]) -> Tuple[Any, Any]:
         for picture in pictures:
             values = np.asarray(picture, np.float32).transpose(2, 0, 1) / 255
             indices.append(at)
-            thumbs.append((_areas(values.shape[1]) @ values @ _areas(values.shape[2]).T).reshape(3, -1))
-    return np.asarray(indices, int), np.asarray(thumbs).reshape(-1, 3, SIDE * SIDE)
+            thumbs.append((_areas(values.shape[1], side) @ values @ _areas(values.shape[2], side).T).reshape(3, -1))
+    return np.asarray(indices, int), np.asarray(thumbs).reshape(-1, 3, side * side)

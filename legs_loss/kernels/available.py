@@ -78,12 +78,11 @@ class Backends:
 
     def ready(self, device: torch.device, operation: Optional[str] = None) -> Optional[Backend]:
         """Return the backend of an operation on a device, None where that is torch: also where no trial may run now."""
-        if is_capturing(device) and any(
-            self._known_already(name, device, operation) is None for name in self.names(device)
-        ):
+        names = [name for name, known in self._known.items() if known.device == device.type]
+        if is_capturing(device) and any(self._known_already(name, device, operation) is None for name in names):
             return None  # a trial waits for the device, which would break a capture
-        name = self.chosen(device, operation)
-        return None if name == "torch" else self.availability(name, device, operation).backend
+        name = forced_backend() or (names[0] if names else "torch")
+        return self.availability(name, device, operation).backend if name in names else None
 
     def availability(self, name: str, device: torch.device, operation: Optional[str] = None) -> Availability:
         """Return whether a backend is available on a device for an operation ("loss", "l1", "ssim"; None: all it has).

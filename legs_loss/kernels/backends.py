@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Callable, Optional
+from typing import Any, Callable, Optional
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from legs_loss.kernels.contract import Backend, DeviceFault, NotNow, Weights
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import weight_map
 
-__all__ = ["fused_l1", "fused_loss", "fused_range", "fused_ssim"]
+__all__ = ["fused_l1", "fused_l1_of_target", "fused_loss", "fused_range", "fused_ssim"]
 
 
 def fused_loss(
@@ -37,6 +37,15 @@ def fused_loss(
 def fused_l1(prediction: Tensor, target: Tensor, weights: Weights) -> Optional[Tensor]:
     """Return what :func:`legs_loss.weighted_l1` returns, by the backend for these images; None where that is torch."""
     return _fused("l1", prediction, target, weights, lambda backend, *given: backend.weighted_l1(*given))
+
+
+def fused_l1_of_target(prediction: Tensor, target: Tensor, spec: WeightSpec) -> Optional[Tensor]:
+    """Return :func:`fused_l1` with the weights of a spec, where a backend makes them in its own pass; else None."""
+
+    def run(backend: Backend, first: Tensor, second: Tensor, resolved: Weights) -> Optional[Tensor]:
+        return None if resolved.spec is None else backend.weighted_l1(first, second, resolved)
+
+    return _fused("l1", prediction, target, Weights(spec), run, with_maps=False)
 
 
 def fused_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros") -> Optional[Tensor]:
@@ -104,14 +113,14 @@ def _resolved(backend: Backend, weights: Weights, target: Tensor, with_maps: boo
 
 def _plain_tensors(prediction: Tensor, *constants: Optional[Tensor]) -> bool:
     """Return whether the values are in plain memory, and only the prediction needs a gradient."""
-    given = [tensor for tensor in constants if isinstance(tensor, Tensor)]
-    return not any(tensor.requires_grad for tensor in given) and not any(map(_is_special, (prediction, *given)))
+    for tensor in (prediction, *constants):
+        if tensor is None:
+            continue
+        if type(tensor) not in (Tensor, torch.nn.Parameter) or (tensor.requires_grad and tensor is not prediction):
+            return False
+        if _is_wrapped is not None and _is_wrapped(tensor):
+            return False
+    return prediction is not constants[0] or not prediction.requires_grad
 
 
-def _is_special(tensor: Tensor) -> bool:
-    """Return whether this is a subclass of Tensor, or wrapped by torch.func."""
-    if type(tensor) not in (Tensor, torch.nn.Parameter):
-        return True
-    functorch = getattr(torch._C, "_functorch", None)
-    wrapped = getattr(functorch, "is_functorch_wrapped_tensor", None)
-    return wrapped is not None and wrapped(tensor)
+_is_wrapped: Any = getattr(getattr(torch._C, "_functorch", None), "is_functorch_wrapped_tensor", None)  # by torch.func

@@ -6,6 +6,7 @@ other curve", which would silently compute something else.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import FrozenSet, NamedTuple, Optional
 
 import torch
@@ -73,8 +74,8 @@ class Backend:
 
     def makes_weights_of(self, spec: WeightSpec) -> bool:
         """Return whether the weights of a spec need no map: it differs from the defaults in what is known here only."""
-        known = WeightSpec(operator=spec.operator, p=spec.p, curve=spec.curve, beta=spec.beta, eps=spec.eps)
-        return spec == known and spec.operator in self.operators and spec.p in self.norms and spec.curve in self.curves
+        known = spec.operator in self.operators and spec.p in self.norms and spec.curve in self.curves
+        return known and _is_known(spec)
 
     def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
         """Return the min response of each view, and max - min: float32 [B, 2] on its device.
@@ -95,3 +96,8 @@ class Backend:
     def ssim(self, prediction: Tensor, target: Tensor) -> Tensor:
         """Return the mean SSIM, with zero padding."""
         raise NotImplementedError
+
+
+@lru_cache(maxsize=64)
+def _is_known(spec: WeightSpec) -> bool:
+    return spec == WeightSpec(operator=spec.operator, p=spec.p, curve=spec.curve, beta=spec.beta, eps=spec.eps)

@@ -45,7 +45,9 @@ class _FusedLoss(torch.autograd.Function):
         loss, gradient = compute(wanted, prediction.detach(), constants)
         if wanted:
             ctx.compute, ctx.scale, ctx.gradient = compute, scale, gradient
-            ctx.save_for_backward(prediction, *map(_counted, constants))
+            # Of a tensor that was made in inference mode a copy, whose changes autograd can count.
+            counted = [one.clone() if one is not None and one.is_inference() else one for one in constants]
+            ctx.save_for_backward(prediction, *counted)
         return loss
 
     @staticmethod
@@ -56,8 +58,3 @@ class _FusedLoss(torch.autograd.Function):
             prediction, *constants = ctx.saved_tensors
             gradient = ctx.compute(True, prediction.detach(), constants)[1]
         return (ctx.scale(gradient, grad_output), *[None] * (len(ctx.needs_input_grad) - 1))
-
-
-def _counted(constant: Optional[Tensor]) -> Optional[Tensor]:
-    """Return a tensor whose changes autograd can count: of one that was made in inference mode, a copy."""
-    return constant.clone() if constant is not None and constant.is_inference() else constant

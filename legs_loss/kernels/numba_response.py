@@ -95,8 +95,10 @@ def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
     found = np.empty((views * strips, 3), np.float32)
     shape = Shape(views, channels, height, width)
     in_threads(_strips, views * strips, image.reshape(-1), shape, operator_of(spec), strips, found)
-    low, high, excess = found.reshape(views, strips, 3).transpose(2, 0, 1)
-    return np.stack([low.min(1), high.max(1), excess.sum(1)], 1)
+    out, found = np.empty((views, 3), np.float32), found.reshape(views, strips, 3)
+    for number, join in enumerate((np.minimum, np.maximum, np.add)):
+        join.reduce(found[:, :, number], 1, out=out[:, number])
+    return out
 
 
 @compiled(fastmath=False)

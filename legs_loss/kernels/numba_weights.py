@@ -103,9 +103,10 @@ def response_range(target: Tensor, spec: WeightSpec) -> Tensor:
         LegsError: a target with NaN, infinity or plainly of 0..255.
     """
     found = extremes(_flat(target).reshape(-1, *target.shape[-3:]), spec)
-    if found[:, 2].sum() != 0.0:  # or NaN; overshoots are fine
+    if np.add.reduce(found[:, 2]) != 0.0:  # or NaN; overshoots are fine
         check_values(target)
-    return torch.from_numpy(np.stack([found[:, 0], found[:, 1] - found[:, 0]], 1))
+    found[:, 1] -= found[:, 0]
+    return torch.from_numpy(found[:, :2])
 
 
 @part(fastmath=False)

@@ -49,3 +49,7 @@ def on_post_build(config: Any, **_: Any) -> None:
     """Write the index of the search as a script, too: a page that is opened from the disk cannot read the other."""
     index = Path(config["site_dir"], "search", "search_index.json")
     index.with_suffix(".js").write_text(f"var __index = {index.read_text(encoding='utf-8')}", encoding="utf-8")
+    # Without an address of the site the page for what is not found links to the root of the host.
+    lost = Path(config["site_dir"], "404.html")
+    text = re.sub(r'(href|src)="/(?!/)', r'\1="./', lost.read_text(encoding="utf-8"))
+    lost.write_text(text.replace('"base": "/"', '"base": "."'), encoding="utf-8")

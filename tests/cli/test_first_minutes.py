@@ -155,7 +155,7 @@ class TestResolution:
         pytest.importorskip("matplotlib")
         code, text = says(capsys, command, scene / "images", "--out", tmp_path / "run")
         assert (code, text.count("\n")) == (2, 1)
-        assert "has no camera: training needs a scene with poses (COLMAP's sparse/0)" in text
+        assert "is a folder of pictures without camera poses: training needs a scene with sparse/0 of COLMAP" in text
         assert not (tmp_path / "run").exists()
 
 

@@ -92,7 +92,9 @@ def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) 
             photograph.imshow(unit.squeeze(-1) if unit.shape[-1] == 1 else unit, cmap="gray", vmin=0, vmax=1)
         strengths = response.imshow(view.normalised.astype(np.float32), cmap="magma", vmin=0, vmax=brightest)
         weights = weighted.imshow(weight, cmap="viridis", vmin=0 if own else 1, vmax=(1 + (spec.beta or 1)) * most)
-        weighted.set_xlabel(f"mean weight {weight.mean():.2f}", fontsize=9, color=_INK)
+        mean = weight.sum() / (weight.size if view.mask is None else max(float(view.mask.sum()), 1e-9))
+        over = "" if view.mask is None else " of what counts"
+        weighted.set_xlabel(f"mean weight{over} {mean:.2f}", fontsize=9, color=_INK)
         if len(views) > 1:
             photograph.set_title(label(view.label), fontsize=10, color=_INK)
     names = ["photograph", *(["mask"] if masked else []), r"response  $\hat{E}$", "weight  $W$"]

@@ -28,7 +28,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add_scene_arguments(parser)
     parser.add_argument(
-        "-m", "--out", type=Path, default=Path("legs_demo"), metavar="DIR", help="default: legs_demo; replaced"
+        "-m",
+        "--out",
+        type=Path,
+        default=Path("legs_demo"),
+        metavar="DIR",
+        help="for all results; default: legs_demo; those of an earlier demo there are replaced",
     )
     parser.add_argument("--iterations", type=int, default=1200, metavar="N", help="of each training; default: 1200")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: 0")

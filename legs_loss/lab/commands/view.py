@@ -20,8 +20,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     from legs_loss.spec import PRESETS
 
-    parser.add_argument("path", metavar="RUN|PLY|COMPARISON", type=Path, help="what to view")
-    parser.add_argument("-s", "--scene", type=Path, metavar="DIR", help="photographs; default: those of the comparison")
+    parser.add_argument(
+        "path", metavar="RUN|PLY|COMPARISON", type=Path, help="a training's folder, a .ply, or a folder of several"
+    )
+    parser.add_argument(
+        "-s",
+        "--scene",
+        type=Path,
+        metavar="DIR",
+        help="the scene that was trained, for its cameras and photographs; default: the comparison's",
+    )
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="of the weight maps; default: legs")
     parser.add_argument("--port", type=int, default=8080, metavar="N", help="default: 8080, or the next that is free")
     parser.add_argument(

@@ -19,6 +19,7 @@ __all__ = [
     "scores_table",
     "tables",
     "times_cell",
+    "too_short",
     "with_values",
 ]
 
@@ -26,6 +27,7 @@ Cell = TypeVar("Cell", str, Tuple[str, str])
 
 LABELS = [column.label for column in COLUMNS]
 MISSING = "–"  # of a row that is older than the metric, or of held-out views where there are none
+DECIDES = 500  # iterations: until then 3DGS's schedule adds no Gaussian
 SAME_NUMBER = 0.01  # of the Gaussians: the count control's promise
 
 
@@ -109,9 +111,17 @@ def differences_table(rows: Rows, arms: Sequence[str]) -> str:
     return markdown(*with_values(["difference", *DIFFERENCES, "Gaussians"], lines))
 
 
+def too_short(rows: Rows) -> str:
+    """Return why no difference of these rows is given: they were trained too shortly; "" where they were not."""
+    fewest = min((row.get("config", {}).get("iterations", DECIDES) for row in rows), default=DECIDES)
+    if fewest >= DECIDES:
+        return ""
+    return f"Too short to decide: {fewest} iterations. Differences are given from {DECIDES} iterations on."
+
+
 def tables(rows: Rows, arms: Sequence[str]) -> str:
-    """Return the scores of the arms, and their differences."""
-    return f"{scores_table(rows, arms)}\n\n{differences_table(rows, arms)}"
+    """Return the scores of the arms, and their differences or why none is given."""
+    return f"{scores_table(rows, arms)}\n\n{too_short(rows) or differences_table(rows, arms)}"
 
 
 def difference_cell(value: Optional[Difference], score: str) -> str:

@@ -17,7 +17,15 @@ from legs_loss.errors import LegsError
 from legs_loss.lab.experiments.arms import BASELINE, parse_arm
 from legs_loss.lab.experiments.running import Row, read_rows, scene_of
 from legs_loss.lab.experiments.statistics import COLUMNS, Difference, difference, summarise_all, times_gaussians
-from legs_loss.lab.experiments.tables import LABELS, MISSING, difference_cell, score_cells, times_cell, with_values
+from legs_loss.lab.experiments.tables import (
+    LABELS,
+    MISSING,
+    difference_cell,
+    score_cells,
+    times_cell,
+    too_short,
+    with_values,
+)
 from legs_loss.lab.report.html_pictures import FORMATS as IMAGE_FORMATS
 from legs_loss.lab.report.html_pictures import ViewPictures, draw_row, encode
 from legs_loss.lab.report.html_plots import by_gaussians, by_iterations
@@ -112,7 +120,8 @@ def _page(
             f"{len(arms)} arms, {len(seeds)} seed(s), {base['iterations']:,} iterations of 3D Gaussian Splatting each, "
             f"on {views[0].width}x{views[0].height} photographs."
         ),
-        verdict=_verdict(rows, arms, preferred),
+        verdict=too_short(rows) or _verdict(rows, arms, preferred),
+        short=too_short(rows),
         scores=_scores(rows, arms),
         differences=_differences(rows, others) if BASELINE in arms and others else None,
         baseline=BASELINE,
@@ -225,7 +234,7 @@ def _proof(proof: Mapping[str, Any]) -> str:
 def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[int], run: Path) -> str:
     base = settings["base"]
     program = ["legs", "compare"] if "upstream" not in settings else ["python", "examples/reproduce_paper/compare.py"]
-    words = [*program, settings["scene"]["name"], *(["CHECKOUT"] if "upstream" in settings else [])]
+    words = [*program, settings["path"], *(["CHECKOUT"] if "upstream" in settings else [])]
     words += ["--arms", *(arm for arm in arms if arm != BASELINE), "--seeds", str(seeds[-1] + 1)]
     words += ["--images", settings["images"]] if settings["images"] is not None else []
     own = settings.get("upstream", base)
@@ -235,8 +244,8 @@ def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[i
         words += ["--profile", own["profile"], *(["--cpu"] if own["cpu"] else [])]
         words += ["--gaussians", str(own["gaussians"])] if own["gaussians"] is not None else []
         words += ["--extra=" + " ".join(map(shlex.quote, own["extra"]))] if own["extra"] else []
-        return " ".join(shlex.quote(word) for word in [*words, "--out", run.name])
-    words += ["--densify_grad_threshold", f"{base['densify_grad_threshold']!r}", "--out", run.name]
+        return " ".join(shlex.quote(word) for word in [*words, "--out", str(run)])
+    words += ["--densify_grad_threshold", f"{base['densify_grad_threshold']!r}", "--out", str(run)]
     return " ".join(shlex.quote(word) for word in words)
 
 

@@ -190,6 +190,11 @@ def pinhole_camera(scene: Scene, view: View) -> Camera:
             f"{scene.root}: the camera of {view.name} is of the model {view.camera_model}: training needs PINHOLE or "
             "SIMPLE_PINHOLE: undistort the photographs first (colmap image_undistorter, or 3DGS's convert.py)"
         )
+    if scene.kind == "folder":
+        raise LegsError(
+            f"{scene.root} is a folder of pictures without camera poses: training needs a scene with sparse/0 of "
+            "COLMAP or transforms.json; legs scene makes one of photographs"
+        )
     raise LegsError(f"{scene.root}: {view.name} has no camera: training needs a scene with poses (COLMAP's sparse/0)")
 
 

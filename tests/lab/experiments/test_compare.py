@@ -204,6 +204,7 @@ def test_the_command(tiny_scene: Path, tmp_path: Path) -> None:
     rows = read_rows(tmp_path / "out")[1]
     assert len(rows) == 6
     assert scores_table(rows, ["3dgs", "legs", "legs@3dgs"]) in done.stdout
+    assert "Too short to decide: 20 iterations" in done.stdout and "legs − 3dgs" not in done.stdout
     again = subprocess.run(arguments, env=environment(), capture_output=True, text=True, encoding="utf-8")
     assert again.returncode == 0
     assert "0 of 6 trainings to do" in again.stdout

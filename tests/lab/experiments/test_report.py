@@ -51,7 +51,7 @@ def page_path(comparison: Path) -> Path:
     return comparison / "report.html"
 
 
-def test_the_page_needs_nothing_else(page_path: Path, comparison: Path) -> None:
+def test_the_page_needs_nothing_else(page_path: Path, comparison: Path, tiny_scene: Path) -> None:
     text = page_path.read_text(encoding="utf-8")
     assert len(text) < report.LIMIT
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:|#)|@import|url\((?!#)|fetch\(""", text)
@@ -60,7 +60,8 @@ def test_the_page_needs_nothing_else(page_path: Path, comparison: Path) -> None:
     settings = read_rows(comparison)[0]
     assert settings["scene"]["sha256"] in text
     assert "its loss is" in text and "torch" in text
-    assert "legs compare table --arms legs legs:scale legs:shuffled --seeds 2 -r 1 --iterations 30" in text
+    assert f"legs compare {tiny_scene} --arms legs legs:scale legs:shuffled --seeds 2 -r 1 --iterations 30" in text
+    assert text.count("Too short to decide: 30 iterations. Differences are given from 500 iterations on.") == 2
     ids = re.findall(r'\bid="([^"]+)"', text)
     assert len(set(ids)) == len(ids)
     assert "#222222" not in text  # plots take the page's ink

@@ -12,7 +12,7 @@ import pytest
 from legs_loss import LegsError
 from legs_loss.lab.commands.demo import table as demo_table
 from legs_loss.lab.experiments.statistics import difference, interval, pooled_difference, summarise, times_gaussians
-from legs_loss.lab.experiments.tables import differences_table, markdown, scores_table
+from legs_loss.lab.experiments.tables import differences_table, markdown, scores_table, tables
 
 pytest.importorskip("numba")
 pytest.importorskip("scipy")
@@ -148,3 +148,11 @@ def test_tables_by_hand() -> None:
     assert times_gaussians(rows, "legs", "eggs") is None
     assert "legs − 3dgs" in differences and "+1.00 [+1.00, +1.00]" in differences and "2.50x" in differences
     assert len({len(line) for line in markdown(("a", "b"), (("x", "1"), ("long", "22"))).splitlines()}) == 1
+
+
+def test_a_short_comparison_gives_no_differences() -> None:
+    rows = [row_of(arm, seed, {"a": 20.0 + seed, "b": 21.0}) for arm in ("3dgs", "legs") for seed in range(2)]
+    short = [{**row, "config": {"iterations": 499}} for row in rows]
+    assert "Too short to decide: 499 iterations" in tables(short, ["3dgs", "legs"])
+    long = tables([{**row, "config": {"iterations": 500}} for row in rows], ["3dgs", "legs"])
+    assert "Too short" not in long and "legs − 3dgs" in long

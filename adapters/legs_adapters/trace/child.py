@@ -60,7 +60,12 @@ def _tracing(spec: Dict[str, Any]) -> Content:
 
     def content() -> Dict[str, Any]:
         terms = list(watch.terms.values())
-        counts = {"steps": watch.steps, "backward_passes": watch.backward_passes, "files": len(watch.photographs)}
+        counts: Dict[str, Any] = {
+            "steps": watch.steps,
+            "backward_passes": watch.backward_passes,
+            "files": len(watch.photographs),
+        }
+        counts["failure"] = watch.failure
         return {"terms": terms, "is_over": bool(over), **counts}
 
     watch = Watch(spec["root"], Photographs(spec["folders"], spec["photos"]), spec["steps"], ended)

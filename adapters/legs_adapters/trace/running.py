@@ -69,6 +69,8 @@ def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optio
     if code:
         message = f"{script} ended with exit code {code}; nothing was changed. By reading: legs-patch {root}"
         raise ScriptFailed(message, code if code > 0 else 128 - code)
+    if content.get("failure"):
+        say(f"legs-patch: warning: a difference could not be watched ({content['failure']})", sys.stderr)
     terms = [Traced.read(term, SURE) for term in content["terms"]]
     if not content["steps"]:
         seen = f"{content['backward_passes']} backward passes" if content["backward_passes"] else "no backward pass"

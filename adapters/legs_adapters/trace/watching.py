@@ -32,6 +32,23 @@ _OWNERS = (  # where torch has each difference; the operand from which is subtra
 Frame = Tuple[str, int, str, Tuple[str, ...]]
 
 
+def _harmless(own: Any) -> Any:
+    """Wrap a method so that nothing of it is watched, and none of its errors reach the script: the first is kept."""
+
+    @functools.wraps(own)
+    def guarded(self: Any, *args: Any) -> Any:
+        self._inside = True
+        try:
+            return own(self, *args)
+        except Exception as error:
+            self.failure = self.failure or f"{type(error).__name__}: {error}"
+            return None
+        finally:
+            self._inside = False
+
+    return guarded
+
+
 class _Record(NamedTuple):
     """A difference: its kind, frames, which operand is the target, and that one's thumbnail and shape."""
 
@@ -72,6 +89,7 @@ class Watch:
         self._files: Dict[str, Optional[str]] = {}
         self._inside = False
         self._names: Dict[int, str] = {}
+        self.failure = ""
 
     def install(self) -> None:
         """Wrap torch's differences, its backward passes and its optimisers, for good."""
@@ -125,31 +143,28 @@ class Watch:
 
         function.apply = classmethod(apply)
 
+    @_harmless
     def _record(self, kind: str, sides: Sequence[Any], made: Any) -> None:
         moving = [side.requires_grad for side in sides]
         largest = max(sides, key=lambda side: side.numel())
         if largest.dim() < 2 or largest.numel() < 64 or not any(moving):
             return
-        self._inside = True
-        try:
-            target = -1 if all(moving) else moving.index(False)
-            frames = self._frames(sides)
-            if not frames:
-                return
-            still = sides[target] if target >= 0 else sides[1]
-            picture = thumbnail(still) if target >= 0 else None
-            node = made.grad_fn
-            record = _Record(kind, frames, target, picture, tuple(still.shape), made.detach(), [])
-            if KEY not in node.metadata:  # of nested functions the inner one
-                node.metadata[KEY] = record
-                node.register_hook(functools.partial(_share, record.shares, record.values))
-        finally:
-            self._inside = False
+        target = -1 if all(moving) else moving.index(False)
+        frames = self._frames(sides)
+        if not frames:
+            return
+        still = sides[target] if target >= 0 else sides[1]
+        picture = thumbnail(still) if target >= 0 else None
+        node = made.grad_fn
+        record = _Record(kind, frames, target, picture, tuple(still.shape), made.detach(), [])
+        if KEY not in node.metadata:  # of nested functions the inner one
+            node.metadata[KEY] = record
+            node.register_hook(functools.partial(_share, record.shares, record.values))
 
     def _frames(self, sides: Sequence[Any]) -> Tuple[Frame, ...]:
         """Return the frames of the checkout, innermost first, each with its names of the two sides."""
         found: List[Frame] = []
-        frame = sys._getframe(3)
+        frame = sys._getframe(4)
         while frame is not None:
             path = self._inside_root(frame.f_code.co_filename)
             if path is None and not found and frame.f_globals.get("__name__", "").startswith(_OWN):
@@ -175,47 +190,41 @@ class Watch:
                 return own(tensors, *args, **kwargs)
             self._settle(False)  # what was stepped without an optimiser of torch's
             roots = list(tensors) if isinstance(tensors, (tuple, list)) else [tensors]
-            seen = self._seen(roots)
+            seen = self._seen(roots) or []
             made = own(tensors, *args, **kwargs)
             self._sum_up(roots, seen)
             return made
 
         return watched
 
+    @_harmless
     def _seen(self, roots: Sequence[Any]) -> List[Tuple[_Record, str, Dict[int, Any]]]:
         """Return the records under the roots, with what is made of each and the leaves that it leads to."""
-        self._inside = True
-        try:
-            graph = Graph.under([getattr(root, "grad_fn", None) for root in roots])
-            found = []
-            for at, record in graph.records().items():
-                record.shares.clear()
-                kind = graph.made_of(at) if record.kind == "difference" else record.kind
-                if record.kind == "l1" and graph.made_of(at) not in ("signed", "l1"):
-                    kind = "robust"
-                found.append((record, kind, graph.leaves(at)))
-            return found
-        finally:
-            self._inside = False
+        graph = Graph.under([getattr(root, "grad_fn", None) for root in roots])
+        found = []
+        for at, record in graph.records().items():
+            record.shares.clear()
+            kind = graph.made_of(at) if record.kind == "difference" else record.kind
+            if record.kind == "l1" and graph.made_of(at) not in ("signed", "l1"):
+                kind = "robust"
+            found.append((record, kind, graph.leaves(at)))
+        return found
 
+    @_harmless
     def _sum_up(self, roots: Sequence[Any], seen: Sequence[Tuple[_Record, str, Dict[int, Any]]]) -> None:
-        self._inside = True
-        try:
-            self.backward_passes += 1
-            loss = sum(float(root.detach().sum()) for root in roots)
-            samples: Dict[int, Tuple[Any, Any, Any]] = {}
-            for record, kind, leaves in seen:
-                if not record.shares:
-                    continue  # its gradient was not asked for
-                term = self._term(record, kind)
-                share = sum(float(part) for part in record.shares) / (loss or 1.0)
-                term["shares"].append(share / 2 if kind == "squared" else share)
-                for at, leaf in leaves.items():
-                    if at not in samples:
-                        samples[at] = _sample(leaf)
-                self._pending.append(_Pending(term, {at: samples[at] for at in leaves}))
-        finally:
-            self._inside = False
+        self.backward_passes += 1
+        loss = sum(float(root.detach().sum()) for root in roots)
+        samples: Dict[int, Tuple[Any, Any, Any]] = {}
+        for record, kind, leaves in seen:
+            if not record.shares:
+                continue  # its gradient was not asked for
+            term = self._term(record, kind)
+            share = sum(float(part) for part in record.shares) / (loss or 1.0)
+            term["shares"].append(share / 2 if kind == "squared" else share)
+            for at, leaf in leaves.items():
+                if at not in samples:
+                    samples[at] = _sample(leaf)
+            self._pending.append(_Pending(term, {at: samples[at] for at in leaves}))
 
     def _term(self, record: _Record, kind: str) -> Dict[str, Any]:
         """Return the entry of a term; those with the same frames, kind and target are one."""

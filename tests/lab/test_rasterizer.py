@@ -173,10 +173,10 @@ def test_a_start_from_points_looks_like_the_photograph(fox):
 class TestRepeatability:
     PROGRAM = """
 import hashlib, sys
-import numba
+import torch
 from tests.lab.rasterizing import camera, run, scene
 for threads in (2, 1, 2):
-    numba.set_num_threads(threads)
+    torch.set_num_threads(threads)
     rendering, gradients = run(scene(3000), camera(130, 120, 100.0))
     digest = hashlib.sha256(rendering.image.detach().numpy().tobytes())
     for gradient in gradients.values():

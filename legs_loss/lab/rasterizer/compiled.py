@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Tuple
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from legs_loss.kernels.compiling import in_threads
 from legs_loss.lab.conventions import SH_C0, View
 from legs_loss.lab.rasterizer import projection, projection_backward, sorting, strips
 from legs_loss.lab.rasterizer.groups import Camera, Footprint, Parameters, Splats, room
@@ -70,8 +70,8 @@ class Drawing(NamedTuple):
 
     def blended(self, background: np.ndarray) -> Drawing:
         """Fill image, entries and ends."""
-        strips.render(
-            numba.get_num_threads(), self.bands, self.across, self.ranges, self.splats, self.draws, self.entries,
+        in_threads(
+            strips.render, len(self.bands), self.bands, self.across, self.ranges, self.splats, self.draws, self.entries,
             self.ends, background, self.image,
         )  # fmt: skip
         return self
@@ -111,7 +111,8 @@ def draw(
         size=np.array([view.width, view.height], np.int64),
     )
     found = room(Splats, count, 9)
-    projection.project(parameters, camera, footprint, found)
+    blocks = -(-count // projection.BLOCK)
+    in_threads(projection.project, blocks, parameters, camera, footprint, found)
     splats, depths, radii, clamped, boxes, slots = found
     if tensors.colours is not None:
         splats[:, 6:9] = _array(tensors.colours)
@@ -119,7 +120,7 @@ def draw(
 
     firsts, reached = sorting.make_slots(boxes, slots, strips.TALL)
     across, down = -(-view.width // strips.WIDE), -(-view.height // strips.TALL)
-    projection.find_rows(splats, boxes, slots, firsts, across, reached)
+    in_threads(projection.find_rows, blocks, splats, boxes, slots, firsts, across, reached)
     if clip is not None:
         clip(np.array(view.tiles), splats, boxes, slots, firsts, reached, radii)
     ranges, draws, bands = sorting.sort_entries(depths, firsts, reached, across, down)
@@ -170,15 +171,24 @@ class _Attach(torch.autograd.Function):
         it: Drawing = ctx.drawing._replace(**dict(zip(ctx.large, arrays)))
         moments = strips.ABSOLUTE_MOMENTS if ctx.columns == 4 else strips.MOMENTS
         sums = sorting.make_sums(it.firsts, moments)
-        strips.render_backward(
-            numba.get_num_threads(), it.bands, it.across, it.ranges, it.draws, it.entries, it.ends, it.image,
-            _array(g_image), moments, sums.reshape(-1),
+        in_threads(
+            strips.render_backward, len(it.bands), it.bands, it.across, it.ranges, it.draws, it.entries, it.ends,
+            it.image, _array(g_image), moments, sums.reshape(-1),
         )  # fmt: skip
         shapes = [None if array is None else array.shape for array in it.parameters] + [(len(it.radii), ctx.columns)]
         gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
         filled: List[Any] = [None if gradient is None else gradient.numpy() for gradient in gradients]
-        projection_backward.project_backward(
-            it.parameters, it.camera, it.splats, it.clamped, it.firsts, sums, Parameters(*filled[:-1]), filled[-1]
+        in_threads(
+            projection_backward.project_backward,
+            -(-len(it.radii) // projection.BLOCK),
+            it.parameters,
+            it.camera,
+            it.splats,
+            it.clamped,
+            it.firsts,
+            sums,
+            Parameters(*filled[:-1]),
+            filled[-1],
         )
         found = [gradient if wanted else None for gradient, wanted in zip(gradients, ctx.needs_input_grad)]
         return (*found, None)

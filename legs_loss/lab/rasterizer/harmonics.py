@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from legs_loss.kernels.compiling import compiled, inlined
+from legs_loss.kernels.compiling import inlined, part
 from legs_loss.lab.conventions import SH_C0, SH_C1, SH_C2, SH_C3
 from legs_loss.lab.simd.arithmetic import splat
 from legs_loss.lab.simd.lanes import transposed
@@ -135,7 +135,7 @@ def _begin(drawn, begin, count, means, position, degree, sh, work, distances, st
     _harmonics(degree, rows)
 
 
-@compiled()
+@part()
 def shade(drawn, count, means, position, degree, sh, clamped, splats, column):
     """Fill Gaussians' colours as seen from `position`, and which of their channels are clamped at 0.
 
@@ -160,7 +160,7 @@ def shade(drawn, count, means, position, degree, sh, clamped, splats, column):
                 splats[i, column + channel] = max(work[COLOUR + channel, j], np.float32(0))
 
 
-@compiled()
+@part()
 def shade_gradient(drawn, count, means, position, degree, sh, clamped, colours, g_means, g_sh):
     """Fill the gradients to Gaussians' coefficients from those to their colours, and add to those of their means.
 

@@ -15,9 +15,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled, inlined
+from legs_loss.kernels.compiling import claimed, compiled, inlined, part
 from legs_loss.lab.conventions import FARTHEST, MIN_ALPHA, NEAR, SQUARE, TILE
 from legs_loss.lab.rasterizer.geometry import (
     conic,
@@ -54,21 +53,21 @@ def ceil(value):
     return -floor(-value)
 
 
-@compiled()
+@part()
 def tile_range(centre, radius, tiles):
     """Return first tile of the square around a splat, and the one past the last, by 3DGS's rounding."""
     first, end = floor((centre - radius) / TILE), floor((centre + radius + (TILE - 1)) / TILE)
     return min(max(first, 0), tiles), min(max(end, 0), tiles)
 
 
-@compiled()
+@part()
 def origin(left, top, rows):
     """Return the pixel coordinates about which an entry is written: amid the rows of the strip that it reaches."""
     first, end, _ = unpacked(rows)
     return left + 0.5 * (WIDE - 1), top + 0.5 * (first + end - 1)
 
 
-@compiled()
+@part()
 def lay_out(means, scales, quaternions, covariances, i, state, j):
     """Write a Gaussian's mean and shape to column `j` of a block's state."""
     for k in range(3):
@@ -94,7 +93,7 @@ def _drawn(x, y, z, a, b, c, determinant, intrinsics, dilation):
     return u, v, a + dilation, b, c + dilation, determinant, largest
 
 
-@compiled()
+@part()
 def _shapes(count, intrinsics, pose, dilation, state):
     """Project means, scales and quaternions to centres and covariances in the image."""
     intrinsics, pose = numbers(intrinsics, pose)
@@ -115,7 +114,7 @@ def _shapes(count, intrinsics, pose, dilation, state):
         state[0, j], state[1, j], state[2, j], state[3, j], state[4, j], state[5, j], state[6, j] = drawn
 
 
-@compiled()
+@part()
 def _covariances(count, intrinsics, pose, dilation, state):
     """Project means and covariances to those in the image. The input may be any matrix."""
     intrinsics, pose = numbers(intrinsics, pose)
@@ -133,7 +132,16 @@ def _covariances(count, intrinsics, pose, dilation, state):
         state[0, j], state[1, j], state[2, j], state[3, j], state[4, j], state[5, j], state[6, j] = drawn
 
 
-@compiled()
+@part()
+def _in_the_image(scales, covariances, count, intrinsics, pose, dilation, state):
+    """Project what is there: of arguments numba sees that they are None, and compiles the other only."""
+    if scales is not None:
+        _shapes(count, intrinsics, pose, dilation, state)
+    if covariances is not None:
+        _covariances(count, intrinsics, pose, dilation, state)
+
+
+@part()
 def _project_block(first, end, parameters, camera, footprint, found):
     means, scales, quaternions, opacities, sh, covariances = parameters
     degree, intrinsics, pose, position, size = camera
@@ -151,10 +159,7 @@ def _project_block(first, end, parameters, camera, footprint, found):
         lay_out(means, scales, quaternions, covariances, i, state, count)
         before_camera[count] = i
         count += 1
-    if scales is not None:
-        _shapes(count, intrinsics, pose, dilation, state)
-    if covariances is not None:
-        _covariances(count, intrinsics, pose, dilation, state)
+    _in_the_image(scales, covariances, count, intrinsics, pose, dilation, state)
     drawn, seen = before_camera, 0
     for j in range(np.uint64(count)):
         i = np.uint64(before_camera[j])
@@ -191,19 +196,20 @@ def _project_block(first, end, parameters, camera, footprint, found):
         splats[i, 5] = summit
         drawn[seen] = i  # where what was read stood, or before
         seen += 1
-    shade(drawn, seen, means, position, degree, sh, clamped, splats, 6)
-
-
-@compiled(parallel=True)
-def project(parameters, camera, footprint, found):
-    """Fill the `Splats` that `Parameters` become to a `Camera`, with a `Footprint` (groups.py)."""
-    count = len(parameters.means)
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        first = block * BLOCK
-        _project_block(first, min(first + BLOCK, count), parameters, camera, footprint, found)
+    shade(drawn, seen, means, position, degree, sh, clamped, splats, np.int64(6))
 
 
 @compiled()
+def project(counter, blocks, parameters, camera, footprint, found):
+    """Fill the `Splats` that `Parameters` become to a `Camera`, with a `Footprint` (groups.py): `in_threads`."""
+    count, block = len(parameters.means), claimed(counter)
+    while block < blocks:
+        first = block * BLOCK
+        _project_block(first, min(first + BLOCK, count), parameters, camera, footprint, found)
+        block = claimed(counter)
+
+
+@part()
 def _find_rows_block(first, end, splats, boxes, slots, firsts, across, reached):
     for i in range(np.uint64(first), np.uint64(end)):
         if slots[i] == 0:
@@ -239,10 +245,11 @@ def _find_rows_block(first, end, splats, boxes, slots, firsts, across, reached):
             band += bands
 
 
-@compiled(parallel=True)
-def find_rows(splats, boxes, slots, firsts, across, reached):
-    """Fill the slots, one for each strip in each Gaussian's box: the strip, or -1, and its rows."""
-    count = len(slots)
-    for block in prange((count + BLOCK - 1) // BLOCK):
+@compiled()
+def find_rows(counter, blocks, splats, boxes, slots, firsts, across, reached):
+    """Fill the slots, one for each strip in each Gaussian's box: the strip, or -1, and its rows: `in_threads`."""
+    count, block = len(slots), claimed(counter)
+    while block < blocks:
         first = block * BLOCK
         _find_rows_block(first, min(first + BLOCK, count), splats, boxes, slots, firsts, across, reached)
+        block = claimed(counter)

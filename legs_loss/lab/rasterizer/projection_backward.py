@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled, inlined
+from legs_loss.kernels.compiling import claimed, compiled, inlined, part
 from legs_loss.lab.rasterizer.geometry import (
     centre_gradient,
     covariance_gradient,
@@ -37,7 +36,7 @@ STATE = 24, BLOCK + 8  # see projection.py
 LENGTH = 1 / UNIT  # of a step of 1 in an entry's coordinates, in the splat's own
 
 
-@compiled()
+@part()
 def _collect(first, end, sums, state, j):
     """Sum a Gaussian's gradients over the bands of the image into the state's column `j`."""
     total, blue, along_u, along_v = load(sums[first], 0), sums[first, 8], 0.0, 0.0
@@ -66,7 +65,7 @@ def _in_the_image(state, j, intrinsics, pose):
     return x, y, z, linearised(x, y, z, intrinsics, pose), gu, gv, s00, s01, s11
 
 
-@compiled()
+@part()
 def _shapes_backward(count, intrinsics, pose, state):
     intrinsics, pose = numbers(intrinsics, pose)
     for j in range(np.uint64(count)):
@@ -97,7 +96,7 @@ def _shapes_backward(count, intrinsics, pose, state):
         state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j] = gx, gy, gz
 
 
-@compiled()
+@part()
 def _covariances_backward(count, intrinsics, pose, state):
     intrinsics, pose = numbers(intrinsics, pose)
     for j in range(np.uint64(count)):
@@ -121,7 +120,7 @@ def _covariances_backward(count, intrinsics, pose, state):
         state[MEAN, j], state[MEAN + 1, j], state[MEAN + 2, j] = gx, gy, gz
 
 
-@compiled()
+@part()
 def _no_gradient(i, g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances):
     """Set the gradients of a Gaussian that was not drawn."""
     g_means[i] = 0
@@ -134,7 +133,7 @@ def _no_gradient(i, g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covar
     g_sh[i] = 0
 
 
-@compiled()
+@part()
 def _take_out(g_scales, g_quaternions, g_covariances, i, state, j):
     """Read the gradients of a Gaussian's shape from column `j` of a block's state."""
     if g_scales is not None:
@@ -147,7 +146,16 @@ def _take_out(g_scales, g_quaternions, g_covariances, i, state, j):
             g_covariances[i, k] = state[SHAPE + k, j]
 
 
-@compiled()
+@part()
+def _backward(scales, covariances, count, intrinsics, pose, state):
+    """Do what there is to do, as `_in_the_image` of projection.py."""
+    if scales is not None:
+        _shapes_backward(count, intrinsics, pose, state)
+    if covariances is not None:
+        _covariances_backward(count, intrinsics, pose, state)
+
+
+@part()
 def _project_backward_block(first, end, parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
     means, scales, quaternions, opacities, sh, covariances = parameters
     degree, intrinsics, pose, position, size = camera
@@ -165,10 +173,7 @@ def _project_backward_block(first, end, parameters, camera, splats, clamped, fir
             state[AXES + k, count] = splats[i, 2 + k]
         drawn[count] = i
         count += 1
-    if scales is not None:
-        _shapes_backward(count, intrinsics, pose, state)
-    if covariances is not None:
-        _covariances_backward(count, intrinsics, pose, state)
+    _backward(scales, covariances, count, intrinsics, pose, state)
     # The colour: to the coefficients, and through the direction to the mean.
     colours, towards = state[COLOUR : COLOUR + 3], state[MEAN : MEAN + 3]
     shade_gradient(drawn, count, means, position, degree, sh, clamped, colours, towards, g_sh)
@@ -185,11 +190,12 @@ def _project_backward_block(first, end, parameters, camera, splats, clamped, fir
             g_means[i, k] = state[MEAN + k, j]
 
 
-@compiled(parallel=True)
-def project_backward(parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
+@compiled()
+def project_backward(counter, blocks, parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
     """Fill the gradients of each Gaussian from the sums of its entries'; of what is None, there is none.
 
     Args:
+        counter, blocks: of `in_threads`; a block is BLOCK Gaussians.
         parameters, gradients: `Parameters`, with None in the same places.
         camera: `Camera`.
         splats: [N, 9], as projected.
@@ -198,8 +204,9 @@ def project_backward(parameters, camera, splats, clamped, firsts, sums, gradient
         sums: [bands, MOMENTS or ABSOLUTE_MOMENTS].
         g_view: [N, 2 or 4], the view-space gradient, and that of absolute values.
     """
-    count = len(parameters.means)
-    for block in prange((count + BLOCK - 1) // BLOCK):
+    count, block = len(parameters.means), claimed(counter)
+    while block < blocks:
         first = block * BLOCK
         end = min(first + BLOCK, count)
         _project_backward_block(first, end, parameters, camera, splats, clamped, firsts, sums, gradients, g_view)
+        block = claimed(counter)

@@ -13,10 +13,9 @@ from __future__ import annotations
 from typing import Tuple
 
 import numpy as np
-from numba import prange
 
 from legs_loss.errors import LegsError
-from legs_loss.kernels.compiling import compiled, inlined
+from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined, part
 
 BAND = 16  # strips
 MOST_BANDS = 1 << 15  # in an image: of 8 x 32 pixel strips, 134 million pixels
@@ -55,7 +54,7 @@ def sort_entries(
     ranges, draws = np.zeros(across * down + 1, np.int64), np.empty((len(reached), 3), np.int32)
     keys = np.empty(len(reached), np.uint32)
     _by_strip(depths.view(np.uint32), firsts, reached, ranges, keys, draws)
-    _by_depth(ranges, keys, draws)
+    in_threads(_by_depth, len(ranges) - 1, ranges, keys, draws)
     rows = np.arange(0, across * down, across)[:, None]
     begins = (rows + np.arange(0, across, BAND)).reshape(-1)
     ends = np.minimum(rows + np.arange(BAND, across + BAND, BAND), rows + across).reshape(-1)
@@ -128,7 +127,7 @@ def _by_strip(depths, firsts, reached, ranges, keys, draws):
                 draws[place, SUM] = first_sum + band
 
 
-@compiled()
+@part()
 def _sort_strip(keys, draws):
     """Sort the entries of a strip, front to back; equal depths keep their order: a radix sort by bytes.
 
@@ -156,9 +155,11 @@ def _sort_strip(keys, draws):
             draws[k, column] = entries[order[k], column]
 
 
-@compiled(parallel=True)
-def _by_depth(ranges, keys, draws):
-    for strip in prange(len(ranges) - 1):
+@compiled()
+def _by_depth(counter, strips, ranges, keys, draws):
+    strip = claimed(counter)
+    while strip < strips:
         begin, end = ranges[strip], ranges[strip + 1]
         if end - begin > 1:
             _sort_strip(keys[begin:end], draws[begin:end])
+        strip = claimed(counter)

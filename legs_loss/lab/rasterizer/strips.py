@@ -23,9 +23,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled, inlined
+from legs_loss.kernels.compiling import claimed, compiled, inlined, part
 from legs_loss.kernels.compiling import multiply_add as multiply_add_one
 from legs_loss.lab.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from legs_loss.lab.rasterizer.projection import TALL, WIDE, origin
@@ -86,7 +85,7 @@ def exp2(x):
     return as_floats(as_integers(fraction) + (as_integers(rounded) << splat(_MANTISSA)))
 
 
-@compiled()
+@part()
 def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
     """Write a strip's entries."""
     for k in range(np.uint64(begin), np.uint64(end)):
@@ -189,7 +188,7 @@ def _blend(state, begin, end, draws, entries):
             store(state, BLUE + i, multiply_add(weight, blue, load(state, BLUE + i)))
 
 
-@compiled()
+@part()
 def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image):
     left, top, wide, tall = place(strip, across, image, state[X:], state[T : T + PIXELS])
     state[RED : RED + 3 * PIXELS] = 0
@@ -207,14 +206,14 @@ def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, ba
                 image[channel, top + y, left + x] = multiply_add_one(abs(state[T + i]), background[channel], colour)
 
 
-@compiled(parallel=True)
-def render(workers, bands, across, ranges, splats, draws, entries, ends, background, image):
-    """Fill the image, and for each strip its entries, up to the end of those that mattered."""
-    for worker in prange(workers):
-        state = np.empty(STATE, np.float32)
-        for turn in range(worker, len(bands), workers):
-            for strip in range(bands[turn, 0], bands[turn, 1]):
-                _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image)
+@compiled()
+def render(counter, tasks, bands, across, ranges, splats, draws, entries, ends, background, image):
+    """Fill the image, and for each strip its entries, up to the end of those that mattered: `in_threads`."""
+    state, band = np.empty(STATE, np.float32), claimed(counter)
+    while band < tasks:
+        for strip in range(bands[band, 0], bands[band, 1]):
+            _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image)
+        band = claimed(counter)
 
 
 @compiled()
@@ -261,7 +260,7 @@ def _blend_backward(state, begin, end, draws, entries, moments, sums):
             sums[at + 10] += total(along_v) * entries[k, 3]
 
 
-@compiled()
+@part()
 def _render_backward_strip(strip, across, state, ranges, draws, entries, ends, image, g_image, moments, sums):
     left, top, wide, tall = place(strip, across, image, state[X:], state[T : T + PIXELS])
     state[RED:X] = 0
@@ -274,13 +273,11 @@ def _render_backward_strip(strip, across, state, ranges, draws, entries, ends, i
     _blend_backward(state, ranges[strip], ends[strip], draws, entries, moments, sums)
 
 
-@compiled(parallel=True)
-def render_backward(workers, bands, across, ranges, draws, entries, ends, image, g_image, moments, sums):
+@compiled()
+def render_backward(counter, tasks, bands, across, ranges, draws, entries, ends, image, g_image, moments, sums):
     """Add the gradient of every entry to its Gaussian's sums; the absolute ones too, where there is room for them."""
-    for worker in prange(workers):
-        state = np.empty(STATE, np.float32)
-        for turn in range(worker, len(bands), workers):
-            for strip in range(bands[turn, 0], bands[turn, 1]):
-                _render_backward_strip(
-                    strip, across, state, ranges, draws, entries, ends, image, g_image, moments, sums
-                )
+    state, band = np.empty(STATE, np.float32), claimed(counter)
+    while band < tasks:
+        for strip in range(bands[band, 0], bands[band, 1]):
+            _render_backward_strip(strip, across, state, ranges, draws, entries, ends, image, g_image, moments, sums)
+        band = claimed(counter)

@@ -63,6 +63,7 @@ class Adam:
         What is not seen keeps its moments, too: the sparse Adam of Taming 3DGS and gsplat, but that the moments' biases
         are corrected here, by the number of all steps.
         """
+        from legs_loss.kernels.compiling import in_threads
         from legs_loss.lab.training.adam_kernel import BETA1, BETA2, update
 
         self.steps += 1
@@ -74,7 +75,8 @@ class Adam:
             arrays = parameter.detach(), parameter.grad, getattr(self.moment1, name), getattr(self.moment2, name)
             starts = np.arange(0, parameter.numel(), rates.size) if seen is None else columns * seen.numpy()
             length = rates.size if seen is None else columns
-            update(*map(_flat, arrays), starts, length, rates * np.float32(scale / correction1), correction2)
+            rates = rates * np.float32(scale / correction1)
+            in_threads(update, len(starts), *map(_flat, arrays), starts, length, rates, correction2)
             parameter.grad = None
 
     def keep(self, kept: Tensor) -> None:

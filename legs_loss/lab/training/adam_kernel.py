@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled, inlined
+from legs_loss.kernels.compiling import claimed, compiled, inlined
 from legs_loss.lab.simd.arithmetic import splat, square_root
 from legs_loss.lab.simd.memory import load, store
 from legs_loss.lab.simd.vectors import LANES
@@ -37,13 +36,14 @@ def _one(parameter, gradient, moment1, moment2, i, rate, correction):  # type: i
     parameter[i] -= rate * moment1[i] / (np.sqrt(moment2[i]) * correction + _EPS)
 
 
-@compiled(fastmath=False, parallel=True)
-def update(parameter, gradient, moment1, moment2, starts, length, rates, correction):  # type: ignore[no-untyped-def]
+@compiled(fastmath=False)
+def update(counter, parts, parameter, gradient, moment1, moment2, starts, length, rates, correction):  # type: ignore[no-untyped-def]
     """Update parts of flat float32 arrays in place: from each of ``starts`` on, so many numbers, ``rates`` theirs.
 
     The rates are already divided by the first moment's bias; ``correction`` is 1 / sqrt(the second one's).
     """
-    for part in prange(starts.size):
+    part = claimed(counter)
+    while part < parts:
         start = starts[part]
         end = min(start + length, parameter.size)
         whole = end - (end - start) % LANES
@@ -51,3 +51,4 @@ def update(parameter, gradient, moment1, moment2, starts, length, rates, correct
             _eight(parameter, gradient, moment1, moment2, i, rates, i - start, correction)
         for i in range(whole, end):
             _one(parameter, gradient, moment1, moment2, i, rates[i - start], correction)
+        part = claimed(counter)

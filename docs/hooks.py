@@ -51,5 +51,6 @@ def on_post_build(config: Any, **_: Any) -> None:
     index.with_suffix(".js").write_text(f"var __index = {index.read_text(encoding='utf-8')}", encoding="utf-8")
     # Without an address of the site the page for what is not found links to the root of the host.
     lost = Path(config["site_dir"], "404.html")
-    text = re.sub(r'(href|src)="/(?!/)', r'\1="./', lost.read_text(encoding="utf-8"))
-    lost.write_text(text.replace('"base": "/"', '"base": "."'), encoding="utf-8")
+    if lost.is_file():
+        text = re.sub(r'(href|src)="/(?!/)', r'\1="./', lost.read_text(encoding="utf-8"))
+        lost.write_text(text.replace('"base": "/"', '"base": "."'), encoding="utf-8")

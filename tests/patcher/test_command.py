@@ -351,6 +351,10 @@ class TestCommandLine:
     ("text", "line", "what"),
     [
         ("import jax\n", 1, "the loss is written in JAX"),
+        ("import mlx.core as mx\n", 1, "the loss is written in MLX"),
+        ("class BadModel(SplatfactoModel):\n    pass\n", 1, "ns-train splatfacto-legs"),
+        ("loss = LOSSES[cfg.loss](image, gt)\nkind = PhotoLoss.L1\n", 2, "the loss is chosen by a setting"),
+        ("loss_fn = getattr(losses, cfg.kind)\n", 1, "the loss is chosen by a setting"),
         ("# mse_loss(image, gt)\nloss = F.mse_loss(image, gt_image)\n", 2, "the image loss is squared"),
         ("delta = image - photo\nloss = (delta**2).mean()\n", 2, "the image loss is squared"),
         ("loss += self.guidance(images, prompts)['loss_sds']\n", 1, "the gradient is a diffusion model's (SDS)"),

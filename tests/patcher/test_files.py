@@ -242,6 +242,10 @@ class TestWhereItLooks:
         [
             (b"print 'hello'\n", "does not parse (line 2)"),
             (b"def f(:\n", "does not parse (line 2)"),
+            (
+                b"class A:\n    def f(self):\n\tx = l1(1)\n",
+                "does not parse, perhaps since it mixes tabs and blanks (line 3)",
+            ),
             (b"# -*- coding: latin-1 -*-\nx = '\xe9'\n", "not UTF-8 (byte 31)"),
             (b"x = '\xe9'\n", "not UTF-8 (byte 5)"),
         ],
@@ -251,6 +255,12 @@ class TestWhereItLooks:
         (root / "old_loss.py").write_bytes(data if b"coding" in data else data + b"# loss.backward() l1_loss\n")
         found = plan(root)
         assert [(entry.path, entry.reason) for entry in found.findings.unreadable] == [("old_loss.py", reason)]
+        assert list(found.after) == ["train.py"]
+
+    def test_a_notebook_that_trains_is_named(self, tmp_path):
+        root = checkout(tmp_path, {**files("inria"), "a.ipynb": "loss.backward()", "b.ipynb": "plot()"})
+        found = plan(root)
+        assert [entry.path for entry in found.findings.unreadable] == ["a.ipynb"]
         assert list(found.after) == ["train.py"]
 
     def test_decoding_says_what_python_would(self):

@@ -50,14 +50,14 @@ class Skipped(NamedTuple):
     why: str
 
 
-def walk(root: Path, exclude: Sequence[str] = ()) -> Iterator[str]:
+def walk(root: Path, exclude: Sequence[str] = (), ends: Tuple[str, ...] = (".py",)) -> Iterator[str]:
     """Yield the paths of the checkout's own Python files, relative, posix separators, a folder's own files first.
 
     A nested checkout belongs to it. Links are not followed, whether to files or to folders; skipped are ``.git``,
     submodules, other worktrees, virtual environments, vendored folders, tests, and what ``exclude`` names: globs on the
     relative path or, without a slash, on the name of the file or of a folder above it.
     """
-    for files, _ in folders_of(root, exclude):
+    for files, _ in folders_of(root, exclude, ends):
         yield from files
 
 
@@ -86,7 +86,9 @@ def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
     return None
 
 
-def folders_of(root: Path, exclude: Sequence[str]) -> Iterator[Tuple[List[str], List[Skipped]]]:
+def folders_of(
+    root: Path, exclude: Sequence[str], ends: Tuple[str, ...] = (".py",)
+) -> Iterator[Tuple[List[str], List[Skipped]]]:
     """Yield, a folder at a time, the Python files in it, and the folders in it that are not entered."""
     submodules: List[str] = []
     for here, folders, names in os.walk(str(root), followlinks=False):
@@ -96,7 +98,7 @@ def folders_of(root: Path, exclude: Sequence[str]) -> Iterator[Tuple[List[str], 
         own = [path for path in paths if not _excluded(path, exclude) and not os.path.islink(str(root / path))]
         why = {path: _why_foreign(root, path, submodules) for path in own if paths[path] in folders}
         folders[:] = [paths[path] for path, reason in why.items() if reason is None]
-        files = [path for path in own if path.endswith(".py") and not _TEST_FILE.match(paths[path])]
+        files = [path for path in own if path.endswith(ends) and not _TEST_FILE.match(paths[path])]
         regular = [path for path in files if path not in why and os.path.isfile(str(root / path))]
         yield regular, [Skipped(path, reason) for path, reason in why.items() if reason is not None]
 

@@ -249,6 +249,11 @@ def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadabl
     try:
         return Module(source.path, source.text, budget)
     except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
+        first = re.search(r"^[ \t](?=\s*\S)", source.text, re.M)
+        other = re.search("^\t" if first is not None and first.group() == " " else "^ ", source.text, re.M)
+        if first is not None and other is not None and isinstance(error, cst.ParserSyntaxError):
+            line = source.text.count("\n", 0, other.start()) + 1
+            return Unreadable(source.path, f"does not parse, perhaps since it mixes tabs and blanks (line {line})")
         return _failure(source.path, error)
 
 

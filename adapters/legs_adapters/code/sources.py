@@ -66,10 +66,10 @@ def read_files(root: Path, exclude: Sequence[str]) -> Tuple[List[Source], List[U
     readable: List[Source] = []
     unreadable: List[Unreadable] = []
     size = 0
-    for path in walk(root, exclude):
+    for path in walk(root, exclude, (".py", ".ipynb")):
         source = read_source(root, path)
         if isinstance(source, Unreadable):
-            unreadable.append(source)
+            unreadable += [source] if source.reason else []
             continue
         readable.append(source)
         size += len(source.data)
@@ -79,7 +79,10 @@ def read_files(root: Path, exclude: Sequence[str]) -> Tuple[List[Source], List[U
 
 
 def read_source(root: Path, path: str) -> Source | Unreadable:
-    """Read one file; one that is not UTF-8, or has a name that is never written, is returned with the reason."""
+    """Read one file; one that is not UTF-8, or has a name that is never written, is returned with the reason.
+
+    A notebook that does not train has none.
+    """
     try:
         check_name(path)
         data = read_regular(root / path, MAX_FILE_BYTES)
@@ -88,6 +91,9 @@ def read_source(root: Path, path: str) -> Source | Unreadable:
     except OSError as error:
         large = f"larger than {MAX_FILE_BYTES >> 20} MiB" if error.errno == errno.EFBIG else ""
         return Unreadable(path, large or f"cannot be read: {error.strerror}")
+    if path.endswith(".ipynb"):
+        trains = b"backward(" in data
+        return Unreadable(path, "a notebook: export it (jupyter nbconvert --to script)" if trains else "")
     return decode(path, data)
 
 

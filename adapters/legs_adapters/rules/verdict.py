@@ -12,6 +12,7 @@ from legs_adapters.code.syntax import one_line, words, words_in
 from legs_adapters.lexicon.meaning import UNKNOWN, swapped
 from legs_adapters.lexicon.words import MESH, PERCEPTUAL, TRACKING, WARPED
 from legs_adapters.rules.analysis import Analysis
+from legs_adapters.rules.causes.other import is_of_other_framework
 from legs_adapters.rules.order import RULES, first
 from legs_adapters.rules.rule import Term
 from legs_adapters.rules.uses import uses_of
@@ -98,7 +99,9 @@ class Verdicts:
         """Return the warning of a skipped term that may be the loss, if nothing else is found; None of any other."""
         term = Term(self.analysis, function, form)
         rule = RULES.get(left.rule)
-        if rule is None or not rule.may_be_loss(term) or is_measured(function, form) or same_root(form):
+        if rule is None or is_of_other_framework(function.module.text):
+            return None
+        if not rule.may_be_loss(term) or is_measured(function, form) or same_root(form):
             return None
         names = [*dict(term.names_around), *getattr(self.analysis.program.owner_of(function), "methods", ())]
         other = (PERCEPTUAL | WARPED | MESH) & words_in(form.node).union(*map(words, names))

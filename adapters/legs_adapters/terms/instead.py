@@ -13,12 +13,20 @@ _SQUARED = "the image loss is squared, not absolute"
 _OF_PICTURES = re.compile(r"rgb|im(g|age)|colou?r|delta", re.I)
 _INSTEAD = (
     (r"^[ \t]*(import|from) jax\b", "the loss is written in JAX, and legs_loss in torch"),
-    (r"\bsuper\(\)\.get_loss_dict\(", "the loss is nerfstudio's own: its hook is `ns-train splatfacto-legs`"),
+    (r"^[ \t]*(import|from) mlx\b", "the loss is written in MLX, and legs_loss in torch"),
+    (
+        r"\bsuper\(\)\.get_loss_dict\(|^class \w+\([\w.]*\bSplatfactoModel\b",
+        "the loss is nerfstudio's own: its hook is `ns-train splatfacto-legs`",
+    ),
     (
         r"\b\w*(l1\w*ssim|ssim\w*l1)\w*\(",
         "one function computes L1 and SSIM, perhaps a compiled kernel: take both apart, and weight the L1",
     ),
     (r"mse_loss\w*\(|\bMSELoss\(|\bimg2mse\(|\bl2_loss\(|\) ?\*\* ?2\b|delta ?\*\* ?2", _SQUARED),
+    (
+        r"\bgetattr\(\w*loss\w*, ?\w|\b\w*Loss\w*\.L1\b|\w*loss\w*\[\w*(cfg|conf|opt|args)\w*\.",
+        "the loss is chosen by a setting: name the line that calls it with --site",
+    ),
     (
         r"loss_sds|\bsds_loss|guidance\w*(\.train_step)?\(",
         "the gradient is a diffusion model's (SDS), of no photograph",

@@ -10,7 +10,7 @@ from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import is_beside_ssim, of_rays
 
-__all__ = ["NotSplats"]
+__all__ = ["NotSplats", "is_of_other_framework"]
 
 _TORCH = re.compile(r"^[ \t]*(import|from)[ \t]+torch", re.M)
 _OTHER_FRAMEWORK = re.compile(
@@ -27,8 +27,7 @@ class NotSplats(Rule):
     INVALID = ["loss = l1_loss(image[ray_indexes], gt[ray_indexes])"]
 
     def evidence(self, term: Term) -> List[Decider]:
-        text = term.function.module.text
-        if _OTHER_FRAMEWORK.search(text) and not _TORCH.search(text):
+        if is_of_other_framework(term.function.module.text):
             return term.here
         if not term.analysis.splats.is_about(term.function):
             return [header(term.function)]
@@ -38,6 +37,11 @@ class NotSplats(Rule):
 
     def may_be_loss(self, term: Term) -> bool:
         return True
+
+
+def is_of_other_framework(text: str) -> bool:
+    """Return whether a file imports another framework of tensors and no torch."""
+    return _OTHER_FRAMEWORK.search(text) is not None and not _TORCH.search(text)
 
 
 def _ray_method(term: Term) -> List[Decider]:

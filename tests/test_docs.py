@@ -86,8 +86,9 @@ def test_the_rows_of_a_run_are_taken_in_the_place_of_its_earlier_ones(machine: s
     if machine == "cpu":
         (folder / "cfg.json").write_text('{"seed": 0}', encoding="utf-8")
     metrics = {"train": {"psnr": 1.0}, "test": {"psnr": 2.0}, "gaussians": 3, "mean_weight": 4.0}
+    extra = {"growth": [], "gpu": "NVIDIA H200"} if machine == "gpu" else {"growth": []}
     views = {"train": {"a": {"psnr": 1.0}}, "test": {"b": {"psnr": 2.0}}}
-    (folder / "metrics-500.json").write_text(json.dumps({**metrics, "growth": [], "views": views}), encoding="utf-8")
+    (folder / "metrics-500.json").write_text(json.dumps({**metrics, **extra, "views": views}), encoding="utf-8")
 
     runpy.run_path(str(copy / "rebuild.py"))["take_schedule"](tmp_path / "out", "fern")
     after = json.loads((copy / f"schedule_{machine}.json").read_text(encoding="utf-8"))["rows"]

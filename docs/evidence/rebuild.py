@@ -27,7 +27,8 @@ FRESH = ("fresh_fern", "fresh_monstree", "fresh_kitchen")
 CANDIDATE = "percentile=99,normalise=mean,scale=0.6,error=1,curve=C1@3dgs"
 CODEBASES = {name: tuple(f"{scene}_{name}_200" for scene in ("fox", "fern", "kitchen")) for name in ("3dgs", "fastgs")}
 CODEBASES["mcmc"] = tuple(f"{scene}_mcmc_200" for scene in ("fox", "fern", "kitchen"))
-SCHEDULES = {"CPU": "schedule_cpu", "H200": "schedule_gpu"}
+SCHEDULES = {"CPU": "schedule_cpu", "H200": "schedule_gpu", "H100": "schedule_h100"}
+PAPERS = "bonsai"  # the capture of the paper's, with a table of its own
 SCHEDULE_COLUMNS = {
     "train PSNR": ".2f",
     "train SSIM": ".3f",
@@ -36,10 +37,11 @@ SCHEDULE_COLUMNS = {
     "strongest 10%": ".2f",
     "Gaussians": ",.0f",
 }
-SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs-l")
+SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs-l", "eggs")
 SCHEDULE_TICKS = (500, 1000, 2000, 4000, 7000, 15000, 30000)
 SCHEDULE_KEPT = ("train", "test", "gaussians", "mean_weight", "processor_seconds")
-COLOURS = ("#555555", "#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#ff7f0e")
+PAPERS_SCORES = {"psnr": ".2f", "ssim": ".4f", "lpips": ".4f"}
+COLOURS = ("#555555", "#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b")
 COLUMNS = {
     "train PSNR": ("train", "psnr"),
     "held-out PSNR": ("test", "psnr"),
@@ -69,14 +71,16 @@ _CURVES = _from_3dgs("legs", "C5", "legs-l", "C4", "C2")
 _ROBUST = (*_from_3dgs("legs", "legs-robust"), ("legs-robust", "legs"), *_from_3dgs("legs-robust@3dgs"))
 TABLES: Mapping[str, Table] = {
     "fox": Table(("fox",), _CONTROLS),
-    "embedded": Table(("embedded",), _CONTROLS),
+    "embedded": Table(
+        ("embedded",),
+        tuple(pair for pair in _CONTROLS if pair[0] in ("legs", "legs:scale", "legs:mean1", "3dgs@legs", "legs@3dgs")),
+    ),
     "codebase-3dgs": Table(CODEBASES["3dgs"], _CODEBASE),
     "codebase-fastgs": Table(CODEBASES["fastgs"], _CODEBASE),
     "codebase-mcmc": Table(CODEBASES["mcmc"], _CODEBASE[:-1]),
     "curves": Table(("fox",), _CURVES),
     "preregistered": Table(FRESH, ((CANDIDATE, "3dgs"),)),
     "degraded-fox": Table(("degraded_fox",), _ROBUST),
-    "degraded-embedded": Table(("degraded_embedded",), _ROBUST),
 }
 
 
@@ -105,7 +109,8 @@ def take_schedule(out: Path, scene: str) -> None:
                 kept["views"] = {"test": metrics["views"]["test"]}
                 rows.append({**run, "iteration": milestone, "metrics": _rounded(kept)})
             if rows:
-                _replace(HERE / f"{SCHEDULES['H200' if by_gpu else 'CPU']}.json", run, rows)
+                machine = metrics["gpu"].split()[1] if by_gpu else "CPU"
+                _replace(HERE / f"{SCHEDULES[machine]}.json", run, rows)
 
 
 def _replace(path: Path, run: Mapping[str, Any], rows: Sequence[Any]) -> None:
@@ -136,7 +141,13 @@ def with_tables(text: str) -> str:
     def table(match: re.Match[str]) -> str:
         name = match.group(1)
         milestone = re.fullmatch(r"schedule-(\d+)", name)
-        body = schedule(int(milestone.group(1))) if milestone else differences(TABLES[name])
+        body = (
+            schedule(int(milestone.group(1)))
+            if milestone
+            else papers()
+            if name == PAPERS
+            else differences(TABLES[name])
+        )
         return f"<!-- {name} -->\n\n{body}\n\n<!-- end -->"
 
     return re.sub(r"<!-- ([\w-]+) -->.*?<!-- end -->", table, text, flags=re.DOTALL)
@@ -146,7 +157,7 @@ def schedule(iteration: int) -> str:
     """Return the scores at a milestone of 3DGS's own schedule, by the package's trainer and on a GPU."""
     lines = []
     for machine, name in SCHEDULES.items():
-        rows = [row for row in rows_of(name) if row["iteration"] == iteration]
+        rows = [row for row in rows_of(name) if row["iteration"] == iteration and row["scene"] != PAPERS]
         for row in rows:
             row["metrics"]["iterations"] = iteration  # a summary has milliseconds by it
         for scene in sorted({row["scene"] for row in rows}):
@@ -157,9 +168,31 @@ def schedule(iteration: int) -> str:
     return compact(["capture", "arm", *SCHEDULE_COLUMNS], lines)
 
 
+def papers() -> str:
+    """Return the scores of the paper's capture over the schedule, one run a line."""
+    rows = [(row, machine) for machine, name in SCHEDULES.items() for row in rows_of(name) if row["scene"] == PAPERS]
+    lines = []
+    for row, machine in sorted(rows, key=lambda one: (one[0]["iteration"], SCHEDULE_ARMS.index(one[0]["arm"]))):
+        splits = [row["metrics"][split] for split in ("train", "test")]
+        cells = [f"{one[key]:{form}}" if key in one else "" for one in splits for key, form in PAPERS_SCORES.items()]
+        metrics = row["metrics"]
+        lines.append(
+            [
+                f"{row['iteration']:,}",
+                row["arm"],
+                *cells,
+                f"{metrics['gaussians']:,}",
+                f"{metrics['mean_weight']:.2f}",
+                machine,
+            ]
+        )
+    heads = [f"{split} {key.upper()}" for split in ("train", "held-out") for key in PAPERS_SCORES]
+    return compact(["iteration", "arm", *heads, "Gaussians", "weight", "on"], lines)
+
+
 def _schedule_cell(one: Summary, label: str) -> str:
     form = SCHEDULE_COLUMNS[label]
-    spread = "" if one.seeds == 1 or label == "Gaussians" else f" ±{one.spread[label]:{form}}"
+    spread = "" if one.seeds == 1 or label == "Gaussians" else f"±{one.spread[label]:{form}}"
     return f"{one.mean[label]:{form}}{spread}"
 
 
@@ -255,13 +288,13 @@ def plots() -> None:
     for machine, name in SCHEDULES.items():
         for row in rows_of(name):
             runs.setdefault((row["scene"], row["arm"], machine, row["seed"]), []).append(row)
-    figure = Figure(figsize=(14, 11), constrained_layout=True)
+    figure = Figure(figsize=(14, 14.5), constrained_layout=True)
     scores = {
         f"{label} {name}": (split, name.lower())
         for name in ("PSNR", "SSIM")
         for split, label in (("train", "train"), ("test", "held-out"))
     }
-    for scene, panels in zip(("fern", "kitchen", "fox"), figure.subplots(3, 4)):
+    for scene, panels in zip(("fern", "kitchen", "fox", PAPERS), figure.subplots(4, 4)):
         for panel, (label, (split, key)) in zip(panels, scores.items()):
             for arm, colour in zip(SCHEDULE_ARMS, COLOURS):
                 lines = [(run, rows) for run, rows in runs.items() if run[:2] == (scene, arm)]

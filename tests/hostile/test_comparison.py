@@ -141,9 +141,9 @@ def header(*lines, count=1):
 
 
 PLY = {
-    "nothing": (lambda good: b"", "not a binary little-endian"),
-    "text": (lambda good: good.replace(b"binary_little_endian", b"ascii"), "not a binary little-endian"),
-    "no end of the header": (lambda good: good.replace(b"end_header", b"end_headex"), "not a binary little-endian"),
+    "nothing": (lambda good: b"", "not a binary .ply"),
+    "text": (lambda good: good.replace(b"binary_little_endian", b"ascii"), "a text; save it as a binary"),
+    "no end of the header": (lambda good: good.replace(b"end_header", b"end_headex"), "not a binary .ply"),
     "cut off": (lambda good: good[:-1], "cut off or damaged"),
     "longer": (lambda good: good + b"x", "cut off or damaged"),
     "2^60 of them": (lambda good: good.replace(b"vertex 9", b"vertex %d" % (1 << 60)), "cut off or damaged"),
@@ -155,8 +155,8 @@ PLY = {
         "cannot read the header line",
     ),
     "a list": (lambda good: good.replace(b"float x", b"list uchar int x"), "cannot read the header line"),
-    "doubles": (lambda good: good.replace(b"float x", b"double x"), "cannot read the header line"),
-    "a name twice": (lambda good: good.replace(b"float y\n", b"float x\n"), "not a .ply of 3D Gaussians"),
+    "doubles": (lambda good: good.replace(b"float x", b"double x"), "cut off or damaged"),
+    "a name twice": (lambda good: good.replace(b"float y\n", b"float x\n"), "cannot read the header line"),
     "another name": (lambda good: good.replace(b"float x", b"float \x1b[2J"), "not a .ply of 3D Gaussians"),
     "no properties": (lambda good: header().encode(), "not a .ply of 3D Gaussians"),
     "a header of megabytes": (lambda good: good.replace(b"ply\n", b"ply\n" + b"a" * (8 << 20)), "not a binary"),

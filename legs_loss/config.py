@@ -25,6 +25,7 @@ _SETTINGS = ("preset", "store", *(field.name for field in fields(WeightSpec)))
 _TEXT_FIELDS = ("operator", "curve", "normalise", "over")
 _OTHER_VARIABLES = ("off", "backend", "masks")
 _JOURNAL = ".legs-patch.json"  # beside the legs.toml that legs-patch wrote
+_LAMBDA = ": the share of D-SSIM is the codebase's own setting, in 3DGS --lambda_dssim"
 _LARGEST = 1 << 20  # bytes of a legs.toml
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("", "0", "false", "no", "off")
 
@@ -174,7 +175,8 @@ def _is_true(value: str) -> bool:
 def _unknown_variables(environ: Mapping[str, str]) -> Tuple[str, ...]:
     known = ["LEGS_" + name.upper() for name in (*_SETTINGS, *_OTHER_VARIABLES)]
     return tuple(
-        f"environment variable {name} is not known and has no effect{did_you_mean(name, known)}"
+        f"environment variable {name} is not known and has no effect"
+        + (_LAMBDA if "LAMBDA" in name else did_you_mean(name, known))
         for name in sorted(environ)
         if name.startswith("LEGS_") and name not in known and not name.startswith("LEGS_TEST")
     )

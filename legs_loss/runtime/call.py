@@ -90,7 +90,10 @@ class Call(NamedTuple):
         if self.own is not None:
             return self.own(self.prediction, self.target)
         if self.is_mean() and self.mask is None:
-            return torch.abs(self.prediction - self.target).mean()
+            error = torch.abs(self.prediction - self.target)
+            if not error.is_floating_point():
+                raise LegsError(f"both images are of type {error.dtype}: give floats in [0, 1] (8-bit: image / 255.0)")
+            return error.mean()
         call = self.aligned()
         return call._with_map(None, call.mask)
 

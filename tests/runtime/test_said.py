@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from legs_loss import LegsError, LEGSLoss, configure, l1_loss, legs_loss, ssim, unweighted, weight_map, weighted_l1
+from legs_loss.config import find_config
 from tests.runtime.support import pair, plain
 from tests.support import legs_environment
 
@@ -114,3 +115,14 @@ class TestALineAtEachEnd:
         code = TRAIN.format(loss="(image - target).abs().mean()")
         assert said(code, tmp_path) == ["legs-loss: no L1 was weighted in this run"]
         assert said(EVALUATE, tmp_path) == []
+
+
+class TestNamed:
+    def test_integers_on_both_sides(self):
+        image = torch.zeros(3, 8, 8, dtype=torch.uint8)
+        with pytest.raises(LegsError, match="both images are of type"):
+            l1_loss(image, image)
+
+    def test_a_variable_for_lambda_names_lambda_s_own_setting(self):
+        (note,) = find_config(environ={"LEGS_LAMBDA": "0.3"}, argv=[]).notes
+        assert note.endswith("the codebase's own setting, in 3DGS --lambda_dssim") and "LEGS_BETA" not in note

@@ -43,6 +43,7 @@ PARTS: Dict[str, List[str]] = {
     "rasterizer-1": ["rasterizer.py", "--threads", "1"],
     "rasterizer-2": ["rasterizer.py", "--threads", "2"],
     "cpu-1": ["cpu.py", "--threads", "1"],
+    "cold": ["cold.py"],
 }
 # Of CUDA, without a GPU: the first needs its compilers, the second g++.
 COMPILE = {"cuda-compile": ["cuda_compile.py"], "cuda-host": ["cuda_host.py"]}

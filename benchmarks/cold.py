@@ -1,4 +1,4 @@
-"""What the first call on a machine costs: the processor's seconds that numba compiles, by function, in an empty cache.
+"""Measure what the first call on a machine costs: the seconds that numba compiles, by function, in an empty cache.
 
 Each case runs in a process of its own with one thread. Exit code 1 where the whole process takes more than its budget.
 """

@@ -145,16 +145,26 @@ def loops(depth):
     return "def f(scene, cam, gaussians):\n" + heads + textwrap.indent(SUM.format("l1_loss(image, gt)"), " " * depth)
 
 
+def step(body, name="f"):
+    """Return a training step with a body between the two images and their loss."""
+    lines = SUM.format("l1_loss(image, gt)").splitlines(True)
+    return f"def {name}(cam, gaussians, c):\n" + "".join([*lines[:2], textwrap.indent(body, "    "), *lines[2:]])
+
+
 # What once was exponential, cubic, or took 500 MB; and whether the file is read.
 LABORIOUS = {
     "20 loops": (loops(20), True),
     "95 loops": (loops(95), False),  # Python compiles 20
     "a sum of 100 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 100)), True),
-    "a sum of 601 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 601)), True),
+    "a sum of 550 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 550)), True),
     "650 lambdas": ("def f():\n    g = " + "lambda: " * 650 + "0\n", True),
     "1,500 lambdas": ("def f():\n    g = " + "lambda: " * 1500 + "0\n", False),
     "1,000 functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(1000)), True),
     "9,000 functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(9000)), False),
+    "200 branches": (step("if c:\n    image = image * gt\nelse:\n    gt = gt + image\n" * 200), True),
+    "1,800 loops": (step("for x in c:\n    image = image + gt\n" * 1800), False),
+    "1,200 try": (step("try:\n    image = image + gt\nexcept ValueError:\n    gt = image\n" * 1200), False),
+    "2,520 functions": ("".join(step("", f"f{i}") for i in range(2520)), True),
     "names for names": ("a0 = l1_loss\n" + "".join(f"a{i + 1} = a{i} if x else a{i}\n" for i in range(60)), True),
 }
 
@@ -177,6 +187,89 @@ def test_the_steps_are_few(what, tmp_path):
     said, kilobytes = done.stdout.decode().splitlines()
     assert said.startswith("[]" if is_read else "['other.py']") and "'train.py'" in said
     assert int(kilobytes) < 300 << 10
+
+
+STATEMENTS = {
+    "assignment": "image = image + gt\n",
+    "annotated": "image: object = gt * image\n",
+    "augmented": "image += gt\n",
+    "unpacked": "image, gt = gt, image\n",
+    "attribute": "c.image = image\nimage = c.image\n",
+    "entry": "c['image'] = image\nimage = c['image']\n",
+    "call": "image = torch.clamp(image, 0, 1)\n",
+    "append": "c.append(image)\nimage = torch.stack(c)\n",
+    "in place": "image.mul_(gt)\n",
+    "index": "image = image[gt > 0]\n",
+    "mask": "image = image * mask\nmask = image > 0\n",
+    "choice": "image = image if c else gt\n",
+    "comprehension": "image = [each * gt for each in image]\n",
+    "lambda": "gt = (lambda each: each + image)(gt)\n",
+    "delete": "del c\nc = image\n",
+    "assert": "assert image is not gt\n",
+    "global": "global image\nimage = gt\n",
+    "import": "import image\nimage = image.of(gt)\n",
+    "with": "with c as image:\n    gt = image\n",
+    "if": "if c:\n    image = image * gt\nelse:\n    gt = gt + image\n",
+    "if alone": "if c:\n    image = torch.cat([image, gt])\n",
+    "for": "for x in c:\n    image = image + gt\n",
+    "for else": "for image in gt:\n    if c:\n        break\nelse:\n    gt = image\n",
+    "while": "while c:\n    image = image + gt\n    continue\n",
+    "try": "try:\n    image = image + gt\nexcept ValueError:\n    gt = image\nfinally:\n    c = gt\n",
+    "raise": "if c:\n    raise ValueError(image)\n",
+    "return": "if c:\n    return image\n",
+    "function": "def image(x):\n    return gt + image(x)\n",
+    "class": "class image:\n    gt = image\n",
+    "loss": "loss = l1_loss(image, gt)\nloss.backward()\n",
+}
+
+
+# Each reads a name that all before it may have bound: n statements, n times n ways. So their steps grow, not more.
+JOINED = {"augmented", "append", "in place", "if", "if alone", "for", "for else", "while", "try", "loss"}
+MANY_WAYS = {False: 4.6, True: 7}  # with --masks each of them is asked from each read
+
+
+def nested(statement, depth):
+    """Return a compound statement in itself, so many deep."""
+    text = statement
+    for _ in range(depth - 1):
+        head, _, rest = statement.partition("\n")
+        text = head + "\n" + textwrap.indent(text, "    ") + rest + "\n"
+    return text
+
+
+@pytest.mark.parametrize("options", [{}, {"ssim": True, "masks": True}], ids=["plain", "ssim and masks"])
+@pytest.mark.parametrize("what", STATEMENTS, ids=lambda what: what.replace(" ", "_"))
+def test_the_steps_grow_with_the_code(what, options, tmp_path, monkeypatch):
+    """Every call of a function counts, and there are not many of them for a step of the budget."""
+    from legs_adapters.code.limits import Budget
+    from legs_adapters.plan import plan
+
+    statement, spent, calls = STATEMENTS[what], [0], [0]
+    spend = Budget.spend
+    monkeypatch.setattr(Budget, "spend", lambda self, path, n: spent.append(spent.pop() + n) or spend(self, path, n))
+
+    def count(frame, event, argument):
+        calls[0] += event == "call"
+
+    def cost(body):
+        head = "import torch\nfrom gaussian_renderer import render\nfrom utils.loss_utils import l1_loss\n\n\n"
+        (tmp_path / "train.py").write_text(head + step("for cam in c:\n" + textwrap.indent(body, "    ")))
+        spent[0] = calls[0] = 0
+        sys.setprofile(count)
+        try:
+            plan(tmp_path, **options)
+        finally:
+            sys.setprofile(None)
+        assert calls[0] < 12 * spent[0]  # none is a walk that nobody counts
+        return spent[0], calls[0]
+
+    cost(statement)  # what is remembered of words
+    shapes = {"in sequence": [statement * n for n in (20, 40)]}
+    if statement.count(":\n    ") == 1 and "else" not in statement:
+        shapes["nested"] = [nested(statement, n) for n in (5, 10)]
+    for shape, (less, more) in shapes.items():
+        for once, twice in zip(cost(less), cost(more)):
+            assert twice <= (MANY_WAYS["masks" in options] if what in JOINED else 2.5) * once, (shape, once, twice)
 
 
 def test_deeper_than_the_stack(tmp_path, monkeypatch):

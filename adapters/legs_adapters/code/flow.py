@@ -47,7 +47,7 @@ class Flow:
         contexts: by a node's id, the loops and the context managers around it (``with torch.no_grad():``), the
             innermost last.
         conditions: by a call's id, the names that must be true where it runs, ``if tracking:``, the innermost last.
-        steps: how many it took: nodes that were visited, and definitions that were copied, four a step.
+        steps: how many it took: nodes that were visited, definitions that reach them, and copied ones, four a step.
     """
 
     def __init__(
@@ -351,6 +351,7 @@ class Flow:
     def _visit_Name(self, node: cst.CSTNode, env: Env) -> None:
         place = path_of(node)
         if place is not None and place in env:
+            self.steps += len(env[place]) - 1
             self._reaching.setdefault(id(node), set()).update(env[place])
 
     def _visit_Attribute(self, node: cst.Attribute, env: Env) -> None:

@@ -7,7 +7,7 @@ and the field's words in the names along it. A name with "depth" or "feature" ou
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional, Set, Tuple
+from typing import Dict, List, Optional, Tuple
 
 import libcst as cst
 
@@ -26,7 +26,7 @@ from legs_adapters.tensors.backward import Training
 __all__ = ["Meanings"]
 
 _DEPTH = 40
-MAX_STEPS = 20000  # for one question: some dataflow is one large cycle
+_NONE = _DEPTH + 2
 
 _Question = Tuple[str, int]  # of an expression, or of the definitions that reach it; its id
 
@@ -43,10 +43,11 @@ class Meanings:
         self.program = program
         self.training = training
         self._by_name = by_name
+        self.rows: Dict[Tuple[int, int], bool] = {}  # see `is_rows`
         self._known: Dict[_Question, Meaning] = {}
-        self._here: Dict[_Question, Meaning] = {}
-        self._open: Set[_Question] = set()
-        self._spent = 0
+        self._here: Dict[_Question, Tuple[Meaning, int]] = {}
+        self._open: Dict[_Question, int] = {}  # in their order, from 0
+        self._needs = _NONE  # the first open question on which the answers since depend
 
     def meaning(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Return the meaning of an expression."""
@@ -63,24 +64,30 @@ class Meanings:
         return self._answer(function, node, self._defined)
 
     def _answer(self, function: Function, node: cst.CSTNode, answer: MeaningOf) -> Meaning:
-        """Answer a question once; unknown where the answer depends on itself or exceeds the budget."""
-        question = answer.__name__, id(node)
-        for known in (self._known, self._here):
-            if question in known:
-                return known[question]
-        if question in self._open or len(self._open) > _DEPTH or self._spent > MAX_STEPS:
+        """Answer a question once; unknown where the answer depends on itself or the file is over its budget."""
+        question, here = (answer.__name__, id(node)), len(self._open)
+        if question in self._known:
+            return self._known[question]
+        if question in self._here:
+            self._needs = min(self._needs, self._here[question][1])
+            return self._here[question][0]
+        is_over = here > _DEPTH or not function.module.spend(2)
+        if question in self._open or is_over:
+            self._needs = 0 if is_over else min(self._needs, self._open[question])
             return UNKNOWN
-        outermost = not self._open
-        self._spent = 0 if outermost else self._spent + 1
-        self._open.add(question)
+        before, self._needs = self._needs, _NONE
+        self._open[question] = here
         try:
             meaning = answer(function, node)
         finally:
-            self._open.discard(question)
-        # An answer from inside a cycle is incomplete: it is not cached.
-        self._here[question] = meaning
-        if outermost:
+            del self._open[question]
+            needs, self._needs = self._needs, min(before, self._needs) if self._needs < here else before
+        # An answer from inside a cycle is incomplete: it is remembered for the outermost question alone.
+        if needs < here:
+            self._here[question] = meaning, needs
+        else:
             self._known[question] = meaning
+        if not here:
             self._here.clear()
         return meaning
 
@@ -158,6 +165,8 @@ class Meanings:
 
     def _defined(self, function: Function, node: cst.CSTNode) -> Meaning:
         definitions = self.program.lookup(function, node) or ()
+        if not function.module.spend(2 * len(definitions)):
+            return UNKNOWN
         ways = [self._definition(where, definition) for where, definition in definitions]
         if any(meaning.role == "target" and meaning.kind in ("image", None) for meaning in ways):
             # or what a setting puts into the photograph's place

@@ -38,8 +38,15 @@ def makes_mask(call: cst.Call) -> bool:
 
 def is_rows(meanings: Meanings, function: Function, node: Optional[cst.CSTNode], depth: int = 0) -> bool:
     """Return whether an expression is a list of pixels, ``image.reshape(-1, 3)``, without neighbours."""
-    if node is None or depth > _DEPTH:
+    if node is None or depth > _DEPTH or not function.module.spend(1):
         return False
+    known = meanings.rows
+    if (id(node), depth) not in known:
+        known[id(node), depth] = _is_rows(meanings, function, node, depth)
+    return known[id(node), depth]
+
+
+def _is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int) -> bool:
     parts: List[Optional[cst.CSTNode]] = []
     if isinstance(node, cst.BinaryOperation):
         parts = [node.left, node.right]

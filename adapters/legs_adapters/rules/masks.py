@@ -101,7 +101,7 @@ class _Finder:
         self.lines: List[_Line] = []
         self.unnamed: List[_Pair] = []
         self.problems: List[Problem] = []
-        self._reads: Dict[Function, List[cst.CSTNode]] = {}
+        self._reads: Dict[Function, Dict[Optional[str], List[cst.CSTNode]]] = {}
 
     def look_at_patched(self, entry: Left) -> None:
         """Take in the terms of a line that were weighted before."""
@@ -153,7 +153,9 @@ class _Finder:
                 if part is not pair.prediction and not (meaning.kind == "image" and meaning.role in ("render", "both")):
                     continue
                 carriers.append((where, part))
-                for made in where.flow.reaching(part) if len(work) < _MOST else ():
+                reaching = where.flow.reaching(part) if len(work) < _MOST else ()
+                where.module.spend(len(reaching))
+                for made in reaching:
                     if made.kind == "parameter":
                         calls = self.analysis.training.sites.get(where, ())
                         given = [(caller, where.given(call, made.place)) for caller, call in calls]
@@ -175,10 +177,12 @@ class _Finder:
         """Yield the reads of the same value, or of the whole of it, that a backward pass reaches."""
         training = self.analysis.training
         if function not in self._reads:
-            reads = _places(function.body)
-            self._reads[function] = [r for r in reads if training.includes(r) or not training.touches(function)]
-        for read in self._reads[function]:
-            if path_of(read) == path_of(carrier):
+            self._reads[function] = {}
+            for read in _places(function.body):
+                if training.includes(read) or not training.touches(function):
+                    self._reads[function].setdefault(path_of(read), []).append(read)
+        for read in self._reads[function].get(path_of(carrier), ()):
+            if function.module.spend(1):
                 yield read
 
 

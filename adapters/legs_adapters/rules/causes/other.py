@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from typing import List
 
@@ -39,6 +40,7 @@ class NotSplats(Rule):
         return True
 
 
+@functools.lru_cache(maxsize=8)
 def is_of_other_framework(text: str) -> bool:
     """Return whether a file imports another framework of tensors and no torch."""
     return _OTHER_FRAMEWORK.search(text) is not None and not _TORCH.search(text)

@@ -82,8 +82,9 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
     model = find_model(root)
     if model is None:
         raise LegsError(f"{root} has no COLMAP model: there is no sparse/0/images.bin or .txt")
-    entries, kind = _entries(model)
+    kind = "bin" if (model / "images.bin").is_file() else "txt"
     cameras = _parse(model / f"cameras.{kind}", _cameras_bin if kind == "bin" else _cameras_txt)
+    entries, kind = _entries(model)
     views = []
     for image in entries:
         if image.camera_id not in cameras:

@@ -93,7 +93,7 @@ class TestStoreElsewhere:
 
     def test_the_store_remembers_its_scene(self, scene, tmp_path, monkeypatch):
         pytest.importorskip("matplotlib")
-        from legs_loss.lab.report import sheet
+        from legs_loss.cli.shared import sheet
 
         shown = []
         monkeypatch.setattr(sheet, "save_sheet", lambda path, views, spec, title: shown.extend(views))
@@ -108,7 +108,7 @@ class TestStoreElsewhere:
 
     def test_a_note_that_is_damaged_or_leads_nowhere_is_no_error(self, scene, tmp_path, monkeypatch):
         pytest.importorskip("matplotlib")
-        from legs_loss.lab.report import sheet
+        from legs_loss.cli.shared import sheet
 
         shown = []
         monkeypatch.setattr(sheet, "save_sheet", lambda path, views, spec, title: shown.extend(views))
@@ -371,7 +371,7 @@ class TestWhatIsOffered:
     @pytest.mark.parametrize(
         ("arguments", "most", "advanced"),
         [
-            (["patch"], 10, "advanced: which terms"),
+            (["patch"], 11, "advanced: which terms"),
             (["train"], 10, "advanced: the training"),
             (["compare"], 9, "advanced"),
         ],

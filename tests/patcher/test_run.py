@@ -93,11 +93,12 @@ class TestTraining:
     def test_in_memory_is_the_same_run(self, runs):
         assert runs["in memory"]["losses"] == runs["patched"]["losses"]
 
-    def test_the_first_weighted_step_says_what_is_active_once(self, runs):
+    def test_the_first_step_says_what_is_active_and_the_end_how_many_were(self, runs):
         lines = [line for line in runs["said"].splitlines() if line.startswith("legs-loss: ")]
-        assert len(lines) == 1
+        assert len(lines) == 2
         assert "preset legs: laplacian, C3, beta 10" in lines[0]
         assert "legs.toml" in lines[0]
+        assert lines[1] == "legs-loss: 8 step(s) weighted, 0 plain with a gradient"
 
     def test_the_losses_fall(self, runs):
         first, last = (float.fromhex(runs["patched"]["losses"][i]) for i in (0, -1))

@@ -58,7 +58,7 @@ class TestWhichScenes:
             (tmp_path / f"{name}.txt").write_text(line + "\n")
         (tmp_path / "one.txt").write_text("other.txt\n")
         (tmp_path / "other.txt").write_text("scenes/scene0\none.txt\n")
-        (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe")
+        (tmp_path / "bytes.txt").write_bytes(b"\xe9t\xe9")
         assert find_scenes([str(tmp_path / "all.txt")]) == [scenes[0], scenes[2]]
         for name in ("self", "one", "other"):
             with pytest.raises(LegsError, match="is in a list that it names itself"):

@@ -42,13 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-m", "--out", type=Path, default=Path("legs_compare"), metavar="DIR", help="default: legs_compare"
     )
-    parser.add_argument(
+    advanced = parser.add_argument_group("advanced")
+    advanced.add_argument(
         "--lpips",
         type=Path,
         metavar="WEIGHTS",
         help="score LPIPS, too, by this state dict of torchvision's squeezenet1_1, alexnet or vgg16",
     )
-    advanced = parser.add_argument_group("advanced")
     advanced.add_argument(
         "--densify_grad_threshold", type=float, metavar="X", help="of all arms; default: as for legs train"
     )

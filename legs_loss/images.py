@@ -119,12 +119,15 @@ def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str =
         return Layout(image.shape, False)
     first, last = image.shape[-3], image.shape[-1]
     if channels_last is None:
-        if (first in _CHANNELS) == (last in _CHANNELS):
-            raise LegsError(
-                f"{name} {shape_of(image)} may have its channels first or last: say channels_last=False ({first} "
-                f"channels) or channels_last=True ({last} channels); gray images are [..., {first}, 1, H, W]"
-            )
-        return Layout(image.shape, last in _CHANNELS)
+        # Not compared with ==: torch.compile can branch on conditions of sizes that change, not compare them.
+        if first in _CHANNELS and last not in _CHANNELS:
+            return Layout(image.shape, False)
+        if last in _CHANNELS and first not in _CHANNELS:
+            return Layout(image.shape, True)
+        raise LegsError(
+            f"{name} {shape_of(image)} may have its channels first or last: say channels_last=False ({first} "
+            f"channels) or channels_last=True ({last} channels); gray images are [..., {first}, 1, H, W]"
+        )
     channel, other = (last, first) if channels_last else (first, last)
     if channel > max(_CHANNELS) and other in _CHANNELS:
         raise LegsError(

@@ -190,8 +190,10 @@ def legs_loss(
     layout, prediction, target = read_pair(prediction, target, channels_last)
     if weight is None and not spec.unweighted:
         check_order(prediction, target)
-    made = "" if spec.unweighted else f"{spec.operator}, {spec.curve}, beta {spec.beta:g}, by legs_loss"
-    _note(prediction, target, made if weight is None else "the map given to legs_loss")
+    made = "the map given to legs_loss"
+    if weight is None and not is_compiling():  # a graph may have numbers that no text can have
+        made = f"{spec.operator}, {spec.curve}, beta {spec.beta:g}, by legs_loss"
+    _note(prediction, target, "" if weight is None and spec.unweighted else made)
     weight, mask = layout.map_first(weight, target, "weight"), layout.map_first(mask, target, "mask")
     prediction, target = layout.channels_first(prediction), layout.channels_first(target)
     weights = Weights(spec if weight is None else None, None, weight, mask, renormalise)

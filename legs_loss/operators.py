@@ -84,5 +84,5 @@ def check_operator(operator: str, p: float) -> None:
     if operator not in OPERATORS:
         names = ", ".join(OPERATORS)
         raise LegsError(f"no operator is named {operator!r}: choose one of {names}" + did_you_mean(operator, OPERATORS))
-    if p not in NORMS:
+    if not any(p == norm for norm in NORMS):  # not `in`: torch.compile with dynamic=True would find none
         raise LegsError(f"p must be 1, 2 or inf, got {p!r}")

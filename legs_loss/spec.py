@@ -116,6 +116,5 @@ def as_spec(spec: Spec) -> WeightSpec:
         return PRESETS[spec]
     except (KeyError, TypeError):
         raise LegsError(
-            f"no preset is named {spec!r}: choose one of {', '.join(PRESETS)}, or give a WeightSpec"
-            + did_you_mean(spec, PRESETS)
+            f"no preset is named {spec!r}: choose one of {', '.join(PRESETS)}" + did_you_mean(spec, PRESETS)
         ) from None

@@ -171,11 +171,15 @@ def forced_backend() -> Optional[str]:
     """Return the backend that LEGS_BACKEND names, or None.
 
     Raises:
-        LegsError: there is none of this name.
+        LegsError: there is none of this name, or it is "cuda" where torch has no CUDA device.
     """
     name = os.environ.get("LEGS_BACKEND", "")
     if name and name not in _NAMES:
         raise LegsError(f"LEGS_BACKEND must be one of {', '.join(_NAMES)}, got {name!r}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise LegsError(
+            f"LEGS_BACKEND=cuda, but {_why_missing(name) or 'there is no CUDA device here'}: unset LEGS_BACKEND"
+        )
     return name or None
 
 

@@ -15,7 +15,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from legs_loss import LegsError, LEGSLoss, WeightSpec, legs_loss, weight_map
+from legs_loss import LegsError, LEGSLoss, WeightSpec, l1_loss, legs_loss, ssim, weight_map
 from legs_loss.kernels.available import BACKENDS
 from legs_loss.operators import OPERATORS, Operator
 from legs_loss.precompute import normalised_map
@@ -267,6 +267,13 @@ class TestSelection:
         torch.testing.assert_close(stored.float(), ((expected - low) / (high - low + 1e-8))[0], rtol=0, atol=2.0**-11)
         assert used(legs_loss(prediction, target)) == "fused"
         assert capfd.readouterr().err == ""
+
+    @pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA here")
+    @pytest.mark.parametrize("loss", [legs_loss, l1_loss, ssim], ids=["legs_loss", "l1_loss", "ssim"])
+    def test_cuda_without_cuda_is_an_error(self, chosen, loss):
+        chosen("cuda")
+        with pytest.raises(LegsError, match=r"LEGS_BACKEND=cuda, but .*CUDA.*: unset LEGS_BACKEND"):
+            loss(*images((3, 20, 30)))
 
     def test_an_unknown_backend_is_an_error(self, chosen):
         chosen("metal")

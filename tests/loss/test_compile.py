@@ -64,6 +64,23 @@ def test_value_and_gradient_are_those_of_eager_from_the_first_call(name):
             torch.testing.assert_close(mine, eager, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("dynamic", [None, True])
+@pytest.mark.parametrize("axes", [(3, 0, 0), (0, 0, 3), (2, 3, 0, 0), (2, 0, 0, 3), (0, 0)], ids=str)
+@pytest.mark.parametrize(
+    "loss", [l1_loss, ssim, legs_loss, LEGSLoss()], ids=["l1_loss", "ssim", "legs_loss", "LEGSLoss"]
+)
+def test_portrait_and_landscape_in_one_capture(loss, axes, dynamic):
+    compiled = torch.compile(loss, fullgraph=True, backend="eager", dynamic=dynamic)
+    for sides in ((16, 20), (16, 25), (25, 20), (20, 16)):  # another width, another height, turned round
+        left = iter(sides)
+        shape = [size or next(left) for size in axes]
+        prediction, target = torch.rand(shape, requires_grad=True), torch.rand(shape)
+        found = value_and_gradient(compiled, prediction, target)
+        for mine, eager in zip(found, value_and_gradient(loss, prediction, target)):
+            torch.testing.assert_close(mine, eager, rtol=1e-4, atol=1e-6)
+
+
 SCRIPT = """
 import torch
 from legs_loss import LEGSLoss, l1_loss, legs_loss

@@ -12,7 +12,7 @@ from tests.support import colmap_scene, legs
 
 FILES = {
     "no toml": ("preset = ", "cannot be read"),
-    "not utf-8": (b"\xff\xfe", "cannot be read"),
+    "not utf-8": (b"preset = '\xff'", "line 1 is not in UTF-8"),
     "a NUL": ("preset = 'a\0'", "cannot be read"),
     "deep": ("preset = " + "[" * 100_000, "cannot be read"),
     "deep tables": ("[" + ".".join(["a"] * 5_000) + "]", "unknown setting 'a'"),

@@ -151,7 +151,7 @@ class TestErrors:
 
     def test_without_numba(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "numba", None)
-        with pytest.raises(LegsError, match=r"pip install 'legs-loss\[cpu\]"):
+        with pytest.raises(LegsError, match=r"needs numba: pip install numba, or, .* '\.\[cpu\]'"):
             rasterize(*scene(), camera(), BACKGROUND, 3)
 
 

@@ -34,7 +34,7 @@ dist: $(VENV)/.lint
 
 $(VENV)/.demo: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)" -e ".[all]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)" -e ".[report,patch,completion]"
 	touch $@
 
 $(VENV)/.test: pyproject.toml

@@ -152,7 +152,7 @@ def _linear(name: str) -> List[Tensor]:
     """Return LPIPS's linear layers of a network, each [C, 1, 1], from the package torchmetrics."""
     package = importlib.util.find_spec("torchmetrics")
     if package is None or not package.submodule_search_locations:
-        raise LegsError('--lpips needs torchmetrics, which has LPIPS\'s linear layers: pip install "legs-loss[lpips]"')
+        raise LegsError("--lpips needs torchmetrics, which has LPIPS's linear layers: pip install torchmetrics")
     path = Path(package.submodule_search_locations[0], "functional", "image", "lpips_models", f"{name}.pth")
     layers = torch.load(str(path), map_location="cpu", weights_only=True)
     return [layers[key][0] for key in sorted(layers)]

@@ -17,7 +17,7 @@ from tests.support import ROOT
 
 NOT_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 # What there is at most. The core is what a training script imports; offline, what makes its files before.
-MOST = {"core": 3715, "offline": 1812, "lab": 5840, "patcher": 5972, "adapters": 7559, "all": 18926}
+MOST = {"core": 3722, "offline": 1812, "lab": 5840, "patcher": 5972, "adapters": 7559, "all": 18933}
 OFFLINE = {"scenes", "precompute", "cli"}
 # What is no Python, with its lines that are not blank.
 OTHERS = {"legs_loss/kernels/cuda/legs.cu": 650, "legs_loss/lab/report/html_page.html": 251}

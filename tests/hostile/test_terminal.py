@@ -102,9 +102,7 @@ class TestLegs:
         for arguments in (
             ["show", lines],
             ["show", lines, "--views", "nothing"],
-            ["train", lines, "--out", tmp_path / "run"],
             ["train", colmap, "--out", tmp_path / "run"],
-            ["compare", lines, "--out", tmp_path / "rows"],
             ["compare", colmap, "--out", tmp_path / "rows"],
             ["info", tmp_path / "no\nlegs: error: b"],
             ["report", tmp_path / "no\nlegs: error: b"],

@@ -41,7 +41,7 @@ class Photographs:
 
     def __init__(self, folders: Sequence[str], photos: Optional[str] = None) -> None:
         roots = [photos] if photos else list(folders)
-        self.root = os.path.commonpath([os.path.realpath(root) for root in roots]) if roots else ""
+        self.root: str = os.path.commonpath([os.path.realpath(root) for root in roots]) if roots else ""
         files = [path for root in roots for path in _image_files(root)][:MAX_FILES]
         listed = set() if photos else {key for root in roots for key in _listed(root)}
         self._tiers: List[List[str]] = [[], []]

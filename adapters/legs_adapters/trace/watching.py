@@ -79,11 +79,12 @@ class Watch:
     """
 
     def __init__(self, root: str, photographs: Photographs, steps: int, ended: Callable[[], None]) -> None:
-        self.root = os.path.join(os.path.realpath(root), "")
-        self.photographs = photographs
+        self.root: str = os.path.join(os.path.realpath(root), "")
+        self.photographs: Photographs = photographs
         self.limit = steps
         self.ended = ended
-        self.steps = self.backward_passes = 0
+        self.steps: int = 0
+        self.backward_passes: int = 0
         self.terms: Dict[Any, Dict[str, Any]] = {}
         self._pending: List[_Pending] = []
         self._files: Dict[str, Optional[str]] = {}

@@ -33,9 +33,9 @@ class Fire(nn.Module):
 
     def __init__(self, inputs: int, squeezed: int, each: int) -> None:
         super().__init__()
-        self.squeeze = nn.Conv2d(inputs, squeezed, 1)
-        self.expand1x1 = nn.Conv2d(squeezed, each, 1)
-        self.expand3x3 = nn.Conv2d(squeezed, each, 3, padding=1)
+        self.squeeze: nn.Module = nn.Conv2d(inputs, squeezed, 1)
+        self.expand1x1: nn.Module = nn.Conv2d(squeezed, each, 1)
+        self.expand3x3: nn.Module = nn.Conv2d(squeezed, each, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return both expansions of the squeezed image."""
@@ -77,8 +77,10 @@ class LPIPS(nn.Module):
 
     def __init__(self, network: Network) -> None:
         super().__init__()
-        self.name, self.features, self.taps = network
-        self.linear = _linear(network.name)
+        self.name: str = network.name
+        self.features: nn.Sequential = network.features
+        self.taps: Tuple[int, ...] = network.taps
+        self.linear: List[Tensor] = _linear(network.name)
 
     def forward(self, prediction: Tensor, target: Tensor) -> Tensor:
         """Return the distance: of unit features, squared, weighted by channel, a mean over pixels, summed over taps."""

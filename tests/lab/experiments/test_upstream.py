@@ -455,7 +455,7 @@ def test_done_rows_stay_and_others_are_added(compared, capsys: pytest.CaptureFix
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
     assert "PSNR by Gaussians" in page and "PSNR by iterations" not in page  # nothing was scored during the runs
     assert "sh_degree" not in page  # of the package's own trainer
-    assert f"examples/reproduce_paper/compare.py {words[0].rpartition('/')[2]} CHECKOUT --arms" in page
+    assert f"examples/reproduce_paper/compare.py {words[0]} CHECKOUT --arms" in page
     assert "--seeds 2 -r 24 --iterations 30 --profile" in page
 
 

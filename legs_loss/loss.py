@@ -55,8 +55,9 @@ def weighted_l1(
         >>> weighted_l1(prediction, target, weight=torch.tensor([[1.0, 3.0]]))
         tensor(2.)
     """
+    loss = mean_error(prediction, target, weight, mask, renormalise, channels_last)
     _note(prediction, target, "" if weight is None else "the map given to weighted_l1")
-    return mean_error(prediction, target, weight, mask, renormalise, channels_last)
+    return loss
 
 
 def mean_error(

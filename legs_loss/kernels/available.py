@@ -73,8 +73,7 @@ class Backends:
         """
         forced, names = forced_backend(), self.names(device)
         name = forced or (names[0] if names else "torch")
-        usable = name in names and self.availability(name, device, operation).backend is not None
-        return name if usable else "torch"
+        return name if name in names and self.availability(name, device, operation).backend is not None else "torch"
 
     def ready(self, device: torch.device, operation: Optional[str] = None) -> Optional[Backend]:
         """Return the backend of an operation on a device, None where that is torch: also where no trial may run now."""

@@ -37,11 +37,13 @@ class Call(NamedTuple):
     layout: Optional[Layout] = None
 
     def check_options(self) -> None:
-        """Check the options; the images are checked by :meth:`aligned`, when they need a weight.
+        """Check the options; the images' shapes are checked by :meth:`aligned`, when they need a weight.
 
         Raises:
-            LegsError: an unknown reduction, or options that exclude one another.
+            LegsError: an image that is no tensor, an unknown reduction, or options that exclude one another.
         """
+        if not (isinstance(self.prediction, Tensor) and isinstance(self.target, Tensor)):
+            read_pair(self.prediction, self.target)  # the error names which
         if self.reduction not in ("mean", "none"):
             raise LegsError(f'reduction must be "mean" or "none", got {self.reduction!r}')
         if self.own is not None and (self.mask is not None or self.reduction != "mean"):

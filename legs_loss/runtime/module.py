@@ -74,8 +74,6 @@ class LEGSLoss(nn.Module):
         mask: Optional[Tensor] = None,
     ) -> Tensor:
         """Return the loss; see :func:`~legs_loss.legs_loss`."""
-        if weight is None and (self._run is not None or not self.spec.unweighted):
-            check_order(prediction, target)
         if self._run is not None and weight is None:
             return self._by_store(self._run, prediction, target, mask)
         return legs_loss(
@@ -92,6 +90,7 @@ class LEGSLoss(nn.Module):
 
     def _by_store(self, run: Run, prediction: Tensor, target: Tensor, mask: Optional[Tensor]) -> Tensor:
         call = Call(prediction, target, None, mask, self.channels_last, "mean", None).aligned()
+        check_order(call.prediction, call.target)
         prediction, target, mask, renormalise = call.prediction, call.target, call.mask, self.renormalise
         with torch.no_grad():
             found = run.source.weights(call)

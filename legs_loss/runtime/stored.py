@@ -86,8 +86,7 @@ class Stored:
         found = self._find(store, image, view)
         if found is None or found.response is None:
             return None
-        spec = self._config.spec
-        over_scene = spec.over == "scene"
+        spec, over_scene = self._config.spec, self._config.spec.over == "scene"
         try:
             values = store.response(found.response) if over_scene else store.normalised_response(found.response)
         except LegsError as error:

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from legs_loss import LegsError, LEGSLoss, WeightSpec, d_ssim, legs_loss, weight_map, weighted_l1
+from legs_loss import LegsError, LEGSLoss, WeightSpec, d_ssim, l1_loss, legs_loss, weight_map, weighted_l1
 from tests.loss.test_ssim import formula_of_3dgs
 from tests.strategies import images
 
@@ -223,3 +223,14 @@ class TestBadInput:
         target[0, 0, 0] = float("nan")
         with pytest.raises(LegsError, match="NaN"):
             legs_loss(torch.rand(3, 4, 5), target)
+
+
+@pytest.mark.parametrize(
+    "loss", [l1_loss, weighted_l1, legs_loss, LEGSLoss()], ids=["l1_loss", "weighted_l1", "legs_loss", "LEGSLoss"]
+)
+@pytest.mark.parametrize("wrong", ["prediction", "target"])
+def test_what_is_no_tensor_is_named(loss, wrong):
+    images = {"prediction": torch.rand(3, 8, 8, requires_grad=True), "target": torch.rand(3, 8, 8)}
+    images[wrong] = [[0.5]]
+    with pytest.raises(LegsError, match=f"{wrong} must be a torch.Tensor, got list"):
+        loss(**images)

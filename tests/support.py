@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from legs_loss.lab.embedded.colmap_writer import write_colmap
 from legs_loss.runtime import state
-from legs_loss.scenes import Camera, PointCloud, write_colmap
+from legs_loss.scenes import Camera, PointCloud
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -89,7 +89,7 @@ FLOORS = [
     {"lab", "__main__"},
 ]
 LAB_FLOORS = [
-    {"simd", "conventions"},
+    {"simd", "conventions", "reconstruct"},
     {"gaussians"},
     {"ply", "rasterizer"},
     {"embedded", "surfels", "training"},

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Optional, Tuple, Union
 
 from legs_loss.errors import LegsError
-from legs_loss.scenes.colmap import read_colmap, write_colmap
+from legs_loss.scenes.colmap import read_colmap
 from legs_loss.scenes.folder import read_folder
 from legs_loss.scenes.images import image_size, image_tensor, load_training_image, open_image, training_size
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
@@ -25,7 +25,6 @@ __all__ = [
     "open_image",
     "read_scene",
     "training_size",
-    "write_colmap",
 ]
 
 

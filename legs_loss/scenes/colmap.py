@@ -7,15 +7,15 @@ import struct
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Callable, Dict, Iterator, List, Mapping, NamedTuple, Optional, Tuple
+from typing import Any, BinaryIO, Callable, Dict, Iterator, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
-from legs_loss.system import open_regular, read_text, write_whole
+from legs_loss.system import open_regular, read_text
 
-__all__ = ["find_model", "read_colmap", "read_points", "write_colmap"]
+__all__ = ["find_model", "read_colmap", "read_points"]
 
 # COLMAP's camera models in the order of their ids, each with its number of parameters and of focal lengths among them,
 # which come first.
@@ -131,33 +131,6 @@ def read_points(path: Path) -> PointCloud:
     return _parse(path, _points_bin if path.suffix == ".bin" else _points_txt)
 
 
-def write_colmap(root: Path, cameras: Mapping[str, Camera], points: PointCloud) -> None:
-    """Write ``root/sparse/0`` in COLMAP's binary format (PINHOLE cameras, no tracks).
-
-    ``cameras`` maps an image's name, relative to ``root/images``, to its camera.
-    """
-    folder = Path(root) / "sparse" / "0"
-    folder.mkdir(parents=True, exist_ok=True)
-    ids: Dict[Tuple[Any, ...], int] = {}
-    posed = [struct.pack("<Q", len(cameras))]
-    for number, (name, camera) in enumerate(sorted(cameras.items()), start=1):
-        intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        camera_id = ids.setdefault(intrinsics, len(ids) + 1)
-        quaternion = _quaternion(camera.world_to_camera[:3, :3])
-        pose = struct.pack("<i7d", number, *quaternion, *camera.world_to_camera[:3, 3])
-        no_points = struct.pack("<Q", 0)
-        posed.append(pose + struct.pack("<i", camera_id) + name.encode() + b"\0" + no_points)
-    lenses = [struct.pack("<Q", len(ids))]
-    lenses += [struct.pack("<iiQQ4d", number, 1, *lens) for lens, number in ids.items()]
-    cloud = [struct.pack("<Q", len(points.xyz))]
-    cloud += [
-        struct.pack("<Q3d3BdQ", number, *xyz, *rgb, 0.0, 0)
-        for number, (xyz, rgb) in enumerate(zip(points.xyz.tolist(), points.rgb.tolist()), start=1)
-    ]
-    for file, parts in (("images", posed), ("cameras", lenses), ("points3D", cloud)):
-        write_whole(folder / f"{file}.bin", b"".join(parts))
-
-
 def _parse(path: Path, parser: Callable[[Any], Any]) -> Any:
     try:
         if path.suffix == ".txt":
@@ -190,22 +163,6 @@ def _rotation(quaternion: Tuple[float, ...]) -> np.ndarray:
     u = np.array([x, y, z])
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return 2 * np.outer(u, u) + (w * w - u @ u) * np.eye(3) + 2 * w * cross
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Return the quaternion w, x, y, z with w >= 0 of a rotation [3, 3]."""
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
-    # Row k is 4 q_k q: the one with the largest diagonal is the safest to divide by.
-    products = np.array(
-        [
-            [1 + a + e + i, h - f, c - g, d - b],
-            [h - f, 1 + a - e - i, b + d, c + g],
-            [c - g, b + d, 1 - a + e - i, f + h],
-            [d - b, c + g, f + h, 1 - a - e + i],
-        ]
-    )
-    row = products[np.argmax(np.diag(products))]
-    return row / np.linalg.norm(row) * (1 if row[0] >= 0 else -1)
 
 
 class _Cursor:

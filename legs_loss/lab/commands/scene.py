@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the scene; 1 when the camera of a photograph was not found."""
     from legs_loss.errors import LegsError
-    from legs_loss.scenes.reconstruct import reconstruct
+    from legs_loss.lab.reconstruct import reconstruct
 
     for name, fits, wanted in (
         ("max_size", args.max_size >= 64, "at least 64"),

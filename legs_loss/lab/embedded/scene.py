@@ -14,8 +14,8 @@ from typing import List, Tuple, Union
 import numpy as np
 
 from legs_loss.lab.embedded import textures
+from legs_loss.lab.embedded.colmap_writer import write_colmap
 from legs_loss.lab.embedded.raycast import Lamp, Quad, Sphere, Tube, bake_light, render
-from legs_loss.scenes.colmap import write_colmap
 from legs_loss.scenes.model import Camera, PointCloud
 from legs_loss.system import write_whole
 

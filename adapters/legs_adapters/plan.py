@@ -162,7 +162,7 @@ def write(plan: Plan, force: bool = False) -> List[str]:
     root = plan.root
     if not plan.after and plan.settings is None:
         return []
-    with locked(root, f"legs-patch {root}"):
+    with locked(root, f"legs-patch {root}") as stop:
         journal = Journal.read(root)
         changes = plan.changes()
         if plan.settings is not None and SETTINGS_FILE in changes:
@@ -182,5 +182,5 @@ def write(plan: Plan, force: bool = False) -> List[str]:
         for path, data in plan.after.items():
             journal.add(path, Layer(plan.source(path), plan.edits[path], digest(data)))
         # The journal is written first, so that --undo works whatever happens next.
-        replace_files(root, {JOURNAL: (journal.data, journal.dump()), **changes})
+        replace_files(root, {JOURNAL: (journal.data, journal.dump()), **changes}, stop)
     return list(changes)

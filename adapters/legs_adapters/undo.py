@@ -37,7 +37,7 @@ def undo(path: str | os.PathLike[str], force: bool = False, look: bool = False) 
         LegsError: nothing was patched; or a file was edited since, and not ``force``. Nothing is changed then.
     """
     root = check_root(path)
-    with locked(root, f"legs-patch --undo {path}"):
+    with locked(root, f"legs-patch --undo {path}") as stop:
         journal = Journal.read(root)
         if journal.data is None:
             raise LegsError(
@@ -49,7 +49,7 @@ def undo(path: str | os.PathLike[str], force: bool = False, look: bool = False) 
             left = {name: layers for name, layers in journal.files.items() if name in dict(kept)}
             is_open = any(name not in journal.created for name, _ in kept)
             rest = journal._replace(files=left).dump() if is_open else None
-            replace_files(root, {**changes, JOURNAL: (journal.data, rest)})
+            replace_files(root, {**changes, JOURNAL: (journal.data, rest)}, stop)
     return changes, kept
 
 

@@ -143,9 +143,9 @@ def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str]
         scene = write_embedded_scene(Path(work) / "scene", **SCENE)
         precompute(read_scene(scene), scene / "legs_weights")
         patched, unpatched = (Path(work) / name / root.name for name in ("patched", "unpatched"))
-        with locked(root, f"legs-patch --verify {folder}"):
+        with locked(root, f"legs-patch --verify {folder}") as stop:
             for copy in (patched, unpatched):
-                shutil.copytree(str(root), str(copy), symlinks=True, ignore=_unneeded)
+                shutil.copytree(str(root), str(copy), symlinks=True, ignore=lambda *at: stop() or _unneeded(*at))
         if not (patched / JOURNAL).is_file():  # undone by another one, before this one had the lock
             raise LegsError(f"{root} is not patched any more: nothing to verify")
         undo(unpatched, force=True)

@@ -62,12 +62,16 @@ def noted() -> Iterator[Callable[[], bool]]:
 
 
 @contextmanager
-def held_back() -> Iterator[None]:
-    """Delay Ctrl-C over a few steps that belong together; it is raised right after them."""
+def held_back() -> Iterator[Callable[[], bool]]:
+    """Delay Ctrl-C over a few steps that belong together; it is raised right after them.
+
+    Yields:
+        A function that returns whether it was pressed.
+    """
     struck: Callable[[], bool] = bool
     try:
         with noted() as struck:
-            yield
+            yield struck
     finally:
         if struck():
             signal.raise_signal(signal.SIGINT) if _RAISES else os.kill(os.getpid(), signal.SIGINT)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from legs_adapters.checkout import replace
+from legs_adapters.checkout.replace import replace_files
 from legs_adapters.cli import main
 from legs_adapters.journal import JOURNAL
 from legs_adapters.plan import plan, write
@@ -159,7 +161,9 @@ OURS = (
     "replace.py",
     "inside.py",
     "locks.py",
-    "interrupts.py",
+    "ctrl_c.py",
+    "contextlib.py",
+    "shutil.py",
 )
 
 
@@ -209,6 +213,38 @@ def lines_of(arguments):
     return int(traced(arguments, -1, None)[1].rpartition("lines ")[2])
 
 
+def interrupted(arguments, root, number):
+    """Run legs-patch in a child that gets Ctrl-C before its n-th operation on files of a checkout; return its words."""
+    read, written = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.dup2(written, 1)
+        os.dup2(written, 2)
+        sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        seen = [0]
+
+        def hook(event, found):
+            is_there = bool(found) and (str(found[0]).startswith(str(root)) or not os.path.isabs(str(found[0])))
+            if is_there and (event == "open" or event.startswith("os.")):  # a name beside a folder's descriptor, too
+                seen[0] += 1
+                if seen[0] == number:
+                    os.kill(os.getpid(), signal.SIGINT)
+
+        code = 99
+        try:
+            sys.addaudithook(hook)
+            code = main([str(word) for word in arguments])
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    os.close(written)
+    with os.fdopen(read) as file:
+        said = file.read()
+    return f"{os.waitpid(child, 0)[1] >> 8} {said}"
+
+
 PLAIN = {name: text.encode() for name, text in SOURCES.items()}
 
 
@@ -234,7 +270,8 @@ class TestAtAnyLine:
         for number, arguments, root in self.points(tmp_path, what):  # from where main is in its try on
             before = snapshot(root)
             status, said = traced(arguments, number, lambda: os.kill(os.getpid(), signal.SIGINT))
-            after = {name: data for name, data in snapshot(root).items() if name != ".legs-patch.lock"}
+            after = snapshot(root)
+            assert not [path for path in root.iterdir() if path.suffix in (".lock", ".tmp")], (number, said)
             assert "Traceback" not in said, (number, said)
             assert status >> 8 == 130, (number, said)
             said_all.add(said.rpartition("interrupted; ")[2])
@@ -244,6 +281,26 @@ class TestAtAnyLine:
             if what == "patch" or after != before:
                 assert {name: data for name, data in snapshot(root).items() if name in PLAIN} == PLAIN
         assert len(said_all) >= 2, "no interrupt came late"
+
+    def test_ctrl_c_at_every_operation_on_files_leaves_nothing(self, what, tmp_path):
+        """A real signal before each: the lock and the staging folder go, whatever stage it comes at."""
+        saids, number = [], -1
+        while not saids or saids[-1].partition(" ")[0] == "130":
+            number += 2  # every second one
+            root = checkout(tmp_path / str(number), SOURCES)
+            if what == "undo":
+                write(plan(root))
+            before = snapshot(root)
+            saids.append(interrupted([root] if what == "patch" else ["--undo", root], root, number))
+            after = snapshot(root)
+            assert "Traceback" not in saids[-1]
+            assert not [path for path in root.iterdir() if path.suffix in (".lock", ".tmp")], (number, saids[-1])
+            assert ("nothing was changed" in saids[-1]) == (after == before), (number, saids[-1])
+            if JOURNAL in after:
+                undo(root)
+            assert snapshot(root) == PLAIN
+        assert number > 25 and saids[-1].startswith("0 ")
+        assert len({said.rpartition("; ")[2] for said in saids}) >= 3, saids
 
     def test_a_kill_leaves_nothing_for_ever(self, what, tmp_path):
         for number, arguments, root in self.points(tmp_path, what):
@@ -289,6 +346,161 @@ def test_a_folder_that_becomes_a_link_at_any_line(what, tmp_path):
         assert snapshot(outside) == precious, number
         said_all.add(said.partition(": ")[2][:20])
     assert len(said_all) >= 2, "no swap came in time"
+
+
+CHANGES = {f"{number}.py": (b"before", b"after") for number in range(4)}
+
+
+def save(path, data, how):
+    """Save a file as editors do: in place, or whole and renamed; None deletes it."""
+    if data is None:
+        path.unlink()
+    elif how == "in place":
+        path.write_bytes(data)
+    else:
+        (path.parent / "whole").write_bytes(data)
+        (path.parent / "whole").rename(path)
+
+
+@pytest.mark.parametrize("how", ["in place", "renamed"])
+@pytest.mark.parametrize("data", [b"mine", None])
+@pytest.mark.parametrize("victim", [0, 2, 3])
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_what_is_saved_before_a_rename_is_not_lost(number, victim, data, how, tmp_path, monkeypatch):
+    """It stops the command, which puts all other files back."""
+    root = checkout(tmp_path, {name: before for name, (before, _) in CHANGES.items()})
+    put, seen = replace._put, []
+
+    def put_after_a_save(*arguments):
+        seen.append(arguments)
+        if len(seen) == number:
+            save(root / f"{victim}.py", data, how)
+        put(*arguments)
+
+    monkeypatch.setattr(replace, "_put", put_after_a_save)
+    if victim < number - 1:  # it is replaced already: a save after the command
+        replace_files(root, CHANGES)
+        expected = b"after"
+    else:
+        with pytest.raises(LegsError, match=f"{victim}.py changed while legs-patch was running: nothing was written"):
+            replace_files(root, CHANGES)
+        expected = b"before"
+    found = dict.fromkeys(CHANGES, expected)
+    found[f"{victim}.py"] = data
+    assert snapshot(root) == {name: text for name, text in found.items() if text is not None}
+    assert not (root / ".legs-patch.tmp").exists()
+
+
+def test_what_is_saved_over_a_file_is_not_put_back(tmp_path, monkeypatch):
+    root = checkout(tmp_path, {name: before for name, (before, _) in CHANGES.items()})
+    put = replace._put
+
+    def put_after_a_save(root, path, *arguments):
+        if path == "2.py":
+            save(root / "0.py", b"mine", "renamed")
+            save(root / "2.py", b"mine, too", "renamed")
+        put(root, path, *arguments)
+
+    monkeypatch.setattr(replace, "_put", put_after_a_save)
+    with pytest.raises(LegsError, match=r"2\.py changed while"):
+        replace_files(root, CHANGES)
+    expected = {**dict.fromkeys(CHANGES, b"before"), "0.py": b"mine", "2.py": b"mine, too"}
+    assert snapshot(root) == expected
+
+
+@pytest.mark.parametrize("how", ["in place", "renamed"])
+def test_what_another_process_saves_while_400_files_are_staged(how, tmp_path):
+    changes = {f"{number}.py": (b"before", b"after") for number in range(400)}
+    root = checkout(tmp_path, {name: before for name, (before, _) in changes.items()})
+    child = os.fork()
+    if child == 0:
+        until = time.monotonic() + 60
+        while time.monotonic() < until:
+            try:
+                staged = len(os.listdir(str(root / ".legs-patch.tmp")))
+            except FileNotFoundError:
+                continue
+            if staged > 100:
+                save(root / "399.py", b"mine", how)
+                break
+        os._exit(0)
+    with pytest.raises(LegsError, match=r"399\.py changed while legs-patch was running"):
+        replace_files(root, changes)
+    assert os.waitpid(child, 0)[1] == 0
+    assert snapshot(root) == {**dict.fromkeys(changes, b"before"), "399.py": b"mine"}
+
+
+def test_where_nothing_can_be_put_back_the_journal_stays(tmp_path, monkeypatch, capsys):
+    """A disk that fails from the third rename on: the message says so, and a later --undo restores every byte."""
+    root = checkout(tmp_path, SOURCES)
+    with monkeypatch.context() as broken:
+        really, calls = os.replace, []
+
+        def fail_from_the_third_on(*arguments, **folders):
+            calls.append(arguments)
+            if len(calls) > 2:
+                raise OSError(5, "Input/output error")
+            really(*arguments, **folders)
+
+        broken.setattr(replace.os, "replace", fail_from_the_third_on)
+        assert main([str(root)]) == 2
+    said = capsys.readouterr().err
+    assert f"Input/output error; some files are changed: legs-patch --undo {root}" in said
+    assert "nothing was changed" not in said
+    assert snapshot(root)["one.py"] != PLAIN["one.py"]
+    assert main(["--undo", str(root)]) == 0
+    assert snapshot(root) == PLAIN
+
+
+def access_list(*entries):
+    """Return an access list as Linux has it in an extended attribute, of (tag, permissions, id)."""
+    return struct.pack("<I", 2) + b"".join(struct.pack("<HHI", *entry) for entry in entries)
+
+
+NO_ID = 0xFFFFFFFF
+OWNER, USER, GROUP, MASK, OTHER = 1, 2, 4, 0x10, 0x20
+LIST = access_list((OWNER, 6, NO_ID), (USER, 6, 1234), (GROUP, 0, NO_ID), (MASK, 6, NO_ID), (OTHER, 0, NO_ID))
+
+
+def attributes(path):
+    return {name: os.getxattr(str(path), name) for name in os.listxattr(str(path))}
+
+
+@pytest.mark.skipif(not hasattr(os, "setxattr"), reason="Linux has them")
+def test_attributes_and_access_lists_stay(tmp_path):
+    """A file keeps what it has, and gets none of its folder's: neither by a patch nor by its undo."""
+    root = checkout(tmp_path, SOURCES)
+    one, two = root / "one.py", root / "two.py"
+    try:
+        os.setxattr(str(one), "user.note", b"mine\0")
+        os.setxattr(str(one), "system.posix_acl_access", LIST)
+        two.chmod(0o640)
+        os.setxattr(str(root), "system.posix_acl_default", LIST)  # for what is made in there from now on
+    except OSError as error:
+        pytest.skip(f"not in this file system: {error}")
+    before = {path: (attributes(path), path.stat().st_mode & 0o7777) for path in (one, two)}
+    assert len(before[one][0]) == 2 and not before[two][0]
+    for step in (lambda: write(plan(root)), lambda: undo(root)):
+        step()
+        assert {path: (attributes(path), path.stat().st_mode & 0o7777) for path in (one, two)} == before
+    assert snapshot(root) == PLAIN
+
+
+def test_an_attribute_that_cannot_be_kept_stops_it(tmp_path, monkeypatch, capsys):
+    """Without its access list a file would be open to its group."""
+    root = checkout(tmp_path, SOURCES)
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "listxattr", lambda _: ["security.label", "system.posix_acl_access"], raising=False)
+    monkeypatch.setattr(os, "getxattr", lambda *_: b"", raising=False)
+    monkeypatch.setattr(os, "setxattr", fail, raising=False)
+    assert main([str(root)]) == 2
+    assert "No space left on device; nothing was changed" in capsys.readouterr().err
+    assert snapshot(root) == PLAIN
+    monkeypatch.setattr(os, "listxattr", lambda _: ["security.label"])
+    assert main([str(root)]) == 0
 
 
 def test_the_owner_stays(tmp_path):

@@ -7,13 +7,14 @@ import os
 import secrets
 import shutil
 import stat
+import time
 from pathlib import Path
-from typing import Dict, Iterator, Optional, Tuple
+from typing import Callable, Dict, Iterator, List, Optional, Tuple
 
 from legs_adapters.checkout.inside import BY_DESCRIPTOR, folder_of
 from legs_adapters.code.folders import check_name
 from legs_loss import LegsError
-from legs_loss.system import FileLock, HeldError, held_back, read_regular
+from legs_loss.system import FileLock, HeldError, held_back, open_regular, read_regular
 
 __all__ = ["MAX_FILE_BYTES", "Changes", "locked", "read_file", "replace_files"]
 
@@ -22,12 +23,16 @@ Changes = Dict[str, Tuple[Optional[bytes], Optional[bytes]]]
 
 MAX_FILE_BYTES = 8 << 20  # of a file that is read here: no source, no journal is larger
 _LOCK, _STAGING = ".legs-patch.lock", ".legs-patch.tmp"
-_WAIT = 30.0  # seconds: a command holds the lock while it writes, and while git looks for changes
+_ACCESS = "system.posix_acl_access"
+_WAIT, _POLL = 30.0, 0.02  # seconds: a command holds the lock while it writes, and while git looks for changes
 
 
 @contextlib.contextmanager
-def locked(root: Path, what: str) -> Iterator[None]:
+def locked(root: Path, what: str) -> Iterator[Callable[[], None]]:
     """Hold the lock of a checkout; delete what a killed legs-patch left.
+
+    Ctrl-C is held back until the lock is released: it leaves neither that nor the staging folder. Yield a function that
+    raises KeyboardInterrupt where it was pressed, to be called wherever nothing is half done.
 
     Args:
         root: the checkout.
@@ -36,41 +41,63 @@ def locked(root: Path, what: str) -> Iterator[None]:
     Raises:
         LegsError: another process holds the lock too long; or the folder cannot be written.
     """
-    note = f"process {os.getpid()} ({what})"
-    try:
-        lock = FileLock(root / _LOCK, wait=_WAIT, note=note, remove=True)
-    except HeldError as error:
-        who = f": {error}" if str(error) else ""
-        raise LegsError(f"another legs-patch is running in {root}{who}; nothing was changed: wait for it") from None
-    except OSError as error:
-        raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
-    with lock:
-        _sweep(root)
-        yield
+    with held_back() as is_struck:
+
+        def stop() -> None:
+            if is_struck():
+                raise KeyboardInterrupt
+
+        with _lock(root, f"process {os.getpid()} ({what})", stop):
+            _sweep(root)
+            yield stop
 
 
-def replace_files(root: Path, changes: Changes) -> None:
-    """Replace files, all of them or none; Ctrl-C is held back from the first one on.
+def _lock(root: Path, note: str, stop: Callable[[], None]) -> FileLock:
+    until = time.monotonic() + _WAIT
+    while True:
+        try:
+            return FileLock(root / _LOCK, wait=0.0, note=note, remove=True)
+        except HeldError as error:
+            if time.monotonic() > until:
+                who = f": {error}" if str(error) else ""
+                raise LegsError(
+                    f"another legs-patch is running in {root}{who}; nothing was changed: wait for it"
+                ) from None
+        except OSError as error:
+            raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
+        stop()
+        time.sleep(_POLL)
+
+
+def replace_files(root: Path, changes: Changes, stop: Callable[[], None] = lambda: None) -> None:
+    """Replace files, all of them or none. What somebody else saves meanwhile is not lost: it stops this, and stays.
+
+    Args:
+        root: the checkout.
+        changes: the files. If they cannot be put back, the first one stays changed, too: the journal.
+        stop: as :func:`locked` yields it; called while no file is replaced yet.
 
     Raises:
-        LegsError: a file is not as expected, or cannot be written; no file is changed then.
+        LegsError: a file is not as expected, or cannot be written; no file is changed then, or the message says so.
     """
-    for path, (expected, _) in changes.items():
-        if read_file(root, path) != expected:
-            raise LegsError(f"{path} changed while legs-patch was running: nothing was written; run it again")
     staged: Dict[str, str] = {}
+    done: List[str] = []
     try:
+        for path, (expected, _) in changes.items():
+            _check(path, read_file(root, path), expected)
         (root / _STAGING).mkdir(mode=0o700)
         for path, (_, data) in changes.items():
+            stop()
             if data is not None:
                 staged[path] = _stage(root, path, data)
-        with held_back(), contextlib.ExitStack() as back:
-            for path, (before, _) in changes.items():
-                _put(root, path, staged.get(path))
-                back.callback(_put_back, root, path, before)
-            back.pop_all()
-    except OSError as error:
-        raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
+        for path, (before, _) in changes.items():
+            _put(root, path, before, staged.get(path))
+            done.append(path)
+    except BaseException as error:
+        _put_back(root, changes, done)
+        if isinstance(error, OSError):
+            raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
+        raise
     finally:
         _sweep(root)
 
@@ -94,27 +121,57 @@ def read_file(root: Path, path: str) -> Optional[bytes]:
         raise LegsError(f"{full} cannot be read: {error.strerror}; nothing was changed") from None
 
 
+def _check(path: str, found: Optional[bytes], expected: Optional[bytes]) -> None:
+    if found != expected:
+        raise LegsError(f"{path} changed while legs-patch was running: nothing was written; run it again")
+
+
 def _stage(root: Path, path: str, data: bytes) -> str:
-    """Write what a file is to become to the staging folder, with the owner and the mode that the file has."""
+    """Write what a file is to become to the staging folder, with owner, mode and attributes that the file has."""
     staged = f"{_STAGING}/{secrets.token_hex(8)}"
     with folder_of(root, staged) as (folder, name):
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         with os.fdopen(os.open(name, flags, 0o666, dir_fd=folder), "wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
             with contextlib.suppress(FileNotFoundError), folder_of(root, path) as (target, old):
-                before = os.stat(old, dir_fd=target, follow_symlinks=False)
-                with contextlib.suppress(PermissionError, AttributeError):  # only root can give a file away, on POSIX
-                    os.fchown(file.fileno(), before.st_uid, before.st_gid)
+                with open_regular(old, target) as before:
+                    found = os.fstat(before.fileno())
+                    with contextlib.suppress(PermissionError, AttributeError):  # only root gives a file away, on POSIX
+                        os.fchown(file.fileno(), found.st_uid, found.st_gid)
+                    _keep_attributes(before.fileno(), file.fileno())
                 # Last: giving a file away takes bits of its mode.
-                os.chmod(file.fileno() if BY_DESCRIPTOR else name, stat.S_IMODE(before.st_mode))
+                os.chmod(file.fileno() if BY_DESCRIPTOR else name, stat.S_IMODE(found.st_mode))
+            os.fsync(file.fileno())
     return staged
 
 
-def _put(root: Path, path: str, staged: Optional[str]) -> None:
-    """Put a staged file in its place; None removes the file that is there."""
+def _keep_attributes(before: int, after: int) -> None:
+    """Give an open file the extended attributes of another one, access lists among them."""
+    if not hasattr(os, "listxattr"):  # Linux has it
+        return
+    names: List[str] = []
+    with contextlib.suppress(OSError):  # no such thing in this file system
+        names = os.listxattr(before)
+    for name in names:
+        try:
+            os.setxattr(after, name, os.getxattr(before, name))
+        except OSError:  # the system's own, as labels of SELinux, are not everybody's to set
+            if name.startswith(("user.", _ACCESS)):
+                raise
+    if _ACCESS not in names:  # the staging folder may have given it one
+        with contextlib.suppress(OSError):
+            os.removexattr(after, _ACCESS)
+
+
+def _put(root: Path, path: str, expected: Optional[bytes], staged: Optional[str]) -> None:
+    """Put a staged file in place of the one that is expected there; None removes that."""
     with folder_of(root, path) as (folder, name):
+        try:
+            found = read_regular(name, MAX_FILE_BYTES, folder)
+        except FileNotFoundError:
+            found = None
+        _check(path, found, expected)
         if staged is None:
             os.unlink(name, dir_fd=folder)
             return
@@ -122,8 +179,17 @@ def _put(root: Path, path: str, staged: Optional[str]) -> None:
             os.replace(new, name, src_dir_fd=source, dst_dir_fd=folder)
 
 
-def _put_back(root: Path, path: str, before: Optional[bytes]) -> None:
-    _put(root, path, None if before is None else _stage(root, path, before))
+def _put_back(root: Path, changes: Changes, done: List[str]) -> None:
+    """Put replaced files back, the last one first; a file that somebody else has saved since stays."""
+    for path in reversed(done):
+        before, after = changes[path]
+        try:
+            with contextlib.suppress(LegsError):
+                _put(root, path, after, None if before is None else _stage(root, path, before))
+        except OSError as error:
+            raise LegsError(
+                f"{error.filename or root}: {error.strerror}; some files are changed: legs-patch --undo {root}"
+            ) from None
 
 
 def _sweep(root: Path) -> None:

@@ -18,6 +18,7 @@ from libcst.metadata import ByteSpanPositionProvider, CodeSpan
 from libcst.metadata.span_provider import SpanProvidingCodegenState, byte_length_in_utf8
 
 from legs_adapters.code.syntax import code
+from legs_loss.system import held_back
 
 __all__ = ["STUB", "Lines", "Part", "Place", "body_part", "outline_part"]
 
@@ -89,7 +90,8 @@ class Part:
             state = SpanProvidingCodegenState(
                 tree.default_indent, tree.default_newline, provider=spans, get_length=byte_length_in_utf8
             )
-            tree._codegen(state)
+            with held_back():  # in there LibCST would make a KeyError of Ctrl-C
+                tree._codegen(state)
             if "".join(state.tokens).encode(tree.encoding) != self.text:
                 raise ValueError("LibCST would write another text")
             self._spans = cast("Mapping[cst.CSTNode, CodeSpan]", spans._computed)

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Optional, Sequence, Tuple
+import sys
+from typing import Any, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from legs_loss.errors import LegsError
 
-__all__ = ["Layout", "check_order", "check_values", "is_compiling", "read_layout", "read_pair", "shape_of"]
+__all__ = [
+    "Layout",
+    "check_order",
+    "check_values",
+    "is_compiling",
+    "is_trained",
+    "is_transformed",
+    "read_layout",
+    "read_pair",
+    "shape_of",
+]
 
 # A rendering may overshoot 1 and an HDR photograph may exceed it; 8-bit values are far larger.
 _SURELY_NOT_UNIT_RANGE = 16.0
@@ -21,6 +33,58 @@ def is_compiling() -> bool:
     compiler = getattr(torch, "compiler", None)
     probe = getattr(compiler, "is_compiling", None)
     return bool(probe()) if probe is not None else False
+
+
+_functorch: Any = getattr(torch._C, "_functorch", None)  # of torch.func; torch 1.12 has none
+_levels: Any = getattr(_functorch, "peek_interpreter_stack", None)
+_modes: Any = getattr(torch._C, "_len_torch_dispatch_stack", None)
+
+
+def is_transformed() -> bool:
+    """Return whether torch.func, forward-mode AD or a recording (torch.jit.trace, make_fx) sees what is computed now.
+
+    Then tensors may have no memory to read, and what is computed is valid until the transform ends: torch computes it,
+    and nothing is looked up or kept.
+    """
+    if forward_ad._current_level >= 0 or torch._C._get_tracing_state() is not None:
+        return True
+    return (_levels is not None and _levels() is not None) or (_modes is not None and _modes() > 0)
+
+
+def is_trained(image: Tensor) -> bool:
+    """Return whether a derivative in an image is taken, in whatever way: a gradient, torch.func, forward-mode AD.
+
+    The first pass of a re-entrant checkpoint counts, too: it runs without gradients, which its second pass takes.
+    """
+    if image.requires_grad and torch.is_grad_enabled():
+        return True
+    if is_compiling():
+        return False
+    if not is_transformed():
+        return not torch.is_grad_enabled() and _in_a_node()
+    while True:  # each transform wraps the tensor of the one outside it
+        batched = _functorch is not None and _functorch.is_batchedtensor(image)
+        if image.requires_grad and torch.is_grad_enabled():
+            return True
+        if forward_ad._current_level >= 0 and not batched and forward_ad.unpack_dual(image).tangent is not None:
+            return True
+        if _functorch is None or not _functorch.is_functorch_wrapped_tensor(image):
+            return False
+        image = _functorch.get_unwrapped(image)
+
+
+def _in_a_node() -> bool:
+    """Return whether this runs in the forward pass of an autograd.Function that becomes a node of a graph."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        code = frame.f_code
+        if code.co_name == "forward" and code.co_argcount:
+            context = frame.f_locals.get(code.co_varnames[0])
+            # It has none where the graph does not get this node.
+            if isinstance(context, torch.autograd.function.FunctionCtx) and getattr(context, "next_functions", None):
+                return True
+        frame = frame.f_back  # type: ignore[assignment]
+    return False
 
 
 def shape_of(tensor: Tensor) -> str:
@@ -167,7 +231,7 @@ def check_order(prediction: Tensor, target: Tensor) -> None:
     Raises:
         LegsError: gradients are taken, and the second image alone requires one.
     """
-    if target.requires_grad and not prediction.requires_grad and torch.is_grad_enabled():
+    if not is_trained(prediction) and is_trained(target):
         raise LegsError(
             "of the two images the second alone requires a gradient, so it seems to be the rendering, and the weights "
             "would come from it: turn them round, loss(rendering, photograph). Where a photograph is learned from a "

@@ -10,7 +10,7 @@ from torch import Tensor
 from legs_loss.config import is_off
 from legs_loss.counting import note_graph, note_step
 from legs_loss.errors import LegsError
-from legs_loss.images import check_order, is_compiling, read_pair
+from legs_loss.images import check_order, is_compiling, is_trained, read_pair
 from legs_loss.kernels.backends import fused_loss, fused_ssim
 from legs_loss.kernels.contract import Weights
 from legs_loss.levels import NEEDS_LEVELS
@@ -210,7 +210,7 @@ def legs_loss(
 
 
 def _note(prediction: Tensor, target: Tensor, weights: str) -> None:
-    if not (torch.is_grad_enabled() and (prediction.requires_grad or target.requires_grad)):
+    if not (torch.is_grad_enabled() and (is_trained(prediction) or is_trained(target))):
         return
     if not is_compiling():
         note_step(weights)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.images import is_compiling, read_pair, shape_of
+from legs_loss.images import is_compiling, is_transformed, read_pair, shape_of
 
 __all__ = ["SIGMA", "SSIM_C1", "SSIM_C2", "WINDOW_SIZE", "d_ssim", "ssim_map"]
 
@@ -68,7 +68,7 @@ _windows: Dict[Tuple[Any, ...], Tensor] = {}  # made on the CPU once, not upload
 
 def _window(channels: int, size: int, like: Tensor) -> Tensor:
     """Return the window [channels, 1, size, size] on the device and of the type of an image."""
-    if is_compiling():
+    if is_compiling() or is_transformed():
         return _new_window(channels, size).to(like)  # part of the graph
     key = channels, size, like.device, like.dtype
     window = _windows.get(key)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legs_loss.curves import curve
 from legs_loss.errors import LegsError
-from legs_loss.images import check_values, is_compiling, read_layout
+from legs_loss.images import check_values, is_compiling, is_transformed, read_layout
 from legs_loss.levels import levels_of, over_scene, percentile
 from legs_loss.responses import normalise_response, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
@@ -49,7 +49,7 @@ def weight_map(
     """
     spec = as_spec(spec)
     layout = read_layout(image, channels_last)
-    if image.device.type == "cpu" and not is_compiling():
+    if image.device.type == "cpu" and not (is_compiling() or is_transformed()):
         check_values(image, "image")
     strength = response(layout.channels_first(image), spec.operator, spec.p, False, spec.smooth)
     if spec.over == "scene":

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.images import is_compiling
+from legs_loss.images import is_compiling, is_transformed
 from legs_loss.kernels.available import BACKENDS, OUT_OF_MEMORY, forced_backend
 from legs_loss.kernels.contract import Backend, DeviceFault, NotNow, Weights
 from legs_loss.spec import WeightSpec
@@ -79,7 +79,11 @@ def _fused(
     run: Operation,
     with_maps: bool = True,
 ) -> Optional[Tensor]:
-    if is_compiling() or not _plain_tensors(prediction, target, weights.map, weights.mask, weights.range):
+    if (
+        is_compiling()
+        or is_transformed()
+        or not _plain_tensors(prediction, target, weights.map, weights.mask, weights.range)
+    ):
         return None
     backend = BACKENDS.ready(prediction.device, operation)
     if backend is None or operation not in backend.offers:

@@ -10,7 +10,8 @@ from typing import Any, Callable, Optional, Sequence, Tuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+
+from legs_loss.errors import LegsError
 
 __all__ = ["Compute", "Scale", "differentiable"]
 
@@ -51,10 +52,31 @@ class _FusedLoss(torch.autograd.Function):
         return loss
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad_output: Tensor) -> Tuple[Optional[Tensor], ...]:
         gradient, ctx.gradient = ctx.gradient, None  # it is passed on, not copied
         if gradient is None:
             prediction, *constants = ctx.saved_tensors
             gradient = ctx.compute(True, prediction.detach(), constants)[1]
-        return (ctx.scale(gradient, grad_output), *[None] * (len(ctx.needs_input_grad) - 1))
+        again = torch.is_grad_enabled()
+        try:
+            scaled = ctx.scale(gradient, grad_output.detach() if again else grad_output)
+        except RuntimeError:  # a batch of factors (is_grads_batched, vmap) has no number to read
+            scaled = gradient * grad_output
+        if again:
+            scaled = _Once.apply(scaled, ctx.saved_tensors[0], grad_output)
+        return (scaled, *[None] * (len(ctx.needs_input_grad) - 1))
+
+
+class _Once(torch.autograd.Function):
+    """A gradient in a graph of gradients, which depends on the prediction in a way that no backend differentiates."""
+
+    @staticmethod
+    def forward(ctx: Any, gradient: Tensor, *_: Tensor) -> Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> Any:
+        raise LegsError(
+            "this loss was computed by a backend, which gives no second derivative: set LEGS_BACKEND=torch "
+            "(the gradient was taken with create_graph=True and is differentiated again)"
+        )

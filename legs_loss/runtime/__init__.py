@@ -14,7 +14,7 @@ from torch import Tensor
 
 from legs_loss.counting import Counts, counted
 from legs_loss.errors import LegsError
-from legs_loss.images import check_order, is_compiling, read_pair
+from legs_loss.images import check_order, is_compiling, is_trained, read_pair
 from legs_loss.kernels.backends import fused_l1_of_target
 from legs_loss.kernels.contract import Weights
 from legs_loss.runtime.call import Call, Own, View
@@ -75,17 +75,17 @@ def l1_loss(
     if is_compiling():
         return _compiled(call)
     trains = call.trains()
-    swapped = not trains and target.requires_grad and torch.is_grad_enabled()
-    run = None if thread.unweighted or not (trains or swapped) else current_run()
+    run = None if thread.unweighted or not (trains or is_trained(target)) else current_run()
     if run is None or not run.active:
         counted.plain += 1
         counted.plain_steps += trains
         if run is not None:
             run.say_what_is_used()
         return call.plain()
-    check_order(prediction, target)
+    if not trains:
+        check_order(prediction, target)
     call = call.aligned()
-    counted.weighted += 1
+    counted.weighted += torch.is_grad_enabled()  # the second pass of a checkpoint counts, not the first
     bare = view is None and mask is None and own is None and reduction == "mean"
     if bare and run.config.store is None and target.device.type == "cpu":
         # Nothing is looked up: on the CPU a SHA-256 of an image's bytes takes longer than its range.
@@ -104,7 +104,7 @@ def _compiled(call: Call) -> Tensor:
     """Return the loss for torch.compile: without a memo, the weight is part of the graph."""
     spec = None if thread.unweighted or not call.trains() else spec_to_compile(version[0])
     if spec is None:
-        if not thread.unweighted and call.target.requires_grad and not call.prediction.requires_grad:
+        if not thread.unweighted:
             check_order(call.prediction, call.target)
         return call.plain()
     if spec.over == "scene":
@@ -141,7 +141,7 @@ def masked(prediction: Tensor, target: Tensor) -> Tensor:
     if is_compiling():
         spec_to_compile(version[0])  # raises where there are masks
         return prediction
-    if thread.unweighted or not ((prediction.requires_grad or target.requires_grad) and torch.is_grad_enabled()):
+    if thread.unweighted or not (is_trained(prediction) or is_trained(target)):
         return prediction
     run = current_run()
     if run.config.off or not run.source.stored.has(MASK):

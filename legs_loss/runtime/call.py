@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.images import Layout, read_pair
+from legs_loss.images import Layout, is_trained, read_pair
 from legs_loss.kernels.backends import fused_l1
 from legs_loss.kernels.contract import Weights
 from legs_loss.loss import mean_error
@@ -51,7 +51,7 @@ class Call(NamedTuple):
 
     def trains(self) -> bool:
         """Return whether the prediction is being trained on: evaluation code is not weighted."""
-        return self.prediction.requires_grad and torch.is_grad_enabled()
+        return is_trained(self.prediction)
 
     def aligned(self) -> Call:
         """Return the call with images [C, H, W] or [B, C, H, W], checked, as a weight needs them.

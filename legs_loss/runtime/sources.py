@@ -16,6 +16,7 @@ from torch import Tensor
 from legs_loss.config import Config
 from legs_loss.counting import Counts
 from legs_loss.errors import LegsError
+from legs_loss.images import is_transformed
 from legs_loss.kernels.available import is_capturing
 from legs_loss.kernels.backends import fused_range
 from legs_loss.kernels.contract import Weights
@@ -28,8 +29,8 @@ __all__ = ["MASK", "NOT_IN_A_GRAPH", "WEIGHTS", "WeightSource"]
 
 MASK, WEIGHTS = "mask", "weights"  # the store's names of the user's own maps; it is imported only where there is one
 NOT_IN_A_GRAPH = (
-    "the store has masks or weights of your own, which are found by the image, and a compiled or captured graph cannot "
-    "look: leave the loss out of the graph, or name a store without them (LEGS_STORE)"
+    "the store has masks or weights of your own, which are found by the image, and a compiled or captured graph, "
+    "torch.func and forward-mode AD cannot look: leave the loss out of them, or name a store without (LEGS_STORE)"
 )
 
 
@@ -72,7 +73,7 @@ class WeightSource:
         """
         if not self.stored.has(kind):
             return None
-        if is_capturing(target.device):
+        if is_transformed() or is_capturing(target.device):
             raise LegsError(NOT_IN_A_GRAPH)
         maps = [
             self.memo.recall(image, partial(self.stored.own, image, name, kind), kind)
@@ -99,7 +100,7 @@ class WeightSource:
     def _weight(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
         """Return an image's weight map [1, H, W], or the range that makes it, [1, 2]."""
         counts = self._counts
-        if is_capturing(image.device):
+        if is_transformed() or is_capturing(image.device):
             # A CUDA graph is replayed with other pixels in the target's memory: their weight is part of the graph.
             counts.computed += 1
             return self._computed(image, call)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
-from typing import List, Tuple
+from typing import List, Optional, Tuple
 
 from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
 from legs_adapters.code.folders import first_of, walk
@@ -54,16 +55,26 @@ def undo(path: str | os.PathLike[str], force: bool = False, look: bool = False) 
 
 
 def unrecorded(root: Path) -> List[Tuple[str, str]]:
-    """Return the files with weighted calls that the journal does not have, and what to put back in each."""
+    """Return the files with weighted calls that the journal does not have, and of each what to do."""
     found: List[Tuple[str, str]] = []
     recorded = Journal.read(root).files
     for name in walk(root):
         source = read_source(root, name) if name not in recorded else None
         lines = weighted_lines(source.text) if isinstance(source, Source) and PACKAGE in source.text else []
-        shown = first_of(lines, 20, "; ")
         if lines:
-            found.append((name, f"no journal has what was there; restore it from git or by hand: {shown}"))
+            where = _recorded_in(root / name)
+            what = f"no journal has what was there; restore it from git or by hand: {first_of(lines, 20, '; ')}"
+            found.append((name, what if where is None else f"the journal is in {where}: legs-patch --undo {where}"))
     return found
+
+
+def _recorded_in(file: Path) -> Optional[Path]:
+    """Return the folder around a file whose journal has it: a checkout around this one, or nested in it."""
+    for folder in file.parents:
+        with contextlib.suppress(LegsError):
+            if file.relative_to(folder).as_posix() in Journal.read(folder).files:
+                return folder
+    return None
 
 
 def _undone(root: Path, journal: Journal, force: bool) -> _Undone:

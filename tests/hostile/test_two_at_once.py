@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -248,38 +249,43 @@ def interrupted(arguments, root, number):
 PLAIN = {name: text.encode() for name, text in SOURCES.items()}
 
 
-@pytest.mark.parametrize("what", ["patch", "undo"])
+ARGUMENTS = {"patch": ["--site", "one.py:10"], "undo": ["--undo"], "other settings": ["--preset", "eggs"]}
+
+
+def prepared(folder, what):
+    """Return a checkout for a command, patched already but for the first patch, with legs.toml."""
+    root = checkout(folder, SOURCES)
+    if what != "patch":
+        assert legs_patch_here(root) == 0
+    return root
+
+
+def legs_patch_here(*arguments):
+    with open(os.devnull, "w") as nothing, redirect_stdout(nothing):
+        return main([str(word) for word in arguments])
+
+
+@pytest.mark.parametrize("what", ARGUMENTS)
 class TestAtAnyLine:
     """Some 30 of the lines, evenly; all of them are too many for every run."""
 
     def points(self, tmp_path, what):
-        root = checkout(tmp_path / "count", SOURCES)
-        arguments = ["--site", "one.py:10", root] if what == "patch" else ["--undo", root]
-        if what == "undo":
-            write(plan(root))
-        count = lines_of(arguments)
+        count = lines_of([*ARGUMENTS[what], prepared(tmp_path / "count", what)])
         assert count > 100
         for number in range(4, count + 1, max(1, count // 30)):
-            fresh = checkout(tmp_path / str(number), SOURCES)
-            if what == "undo":
-                write(plan(fresh))
-            yield number, [*arguments[:-1], fresh], fresh
+            yield number, prepared(tmp_path / str(number), what)
 
     def test_ctrl_c_says_what_is_true(self, what, tmp_path):
         said_all = set()
-        for number, arguments, root in self.points(tmp_path, what):  # from where main is in its try on
+        for number, root in self.points(tmp_path, what):  # from where main is in its try on
             before = snapshot(root)
+            arguments = [*ARGUMENTS[what], root]
             status, said = traced(arguments, number, lambda: os.kill(os.getpid(), signal.SIGINT))
             after = snapshot(root)
-            assert not [path for path in root.iterdir() if path.suffix in (".lock", ".tmp")], (number, said)
             assert "Traceback" not in said, (number, said)
             assert status >> 8 == 130, (number, said)
             said_all.add(said.rpartition("interrupted; ")[2])
-            assert ("nothing was changed" in said) == (after == before), (number, said)
-            if what == "patch" and after != before:
-                undo(root)
-            if what == "patch" or after != before:
-                assert {name: data for name, data in snapshot(root).items() if name in PLAIN} == PLAIN
+            check_ended(root, before, after, said)
         assert len(said_all) >= 2, "no interrupt came late"
 
     def test_ctrl_c_at_every_operation_on_files_leaves_nothing(self, what, tmp_path):
@@ -287,24 +293,16 @@ class TestAtAnyLine:
         saids, number = [], -1
         while not saids or saids[-1].partition(" ")[0] == "130":
             number += 2  # every second one
-            root = checkout(tmp_path / str(number), SOURCES)
-            if what == "undo":
-                write(plan(root))
+            root = prepared(tmp_path / str(number), what)
             before = snapshot(root)
-            saids.append(interrupted([root] if what == "patch" else ["--undo", root], root, number))
-            after = snapshot(root)
-            assert "Traceback" not in saids[-1]
-            assert not [path for path in root.iterdir() if path.suffix in (".lock", ".tmp")], (number, saids[-1])
-            assert ("nothing was changed" in saids[-1]) == (after == before), (number, saids[-1])
-            if JOURNAL in after:
-                undo(root)
-            assert snapshot(root) == PLAIN
+            saids.append(interrupted([*ARGUMENTS[what], root], root, number))
+            check_ended(root, before, snapshot(root), saids[-1])
         assert number > 25 and saids[-1].startswith("0 ")
         assert len({said.rpartition("; ")[2] for said in saids}) >= 3, saids
 
     def test_a_kill_leaves_nothing_for_ever(self, what, tmp_path):
-        for number, arguments, root in self.points(tmp_path, what):
-            traced(arguments, number, lambda: os.kill(os.getpid(), signal.SIGKILL))
+        for number, root in self.points(tmp_path, what):
+            traced([*ARGUMENTS[what], root], number, lambda: os.kill(os.getpid(), signal.SIGKILL))
             if (root / JOURNAL).exists():
                 undo(root)
             else:
@@ -312,6 +310,39 @@ class TestAtAnyLine:
                 undo(root)
             assert snapshot(root) == PLAIN
             assert sorted(path.name for path in root.iterdir()) == sorted(PLAIN)
+
+
+def check_ended(root, before, after, said):
+    """Check that a command that ended said what is true, left nothing of its own, and is undone."""
+    assert "Traceback" not in said
+    assert not [path for path in root.iterdir() if path.suffix in (".lock", ".tmp")], said
+    assert ("nothing was changed" in said) == (after == before), said
+    if JOURNAL in after:
+        assert legs_patch_here("--undo", root) == 0, said
+    assert snapshot(root) == PLAIN
+
+
+@pytest.mark.parametrize("at", range(1, 4))
+def test_other_settings_killed_before_each_rename(at, tmp_path):
+    """The journal is written, legs.toml maybe not yet: --undo takes both versions for its own."""
+    root = prepared(tmp_path, "other settings")
+    child = os.fork()
+    if child == 0:
+        really, seen = replace._put, []
+
+        def put(*arguments):
+            seen.append(arguments)
+            if len(seen) == at:
+                os.kill(os.getpid(), signal.SIGKILL)
+            really(*arguments)
+
+        replace._put = put
+        os._exit(legs_patch_here("--preset", "eggs", root))
+    assert os.waitpid(child, 0)[1] == (signal.SIGKILL if at < 3 else 0)
+    assert ("eggs" in (root / "legs.toml").read_text().partition("\npreset = ")[2].split()[0]) == (at == 3)
+    assert legs_patch_here("--undo", root) == 0
+    assert snapshot(root) == PLAIN
+    assert sorted(path.name for path in root.iterdir()) == sorted(PLAIN)
 
 
 @pytest.mark.parametrize("what", ["patch", "undo"])

@@ -147,6 +147,27 @@ def check_restored(name, formatted, folder):
             )
 
 
+@pytest.mark.parametrize("first", ["outer", "nested"])
+def test_another_checkout_s_journal_is_named(first, tmp_path, capsys):
+    """A nested checkout is undone where it was patched: from there, and from the other one, the command is said."""
+    texts = {f"method/{name}": text for name, text in files("inria").items()}
+    root = checkout(tmp_path / "framework", {**texts, "main.py": "x = 1\n"})
+    (root / "method" / ".git").mkdir()
+    before = snapshot(root)
+    patched, other = (root, root / "method") if first == "outer" else (root / "method", root)
+    assert main([str(patched)]) == 0
+    whole = snapshot(root)
+    capsys.readouterr()
+    assert main(["--undo", str(other)]) == 2
+    said = capsys.readouterr().err
+    assert f"{other}: nothing to undo" in said
+    assert f"the journal is in {patched}: legs-patch --undo {patched}" in said
+    assert "no journal has" not in said
+    assert snapshot(root) == whole
+    assert main(["--undo", str(patched)]) == 0
+    assert snapshot(root) == before
+
+
 class TestWhatStaysWeighted:
     def test_keeps_its_journal_and_settings(self, tmp_path, capsys):
         root = checkout(tmp_path, files("inria"))

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from textwrap import dedent, indent
-from typing import List, Sequence
+from typing import List
 
 from legs_adapters.rules.order import RULES
-from legs_adapters.rules.rule import Rule
 from legs_loss import LegsError
 
-__all__ = ["explain", "listed", "snippets", "table"]
-
-
-def snippets(texts: Sequence[str]) -> List[str]:
-    """Return the code of a rule's list, VALID or INVALID, without its indentation."""
-    return [dedent(text).strip() for text in texts]
+__all__ = ["explain", "listed", "table"]
 
 
 def explain(name: str) -> str:
@@ -26,20 +19,13 @@ def explain(name: str) -> str:
     rules = [rule for rule in RULES.values() if name == rule.id] or [r for r in RULES.values() if name == r.reason]
     if not rules:
         raise LegsError(f"there is no rule {name!r}; legs-patch --explain lists them")
-    return "\n".join(_explained(rule) for rule in rules)
+    return "\n".join(f"{rule.id}: {rule.text}\n" for rule in rules)
 
 
 def table() -> str:
     """Return the table of rules in docs/patching.md."""
     rows = [f"| `{rule.id}` | {rule.sentence()} | {rule.reason} |" for rule in RULES.values()]
     return "\n".join(["| rule | why it skips a term | `reason` |", "| --- | --- | --- |", *rows, ""])
-
-
-def _explained(rule: Rule) -> str:
-    parts = [f"{rule.id}: skipped", f"  {rule.sentence()}"]
-    for title, texts in (("skipped", rule.INVALID), ("weighted", rule.VALID)):
-        parts += [f"\n  {title}:", "\n\n".join(indent(snippet, "    ") for snippet in snippets(texts))]
-    return "\n".join([*parts, ""])
 
 
 def listed() -> str:

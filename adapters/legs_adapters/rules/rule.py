@@ -1,11 +1,13 @@
 """The base class of the rules that skip terms, and the terms that they are given.
 
-A rule is a class in ``causes/``, or a row of one. Its docstring says why in one sentence, `INVALID` are terms that it
-skips, `VALID` terms that are weighted; all are tests. ``order.py`` lists the rules as they are asked.
+A rule is a class in ``causes/``, or a row of one. Its docstring says why in one sentence, then shows code with a term
+that it skips ("skipped:"), and code that is weighted ("weighted:"); all are tests. ``order.py`` lists the rules as they
+are asked.
 """
 
 from __future__ import annotations
 
+import inspect
 from typing import TYPE_CHECKING, Callable, Iterator, List, Optional, Sequence, Tuple
 
 import libcst as cst
@@ -75,22 +77,23 @@ class Rule:
     Attributes:
         id: its name, for ``--explain`` and the report.
         reason: the word in the JSON report; several rules may share it.
-        VALID, INVALID: code whose terms are weighted, and code with a term that the rule skips; the body of a training
-            step, or functions.
         needs_target: warn of the term only if a side is known to be the photograph.
         is_doubted_beside_sites: warn of the term also where the codebase has other terms.
     """
 
     id: str = ""
     reason: str = ""
-    VALID: List[str] = ["loss = l1_loss(image, gt)"]
-    INVALID: List[str] = []
     needs_target = True
     is_doubted_beside_sites = True
 
     def sentence(self) -> str:
         """Return why a term is skipped."""
-        return " ".join((self.__doc__ or "").replace("``", "`").split())
+        return " ".join(self.text.partition("\n\n")[0].split())
+
+    @property
+    def text(self) -> str:
+        """The docstring: why a term is skipped, and examples."""
+        return inspect.cleandoc(self.__doc__ or "").replace("``", "`")
 
     def evidence(self, term: Term) -> List[Decider]:
         """Return the evidence to skip a term; nothing where the rule does not apply."""

@@ -14,10 +14,14 @@ __all__ = ["Definition"]
 
 
 class Definition(Rule):
-    """The term is in the body of the codebase's own L1 function, whose calls are decided one by one."""
+    """The term is in the body of the codebase's own L1 function, whose calls are decided one by one.
+
+    skipped:
+        def photometric(image, gt):
+            return torch.abs(image - gt).mean()
+    """
 
     id = reason = "definition"
-    INVALID = ["def photometric(image, gt):\n    return torch.abs(image - gt).mean()"]
     is_doubted_beside_sites = False
 
     def evidence(self, term: Term) -> List[Decider]:

@@ -18,11 +18,15 @@ __all__ = ["Distillation", "is_rendered"]
 
 
 class Distillation(Rule):
-    """The target is a rendering: of another model, of another view, or of the same model at an earlier step."""
+    """The target is a rendering: of another model, of another view, or of the same model at an earlier step.
+
+    skipped:
+        teacher_image = render(camera, teacher, None, None)["render"]
+        loss = l1_loss(image, teacher_image)
+    """
 
     id = reason = "distillation"
     needs_target = False
-    INVALID = ['teacher_image = render(camera, teacher, None, None)["render"]\nloss = l1_loss(image, teacher_image)']
 
     def evidence(self, term: Term) -> List[Decider]:
         rendered = term.pair.a.role == term.pair.b.role == "render"

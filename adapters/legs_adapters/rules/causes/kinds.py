@@ -18,24 +18,30 @@ __all__ = ["KINDS", "OtherKind"]
 
 
 class OtherKind(Rule):
-    """Skip a term by the kind of its first side that is no photograph or rendering; each kind is a row of `KINDS`.
+    """By its name, or that of what it comes from, one side is {what}.
 
-    Args:
-        id: the rule's name.
-        kind: the kind, a row of the words in ``lexicon/words.py``.
-        what: the kind in words.
-        invalid: what a step compares that it skips.
-        reason: the word in the report; default: the id.
+    skipped:
+        loss = l1_loss({sides})
+    weighted:
+        loss = l1_loss(image * camera.mask, gt * camera.mask)
+    weighted:
+        loss = l1_loss(package["render"], gt)
     """
 
-    VALID = ["loss = l1_loss(image * camera.mask, gt * camera.mask)", 'loss = l1_loss(package["render"], gt)']
+    def __init__(self, id: str, kind: str, what: str, sides: str, reason: str = "") -> None:
+        """Make the rule of a kind of image, a row of `KINDS`.
 
-    def __init__(self, id: str, kind: str, what: str, invalid: str, reason: str = "") -> None:
+        Args:
+            id: the rule's name.
+            kind: the kind, a row of the words in ``lexicon/words.py``.
+            what: the kind in words.
+            sides: what a step compares that it skips.
+            reason: the word in the report; default: the id.
+        """
         self.id: str = id
         self.kind: str = kind
         self.reason: str = reason or id
-        self.__doc__ = f"By its name, or that of what it comes from, one side is {what}."
-        self.INVALID: List[str] = [f"loss = l1_loss({invalid})"]
+        self.__doc__ = str(OtherKind.__doc__).format(what=what, sides=sides)
 
     def evidence(self, term: Term) -> List[Decider]:
         """Return what shows the kind of the first side that is of any of these kinds."""

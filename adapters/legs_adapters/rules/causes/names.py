@@ -26,13 +26,17 @@ __all__ = ["NAMES", "EvaluationName", "OtherName", "Tracking"]
 
 
 class Tracking(Rule):
-    """The name of the function, its class or a condition around the term is about tracking."""
+    """The name of the function, its class or a condition around the term is about tracking.
+
+    skipped:
+        def track_camera(image, gt):
+            l1_loss(image, gt).backward()
+    skipped:
+        def refine_pose(image, gt):
+            l1_loss(image, gt).backward()
+    """
 
     id = reason = "tracking"
-    INVALID = [
-        "def track_camera(image, gt):\n    l1_loss(image, gt).backward()",
-        "def refine_pose(image, gt):\n    l1_loss(image, gt).backward()",
-    ]
 
     def evidence(self, term: Term) -> List[Decider]:
         named = [decider for name, decider in term.names_around if _is_of_tracking(name)]
@@ -41,11 +45,15 @@ class Tracking(Rule):
 
 
 class EvaluationName(Rule):
-    """The name of the function, its file or its folder is about rendering or testing."""
+    """The name of the function, its file or its folder is about rendering or testing.
+
+    skipped:
+        def evaluate_views(image, gt):
+            l1_loss(image, gt).backward()
+    """
 
     id = "evaluation-name"
     reason = "evaluation"
-    INVALID = ["def evaluate_views(image, gt):\n    l1_loss(image, gt).backward()"]
 
     def evidence(self, term: Term) -> List[Decider]:
         first, *others = words(term.function.name) or ("",)
@@ -60,14 +68,19 @@ class EvaluationName(Rule):
 
 
 class OtherName(Rule):
-    """Skip a term by a word in the name of its function, its class or its file; a row of `NAMES` for each."""
+    """{why}
 
-    def __init__(self, id: str, reason: str, words: AbstractSet[str], why: str, invalid: str) -> None:
+    skipped:
+        def {name}(cam, image):
+            l1_loss(image, cam.original_image).backward()
+    """
+
+    def __init__(self, id: str, reason: str, words: AbstractSet[str], why: str, name: str) -> None:
+        """Make the rule of a list of words in the name of a function, its class or its file; a row of `NAMES`."""
         self.id: str = id
         self.reason: str = reason
         self.words: AbstractSet[str] = words
-        self.__doc__ = why
-        self.INVALID: List[str] = [f"def {invalid}(cam, image):\n    l1_loss(image, cam.original_image).backward()"]
+        self.__doc__ = str(OtherName.__doc__).format(why=why, name=name)
 
     def evidence(self, term: Term) -> List[Decider]:
         """Return the first name that has one of the words."""

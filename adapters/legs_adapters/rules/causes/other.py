@@ -20,12 +20,15 @@ _OTHER_FRAMEWORK = re.compile(
 
 
 class NotSplats(Rule):
-    """The code around the term is not about Gaussian splatting in torch, or the sides are colours of rays."""
+    """The code around the term is not about Gaussian splatting in torch, or the sides are colours of rays.
+
+    skipped:
+        loss = l1_loss(image[ray_indexes], gt[ray_indexes])
+    """
 
     id = "not-splats"
     reason = "unrelated"
     is_doubted_beside_sites = False
-    INVALID = ["loss = l1_loss(image[ray_indexes], gt[ray_indexes])"]
 
     def evidence(self, term: Term) -> List[Decider]:
         if is_of_other_framework(term.function.module.text):

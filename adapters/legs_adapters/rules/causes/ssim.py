@@ -8,12 +8,17 @@ __all__ = ["UnprovenSsim"]
 
 
 class UnprovenSsim(Rule):
-    """With `--ssim`: it is no call of a known form of 3DGS's SSIM with its defaults, but a library's, or masked."""
+    """With `--ssim`: it is no call of a known form of 3DGS's SSIM with its defaults, but a library's, or masked.
+
+    skipped:
+        loss = l1_loss(image, gt) - ssim(image, gt, window_size=7)
+    skipped:
+        loss = l1_loss(image, gt) - fused_ssim(image[None], gt[None])
+    weighted:
+        loss = l1_loss(image, gt) - ssim(image, gt)
+    weighted:
+        loss = l1_loss(image, gt) - ssim(image, gt, 11)
+    """
 
     id = "ssim-unproven"
     reason = "unproven SSIM"
-    VALID = ["loss = l1_loss(image, gt) - ssim(image, gt)", "loss = l1_loss(image, gt) - ssim(image, gt, 11)"]
-    INVALID = [
-        "loss = l1_loss(image, gt) - ssim(image, gt, window_size=7)",
-        "loss = l1_loss(image, gt) - fused_ssim(image[None], gt[None])",
-    ]

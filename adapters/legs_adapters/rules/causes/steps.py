@@ -20,34 +20,32 @@ class _OtherStep(Rule):
 
 
 class PoseStep(_OtherStep):
-    """By the names of what it is given, the optimiser updates camera poses, or an embedding, and no Gaussians."""
+    """By the names of what it is given, the optimiser updates camera poses, or an embedding, and no Gaussians.
 
-    id = "pose-step"
-    reason = "tracking"
-    INVALID = [
-        """
+    skipped:
         def refine(gaussians, camera):
             pose_optimizer = torch.optim.Adam([camera.pose_delta], lr=0.001)
             image = render(camera, gaussians, None, None)["render"]
             l1_loss(image, camera.original_image).backward()
             pose_optimizer.step()
-        """
-    ]
+    """
+
+    id = "pose-step"
+    reason = "tracking"
 
 
 class NoStep(_OtherStep):
-    """No optimiser was found that uses the gradients: code that only reads them scores the Gaussians."""
+    """No optimiser was found that uses the gradients: code that only reads them scores the Gaussians.
 
-    id = "no-step"
-    reason = "scoring"
-    INVALID = [
-        """
+    skipped:
         def sensitivity(gaussians, camera):
             image = render(camera, gaussians, None, None)["render"]
             l1_loss(image, camera.original_image).backward()
             return gaussians.points.grad.norm()
-        """
-    ]
+    """
+
+    id = "no-step"
+    reason = "scoring"
 
     def may_be_loss(self, term: Term) -> bool:
         return True

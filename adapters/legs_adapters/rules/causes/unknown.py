@@ -16,17 +16,25 @@ __all__ = ["Unknown"]
 
 
 class Unknown(Rule):
-    """Neither side is known to be an image, or nothing shows which is the photograph and not both names are images."""
+    """Neither side is known to be an image, or nothing shows which is the photograph and not both names are images.
+
+    skipped:
+        loss = l1_loss(network(camera), camera.something)
+    skipped:
+        loss = l1_loss(fused_image(camera), other(camera))
+    skipped:
+        loss = l1_loss(torch.abs(image - gt), 0.5)
+    skipped:
+        color = model.colors()
+        loss = l1_loss(color, gt["color"])
+    skipped:
+        loss = l1_loss(model.current_rgb, sampled["target"])
+    skipped:
+        bg_img = gt * 0 + background[:, None, None]
+        loss = l1_loss(image, bg_img)
+    """
 
     id = reason = "unknown"
-    INVALID = [
-        "loss = l1_loss(network(camera), camera.something)",
-        "loss = l1_loss(fused_image(camera), other(camera))",
-        "loss = l1_loss(torch.abs(image - gt), 0.5)",
-        'color = model.colors()\nloss = l1_loss(color, gt["color"])',
-        'loss = l1_loss(model.current_rgb, sampled["target"])',
-        "bg_img = gt * 0 + background[:, None, None]\nloss = l1_loss(image, bg_img)",
-    ]
 
     def evidence(self, term: Term) -> List[Decider]:
         pair = term.pair

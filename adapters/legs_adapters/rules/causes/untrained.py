@@ -18,20 +18,28 @@ MAX_CALLERS = 8
 
 
 class Scoring(Rule):
-    """No backward pass was found that reaches the term, and a name says that it is for densification or pruning."""
+    """No backward pass was found that reaches the term, and a name says that it is for densification or pruning.
+
+    skipped:
+        def importance_score(camera, image):
+            return l1_loss(image, camera.original_image)
+    """
 
     id = reason = "scoring"
-    INVALID = ["def importance_score(camera, image):\n    return l1_loss(image, camera.original_image)"]
 
     def evidence(self, term: Term) -> List[Decider]:
         return _named(term, SCORING) if _is_untrained(term) else []
 
 
 class Evaluation(Rule):
-    """No backward pass was found that reaches it, and it is under ``no_grad``, or in code that reports or tests."""
+    """No backward pass was found that reaches it, and it is under ``no_grad``, or in code that reports or tests.
+
+    skipped:
+        with torch.no_grad():
+            error = l1_loss(image, gt)
+    """
 
     id = reason = "evaluation"
-    INVALID = ["with torch.no_grad():\n    error = l1_loss(image, gt)"]
 
     def evidence(self, term: Term) -> List[Decider]:
         if not _is_untrained(term):
@@ -45,10 +53,14 @@ class Evaluation(Rule):
 
 
 class Untrained(Rule):
-    """No backward pass was found that reaches the term, and no name says what it is for."""
+    """No backward pass was found that reaches the term, and no name says what it is for.
+
+    skipped:
+        def compared(camera, image):
+            return l1_loss(image, camera.original_image)
+    """
 
     id = reason = "untrained"
-    INVALID = ["def compared(camera, image):\n    return l1_loss(image, camera.original_image)"]
 
     def evidence(self, term: Term) -> List[Decider]:
         if not _is_untrained(term):

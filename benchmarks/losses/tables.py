@@ -8,7 +8,7 @@ from typing import Any, Dict, List, Tuple
 import torch
 
 from .contenders import Contenders
-from .timing import as_launched, copy_bandwidth, timed
+from .timing import copy_bandwidth, timed
 
 __all__ = ["TOO_LONG", "at_bandwidth", "side_by_side"]
 
@@ -30,10 +30,11 @@ def side_by_side(contenders: Contenders, rounds: int, against: str, device: torc
             print(f"{name}: it does not run here ({type(error).__name__}: {str(error).strip().splitlines()[0]})")
             del contenders[name]
     times: Dict[str, List[float]] = {name: [] for name in contenders}
+    launched: Dict[str, List[float]] = {name: [] for name in contenders}  # of a GPU alone
     for i in range(rounds):
         for name, step in contenders.items():
             if i < SLOW_ROUNDS or first[name] < TOO_LONG:
-                times[name].append(timed(step, device))
+                times[name].append(timed(step, device, launched[name]))
     table = {}
     against = against if against in times else next(iter(times))
     digits = 4 if device.type == "cuda" else 2
@@ -46,10 +47,11 @@ def side_by_side(contenders: Contenders, rounds: int, against: str, device: torc
         }
         spread = f"{statistics.median(ratios):7.4f}  ({min(ratios):.4f} to {max(ratios):.4f})"
         print(f"{name:<46} {1e3 * statistics.median(seconds):10.{digits}f} ms   ours / it {spread}", flush=True)
-        if device.type == "cuda":
-            launched = statistics.median(as_launched(contenders[name], device) for _ in range(SLOW_ROUNDS))
-            table[name]["ms as launched"] = 1e3 * launched
-            print(f"{'':<46} {1e3 * launched:10.{digits}f} ms as Python launches it", flush=True)
+        if launched[name]:
+            ratios = [ours / theirs for ours, theirs in zip(launched[against], launched[name])]
+            table[name]["ms as launched"] = 1e3 * statistics.median(launched[name])
+            table[name]["its ratio as launched"] = [statistics.median(ratios), min(ratios), max(ratios)]
+            print(f"{'':<46} {table[name]['ms as launched']:10.{digits}f} ms as Python launches it", flush=True)
     return table
 
 

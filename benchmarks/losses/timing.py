@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from typing import Any, Callable
+from typing import Any, Callable, List, Optional
 
 import torch
 
@@ -16,11 +16,17 @@ FASTEST_CLOCK = 3e9  # of any GPU, in cycles a second: a slower one waits longer
 COPIED = 1 << 28  # bytes
 
 
-def timed(step: Callable[[], Any], device: torch.device) -> float:
-    """Return the seconds of a step: on one thread the processor's own, which other people's work hardly changes."""
+def timed(step: Callable[[], Any], device: torch.device, launched: Optional[List[float]] = None) -> float:
+    """Return the seconds of a step: on one thread the processor's own, which other people's work hardly changes.
+
+    launched: gets the seconds of a GPU's step as Python launches it.
+    """
     if device.type == "cuda":
         step()  # what is compiled or allocated now is not timed
-        return between_events(step, as_launched(step, device))
+        by_python = as_launched(step, device)
+        if launched is not None:
+            launched.append(by_python)
+        return between_events(step, by_python)
     clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
     before = clock()
     step()

@@ -5,13 +5,17 @@
 The density control, the rates, the order of the views and the scores are those of the package's trainer, schedule.py;
 the pictures and their gradients are drawn by 3DGS's own CUDA rasterizer (its branch 3dgs_accel), the loss is computed
 by the package's CUDA kernels. The rasterizer adds in no fixed order: a run does not repeat bit by bit. An arm X@Y may
-run beside Y, whose numbers of Gaussians it reads as they come. OUT/seed-N/ARM/metrics-M.json has the scores.
+run beside Y, whose numbers of Gaussians it reads as they come. An arm that another equals up to some iteration
+(`legs:until=15000` and `legs`, `legs:from=15000` and `3dgs`) goes on from that one's state there, if that stands before
+it among the arms, and has its own milestones from there on. OUT/seed-N/ARM/metrics-M.json has the scores.
 """
 
 from __future__ import annotations
 
 import json
 import time
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional
 
@@ -40,11 +44,22 @@ def main() -> None:
     """Train what is missing."""
     args = arguments(str(__doc__))
     torch.set_default_device("cuda")
-    for arm in parse_arms(args.arms):
-        folder = args.out / f"seed-{args.seed}"
-        milestones = [at for at in args.milestones if at <= args.until]
-        if not (folder / arm.folder / f"metrics-{milestones[-1]}.json").is_file():
-            Run(read_scene(args.scene), arm, settings(arm, args), folder).go(milestones)
+    folder = args.out / f"seed-{args.seed}"
+    milestones = [at for at in args.milestones if at <= args.until]
+    arms = parse_arms(args.arms)
+    scene = read_scene(args.scene)
+    runs = [
+        Run(scene, arm, settings(arm, args), folder)
+        for arm in arms
+        if not (folder / arm.folder / f"metrics-{milestones[-1]}.json").is_file()
+    ]
+    for run in runs:
+        for other in runs:
+            at = other.equals_until(run)
+            if at is not None:
+                run.go([one for one in milestones if one <= at])
+                other.take(run)
+        run.go(milestones)
 
 
 class Shown(NamedTuple):
@@ -138,15 +153,43 @@ class Run:
         self.adam = Optimiser(Gaussians(*(value.cuda() for value in vars(points).values())))
         self.growth: List[List[int]] = []
         self.seconds = 0.0
+        self.iteration = 0
         self._forget_gradients()
         self.folder.mkdir(parents=True, exist_ok=True)
 
+    def equals_until(self, other: Run) -> Optional[int]:
+        """Return to which iteration this arm's training is that of another one without a window; None: it is another's.
+
+        Only of those that have not begun.
+        """
+        own = self.config
+        if self.iteration or self.leader is not None:
+            return None
+        for at, plain in (
+            (own.weights_until, replace(own, weights_until=None)),
+            (own.weights_from, replace(own, weights_from=None, spec="3dgs")),
+        ):
+            if at is not None and plain == other.config:
+                return at
+        return None
+
+    def take(self, other: Run) -> None:
+        """Go on from the state of another run."""
+        self.adam = copy(other.adam)
+        self.adam.replace(torch.arange(len(self.adam.values["means"])))  # a copy, with copies of the moments
+        self.order, self.growth = list(other.order), list(other.growth)
+        self.orders.set_state(other.orders.get_state())
+        self.places.set_state(other.places.get_state())
+        self.gradient_sum, self.times_seen = other.gradient_sum.clone(), other.times_seen.clone()
+        self.iteration, self.seconds = other.iteration, other.seconds
+
     def go(self, milestones: List[int]) -> None:
-        """Train to the last milestone, and write the scores of each."""
+        """Train on to the last milestone, and write the scores of each that is ahead."""
         due = {at if at == self.config.iterations else at - 1: at for at in milestones}
         started = time.perf_counter()
-        for iteration in range(1, max(due) + 1):
+        for iteration in range(self.iteration + 1, max(due, default=0) + 1):
             self.step(iteration)
+            self.iteration = iteration
             if iteration in due:
                 torch.cuda.synchronize()
                 self.seconds += time.perf_counter() - started
@@ -261,6 +304,7 @@ def _shown(view: TrainingView) -> Shown:
         "prefiltered": False,
         "debug": False,
         "antialiasing": False,
+        "pixel_weights": None,  # of the rasterizer of Taming 3DGS
     }
     weight = torch.ones(1, height, width) if view.weight is None else view.weight.cuda()
     with torch.device("cpu"):

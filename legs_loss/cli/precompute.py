@@ -217,8 +217,6 @@ class _Bar:
     def __enter__(self) -> _Bar:
         from tqdm import tqdm
 
-        if sys.stderr.isatty():
-            say("weight maps: the first time on a machine it compiles for 10 to 40 s", sys.stderr)
         # With a delay, nothing is shown before the first view or for earlier failures.
         self._bar = tqdm(total=0, desc=self._title(), unit="view", delay=0.001)
         return self

@@ -1,18 +1,26 @@
-"""`compiled`, `part` and `inlined`: numba's njit as the package uses it; a multiply-add; the threads of a call."""
+"""`compiled`, `part` and `inlined`: numba's njit as the package uses it, and what is said while it compiles.
+
+And a multiply-add, and the threads of a call.
+"""
 
 from __future__ import annotations
 
 import os
+import sys
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
-from typing import Any, Callable, List, Optional
+from contextlib import contextmanager, suppress
+from typing import Any, Callable, Iterator, List, Optional, Sequence
 
 import numba
 import numpy as np
 import torch
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils, extending
+from numba.core import cgutils, event, extending
+from tqdm import tqdm
+
+from legs_loss.system import is_first_process, say
 
 # No NaN or infinity arises from checked input. Sums keep their order, and a * b + c is rounded twice unless the code
 # says otherwise: if the compiler may choose, the process that compiles and a later one that loads the cached code can
@@ -44,6 +52,56 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function into its callers, with their settings."""
     return numba.njit(inline="always")(function)
+
+
+@contextmanager
+def said(command: str, expected: str, functions: Sequence[Any] = ()) -> Iterator[None]:
+    """Say on stderr that the block compiles, and at its end how long that took; nothing where all is in the cache.
+
+    Args:
+        command: who says it.
+        expected: how long it takes, such as "20 to 60 s".
+        functions: the compiled functions that the block calls, for a bar on a terminal.
+    """
+    progress = _Progress(command, expected, functions)
+    try:
+        with event.install_listener("numba:compile", progress):
+            yield
+    finally:
+        progress.end()
+
+
+class _Progress(event.Listener):
+    def __init__(self, command: str, expected: str, functions: Sequence[Any]) -> None:
+        self.command, self.expected, self.functions = command, expected, functions
+        self.depth, self.seconds, self.count = 0, 0.0, 0
+        self.bar: Optional[Any] = None
+
+    def on_start(self, event: Any) -> None:
+        if self.bar is None:
+            self._say(f"compiling for this processor, once a machine: {self.expected}")
+            self.bar = tqdm(total=len(self.functions) or None, desc="compiling", unit="function", disable=None)
+        if self.depth == 0:  # a function is compiled within those that call it
+            self.begun = time.perf_counter()
+            self.bar.set_postfix_str(event.data["dispatcher"].py_func.__name__.strip("_"))
+        self.depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self.depth -= 1
+        if self.depth == 0 and self.bar is not None:
+            self.seconds += time.perf_counter() - self.begun
+            self.count += 1
+            done = sum(bool(function.overloads) for function in self.functions)
+            self.bar.update((done or self.count) - self.bar.n)
+
+    def end(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+            self._say(f"compiled in {self.seconds:.0f} s, and kept for later")
+
+    def _say(self, text: str) -> None:
+        if is_first_process():
+            say(f"{self.command}: {text}", sys.stderr)
 
 
 def _multiply_add(typingctx: Any, a: Any, b: Any, c: Any) -> Any:

@@ -6,8 +6,9 @@ other curve", which would silently compute something else.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from functools import lru_cache
-from typing import FrozenSet, NamedTuple, Optional
+from typing import Any, ContextManager, FrozenSet, NamedTuple, Optional
 
 import torch
 from torch import Tensor
@@ -71,6 +72,10 @@ class Backend:
     operators: FrozenSet[str] = frozenset()
     norms: FrozenSet[float] = frozenset()
     curves: FrozenSet[str] = frozenset()
+
+    def preparing(self) -> ContextManager[Any]:
+        """Return what the trial runs in: a backend that compiles says so in it."""
+        return nullcontext()
 
     def makes_weights_of(self, spec: WeightSpec) -> bool:
         """Return whether the weights of a spec need no map: it differs from the defaults in what is known here only."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Callable, Dict, List, Optional, Union
@@ -14,8 +14,9 @@ from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.precompute.one_view import Job, ViewTask, make
 from legs_loss.precompute.own_maps import NO_MAPS, OwnMaps, is_below, stage_own
+from legs_loss.precompute.photograph import compile_response
 from legs_loss.precompute.workers import in_processes
-from legs_loss.scenes import Scene, training_size
+from legs_loss.scenes import Scene, image_size, training_size
 from legs_loss.spec import Spec, as_spec
 from legs_loss.store import Entry, StoreWriter
 from legs_loss.store.origin import note_scene
@@ -96,6 +97,9 @@ def precompute(
         for entry in writer.entries():
             known.setdefault(entry.view, []).append(entry)
         tasks = [ViewTask(view, known.get(name, [])) for name, view in views.items()]
+        if workers > 1 and any(not task.known for task in tasks):
+            with suppress(LegsError):  # a photograph that cannot be read is skipped later, with the reason
+                compile_response(*training_size(*image_size(tasks[0].view.path), resolution), spec)
         results = in_processes(job, tasks, workers) if workers > 1 else (make(job, task) for task in tasks)
         staged: List[Entry] = []
         due = time.monotonic()  # the first at once, so that there is a store

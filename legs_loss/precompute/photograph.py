@@ -16,7 +16,7 @@ from legs_loss.scenes import image_tensor
 from legs_loss.scenes.images import row_strips
 from legs_loss.spec import WeightSpec
 
-__all__ = ["normalised_map", "normalised_map_and_levels", "response_map"]
+__all__ = ["compile_response", "normalised_map", "normalised_map_and_levels", "response_map"]
 
 _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 
@@ -36,13 +36,21 @@ def normalised_map_and_levels(image: np.ndarray, spec: WeightSpec) -> Tuple[np.n
     return normalised, {"low": low, "span": span, "median": median, "strong": strong}
 
 
+def compile_response(width: int, height: int, spec: WeightSpec) -> None:
+    """Compile what photographs of a size need, once, before processes that would each compile it."""
+    if 3 * width * height >= _WORTH_COMPILING:
+        response_map(np.zeros((height, width, 3), np.uint8), spec)
+
+
 def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
     if image.size >= _WORTH_COMPILING and BACKENDS.chosen(torch.device("cpu"), "l1") == "numba":
+        from legs_loss.kernels.compiling import said
         from legs_loss.kernels.numba_response import photograph_response, supports_response
 
         if supports_response(spec):
-            return torch.from_numpy(photograph_response(image, spec))
+            with said("legs precompute", "1 to 5 s"):
+                return torch.from_numpy(photograph_response(image, spec))
     height, width = image.shape[:2]
     reach = OPERATORS[spec.operator].reach + math.ceil(3.0 * spec.smooth)
     strength = torch.from_numpy(np.empty((height, width), np.float32))

@@ -8,6 +8,9 @@
 
 from __future__ import annotations
 
+import atexit
+import importlib.util
+from contextlib import ExitStack
 from pathlib import Path
 
 from legs_adapters.shims.missing import MissingShim
@@ -23,3 +26,9 @@ def start(root: Path) -> None:
     torch_cuda.redirect()
     nvidia_smi.offer()
     finder.install(finder.table_for(survey(root)))
+    if importlib.util.find_spec("numba"):  # without it the rasterizer says what to install
+        from legs_loss.lab.rasterizer import said
+
+        compiling = ExitStack()
+        compiling.enter_context(said("legs run", "20 to 100 s"))
+        atexit.register(compiling.close)

@@ -64,11 +64,11 @@ def run(args: argparse.Namespace) -> int:
 
     from legs_loss.cli.shared.checks import check_writable
     from legs_loss.errors import LegsError
-    from legs_loss.lab.commands.train import COMPILING, set_threads
+    from legs_loss.lab.commands.train import set_threads
     from legs_loss.lab.experiments.arms import STUDIES, needed, parse_arms, these_arms
     from legs_loss.lab.experiments.running import Comparison
     from legs_loss.lab.report.tensorboard import tensorboard_log
-    from legs_loss.lab.training.trainer import Progress, TrainConfig
+    from legs_loss.lab.training.trainer import Progress, TrainConfig, compile_step
     from legs_loss.scenes import read_scene
 
     set_threads(None)  # fail now if numba is missing
@@ -91,9 +91,10 @@ def run(args: argparse.Namespace) -> int:
     )
     missing = sum(comparison.row(arm, seed) is None for arm in arms for seed in seeds)
     say(f"{len(arms)} arms, {len(seeds)} seed(s); {missing} of {len(arms) * len(seeds)} trainings to do")
+    if missing and args.scheduler is None:
+        compile_step("legs compare")
     reached: Dict[str, int] = {}
     bar = tqdm(total=missing * base.iterations, desc="iterations", mininterval=0.5, disable=not missing, delay=0.001)
-    bar.set_postfix_str(COMPILING)
     with bar, tensorboard_log(args.tensorboard) as log:
 
         def show(name: str, progress: Progress) -> None:

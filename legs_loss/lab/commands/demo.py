@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.lab.report.comparison import check_matplotlib
     from legs_loss.lab.training.checkpoint import CHECKPOINT
     from legs_loss.lab.training.side_by_side import Arm, train_side_by_side
-    from legs_loss.lab.training.trainer import TrainConfig, check_trainable
+    from legs_loss.lab.training.trainer import TrainConfig, check_trainable, compile_step
     from legs_loss.precompute import precompute
     from legs_loss.scenes import read_scene
     from legs_loss.spec import PRESETS
@@ -74,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
         for view, reason in report.skipped.items():
             raise LegsError(f"{view}: {reason}")
 
+    compile_step("legs demo")  # once, before the processes that train load it
     base = TrainConfig(iterations=args.iterations, resolution=resolution, seed=args.seed)
     arms = [Arm(name, root, replace(base, spec=name), out / name, args.images, store) for name in METHODS]
     for arm in arms:  # of an earlier demo, which this one replaces

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 HELP = "train 3D Gaussians on a scene, on the CPU"
 
-COMPILING = "starts; the first time on a machine it compiles for 10 to 40 s"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
@@ -71,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.errors import LegsError
     from legs_loss.lab.report.tensorboard import tensorboard_log
     from legs_loss.lab.training.checkpoint import CHECKPOINT, check_new
-    from legs_loss.lab.training.trainer import TrainConfig, check_trainable, point_cloud, train
+    from legs_loss.lab.training.trainer import TrainConfig, check_trainable, compile_step, point_cloud, train
     from legs_loss.scenes import read_scene
 
     set_threads(args.threads)
@@ -88,6 +86,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.resume:
         check_new(out)  # and again when it begins: another may have begun meanwhile
     check_writable(out)
+    compile_step("legs train")
     with progress_bar(config.iterations, out.name) as show, tensorboard_log(args.tensorboard) as log:
 
         def on_progress(progress: Progress) -> None:
@@ -135,7 +134,6 @@ def progress_bar(iterations: int, name: str, position: int = 0) -> Iterator[Call
     from tqdm import tqdm
 
     with tqdm(total=iterations, desc=printable(name), position=position, leave=position == 0, mininterval=0.5) as bar:
-        bar.set_postfix_str(COMPILING)
 
         def show(progress: Progress) -> None:
             if bar.n == 0 and progress.iteration > 10:  # resumed: this run did not compute these iterations

@@ -20,6 +20,7 @@ from legs_loss.lab.rasterizer.rasterize import rasterize as rasterize
 if TYPE_CHECKING:
     from legs_loss.lab.rasterizer.compact_box import CompactBox as CompactBox
     from legs_loss.lab.rasterizer.compiled import Tensors as Tensors
+    from legs_loss.lab.rasterizer.compiled import said as said
     from legs_loss.lab.rasterizer.drawing import Contributions as Contributions
     from legs_loss.lab.rasterizer.drawing import Drawn as Drawn
     from legs_loss.lab.rasterizer.drawing import Lens as Lens
@@ -36,6 +37,7 @@ _HOMES = {
     "compensation": "drawing",
     "covariance": "drawing",
     "draw": "drawing",
+    "said": "compiled",
 }
 __all__ = ["MIN_ALPHA", "NEAR", "Gaussians", "Rendering", "View", "rasterize", "rotations", *_HOMES]
 

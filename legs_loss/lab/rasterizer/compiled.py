@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from legs_loss.kernels.compiling import in_threads
+from legs_loss.kernels.compiling import said as said
 from legs_loss.lab.conventions import SH_C0, View
 from legs_loss.lab.rasterizer import projection, projection_backward, sorting, strips
 from legs_loss.lab.rasterizer.groups import Camera, Footprint, Parameters, Splats, room

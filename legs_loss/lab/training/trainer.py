@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.errors import LegsError
+from legs_loss.errors import LegsError, require
 from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import write_ply
 from legs_loss.lab.rasterizer import Rendering, rasterize
@@ -36,7 +36,7 @@ from legs_loss.lab.training.dataset import (
 )
 from legs_loss.lab.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.lab.training.metrics import mean_scores, psnr, score
-from legs_loss.scenes import Scene
+from legs_loss.scenes import Camera, Scene
 from legs_loss.system import keep_freed_memory, noted, write_whole
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "TrainConfig",
     "TrainingResult",
     "check_trainable",
+    "compile_step",
     "default_threshold",
     "draw",
     "point_cloud",
@@ -78,6 +79,27 @@ def step_loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lamb
     from legs_loss.kernels.numba_loss import fused_loss
 
     return fused_loss(prediction, target, weight, lambda_dssim)
+
+
+def compile_step(command: str) -> None:
+    """Compile what a step calls, as far as it is not kept from before: said by a command, and in nobody's time.
+
+    Raises:
+        LegsError: numba is missing.
+    """
+    require("a training", "cpu", "numba")
+    from legs_loss.kernels.compiling import said
+    from legs_loss.kernels.numba_tiles import all_tiles
+    from legs_loss.lab.rasterizer import projection, projection_backward, strips
+    from legs_loss.lab.training.adam_kernel import update
+
+    calls = (projection.project, projection.find_rows, strips.render, all_tiles, strips.render_backward)
+    with said(command, "20 to 100 s", (*calls, projection_backward.project_backward, update)):
+        adam = Adam(Gaussians.from_points(np.eye(3) + 2.0, np.full((3, 3), 99), 1))
+        view = TrainingView("", Camera(16, 16, 9.0, 9.0, 8.0, 8.0, np.eye(4)), torch.ones(3, 16, 16))
+        image = _rasterize(adam.gaussians, view, TrainConfig(), 1, torch.zeros(3, 2, requires_grad=True)).image
+        step_loss(image, view.image, None, 0.5).backward()
+        adam.step(0.0)
 
 
 def draw(gaussians: Gaussians, view: TrainingView, config: TrainConfig) -> Tensor:
@@ -138,6 +160,7 @@ def train(
     if resume and folder is None:
         raise LegsError("there is nothing to resume from without an output folder")
     begun = None if resume else _Run.begin(data, config, scene)
+    compile_step("legs train")
     keep_freed_memory()  # the arrays of a step are as large as those of the step before
     with alone_in(folder, make=not resume):
         if folder is not None and resume is None:

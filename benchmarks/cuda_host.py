@@ -23,12 +23,12 @@ from typing import Any, Callable, Dict
 
 import torch
 
-from legs_loss.kernels.contract import Weights
 from legs_loss.kernels.cuda.backend import THREADS, CudaBackend, Task
 from legs_loss.kernels.cuda.driver import CudaDriver
 from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules
 from legs_loss.kernels.cuda.nvrtc import Compiler
 from legs_loss.spec import PRESETS
+from legs_loss.weights import Weights
 from tests.cuda_emulation import COMPILER, Runtime, libraries
 
 STEPS = 200

@@ -16,15 +16,16 @@ if TYPE_CHECKING:
     from legs_loss.curves import register_curve as register_curve
     from legs_loss.errors import LegsError as LegsError
     from legs_loss.loss import legs_loss as legs_loss
-    from legs_loss.loss import ssim as ssim
     from legs_loss.loss import weighted_l1 as weighted_l1
     from legs_loss.operators import OPERATORS as OPERATORS
     from legs_loss.responses import response as response
     from legs_loss.runtime import configure as configure
     from legs_loss.runtime import l1_loss as l1_loss
-    from legs_loss.runtime import masked as masked
     from legs_loss.runtime import unweighted as unweighted
     from legs_loss.runtime.module import LEGSLoss as LEGSLoss
+    from legs_loss.runtime.terms import coverage as coverage
+    from legs_loss.runtime.terms import masked as masked
+    from legs_loss.runtime.terms import ssim as ssim
     from legs_loss.similarity import d_ssim as d_ssim
     from legs_loss.spec import PRESETS as PRESETS
     from legs_loss.spec import WeightSpec as WeightSpec
@@ -41,13 +42,14 @@ _HOMES = {
     "__version__": "_version",
     "apply_to": "upstreams",
     "configure": "runtime",
+    "coverage": "runtime.terms",
     "d_ssim": "similarity",
     "l1_loss": "runtime",
-    "masked": "runtime",
+    "masked": "runtime.terms",
     "legs_loss": "loss",
     "register_curve": "curves",
     "response": "responses",
-    "ssim": "loss",
+    "ssim": "runtime.terms",
     "unweighted": "runtime",
     "weight_map": "weights",
     "weighted_l1": "loss",

@@ -1,8 +1,17 @@
-"""The weight map of a photograph: W = 1 + beta * f(E^)."""
+"""The weight map of a photograph, W = 1 + beta * f(E^); and what a pixel counts in a loss: the one algebra of weights.
+
+With a weight W (a preset's map, times the user's), a mask M in [0, 1], the rendering U and the photograph F:
+
+    L1     = sum(M * W * |U - F|) / sum(M)
+    D-SSIM = sum(1 - SSIM(U', F)) / number of pixels with M > 0        U' = U where M > 0, F elsewhere
+
+so a pixel that does not count has no gradient, and dilutes neither term. Both are the mean over the whole image, of U'
+and with the map W * M * s / mean(M), divided by s, the share of the pixels with M > 0. So no backend knows of masks.
+"""
 
 from __future__ import annotations
 
-from typing import Iterable, List, Optional, Tuple
+from typing import Iterable, List, NamedTuple, Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -14,7 +23,7 @@ from legs_loss.levels import levels_of, over_scene, percentile
 from legs_loss.responses import normalise_response, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
-__all__ = ["curved", "weight_from_response", "weight_map", "weight_maps", "weight_over_scene"]
+__all__ = ["Weights", "curved", "weight_from_response", "weight_map", "weight_maps", "weight_over_scene"]
 
 
 def weight_map(
@@ -86,8 +95,7 @@ def weight_over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor
     Returns:
         The same shape, float32 (float64 for float64).
     """
-    strength = strength.to(torch.promote_types(strength.dtype, torch.float32))
-    return curved(over_scene(strength, spec, scene), spec)
+    return curved(over_scene(_floats(strength), spec, scene), spec)
 
 
 def weight_from_response(normalised: Tensor, spec: Spec = "legs") -> Tensor:
@@ -110,7 +118,7 @@ def weight_from_response(normalised: Tensor, spec: Spec = "legs") -> Tensor:
     spec = as_spec(spec)
     if spec.over == "scene":
         raise LegsError('E^ is normalised by itself: a spec with over="scene" needs weight_over_scene')
-    normalised = normalised.to(torch.promote_types(normalised.dtype, torch.float32))
+    normalised = _floats(normalised)
     if spec.percentile < 100.0:
         strong = percentile(normalised, spec.percentile)
         normalised = (normalised / (strong.reshape(*strong.shape, 1, 1, 1) + spec.eps)).clamp(max=1.0)
@@ -127,3 +135,77 @@ def curved(normalised: Tensor, spec: WeightSpec) -> Tensor:
 
 def _pixels(maps: Tensor) -> Tuple[int, ...]:
     return tuple(range(maps.dim() - 3, maps.dim()))
+
+
+class Weights(NamedTuple):
+    """Weights of the pixels of a target: the product of what is given, 1 where nothing is. It carries no gradient.
+
+    Attributes:
+        spec: a factor that is made from the target by this spec.
+        range: what :meth:`Backend.response_range` returned for these targets and this spec, [B, 2]. Without it a
+            backend makes it, in a pass of its own over the target.
+        map: the product of all other factors, floats, [1, H, W] or [B, 1, H, W].
+        seen: bool, in the same shapes: the pixels that count at all. None where all do.
+        share: a scalar tensor, the share of these, that the loss is divided by; None where it is not.
+    """
+
+    spec: Optional[WeightSpec] = None
+    range: Optional[Tensor] = None
+    map: Optional[Tensor] = None
+    seen: Optional[Tensor] = None
+    share: Optional[Tensor] = None
+
+    def times(self, factor: Optional[Tensor]) -> Weights:
+        """Return these weights times a map."""
+        if factor is None:
+            return self
+        return self._replace(map=_floats(factor) if self.map is None else self.map * factor)
+
+    def masked(self, mask: Optional[Tensor], renormalise: bool = True) -> Weights:
+        """Return these weights times a mask, bool or floats in [0, 1]; with ``renormalise`` losses are of what counts.
+
+        Where nothing counts, the loss is 0.
+        """
+        if mask is None:
+            return self
+        mask, seen = _floats(mask), mask > 0
+        both = seen if self.seen is None else seen & self.seen
+        if not renormalise:
+            return self.times(mask)._replace(seen=both)
+        share, covered = _share(seen).to(mask.dtype), mask.mean().clamp(min=torch.finfo(mask.dtype).tiny)
+        return self.times(mask * (share / covered))._replace(seen=both, share=share)
+
+    def with_map(self, target: Tensor) -> Weights:
+        """Return these weights with the spec's factor in their map; target [C, H, W] or [B, C, H, W]."""
+        made = None if self.spec is None or self.spec.unweighted else weight_map(target, self.spec, False)
+        return self._replace(spec=None, range=None).times(made)
+
+    def hidden(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """Return the prediction with the target's pixels where nothing counts; the very tensor without a mask."""
+        return prediction if self.seen is None else torch.where(self.seen, prediction, target.to(prediction.dtype))
+
+    def of_what_counts(self, values: Tensor, border: int = 0) -> Tensor:
+        """Return the loss of a mean over the whole image, or a weight map as such a mean needs it.
+
+        Args:
+            values: either of them.
+            border: how many pixels on each side the mean leaves out.
+        """
+        if self.seen is None or self.share is None:
+            return values
+        share = self.share if border == 0 else _share(self.seen[..., border:-border, border:-border])
+        return values / share.to(values.dtype)
+
+    def mean_weight(self) -> float:
+        """Return the mean of the map over what counts; 1 without one."""
+        return 1.0 if self.map is None else float(self.of_what_counts(self.map.double().mean()))
+
+
+def _share(seen: Tensor) -> Tensor:
+    """Return the share of the pixels that count; 1 where none does, so that their loss is 0."""
+    share = seen.to(torch.float32).mean()
+    return torch.where(share > 0, share, torch.ones_like(share))
+
+
+def _floats(values: Tensor) -> Tensor:
+    return values.to(torch.promote_types(values.dtype, torch.float32))

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from legs_loss import legs_loss, weight_map
 from legs_loss.kernels.available import BACKENDS
-from legs_loss.kernels.contract import Weights
 from legs_loss.similarity import ssim_map
 from legs_loss.spec import PRESETS
+from legs_loss.weights import Weights
 
 from .images import Pairs, in_turns
 

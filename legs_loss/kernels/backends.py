@@ -10,9 +10,9 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.images import is_compiling, is_transformed
 from legs_loss.kernels.available import BACKENDS, OUT_OF_MEMORY, forced_backend
-from legs_loss.kernels.contract import Backend, DeviceFault, NotNow, Weights
+from legs_loss.kernels.contract import Backend, DeviceFault, NotNow
 from legs_loss.spec import WeightSpec
-from legs_loss.weights import weight_map
+from legs_loss.weights import Weights
 
 __all__ = ["fused_l1", "fused_l1_of_target", "fused_loss", "fused_range", "fused_ssim"]
 
@@ -28,10 +28,11 @@ def fused_loss(
 
     The arguments of this and the next functions are checked already, channels first, as the contract says.
     """
-    unweighted = weights.map is weights.mask is None and (weights.spec is None or weights.spec.unweighted)
+    unweighted = weights.map is None and (weights.spec is None or weights.spec.unweighted)
     if padding != "zeros" or lambda_dssim == 0.0 or (unweighted and not forced_backend()):
         return None  # unweighted it is 3DGS's own loss, bit-identical
-    return _fused("loss", prediction, target, weights, lambda backend, *given: backend.loss(*given, lambda_dssim))
+    seen = weights.hidden(prediction, target)
+    return _fused("loss", seen, target, weights, lambda backend, *given: backend.loss(*given, lambda_dssim))
 
 
 def fused_l1(prediction: Tensor, target: Tensor, weights: Weights) -> Optional[Tensor]:
@@ -79,11 +80,7 @@ def _fused(
     run: Operation,
     with_maps: bool = True,
 ) -> Optional[Tensor]:
-    if (
-        is_compiling()
-        or is_transformed()
-        or not _plain_tensors(prediction, target, weights.map, weights.mask, weights.range)
-    ):
+    if is_compiling() or is_transformed() or not _plain_tensors(prediction, target, weights.map, weights.range):
         return None
     backend = BACKENDS.ready(prediction.device, operation)
     if backend is None or operation not in backend.offers:
@@ -94,7 +91,7 @@ def _fused(
     if not {prediction.dtype, target.dtype} <= backend.dtypes:
         return None
     try:
-        return run(backend, prediction, target, _resolved(backend, weights, target, with_maps))
+        loss = run(backend, prediction, target, _resolved(backend, weights, target, with_maps))
     except NotNow:
         return None
     except (LegsError, MemoryError, OUT_OF_MEMORY, DeviceFault):
@@ -102,17 +99,14 @@ def _fused(
     except Exception as error:  # a size or type that its trial did not cover
         BACKENDS.give_up(backend.name, prediction.device, error)
         return None
+    return None if loss is None else weights.of_what_counts(loss)
 
 
 def _resolved(backend: Backend, weights: Weights, target: Tensor, with_maps: bool) -> Weights:
     """Return weights as the backend takes them: without a spec that it does not know."""
-    spec, map_ = weights.spec, weights.map
-    if spec is None or (not spec.unweighted and backend.makes_weights_of(spec)):
+    if weights.spec is None or (not weights.spec.unweighted and backend.makes_weights_of(weights.spec)):
         return weights
-    if with_maps and not spec.unweighted:
-        made = weight_map(target, spec, False)
-        map_ = made if map_ is None else map_.to(made.dtype) * made
-    return weights._replace(spec=None, range=None, map=map_)
+    return weights.with_map(target) if with_maps else weights._replace(spec=None, range=None)
 
 
 def _plain_tensors(prediction: Tensor, *constants: Optional[Tensor]) -> bool:

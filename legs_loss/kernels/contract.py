@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from functools import lru_cache
-from typing import Any, ContextManager, FrozenSet, NamedTuple, Optional
+from typing import Any, ContextManager, FrozenSet
 
 import torch
 from torch import Tensor
 
 from legs_loss.spec import WeightSpec
+from legs_loss.weights import Weights
 
-__all__ = ["Backend", "DeviceFault", "NotNow", "Weights"]
+__all__ = ["Backend", "DeviceFault", "NotNow"]
 
 
 class NotNow(Exception):
@@ -26,35 +27,13 @@ class DeviceFault(RuntimeError):
     """A kernel of somebody else's has failed, and the device computes nothing any more: no backend's failure."""
 
 
-class Weights(NamedTuple):
-    """The weight of a pixel: the product of what is given, 1 where nothing is. No gradient flows to any of it.
-
-    With a weight W and a mask M, and D the mean over channels of the absolute difference, the weighted L1 is
-    sum(M * W * D) / sum(M) over the pixels where ``renormalise`` is set, and mean(M * W * D) where not. Its gradient is
-    exactly 0 where M * W is. SSIM has no weight.
-
-    Attributes:
-        spec: a factor that is made from the target by this spec.
-        range: what :meth:`Backend.response_range` returned for these targets and this spec, [B, 2]. Without it the
-            backend makes it, in a pass of its own over the target.
-        map: a factor, one value a pixel, floats, [1, H, W] or [B, 1, H, W].
-        mask: a factor in the same shapes, bool or floats in [0, 1]: how much a pixel counts.
-        renormalise: divide the weighted L1 by the mask's mean (at least the least normal float32).
-    """
-
-    spec: Optional[WeightSpec] = None
-    range: Optional[Tensor] = None
-    map: Optional[Tensor] = None
-    mask: Optional[Tensor] = None
-    renormalise: bool = False
-
-
 class Backend:
     """A fast implementation of the loss. Subclasses set the attributes and define the operations in ``offers``.
 
-    Images are [C, H, W] or [B, C, H, W] with any strides, of a type in ``dtypes``; no gradient flows to a target, a
-    map or a mask. An operation returns a float32 scalar, differentiable once in the prediction. It repeats bit for
-    bit. On a GPU nothing waits for the device, and all is launched on the current stream.
+    Images are [C, H, W] or [B, C, H, W] with any strides, of a type in ``dtypes``; no gradient flows to a target or a
+    map. Of weights only spec, range and map are read: what a mask does is done around the operation. An operation
+    returns a float32 scalar, differentiable once in the prediction. It repeats bit for bit. On a GPU nothing waits for
+    the device, and all is launched on the current stream.
 
     Attributes:
         name: as in LEGS_BACKEND.

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from legs_loss.kernels.compiling import in_threads, said
-from legs_loss.kernels.contract import Backend, Weights
+from legs_loss.kernels.contract import Backend
 from legs_loss.kernels.differentiable import differentiable
 from legs_loss.kernels.numba_l1 import ROWS, all_strips
 from legs_loss.kernels.numba_response import NORMS, STENCILS
 from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles
 from legs_loss.kernels.numba_weights import CURVES, Images, WeightSource, images_of, response_range, source_of
 from legs_loss.spec import WeightSpec
-from legs_loss.weights import weight_map
+from legs_loss.weights import Weights, weight_map
 
 __all__ = ["BACKEND", "fused_loss"]
 
@@ -78,37 +78,31 @@ def fused_loss(
 
 def _differentiable(prediction: Tensor, target: Tensor, weights: Weights, share: float) -> Tensor:
     def compute(wanted: bool, image: Tensor, constants: Sequence[Optional[Tensor]]) -> Tuple[Tensor, Optional[Tensor]]:
-        target, map_, mask, found = constants
+        target, map_, found = constants
         assert target is not None
         images = images_of(image, target)
-        source = source_of(weights._replace(map=map_, mask=mask, range=found), target, images)
-        covered = 1.0
-        if weights.renormalise and mask is not None:
-            covered = max(float(mask.float().mean()), torch.finfo(torch.float32).tiny)
+        source = source_of(weights._replace(map=map_, range=found), target, images)
         gradient = np.empty(images.x.size if wanted else 0, np.float32)
-        loss = (_l1_alone if share == 0.0 else _l1_and_ssim)(images, source, share, covered, gradient)
+        loss = (_l1_alone if share == 0.0 else _l1_and_ssim)(images, source, share, gradient)
         return image.new_tensor(loss), torch.from_numpy(gradient).reshape(image.shape) if wanted else None
 
-    constants = (target, weights.map, weights.mask, weights.range)
+    constants = (target, weights.map, weights.range)
     return differentiable(prediction.float(), constants, compute, _scaled)
 
 
-def _l1_and_ssim(images: Images, source: WeightSource, share: float, covered: float, gradient: np.ndarray) -> float:
+def _l1_and_ssim(images: Images, source: WeightSource, share: float, gradient: np.ndarray) -> float:
     down, across = -(-images.height // TILE_HEIGHT), -(-images.width // TILE_WIDTH)
     sums, size = np.zeros((images.views * down * across, 2)), images.x.size
-    scales = (
-        np.float32((1.0 - share) / size / covered),
-        np.float32(-2.0 * share / size),
-    )  # SSIM's, of halves of slopes
+    scales = np.float32((1.0 - share) / size), np.float32(-2.0 * share / size)  # SSIM's, of halves of slopes
     in_threads(all_tiles, len(sums), images, down, across, scales, source, gradient, sums)
     absolute_error, similarity = sums.sum(0) / size
-    return float((1.0 - share) * absolute_error / covered + share * (1.0 - similarity))
+    return float((1.0 - share) * absolute_error + share * (1.0 - similarity))
 
 
-def _l1_alone(images: Images, source: WeightSource, share: float, covered: float, gradient: np.ndarray) -> float:
+def _l1_alone(images: Images, source: WeightSource, share: float, gradient: np.ndarray) -> float:
     sums, size = np.empty(images.views * -(-images.height // ROWS)), images.x.size
-    in_threads(all_strips, len(sums), images, source, np.float32(1.0 / size / covered), gradient, sums)
-    return float(sums.sum()) / size / covered
+    in_threads(all_strips, len(sums), images, source, np.float32(1.0 / size), gradient, sums)
+    return float(sums.sum()) / size
 
 
 def _scaled(gradient: Tensor, factor: Tensor) -> Tensor:

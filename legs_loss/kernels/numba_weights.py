@@ -6,7 +6,7 @@ view. With them the weights are made row by row where they are used, from pixels
 
 from __future__ import annotations
 
-from typing import NamedTuple, Optional
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,9 +15,9 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, shape_of
 from legs_loss.kernels.compiling import part
-from legs_loss.kernels.contract import Weights
 from legs_loss.kernels.numba_response import Operator, Shape, extremes, operator_of, response_row
 from legs_loss.spec import WeightSpec
+from legs_loss.weights import Weights
 
 __all__ = ["CURVES", "Images", "WeightSource", "images_of", "response_range", "source_of", "weights_of_row"]
 
@@ -48,7 +48,7 @@ class WeightSource(NamedTuple):
     beta: of that weight.
     ranges: float32 [views, 2]: the min response, and the reciprocal of max - min + eps.
     stencil, side, middle, norm: an Operator's; a parallel loop takes no group in a group.
-    map, mask: float32 [height * width] for all views, or [views * height * width], or empty.
+    map: float32 [height * width] for all views, or [views * height * width], or empty.
     """
 
     curve: int
@@ -59,7 +59,6 @@ class WeightSource(NamedTuple):
     middle: np.float32
     norm: int
     map: np.ndarray
-    mask: np.ndarray
 
 
 def images_of(prediction: Tensor, target: Tensor) -> Images:
@@ -73,7 +72,7 @@ def source_of(weights: Weights, target: Tensor, images: Images) -> WeightSource:
     """Return where the weights come from.
 
     Raises:
-        LegsError: a map or mask that does not fit; a spec, and a target with NaN, infinity or plainly of 0..255.
+        LegsError: a map that does not fit; a spec, and a target with NaN, infinity or plainly of 0..255.
     """
     spec = weights.spec or WeightSpec()
     found = np.empty((0, 2), np.float32)
@@ -81,19 +80,11 @@ def source_of(weights: Weights, target: Tensor, images: Images) -> WeightSource:
         found = (response_range(target, spec) if weights.range is None else weights.range).numpy().copy()
         found[:, 1] = _ONE / (found[:, 1] + np.float32(spec.eps))
     curve = 0 if weights.spec is None else CURVES[spec.curve]
-    factors = (
-        _factor(values, name, images, target) for values, name in ((weights.map, "weight"), (weights.mask, "mask"))
-    )
-    return WeightSource(curve, np.float32(spec.beta), found, *operator_of(spec), *factors)
-
-
-def _factor(values: Optional[Tensor], name: str, images: Images, target: Tensor) -> np.ndarray:
-    if values is None:
-        return np.empty(0, np.float32)
-    flat, pixels = _flat(values), images.height * images.width
-    if flat.size not in (pixels, images.views * pixels):
-        raise LegsError(f"{name} {shape_of(values)} does not fit images {shape_of(target)}")
-    return flat
+    factor = np.empty(0, np.float32) if weights.map is None else _flat(weights.map)
+    pixels = images.height * images.width
+    if weights.map is not None and factor.size not in (pixels, images.views * pixels):
+        raise LegsError(f"weight {shape_of(weights.map)} does not fit images {shape_of(target)}")
+    return WeightSource(curve, np.float32(spec.beta), found, *operator_of(spec), factor)
 
 
 def response_range(target: Tensor, spec: WeightSpec) -> Tensor:
@@ -121,10 +112,9 @@ def weights_of_row(images, source, view, row, left, right, out):  # type: ignore
         operator = Operator(source.stencil, source.side, source.middle, source.norm)
         response_row(images.y, shape, operator, view, row, left, right, out)
         _weigh(out, count, source.curve, source.beta, source.ranges[view, 0], source.ranges[view, 1])
-    for factor in (source.map, source.mask):
-        if factor.size > 0:
-            at = (row if factor.size == height * width else view * height + row) * width + left
-            _multiply(out, factor[at:], count)
+    if source.map.size > 0:
+        at = (row if source.map.size == height * width else view * height + row) * width + left
+        _multiply(out, source.map[at:], count)
 
 
 @part(fastmath=False)

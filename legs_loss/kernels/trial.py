@@ -7,10 +7,10 @@ from typing import Callable, Collection, Iterator, Optional, Tuple
 import torch
 from torch import Tensor
 
-from legs_loss.kernels.contract import Backend, Weights
+from legs_loss.kernels.contract import Backend
 from legs_loss.similarity import d_ssim
 from legs_loss.spec import WeightSpec
-from legs_loss.weights import weight_map
+from legs_loss.weights import Weights, weight_map
 
 __all__ = ["difference_from_torch"]
 

@@ -2,7 +2,8 @@
 
 It weights only a prediction that is being trained on; under ``no_grad`` it is the plain mean, so that reported metrics
 do not change. call.py is the call, checked, and the loss that it gives; sources.py finds its weights in memo.py, in
-stored.py or from the target; state.py has the settings and the counts of the process.
+stored.py or from the target; terms.py is what a store's masks do to other terms, and ``ssim``; state.py has the
+settings and the counts of the process.
 """
 
 from __future__ import annotations
@@ -14,15 +15,13 @@ from torch import Tensor
 
 from legs_loss.counting import Counts, counted
 from legs_loss.errors import LegsError
-from legs_loss.images import check_order, is_compiling, is_trained, read_pair
+from legs_loss.images import check_order, is_compiling, is_trained
 from legs_loss.kernels.backends import fused_l1_of_target
-from legs_loss.kernels.contract import Weights
 from legs_loss.runtime.call import Call, Own, View
-from legs_loss.runtime.sources import MASK
 from legs_loss.runtime.state import active, configure, counts, current_run, spec_to_compile, thread, version
-from legs_loss.weights import weight_map
+from legs_loss.weights import Weights, weight_map
 
-__all__ = ["Counts", "active", "configure", "counts", "l1_loss", "masked", "unweighted"]
+__all__ = ["Counts", "active", "configure", "counts", "l1_loss", "unweighted"]
 
 Result = TypeVar("Result")
 
@@ -114,49 +113,6 @@ def _compiled(call: Call) -> Tensor:
         )
     call = call.aligned()
     return call.weighted(Weights(map=weight_map(call.target, spec, False)))
-
-
-def masked(prediction: Tensor, target: Tensor) -> Tensor:
-    """Return the prediction with the pixels that the store's mask leaves out replaced by the target's.
-
-    Written before the losses of a training step, it masks all of them, whatever computes them: where the mask is 0, no
-    loss sees a difference, and the gradient of the prediction is exactly 0. Elsewhere, under a grey mask too, the
-    prediction stays; ``l1_loss`` counts grey pixels in part.
-
-    Args:
-        prediction, target: the rendering and the photograph, as for :func:`l1_loss`.
-
-    Returns:
-        The prediction's shape; the prediction itself, the same tensor, where no mask leaves anything out: no store with
-        masks, LEGS_OFF, a prediction that is not trained on, a view without a mask.
-
-    Raises:
-        LegsError: as :func:`l1_loss`; with LEGS_MASKS=require a target that is not in the store.
-
-    Examples:
-        >>> image, gt_image = torch.rand(3, 8, 8, requires_grad=True), torch.rand(3, 8, 8)
-        >>> masked(image, gt_image) is image
-        True
-    """
-    if is_compiling():
-        spec_to_compile(version[0])  # raises where there are masks
-        return prediction
-    if thread.unweighted or not (is_trained(prediction) or is_trained(target)):
-        return prediction
-    run = current_run()
-    if run.config.off or not run.source.stored.has(MASK):
-        return prediction
-    check_order(prediction, target)
-    layout, _, aligned = read_pair(prediction, target)
-    first = layout.channels_first(aligned)
-    with torch.no_grad():
-        mask = run.source.own(first, [None] * (first.shape[0] if first.dim() == 4 else 1), MASK)
-    run.tell_at_end()
-    if mask is None:
-        return prediction
-    counted.hidden += 1
-    left_out = layout.restored((mask == 0).expand_as(first)).reshape(prediction.shape)
-    return torch.where(left_out, aligned.reshape(prediction.shape).to(prediction.dtype), prediction)
 
 
 def unweighted(function: Callable[..., Result]) -> Callable[..., Result]:

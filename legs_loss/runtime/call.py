@@ -10,9 +10,8 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.images import Layout, is_trained, read_pair
 from legs_loss.kernels.backends import fused_l1
-from legs_loss.kernels.contract import Weights
 from legs_loss.loss import mean_error
-from legs_loss.weights import weight_map
+from legs_loss.weights import Weights
 
 __all__ = ["Call", "Own", "View"]
 
@@ -97,40 +96,30 @@ class Call(NamedTuple):
                 raise LegsError(f"both images are of type {error.dtype}: give floats in [0, 1] (8-bit: image / 255.0)")
             return error.mean()
         call = self.aligned()
-        return call._with_map(None, call.mask)
+        return call._of(Weights().masked(call.mask, renormalise=False))
 
     def weighted(self, weights: Weights) -> Tensor:
         """Return the loss with these weights."""
-        if self.mask is not None and weights.mask is not None:  # the call's own is not renormalised: a factor
-            factor = self.mask.to(torch.float32)
-            weights = weights._replace(map=factor if weights.map is None else weights.map * factor)
-        elif self.mask is not None:
-            weights = weights._replace(mask=self.mask)
+        weights = weights.masked(self.mask, renormalise=False)
         if self.is_mean():
             loss = fused_l1(self.prediction, self.target, weights)
             if loss is not None:
                 return loss
-        weight = weights.map
-        if weights.spec is not None:
-            with torch.no_grad():
-                made = weight_map(self.target, weights.spec, False)
-            weight = made if weight is None else made * weight
-        return self._with_map(weight, weights.mask, weights.renormalise)
+        with torch.no_grad():
+            weights = weights.with_map(self.target)
+        return self._of(weights)
 
-    def _with_map(self, weight: Optional[Tensor], mask: Optional[Tensor], renormalise: bool = False) -> Tensor:
+    def _of(self, weights: Weights) -> Tensor:
         assert self.layout is not None
-        if self.reduction == "mean" and self.own is None:
-            return mean_error(self.prediction, self.target, weight, mask, renormalise, False)
-        if mask is not None:  # where a reduction of the codebase follows, its mean becomes the mean over what counts
-            mask = mask.to(torch.float32)
-            mask = mask / mask.mean().clamp(min=torch.finfo(torch.float32).tiny) if renormalise else mask
-            weight = mask if weight is None else weight * mask
-        if self.own is not None:
-            if weight is None:
-                return self.own(self.layout.restored(self.prediction), self.layout.restored(self.target))
-            # |F + W * (U - F) - F| = W * |U - F|: any L1 of the difference becomes the weighted one, and masks that the
-            # codebase makes from the target stay as they are.
-            moved = self.target + weight.to(self.prediction.dtype) * (self.prediction - self.target)
-            return self.own(self.layout.restored(moved), self.layout.restored(self.target))
-        error = torch.abs(self.prediction - self.target)
-        return self.layout.restored(error if weight is None else weight.to(error.dtype) * error)
+        if self.is_mean():
+            return mean_error(self.prediction, self.target, weights)
+        weight, error = weights.map, self.prediction - self.target
+        if weight is not None:  # where a reduction of the codebase follows, its mean becomes the mean over what counts
+            error = weights.of_what_counts(weight).to(error.dtype) * error
+        if self.own is None:
+            return self.layout.restored(torch.abs(error))
+        if weight is None:
+            return self.own(self.layout.restored(self.prediction), self.layout.restored(self.target))
+        # |F + W * (U - F) - F| = W * |U - F|: any L1 of the difference becomes the weighted one, and masks that the
+        # codebase makes from the target stay as they are.
+        return self.own(self.layout.restored(self.target + error), self.layout.restored(self.target))

@@ -17,7 +17,7 @@ import mmap
 import threading
 import weakref
 from collections import OrderedDict
-from typing import Callable, Hashable, Optional, Union
+from typing import Callable, Hashable, Optional, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from torch import Tensor
 __all__ = ["DEFAULT_LIMIT", "WeightMemo"]
 
 DEFAULT_LIMIT = 1 << 30  # bytes
+Value = TypeVar("Value")
 _LARGE = 1 << 16  # bytes
 _OVERHEAD = 1 << 10  # bytes of an entry beside its values: key, tensor, bookkeeping
 
@@ -57,12 +58,12 @@ class WeightMemo:
     def __len__(self) -> int:
         return len(self._entries)
 
-    def recall(self, target: Tensor, make: Callable[[], Tensor], form: Hashable = None) -> Tensor:
+    def recall(self, target: Tensor, make: Callable[[], Value], form: Hashable = None) -> Value:
         """Return the value of this target; or make it, and store it if the target can be identified later.
 
         Args:
             target: the image.
-            make: makes its weight map, or the range of its response.
+            make: makes its weight map; or what takes little memory, as the range of its response.
             form: the kind of value, if there are several; each is stored separately.
         """
         found = _key(target)
@@ -73,15 +74,15 @@ class WeightMemo:
             entry = self._entries.get(key)
             if entry is not None:
                 entry.used = True
-                return entry.weight
-        weight = make()
-        size = _size(weight)
+                return cast(Value, entry.value)
+        value = make()
+        size = _size(value)
         with self._lock:
             self._drop(key)
             if self._make_room(size):
-                self._entries[key] = _Entry(weight, size, self._owner(target, key))
+                self._entries[key] = _Entry(value, size, self._owner(target, key))
                 self.bytes += size
-        return weight
+        return value
 
     def clear(self) -> None:
         """Forget everything."""
@@ -118,9 +119,9 @@ class WeightMemo:
         return self.bytes + size <= self.limit
 
 
-def _size(weight: Tensor) -> int:
+def _size(value: object) -> int:
     """Return the bytes that an entry takes."""
-    size = weight.numel() * weight.element_size()
+    size = value.numel() * value.element_size() if isinstance(value, Tensor) else 0
     return _OVERHEAD + (-(-size // mmap.PAGESIZE) * mmap.PAGESIZE if size >= _LARGE else size)
 
 
@@ -131,23 +132,23 @@ class _Entry:
     memo of such tensors took twice the memory that it counted.
     """
 
-    __slots__ = ("_dtype", "_shape", "_values", "owner", "size", "used")
+    __slots__ = ("_shape", "_value", "owner", "size", "used")
 
-    def __init__(self, weight: Tensor, size: int, owner: Optional[weakref.ref[Tensor]]) -> None:
+    def __init__(self, value: object, size: int, owner: Optional[weakref.ref[Tensor]]) -> None:
         self.size = size
         self.owner = owner
         self.used = False
-        self._dtype, self._shape = weight.dtype, tuple(weight.shape)
-        self._values: Union[Tensor, mmap.mmap] = weight
-        if weight.device.type == "cpu" and type(weight) is Tensor and weight.numel() * weight.element_size() >= _LARGE:
-            self._values = mmap.mmap(-1, weight.numel() * weight.element_size())
-            self.weight.copy_(weight)
+        self._value: object = value
+        if type(value) is Tensor and value.device.type == "cpu" and value.numel() * value.element_size() >= _LARGE:
+            self._value, self._shape = mmap.mmap(-1, value.numel() * value.element_size()), (value.dtype, value.shape)
+            torch.frombuffer(self._value, dtype=value.dtype).copy_(value.reshape(-1))
 
     @property
-    def weight(self) -> Tensor:
-        if isinstance(self._values, Tensor):
-            return self._values
-        return torch.frombuffer(self._values, dtype=self._dtype).reshape(self._shape)
+    def value(self) -> object:
+        if not isinstance(self._value, mmap.mmap):
+            return self._value
+        dtype, shape = self._shape
+        return torch.frombuffer(self._value, dtype=dtype).reshape(shape)
 
 
 def _key(target: Tensor) -> Optional[Hashable]:

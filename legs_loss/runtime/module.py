@@ -12,11 +12,10 @@ from torch import Tensor, nn
 from legs_loss.config import find_config
 from legs_loss.counting import counted
 from legs_loss.images import check_order
-from legs_loss.loss import legs_loss
+from legs_loss.loss import legs_loss, total_loss
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.state import Run
 from legs_loss.spec import Spec, WeightSpec, as_spec
-from legs_loss.weights import weight_map
 
 __all__ = ["LEGSLoss"]
 
@@ -30,11 +29,11 @@ class LEGSLoss(nn.Module):
         spec: as for :func:`~legs_loss.legs_loss`, like the others.
         lambda_dssim: the share of D-SSIM.
         padding: of SSIM.
-        renormalise: divide the masked L1 term by the mask's mean.
+        renormalise: make both terms the mean over what a ``mask`` counts.
         channels_last: where the channel stands, for shapes that do not show it.
         store: a folder that ``legs precompute`` wrote: its maps are used for exactly the images that they belong to.
-            With masks in it the L1 is the mean over what counts, SSIM sees no difference where it is 0, and an image
-            that is not found is said, or with LEGS_MASKS=require an error (docs/masks.md).
+            With masks in it both terms are the mean over what counts, and an image that is not found is said, or with
+            LEGS_MASKS=require an error (docs/masks.md).
 
     Shape:
         prediction, target: [H, W], [C, H, W], [H, W, C] or batches; weight, mask: one value a pixel; output: a scalar.
@@ -91,23 +90,13 @@ class LEGSLoss(nn.Module):
     def _by_store(self, run: Run, prediction: Tensor, target: Tensor, mask: Optional[Tensor]) -> Tensor:
         call = Call(prediction, target, None, mask, self.channels_last, "mean", None).aligned()
         check_order(call.prediction, call.target)
-        prediction, target, mask, renormalise = call.prediction, call.target, call.mask, self.renormalise
         with torch.no_grad():
-            found = run.source.weights(call)
-            weight = found.map
-            if found.spec is not None and (weight is not None or found.mask is not None):
-                made = weight_map(target, self.spec, False)
-                weight = made if weight is None else made * weight
-        if found.mask is not None:
-            if mask is not None:  # the call's own is not renormalised: a factor of the weight
-                weight = mask.float() if weight is None else weight * mask
-            mask, renormalise = found.mask, True
-            counted.hidden += 1
-            prediction = torch.where(mask == 0, target.to(prediction.dtype), prediction)
+            weights = run.source.weights(call)
+            counted.hidden += weights.share is not None
+            weights = weights.masked(call.mask, self.renormalise and weights.share is None)
         run.say_what_is_used()
-        return legs_loss(
-            prediction, target, self.spec, weight, mask, self.lambda_dssim, self.padding, renormalise, False
-        )
+        made = "" if weights.map is None and self.spec.unweighted else "by LEGSLoss"
+        return total_loss(call.prediction, call.target, weights, self.lambda_dssim, self.padding, made)
 
     def extra_repr(self) -> str:
         """Return the settings, for ``print(module)``."""

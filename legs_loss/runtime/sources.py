@@ -8,7 +8,7 @@ least response and the span; torch needs the map.
 from __future__ import annotations
 
 from functools import partial
-from typing import Callable, List, Optional, Sequence
+from typing import Callable, List, NamedTuple, Optional, Sequence, Union
 
 import torch
 from torch import Tensor
@@ -19,11 +19,10 @@ from legs_loss.errors import LegsError
 from legs_loss.images import is_transformed
 from legs_loss.kernels.available import is_capturing
 from legs_loss.kernels.backends import fused_range
-from legs_loss.kernels.contract import Weights
 from legs_loss.runtime.call import Call
 from legs_loss.runtime.memo import WeightMemo
-from legs_loss.runtime.stored import Stored
-from legs_loss.weights import weight_map
+from legs_loss.runtime.stored import Stored, Whole
+from legs_loss.weights import Weights, weight_map
 
 __all__ = ["MASK", "NOT_IN_A_GRAPH", "WEIGHTS", "WeightSource"]
 
@@ -32,6 +31,12 @@ NOT_IN_A_GRAPH = (
     "the store has masks or weights of your own, which are found by the image, and a compiled or captured graph, "
     "torch.func and forward-mode AD cannot look: leave the loss out of them, or name a store without (LEGS_STORE)"
 )
+
+
+class Range(NamedTuple):
+    """The least response of an image and the span, [1, 2], that a backend makes its weights of."""
+
+    values: Tensor
 
 
 class WeightSource:
@@ -57,9 +62,7 @@ class WeightSource:
         weights = Weights() if self.config.spec.unweighted else self._made_weights(call, names)
         own = self.own(call.target, names, WEIGHTS)
         mask = self.own(call.target, names, MASK, counted=True)
-        if own is not None:
-            weights = weights._replace(map=own if weights.map is None else weights.map * own)
-        return weights if mask is None else weights._replace(mask=mask, renormalise=True)
+        return weights.times(own).masked(mask)
 
     def has_own(self) -> bool:
         """Return whether the store has masks or weights of the user's, which hold for every preset."""
@@ -80,25 +83,26 @@ class WeightSource:
             for image, name in zip(_images(target), names)
         ]
         if counted:
-            self._counts.masked += sum(one.dim() == 3 for one in maps)
-            self._counts.unmasked += sum(one.dim() == 2 for one in maps)
-        if not any(one.dim() == 3 for one in maps):
+            self._counts.masked += sum(isinstance(one, Tensor) for one in maps)
+            self._counts.unmasked += sum(one is Whole.UNKNOWN for one in maps)
+        if not any(isinstance(one, Tensor) for one in maps):
             return None
         ones = torch.ones((1, *target.shape[-2:]), device=target.device)
-        whole = [one if one.dim() == 3 else ones for one in maps]
+        whole = [one if isinstance(one, Tensor) else ones for one in maps]
         return whole[0] if target.dim() == 3 else torch.stack(whole)
 
     def _made_weights(self, call: Call, names: Sequence[Optional[str]]) -> Weights:
         images = _images(call.target)
         found = [self._weight(image, name, call) for image, name in zip(images, names)]
         spec = self.config.spec
-        if all(map(_is_range, found)):
-            return Weights(spec=spec, range=torch.cat(found))
-        maps = [weight_map(image, spec, False) if _is_range(weight) else weight for image, weight in zip(images, found)]
+        ranges = [one.values for one in found if isinstance(one, Range)]
+        if len(ranges) == len(found):
+            return Weights(spec=spec, range=torch.cat(ranges))
+        maps = [one if isinstance(one, Tensor) else weight_map(image, spec, False) for image, one in zip(images, found)]
         return Weights(map=maps[0] if call.target.dim() == 3 else torch.stack(maps))
 
-    def _weight(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
-        """Return an image's weight map [1, H, W], or the range that makes it, [1, 2]."""
+    def _weight(self, image: Tensor, view: Optional[str], call: Call) -> Union[Tensor, Range]:
+        """Return an image's weight map [1, H, W], or the range that makes it."""
         counts = self._counts
         if is_transformed() or is_capturing(image.device):
             # A CUDA graph is replayed with other pixels in the target's memory: their weight is part of the graph.
@@ -109,13 +113,13 @@ class WeightSource:
             found = fused_range(image, self.config.spec)
             if found is not None:
                 counts.computed += 1
-                return found
+                return Range(found)
         before = counts.stored + counts.computed
         weight = self.memo.recall(image, lambda: self._made(image, view, call), call.is_mean())
         counts.remembered += counts.stored + counts.computed == before
         return weight
 
-    def _made(self, image: Tensor, view: Optional[str], call: Call) -> Tensor:
+    def _made(self, image: Tensor, view: Optional[str], call: Call) -> Union[Tensor, Range]:
         weight = self.stored.weight(image, view)
         if weight is not None:
             self._counts.stored += 1
@@ -123,17 +127,13 @@ class WeightSource:
         self._counts.computed += 1
         return self._computed(image, call)
 
-    def _computed(self, image: Tensor, call: Call) -> Tensor:
+    def _computed(self, image: Tensor, call: Call) -> Union[Tensor, Range]:
         spec = self.config.spec
         if spec.over == "scene":
             return weight_map(image, spec, False, self.stored.scene_levels(image.shape[-2] * image.shape[-1]))
         found = fused_range(image, spec) if call.is_mean() else None
-        return weight_map(image, spec, False) if found is None else found
+        return weight_map(image, spec, False) if found is None else Range(found)
 
 
 def _images(target: Tensor) -> List[Tensor]:
     return [target] if target.dim() == 3 else list(target)
-
-
-def _is_range(weight: Tensor) -> bool:
-    return weight.dim() == 2

@@ -26,6 +26,7 @@ __all__ = [
     "counted",
     "counts",
     "current_run",
+    "refuse_masks",
     "reset",
     "reset_counts",
     "spec_to_compile",
@@ -125,20 +126,27 @@ def _say_masked() -> None:
         say(f"legs-loss: {masked.summary(counted.unmasked, in_l1_alone)}", sys.stderr)
 
 
-def spec_to_compile(version: int) -> Optional[WeightSpec]:
-    """Return the spec of a compiled call, None without a weight."""
+def refuse_masks(version: int) -> None:
+    """Raise a LegsError where a graph is compiled, and the store has masks or weights of the user's."""
     run = current_run()
     if not run.config.off and run.source.has_own():
         raise LegsError(NOT_IN_A_GRAPH)
+
+
+def spec_to_compile(version: int) -> Optional[WeightSpec]:
+    """Return the spec of a compiled call, None without a weight."""
+    refuse_masks(version)
+    run = current_run()
     run.say_what_is_used()
     if run.config.active:
         note_graph(version)
     return run.config.spec if run.config.active else None
 
 
-# torch.compile calls it while it traces, and takes its result as a constant: it cannot trace a lock, or a file that is
-# read. What torch.compiler.assume_constant_result would set, without the seconds that importing the compiler takes.
-spec_to_compile._dynamo_marked_constant = True  # type: ignore[attr-defined]
+# torch.compile calls them while it traces, and takes what they return as a constant: it cannot trace a lock, or a file
+# that is read. What torch.compiler.assume_constant_result would set, without the seconds of importing the compiler.
+for _constant in (refuse_masks, spec_to_compile):
+    _constant._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def reset() -> None:

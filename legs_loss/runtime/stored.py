@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import weakref
-from typing import TYPE_CHECKING, Callable, Dict, Optional, Set, Tuple
+from enum import Enum
+from typing import TYPE_CHECKING, Callable, Dict, Optional, Set, Tuple, Union
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from legs_loss.weights import weight_from_response, weight_over_scene
 if TYPE_CHECKING:
     from legs_loss.store import Found, WeightStore
 
-__all__ = ["Masked", "Stored"]
+__all__ = ["Masked", "Stored", "Whole"]
 
 _MISSES = 2  # lookups for each map of the store
 
@@ -33,6 +34,13 @@ _OTHER_PIXELS = (
     "its pixels are no photograph's that legs precompute read, so it was changed on the way: augmented, shifted, "
     "resized or laid on another background"
 )
+
+
+class Whole(Enum):
+    """Reasons for an image to count whole: the store has no mask or weights for it, or does not know it."""
+
+    KNOWN = 0
+    UNKNOWN = 1
 
 
 class Masked:
@@ -104,10 +112,8 @@ class Stored:
         self._open()
         return kind in self._kinds
 
-    def own(self, image: Tensor, view: Optional[str], kind: str) -> Tensor:
-        """Return the user's mask or weights of an image, float32 [1, H, W].
-
-        An image that has none counts whole: an empty tensor [0], or [0, 0] where the store does not know the image.
+    def own(self, image: Tensor, view: Optional[str], kind: str) -> Union[Tensor, Whole]:
+        """Return the user's mask or weights of an image, float32 [1, H, W]; or why it counts whole.
 
         Raises:
             LegsError: a file of the store is damaged; or LEGS_MASKS=require, and the image is not in the store.
@@ -120,12 +126,12 @@ class Stored:
         if found is None:
             if kind == MASK:
                 self._say_unmasked(store, image, view)
-            return torch.empty(0, 0)
+            return Whole.UNKNOWN
         entry = found.mask if kind == MASK else found.weights
         if kind == MASK:
             (self.masked.whole if entry is None else self.masked.views).add(found.view)
         if entry is None:
-            return torch.empty(0)
+            return Whole.KNOWN
         return torch.from_numpy(store.own_map(entry)).to(image.device).unsqueeze(0)
 
     def scene_levels(self, pixels: int) -> Tensor:

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from legs_loss import legs_loss
-from legs_loss.kernels.contract import Weights
 from legs_loss.spec import PRESETS
+from legs_loss.weights import Weights
 from tests.kernels.on_device import DEVICE, MISSING, new_backend
 from tests.kernels.support import images
 
@@ -32,11 +32,11 @@ def backend(request):
 
 @pytest.fixture
 def given(backend):
-    """A prediction, a target, a map and a mask on the backend's device."""
+    """A prediction, a target and a map on the backend's device."""
     device = DEVICE if backend.name == "cuda" else torch.device("cpu")
     prediction, target = (image.detach().to(device) for image in images((3, 24, 40)))
-    map_, mask = 1.0 + torch.rand(1, 24, 40, device=device), torch.rand(1, 24, 40, device=device)
-    return {"prediction": prediction.requires_grad_(), "target": target, "map": map_, "mask": mask}
+    map_ = 1.0 + torch.rand(1, 24, 40, device=device)
+    return {"prediction": prediction.requires_grad_(), "target": target, "map": map_}
 
 
 OPERATIONS = {
@@ -47,14 +47,13 @@ OPERATIONS = {
 
 
 def loss_of(backend, operation, given):
-    weights = Weights(map=given["map"], mask=given["mask"])
-    return OPERATIONS[operation](backend, given["prediction"], given["target"], weights)
+    return OPERATIONS[operation](backend, given["prediction"], given["target"], Weights(map=given["map"]))
 
 
 def torchs(given):
     """The same loss by torch, whose behaviour is the model."""
     image = given["prediction"].double()
-    return legs_loss(image, given["target"].double(), weight=given["map"].double(), mask=given["mask"])
+    return legs_loss(image, given["target"].double(), weight=given["map"].double())
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
@@ -67,8 +66,8 @@ def test_a_retained_graph_gives_the_same_bits_again(backend, given, operation):
 
 @pytest.mark.parametrize(
     ("operation", "changed"),
-    [("loss", "prediction"), ("loss", "target"), ("loss", "map"), ("loss", "mask"), ("l1", "prediction"),
-     ("l1", "target"), ("ssim", "prediction"), ("ssim", "target")],
+    [("loss", "prediction"), ("loss", "target"), ("loss", "map"), ("l1", "prediction"), ("l1", "target"),
+     ("ssim", "prediction"), ("ssim", "target")],
 )  # fmt: skip
 def test_what_was_changed_in_place_is_not_differentiated_again(backend, given, operation, changed):
     loss = loss_of(backend, operation, given)

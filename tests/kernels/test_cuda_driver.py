@@ -14,12 +14,13 @@ import torch
 from legs_loss import legs_loss
 from legs_loss.kernels import available, trial
 from legs_loss.kernels.available import BACKENDS, Known
-from legs_loss.kernels.contract import DeviceFault, NotNow, Weights
+from legs_loss.kernels.contract import DeviceFault, NotNow
 from legs_loss.kernels.cuda.backend import THREADS, CudaBackend, Task
 from legs_loss.kernels.cuda.driver import CudaDriver, DriverError, OutOfMemory
 from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules, Variant
 from legs_loss.kernels.cuda.nvrtc import Compiler, CompilerError
 from legs_loss.spec import PRESETS
+from legs_loss.weights import Weights
 from tests.cuda_emulation import COMPILER, Runtime, libraries
 from tests.kernels.support import images, used
 from tests.support import legs_environment

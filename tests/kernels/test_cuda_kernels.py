@@ -29,12 +29,12 @@ from legs_loss import (
 )
 from legs_loss.kernels import backends
 from legs_loss.kernels.available import BACKENDS, Availability, Known
-from legs_loss.kernels.contract import Weights
 from legs_loss.kernels.cuda.backend import STENCILS
 from legs_loss.kernels.trial import difference_from_torch
 from legs_loss.responses import response
 from legs_loss.runtime import state
 from legs_loss.spec import PRESETS
+from legs_loss.weights import Weights
 from tests.cuda_emulation import COMPILER
 from tests.kernels.on_device import DEVICE, MISSING, new_backend, new_driver
 from tests.kernels.support import compare, images, used
@@ -269,8 +269,8 @@ class TestWeightedL1:
     def test_masks(self, backend, renormalise):
         prediction, target = images((2, 3, 40, 50))
         for mask in (torch.rand(40, 50) > 0.4, torch.rand(2, 1, 40, 50), torch.zeros(1, 40, 50)):
-            weights = Weights(spec=LEGS, mask=mask, renormalise=renormalise)
-            loss = backend.weighted_l1(prediction, target, weights)
+            weights = Weights(spec=LEGS).masked(mask if mask.dim() > 2 else mask[None], renormalise)
+            loss = weights.of_what_counts(backend.weighted_l1(prediction, target, weights))
             expected = weighted_l1(prediction, target, weight_map(target), mask, renormalise)
             assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
             gradients = [torch.autograd.grad(value, prediction)[0] for value in (loss, expected)]
@@ -418,7 +418,7 @@ def test_no_access_is_out_of_bounds():
     code = (
         "import torch\n"
         "from legs_loss import WeightSpec\n"
-        "from legs_loss.kernels.contract import Weights\n"
+        "from legs_loss.weights import Weights\n"
         "from tests.cuda_emulation import emulated\n"
         "backend = emulated(flags=['-fsanitize=address,undefined', '-fno-sanitize-recover=all', '-O1'])\n"
         "for shape in ((3, 1, 1), (1, 2, 7), (2, 3, 37, 113), (3, 130, 5)):\n"
@@ -426,7 +426,7 @@ def test_no_access_is_out_of_bounds():
         "        x, y = torch.rand(shape).to(dtype).requires_grad_(), torch.rand(shape).to(dtype)\n"
         "        mask = torch.rand(shape[-2:])\n"
         "        for spec in (WeightSpec(curve='C5'), WeightSpec(operator='scharr', p=float('inf'))):\n"
-        "            weights = Weights(spec=spec, mask=mask)\n"
+        "            weights = Weights(spec=spec, map=mask)\n"
         "            backend.loss(x, y, weights, 0.2).backward()\n"
         "            backend.weighted_l1(x, y, weights).backward()\n"
         "        backend.ssim(x, y).backward()\n"

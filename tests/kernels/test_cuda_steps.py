@@ -11,7 +11,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from legs_loss import LegsError, configure, l1_loss, legs_loss, ssim
 from legs_loss.kernels import available, backends, trial
 from legs_loss.kernels.available import BACKENDS, Availability, Known
-from legs_loss.kernels.contract import Weights
 from legs_loss.kernels.cuda.backend import CudaBackend, Layout, Task, chunks_of, strip_of
 from legs_loss.kernels.cuda.driver import DriverError
 from legs_loss.kernels.cuda.modules import BinaryCache, Modules
@@ -19,6 +18,7 @@ from legs_loss.kernels.cuda.nvrtc import NotFound
 from legs_loss.runtime import counts, sources, state
 from legs_loss.runtime.memo import _OVERHEAD
 from legs_loss.spec import PRESETS
+from legs_loss.weights import Weights
 from tests.kernels.parts import FakeCompiler, FakeDriver
 from tests.kernels.support import images, used
 
@@ -160,7 +160,7 @@ class TestDropIn:
         assert used(loss) == "fused" and watched.seen > 0 and not watched.waits
         assert on_meta.launches.count("legs_range") == 2
         assert (counts().computed, counts().remembered) == (2, 2)
-        assert state.current_run().source.memo.bytes == 2 * (_OVERHEAD + 8)
+        assert state.current_run().source.memo.bytes == 2 * _OVERHEAD
 
     def test_a_capture_makes_the_range_part_of_the_graph(self, on_meta, monkeypatch):
         target = torch.empty(3, 40, 50, device="meta")

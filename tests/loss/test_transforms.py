@@ -8,9 +8,9 @@ import torch.nn.functional as F
 from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
-from legs_loss import LegsError, LEGSLoss, configure, l1_loss, legs_loss, ssim, weight_map, weighted_l1
+from legs_loss import LegsError, LEGSLoss, configure, l1_loss, legs_loss, masked, ssim, weight_map, weighted_l1
 from legs_loss.precompute import OwnMaps, precompute
-from legs_loss.runtime import counts, masked, state
+from legs_loss.runtime import counts, state
 from legs_loss.scenes import read_scene
 from tests.runtime.support import plain
 from tests.support import colmap_scene, photograph, save

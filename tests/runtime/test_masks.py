@@ -15,6 +15,7 @@ from legs_loss import LegsError, configure, l1_loss
 from legs_loss.precompute import OwnMaps, precompute
 from legs_loss.runtime import active, counts, state
 from legs_loss.scenes import read_scene
+from legs_loss.similarity import ssim_map
 from tests.runtime.support import plain
 from tests.support import legs_environment
 
@@ -170,6 +171,46 @@ class TestMasked:
         assert torch.equal(l1_loss(prediction, photograph(scene, "a")), plain(prediction, photograph(scene, "a")))
 
 
+class TestOtherTerms:
+    def test_ssim_is_of_what_counts(self, scene):
+        stored(scene, masks="masks")
+        for name, mask in masks().items():
+            prediction, target = rendering(), photograph(scene, name)
+            left_out, counts_for = torch.from_numpy(mask == 0), (mask > 0).mean()
+            seen = torch.where(left_out, target, prediction)
+            expected = 1.0 - legs_loss.d_ssim(seen, target) / counts_for
+            for pair in ((prediction, target), (target, prediction), (legs_loss.masked(prediction, target), target)):
+                found = legs_loss.ssim(*pair)
+                torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+                gradient = torch.autograd.grad(found, prediction)[0]
+                assert not gradient[:, left_out].any() and gradient[:, ~left_out].all()
+            torch.testing.assert_close(legs_loss.ssim(prediction, target, 11, False), expected, rtol=1e-5, atol=1e-6)
+            share = legs_loss.coverage(prediction, target)
+            assert float(share) == pytest.approx(counts_for)
+            with torch.no_grad():  # an evaluation is of all pixels, as that of every other codebase
+                assert legs_loss.coverage(prediction, target) == 1.0
+                torch.testing.assert_close(1 - legs_loss.ssim(prediction, target), legs_loss.d_ssim(prediction, target))
+
+    def test_without_a_mask_nothing_changes(self, scene, monkeypatch):
+        stored(scene, masks="masks")
+        prediction, target = rendering(), photograph(scene, "c")
+        assert legs_loss.coverage(prediction, target) == 1.0
+        plain_ssim = 1.0 - legs_loss.d_ssim(prediction, target)
+        torch.testing.assert_close(legs_loss.ssim(prediction, target), plain_ssim)
+        monkeypatch.setenv("LEGS_OFF", "1")
+        configure("legs", store=scene / "legs_weights")
+        target = photograph(scene, "a")
+        assert legs_loss.coverage(prediction, target) == 1.0
+        assert torch.equal(legs_loss.ssim(prediction, target), ssim_map(prediction, target).mean())
+
+    def test_a_batch_one_value_an_image(self, scene):
+        stored(scene, masks="masks")
+        target = torch.stack([photograph(scene, name) for name in "abc"])
+        prediction = torch.rand(3, 3, HEIGHT, WIDTH, requires_grad=True)
+        each = legs_loss.ssim(prediction, target, size_average=False)
+        torch.testing.assert_close(each, torch.stack([legs_loss.ssim(*pair) for pair in zip(prediction, target)]))
+
+
 class TestNoSilence:
     @pytest.mark.parametrize(
         ("change", "reason"),
@@ -179,7 +220,7 @@ class TestNoSilence:
             (lambda target: target[:, :8], f"the store has {WIDTH}x{HEIGHT}"),
         ],
     )
-    @pytest.mark.parametrize("call", [l1_loss, legs_loss.masked])
+    @pytest.mark.parametrize("call", [l1_loss, legs_loss.masked, legs_loss.ssim])
     def test_a_target_that_is_not_found_is_said_once_with_the_reason(self, scene, capsys, change, reason, call):
         stored(scene, masks="masks")
         target = change(photograph(scene, "a"))
@@ -201,7 +242,7 @@ class TestNoSilence:
         stored(scene, masks="masks")
         l1_loss(rendering(), photograph(scene, "a"))
         l1_loss(rendering(), photograph(scene, "c"))  # it is there, and has no mask: it counts whole
-        for call in (l1_loss, legs_loss.masked):
+        for call in (l1_loss, legs_loss.masked, legs_loss.ssim, legs_loss.coverage):
             with pytest.raises(LegsError, match=r"NOT MASKED.*augmented"):
                 call(rendering(), torch.rand(3, HEIGHT, WIDTH))
 
@@ -229,8 +270,9 @@ class TestNoSilence:
 
     def test_a_compiled_graph_is_refused(self, scene):
         stored(scene, masks="masks")
-        with pytest.raises(LegsError, match="compiled or captured graph"):
-            state.spec_to_compile(0)
+        for refused in (state.spec_to_compile, state.refuse_masks):
+            with pytest.raises(LegsError, match="compiled or captured graph"):
+                refused(0)
 
     def test_beta_zero_with_masks_is_active(self, scene):
         stored(scene, "3dgs", masks="masks")
@@ -283,8 +325,11 @@ class TestLibraries:
             loss = losses.l1_loss(image, pixels).mean()
             loss = loss + losses.ssim_loss(image.permute(0, 3, 1, 2), pixels.permute(0, 3, 1, 2), padding="valid")
         sys.modules.pop("gsplat.losses"), sys.modules.pop("gsplat")
-        loss.backward()
         left_out = torch.from_numpy(masks()["a"] == 0)
+        squares = (prediction - target).square()[:, ~left_out].mean()  # of what counts
+        expected = by_hand(prediction, target, masks()["a"]) + squares
+        assert loss.item() == pytest.approx(expected.item(), rel=2e-4)
+        loss.backward()
         assert not prediction.grad[:, left_out].any() and prediction.grad[:, ~left_out].all()
         assert (counts().masked, counts().hidden) == (1, 1)
 
@@ -316,7 +361,7 @@ class TestLibraries:
         assert not prediction.grad[left_out].any() and prediction.grad[~left_out].all()
         seen = torch.where(left_out[..., None], target, prediction.detach())
         expected = 0.8 * by_hand(prediction.movedim(-1, 0), target.movedim(-1, 0), masks()["a"])
-        expected = expected + 0.2 * (seen - target).square().mean()
+        expected = expected + 0.2 * (seen - target).square().mean() / (~left_out).float().mean()
         assert loss.item() == pytest.approx(expected.item(), rel=2e-4)
 
 
@@ -330,7 +375,8 @@ class TestModule:
             loss = criterion(prediction, target)
             left_out = torch.from_numpy(mask == 0)
             seen = torch.where(left_out, target, prediction)
-            expected = 0.8 * by_hand(prediction, target, mask, preset) + 0.2 * legs_loss.d_ssim(seen, target)
+            structural = legs_loss.d_ssim(seen, target) / (mask > 0).mean()
+            expected = 0.8 * by_hand(prediction, target, mask, preset) + 0.2 * structural
             assert loss.item() == pytest.approx(expected.item(), rel=5e-4)
             loss.backward()
             assert not prediction.grad[:, left_out].any() and prediction.grad[:, ~left_out].all()

@@ -2,7 +2,7 @@
 
 That function takes tensors of any shape and returns unreduced errors. It is weighted for trained images of three
 channels in either layout; depths, intensities and everything without a gradient are unchanged. A target that requires a
-gradient is not a photograph. Its ``ssim_loss`` of such images sees no pixel that a mask of the store leaves out.
+gradient is not a photograph. Its ``ssim_loss`` of such images is the mean over what a mask of the store counts.
 Source: gsplat/losses.py, which gsplat has after its release 1.5.3.
 """
 
@@ -33,8 +33,10 @@ def apply(applied: Applied) -> None:
 
     @functools.wraps(own_ssim or own)
     def ssim_loss(pred: Any, target: Any, *settings: Any, **named: Any) -> Any:
-        seen = pred if _channels_last(pred, target) is None else legs_loss.masked(pred, target)
-        return own_ssim(seen, target, *settings, **named)
+        if _channels_last(pred, target) is None:
+            return own_ssim(pred, target, *settings, **named)
+        loss = own_ssim(legs_loss.masked(pred, target), target, *settings, **named)
+        return loss / legs_loss.coverage(pred, target)
 
     applied.replace(losses, "l1_loss", l1_loss)
     if own_ssim is not None:

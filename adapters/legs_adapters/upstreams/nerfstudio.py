@@ -113,20 +113,23 @@ def weighted(
 ) -> Dict[str, Any]:
     """Return splatfacto's losses with the L1 share of ``main_loss`` weighted, in training and while LEGS is on.
 
-    Masked pixels of a store are hidden from all of them.
+    Both terms are means over what a mask of a store counts.
     """
     if not outputs["rgb"].requires_grad or not active():
         return own(outputs, batch, metrics_dict)
     # The rendering and the photograph as splatfacto's own loss compares them.
     target = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
-    prediction = outputs["rgb"]
+    prediction: Any = outputs["rgb"]
+    share: Any = 1.0
     if "mask" in batch:
         mask = model._downscale_if_required(batch["mask"]).to(model.device)
         prediction, target = prediction * mask, target * mask
     else:
+        share = legs_loss.coverage(prediction, target)
         prediction = legs_loss.masked(prediction, target)
         outputs = {**outputs, "rgb": prediction}
     losses = own(outputs, batch, metrics_dict)
-    plain = legs_loss.weighted_l1(prediction, target, channels_last=True)
-    change = legs_loss.l1_loss(prediction, target, channels_last=True) - plain
-    return {**losses, "main_loss": losses["main_loss"] + (1.0 - model.config.ssim_lambda) * change}
+    main, plain = losses["main_loss"], (1.0 - model.config.ssim_lambda) * (prediction - target).abs().mean()
+    photometric = (1.0 - model.config.ssim_lambda) * legs_loss.l1_loss(prediction, target, channels_last=True)
+    # What is not the L1 is the structural term, a mean over all pixels.
+    return {**losses, "main_loss": main + (photometric - plain) + (main - plain) * (1.0 / share - 1.0)}

@@ -13,12 +13,13 @@ from typing import Any, Callable, Dict, FrozenSet, NamedTuple, Optional, Sequenc
 import torch
 from torch import Tensor
 
-from legs_loss.kernels.contract import Backend, Weights
+from legs_loss.kernels.contract import Backend
 from legs_loss.kernels.cuda.driver import CudaDriver
 from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules, Variant, cache_folder
 from legs_loss.kernels.cuda.nvrtc import find_compiler
 from legs_loss.kernels.differentiable import differentiable
 from legs_loss.spec import WeightSpec
+from legs_loss.weights import Weights
 
 __all__ = [
     "BACKEND",
@@ -172,16 +173,16 @@ class _Device:
         dtype = prediction.dtype
 
         def compute(wanted: bool, x: Tensor, constants: Sequence[Optional[Tensor]]) -> Tuple[Tensor, Optional[Tensor]]:
-            y, map_, mask, found = constants
+            y, map_, found = constants
             assert y is not None
-            given = Weights(weights.spec, found, map_, mask, weights.renormalise)
+            given = Weights(weights.spec, found, map_)
             loss, gradient = self._loss_and_gradient(_batch(x), _batch(y.detach()), given, shares, wanted)
             return loss, gradient[0] if gradient is not None and x.dim() == 3 else gradient
 
         def scale(gradient: Tensor, step: Tensor) -> Tensor:
             return self._scaled(gradient, step, dtype)
 
-        return differentiable(prediction, (target, weights.map, weights.mask, weights.range), compute, scale)
+        return differentiable(prediction, (target, weights.map, weights.range), compute, scale)
 
     def response_range(self, y: Tensor, spec: WeightSpec) -> Tensor:
         """Return the least response of each view of [B, C, H, W], and max - min: float32 [B, 2]."""
@@ -242,18 +243,15 @@ class _Device:
         return [values for values in (given, made) if values is not None]
 
     def _add_map(self, task: Task, y: Tensor, weights: Weights) -> Optional[Tensor]:
-        """Set the factors of a task's weights that are given for each pixel; return their memory."""
-        factors = [values for values in (weights.map, _mask_of(weights)) if values is not None]
-        if not factors:
+        """Set the map of a task's weights; return its memory."""
+        if weights.map is None:
             return None
         views, _, height, width = y.shape
-        wrong = [list(each.shape) for each in factors if each.numel() not in (height * width, views * height * width)]
-        if wrong:
-            raise ValueError(f"weights {wrong[0]} do not fit images {list(y.shape)}")
-        planes = [values.detach().to(torch.float32).reshape(-1, height, width) for values in factors]
-        product = (planes[0] if len(planes) == 1 else planes[0] * planes[1]).contiguous()
-        task.map, task.map_view = product.data_ptr(), product.shape[0] > 1
-        return product
+        if weights.map.numel() not in (height * width, views * height * width):
+            raise ValueError(f"weights {list(weights.map.shape)} do not fit images {list(y.shape)}")
+        plane = weights.map.detach().to(torch.float32).reshape(-1, height, width).contiguous()
+        task.map, task.map_view = plane.data_ptr(), plane.shape[0] > 1
+        return plane
 
     def _scaled(self, gradient: Tensor, step: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the gradient times the incoming gradient of backward, rounded once, in the prediction's type."""
@@ -338,12 +336,6 @@ def chunks_of(images: Tensor) -> int:
 
 def _batch(images: Tensor) -> Tensor:
     return images.unsqueeze(0) if images.dim() == 3 else images
-
-
-def _mask_of(weights: Weights) -> Optional[Tensor]:
-    """Return the mask, divided by its mean where the L1 is to be."""
-    mask = None if weights.mask is None else weights.mask.float()
-    return mask / mask.mean().clamp_min(1.1754944e-38) if mask is not None and weights.renormalise else mask
 
 
 def _task_of(images: Tensor, spec: Optional[WeightSpec]) -> Task:

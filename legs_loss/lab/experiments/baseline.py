@@ -9,7 +9,7 @@ import torch
 
 from legs_loss.errors import LegsError
 from legs_loss.lab.training.dataset import TrainingView
-from legs_loss.lab.training.trainer import TrainConfig, step_loss, step_weight
+from legs_loss.lab.training.trainer import TrainConfig, step_loss, step_weights
 from legs_loss.similarity import d_ssim
 
 __all__ = ["prove_unweighted"]
@@ -34,17 +34,17 @@ def prove_unweighted(views: Sequence[TrainingView], config: TrainConfig) -> Dict
     generator = torch.Generator().manual_seed(0)
     ours_sum = theirs_sum = worst = 0.0
     for view in views:
-        weight = step_weight(view.weight, replace(view, mask=None), config)
-        if weight is not None and not bool((weight == 1).all()):
+        weights = step_weights(view.weight, replace(view, mask=None), config)
+        if weights.map is not None and not bool((weights.map == 1).all()):
             raise LegsError(
-                f"the baseline is weighted: {view.name} has a weight map of mean {float(weight.mean()):.3f}: "
+                f"the baseline is weighted: {view.name} has a weight map of mean {weights.mean_weight():.3f}: "
                 "differences from it would be meaningless. Is it of --weights? Move the store away; masks may stay"
             )
         # Any rendering will do: the photograph with noise has errors of all sizes.
         rendering = (view.image + 0.2 * torch.randn(view.image.shape, generator=generator)).clamp(0, 1).requires_grad_()
         absolute, share = (rendering - view.image).abs().mean(), config.lambda_dssim
         losses = (
-            step_loss(rendering, view.image, weight, share),
+            step_loss(rendering, view.image, weights, share),
             (1 - share) * absolute + share * d_ssim(rendering, view.image),
         )
         our_gradient, their_gradient = (torch.autograd.grad(loss, rendering)[0] for loss in losses)

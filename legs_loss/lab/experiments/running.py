@@ -32,7 +32,7 @@ from legs_loss.lab.training.trainer import Progress, TrainConfig, default_thresh
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
 from legs_loss.system import read_regular, write_whole
-from legs_loss.weights import weight_maps
+from legs_loss.weights import Weights, weight_maps
 
 __all__ = [
     "Comparison",
@@ -94,8 +94,7 @@ class Comparison:
         """Return the mean weight of a spec's maps over what counts of the training views."""
         if spec not in self._mean_weights:
             maps = zip(self.data.train, weight_maps((view.image for view in self.data.train), spec))
-            counted = (weight if view.mask is None else weight * view.mask / view.mask.mean() for view, weight in maps)
-            means = [float(weight.double().mean()) for weight in counted]
+            means = [Weights(map=weight).masked(view.mask).mean_weight() for view, weight in maps]
             self._mean_weights[spec] = sum(means) / len(means)
         return self._mean_weights[spec]
 

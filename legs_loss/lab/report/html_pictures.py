@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d
 from legs_loss.errors import LegsError
 from legs_loss.lab.ply import read_ply
 from legs_loss.lab.training.dataset import TrainingView, shuffled
-from legs_loss.lab.training.trainer import TrainConfig, draw, point_cloud, step_weight
+from legs_loss.lab.training.trainer import TrainConfig, draw, point_cloud, step_weights
 from legs_loss.scenes import image_tensor, open_image
 from legs_loss.scenes.own_maps import dimmed
 from legs_loss.weights import weight_map
@@ -72,8 +72,9 @@ def draw_row(row: Mapping[str, Any], folder: Path, view: TrainingView, scene: Op
         view = replace(view, weight=weight_map(view.image, config.weights, scene=scene))
     if config.shuffled:
         view = shuffled([view], config.seed)[0]
-    weight = step_weight(view.weight, view, config)
-    return DrawnView(rendering.clamp(0, 1), torch.ones_like(view.image[:1]) if weight is None else weight)
+    weights = step_weights(view.weight, view, config)
+    counted = torch.ones_like(view.image[:1]) if weights.map is None else weights.of_what_counts(weights.map)
+    return DrawnView(rendering.clamp(0, 1), counted)
 
 
 def _upstreams_own(row: Mapping[str, Any], folder: Path, view: TrainingView) -> Tensor:

@@ -38,6 +38,7 @@ from legs_loss.lab.training.densify import RESET_OPACITY, Schedule, densify, pru
 from legs_loss.lab.training.metrics import mean_scores, psnr, score
 from legs_loss.scenes import Camera, Scene
 from legs_loss.system import keep_freed_memory, noted, write_whole
+from legs_loss.weights import Weights
 
 __all__ = [
     "Progress",
@@ -49,7 +50,7 @@ __all__ = [
     "draw",
     "point_cloud",
     "step_loss",
-    "step_weight",
+    "step_weights",
     "train",
 ]
 
@@ -74,11 +75,12 @@ class TrainingResult:
     metrics: Dict[str, Any]
 
 
-def step_loss(prediction: Tensor, target: Tensor, weight: Optional[Tensor], lambda_dssim: float) -> Tensor:
-    """Return the loss of one iteration: of a rendering [3, H, W], its photograph and its weight map [1, H, W]."""
+def step_loss(prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
+    """Return the loss of one iteration: of a rendering [3, H, W], its photograph and the weights of its pixels."""
     from legs_loss.kernels.numba_loss import fused_loss
 
-    return fused_loss(prediction, target, weight, lambda_dssim)
+    loss = fused_loss(weights.hidden(prediction, target), target, weights.map, lambda_dssim)
+    return weights.of_what_counts(loss)
 
 
 def compile_step(command: str) -> None:
@@ -98,7 +100,7 @@ def compile_step(command: str) -> None:
         adam = Adam(Gaussians.from_points(np.eye(3) + 2.0, np.full((3, 3), 99), 1))
         view = TrainingView("", Camera(16, 16, 9.0, 9.0, 8.0, 8.0, np.eye(4)), torch.ones(3, 16, 16))
         image = _rasterize(adam.gaussians, view, TrainConfig(), 1, torch.zeros(3, 2, requires_grad=True)).image
-        step_loss(image, view.image, None, 0.5).backward()
+        step_loss(image, view.image, Weights(), 0.5).backward()
         adam.step(0.0)
 
 
@@ -221,7 +223,7 @@ class _Run:
         self.loss: Optional[float] = None
         self.psnr: Optional[float] = None
         self._forget_gradients()
-        self.weights = [step_weight(view.weight, view, config) for view in data.train]
+        self.weights = [step_weights(view.weight, view, config) for view in data.train]
         self.caps: Optional[Mapping[int, int]] = None
         self.growth: List[List[int]] = []  # [iteration of a densification, Gaussians before it pruned]
         self.evaluate_every: Optional[int] = None
@@ -294,8 +296,8 @@ class _Run:
         viewspace = torch.zeros(len(gaussians), 2, requires_grad=True)
         drawn = _rasterize(gaussians, view, self.config, degree, viewspace)
         weighted = self.config.weighted(self.iteration)
-        weight = self.weights[index] if weighted else step_weight(None, view, self.config)
-        loss = step_loss(view.hidden(drawn.image), view.image, weight, self.config.lambda_dssim)
+        weights = self.weights[index] if weighted else step_weights(None, view, self.config)
+        loss = step_loss(drawn.image, view.image, weights, self.config.lambda_dssim)
         loss.backward()
         if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
             self._report(float(loss.detach()), psnr(drawn.image.detach(), view.image, view.counts))
@@ -340,8 +342,8 @@ class _Run:
         return draw(self.adam.gaussians, view, self.config)
 
     def _mean_weight(self) -> float:
-        maps = [1.0 if weight is None else float(weight.double().mean()) for weight in self.weights]
-        return sum(maps) / len(maps)
+        means = [weights.mean_weight() for weights in self.weights]
+        return sum(means) / len(means)
 
     def _evaluate(self) -> None:
         begun = _clocks()
@@ -387,17 +389,10 @@ def _rasterize(
     )
 
 
-def step_weight(weight: Optional[Tensor], view: TrainingView, config: TrainConfig) -> Optional[Tensor]:
-    """Return the factor of the L1 term of a view whose weight map is ``weight``; None without one.
-
-    With a mask M it has the factor M / mean(M): the term is the mean over what counts.
-    """
-    factor = None if view.mask is None else view.mask / view.mask.mean()
-    if config.l1_scale != 1.0:
-        factor = config.l1_scale * (torch.ones_like(view.image[:1]) if factor is None else factor)
-    if factor is None or weight is None:
-        return weight if factor is None else factor
-    return factor * weight
+def step_weights(weight: Optional[Tensor], view: TrainingView, config: TrainConfig) -> Weights:
+    """Return what the pixels of a view count whose weight map is ``weight``; None without one."""
+    scale = None if config.l1_scale == 1.0 else torch.full_like(view.image[:1], config.l1_scale)
+    return Weights().times(scale).times(weight).masked(view.mask)
 
 
 def _clocks() -> np.ndarray:

@@ -13,6 +13,7 @@ import torch
 from legs_loss import PRESETS, LegsError, WeightSpec, weight_map
 from legs_loss.lab.experiments.arms import CHANGES, LOOSE, STUDIES, needed, parse_arm, parse_arms, these_arms
 from legs_loss.lab.experiments.baseline import prove_unweighted
+from legs_loss.weights import Weights
 
 pytest.importorskip("numba")
 pytest.importorskip("scipy")
@@ -138,7 +139,7 @@ def test_the_baseline_is_proven(tiny_scene: Path, monkeypatch: pytest.MonkeyPatc
 
     def patched(prediction: Any, target: Any, weight: Any, lambda_dssim: float) -> Any:
         """A loss that was patched where no map shows it."""
-        return trainer_loss(prediction, target, weight_map(target, "legs-l"), lambda_dssim)
+        return trainer_loss(prediction, target, Weights(map=weight_map(target, "legs-l")), lambda_dssim)
 
     trainer_loss = trainer.step_loss
     monkeypatch.setattr("legs_loss.lab.experiments.baseline.step_loss", patched)

@@ -21,6 +21,7 @@ from legs_loss import LegsError, weight_map
 from legs_loss.cli import main
 from legs_loss.lab.experiments.arms import parse_arm, parse_arms
 from legs_loss.lab.experiments.tables import scores_table
+from legs_loss.weights import Weights
 
 pytest.importorskip("numba")
 pytest.importorskip("scipy")
@@ -134,7 +135,9 @@ def test_a_baseline_is_proven_anew_when_a_comparison_goes_on(
     plain = trainer.step_loss
     monkeypatch.setattr(
         "legs_loss.lab.experiments.baseline.step_loss",
-        lambda prediction, target, weight, share: plain(prediction, target, weight_map(target, "legs"), share),
+        lambda prediction, target, weight, share: plain(
+            prediction, target, Weights(map=weight_map(target, "legs")), share
+        ),
     )
     with pytest.raises(LegsError, match="the baseline's loss is not 3DGS's"):
         Comparison(tiny_scene, BASE, tmp_path)

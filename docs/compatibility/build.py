@@ -31,7 +31,7 @@ VERDICTS = {
 # Where other documents name a figure: the sentence that must stand there.
 SENTENCES = {
     "README.md": "It was tried on $codebases public codebases. "
-    "Of $blind that it had never met, it was right at first contact in $first_right_rate",
+    "Of the last $newest, never met before, $newest_rate were right at first contact",
     "docs/patching.md": "says what it does to $codebases public codebases",
     "docs/codebases/3dgs.md": "What was chosen in each of $codebases is in [the list]",
     "docs/codebases/others.md": "among the $codebases that were tried",
@@ -134,6 +134,7 @@ def figures():
     last = max(int(row["round"]) for row in blind)
     recent = [row for row in blind if int(row["round"]) >= recent_from(blind)]
     latest = [row for row in blind if int(row["round"]) == last]
+    newest = [row for row in blind if int(row["round"]) >= last - 1]
     split = [row for row in blind if 6 <= int(row["round"]) <= 11]
     first = Counter(row["first"] for row in blind)
     now = Counter(row["now"] for row in rows)
@@ -151,6 +152,9 @@ def figures():
         "recent_last": last,
         "recent_wrong": sum(row["first"] == "wrong term" for row in recent),
         "latest": right_of([row for row in blind if int(row["round"]) > last - 4]),
+        "newest": len(newest),
+        "newest_rate": rate(sum(row["first"] == "right" for row in newest), len(newest)),
+        "newest_fair": fair_of(newest, "first"),
         "last": right_of(latest),
         "last_wrong": sum(row["first"] == "wrong term" for row in latest),
         "last_alarms": sum(row["first"] == "false alarm" for row in latest),

@@ -41,7 +41,7 @@ WORST_FIRST = ("wrong weight", "missed", "error")
 _OFF = {
     "form": {
         "PassedByName": {"terms.kinds.callback:Callbacks.assigned_in": []},
-        "Registered": {"upstreams.registered:forms_of": []},
+        "Registered": {"terms.kinds.callback:Callbacks.registered_in": []},
     },
     "reader": {
         "masks: rows": {"rules.verdict:is_rows": False},

@@ -56,6 +56,7 @@ CHANGES = [
     ("import torch.nn.functional as F", "import utils.functional as F"),
     ("def ssim(", "@torch.no_grad()\ndef ssim("),
     ("    C1 = 0.01 ** 2\n", ""),
+    ("(window_size, sigma):", "(window_size: int, sigma: float) -> torch.Tensor:"),  # what it is called by is not known
 ]
 SAME = [
     ("mu1", "mean_of_first"),
@@ -63,10 +64,9 @@ SAME = [
     ("taps", "row"),
     ("_ssim(", "similarity("),
     ("create_window", "window_of"),
-    ("(window_size, sigma):", "(window_size: int, sigma: float) -> torch.Tensor:"),
     ("    channel = img1", '    """The mean SSIM."""\n    # of each channel\n    channel = img1'),
     ("F.conv2d(", "torch.nn.functional.conv2d("),
-    ("    return taps / taps.sum()", "    return (taps /\n            taps.sum())"),
+    ("taps.sum()", "taps . sum( )"),
 ]
 
 
@@ -82,23 +82,22 @@ def test_any_other_constant_default_argument_or_operation_is_another_form(old, n
 
 
 @pytest.mark.parametrize(("old", "new"), SAME)
-def test_names_annotations_comments_and_docstrings_are_not_in_the_form(old, new):
+def test_names_comments_spaces_and_docstrings_are_not_in_the_form(old, new):
     assert old in SSIM
     assert form(SSIM.replace(old, new)) == form(SSIM)
 
 
-def test_a_keyword_is_kept_by_the_parameter_that_it_names():
+def test_a_keyword_of_the_checkouts_own_function_has_no_form_and_one_of_torchs_is_kept():
     by_keyword = SSIM.replace("channel, size_average)\n", "channel=channel, size_average=size_average)\n")
-    assert form(by_keyword) == form(by_keyword.replace("size_average", "mean"))
-    crossed = by_keyword.replace(
-        "channel=channel, size_average=size_average", "size_average=channel, channel=size_average"
-    )
-    assert len({form(SSIM), form(by_keyword), form(crossed)}) == 3
+    assert by_keyword != SSIM and form(by_keyword) is None
+    stride = "def ssim(a, padding, stride):\n    return torch.nn.functional.conv2d(a, a, {}={})\n"
+    made = {form("import torch\n" + stride.format(*names)) for names in (("padding", "padding"), ("stride", "padding"))}
+    assert len(made) == 2 and None not in made
 
 
 @pytest.mark.parametrize(
     "body",
-    ["scale * a", "(lambda: a)()", "unknown(a, b)", "[C1 for C1 in a][C2]", "other_package_or_not.ssim(a, b)"],
+    ["scale * a", "unknown(a, b)", "[C1 for C1 in a][C2]", "other_package_or_not.ssim(a, b)"],
 )
 def test_a_function_with_a_name_of_unknown_value_has_no_form(body):
     assert form(f"scale = 1.0\n\n\ndef ssim(a, b):\n    return {body}\n") is None

@@ -112,8 +112,6 @@ class Meanings:
         """Return the meaning of a name, of its words and of what is assigned to it."""
         shown = "image_" if flow.kind == "image" else ""
         kind, role = kind_of_words(shown + node.value), role_of_words(node.value)
-        if kind == "mask" and flow.kind == "image" and _is_masked(function, node):
-            return flow  # gt_mask_images = gt_image * mask
         role = role or flow.role if self._by_name else flow.role or role
         if kind == "image" and flow.kind == "feature":
             return Meaning("image", role)  # `rgb = outputs["features"]`: colours, there
@@ -185,8 +183,6 @@ class Meanings:
             return mix([self._flow(function, definition.node.target), self.meaning(function, value)])
         if definition.kind == "element" and definition.index is not None:
             meaning = self._element(function, value, definition.index)
-            if _is_called_for_another(value, definition.place, meaning.kind):
-                meaning = meaning._replace(kind="image")  # flows, image = match_flow(image)
             beside = definition.index > 0 and role_of_words(definition.place) == "target"
             return meaning._replace(role=None) if beside else meaning  # image, gt_image = render(...)
         if definition.kind == "part":
@@ -252,20 +248,6 @@ def _parts(node: cst.CSTNode) -> List[cst.CSTNode]:
     if isinstance(node, (cst.ListComp, cst.GeneratorExp)):
         return [node.elt]
     return [node.expression] if isinstance(node, cst.UnaryOperation) else []
-
-
-def _is_called_for_another(value: cst.CSTNode, place: str, kind: Optional[str]) -> bool:
-    """Return whether only the function's name has the kind, and the name of this result is an image's."""
-    named = isinstance(value, cst.Call) and kind is not None and kind_of_words(call_name(value)) == kind
-    return named and kind != "image" and kind_of_words(place) == "image"
-
-
-def _is_masked(function: Function, node: cst.Name) -> bool:
-    """Return whether a name that also has a word for images is a product, of an image and a mask."""
-    made = function.flow.assigned(node)
-    products = [v for v in made if isinstance(v, cst.BinaryOperation) and isinstance(v.operator, cst.Multiply)]
-    says_image = any(kind_of_words(word) == "image" for word in words(node.value))
-    return says_image and bool(made) and len(products) == len(made)
 
 
 def _is_of_neighbours(node: cst.BinaryOperation) -> bool:

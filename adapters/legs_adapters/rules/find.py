@@ -25,7 +25,6 @@ from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.patched import patched_nodes
 from legs_adapters.terms.traced import Trace
-from legs_adapters.upstreams import registered
 
 __all__ = ["find"]
 
@@ -120,9 +119,8 @@ class _Finder:
         callbacks = self.analysis.callbacks.assigned_in(function)
         found: List[Tuple[Form, Union[Site, Left]]]
         found = [(form, self.verdicts.decide_callback(function, form)) for form in callbacks]
-        for call in function.flow.calls if registered.MENTIONED.search(function.text) else ():
-            forms = registered.forms_of(self.analysis.program, function, call)
-            found += [(form, self.verdicts.callable(function, form)) for form in forms]
+        registered = self.analysis.callbacks.registered_in(function)
+        found += [(form, self.verdicts.callable(function, form)) for form in registered]
         for form, verdict in found:
             place = function.place(form.node)
             if not self.by_hand or self._is_chosen(function, place):

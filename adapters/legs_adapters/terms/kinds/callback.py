@@ -1,4 +1,8 @@
-"""Find L1 functions that are passed by name, ``self.criterion = l1_loss``: the name is replaced there."""
+"""Find L1 functions that are passed by name, ``self.criterion = l1_loss``: the name is replaced there.
+
+NeRFICG, and FasterGS in it, registers them, ``self.add_loss_metric('L1_Color', torch.nn.functional.l1_loss, weight)``,
+and calls them later with ``input=`` and ``target=``.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,8 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import code
+from legs_adapters.code.syntax import arguments, call_name, code, constant, dotted
+from legs_adapters.lexicon.names import is_l1_name, kind_of_words
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.forms import Forms
@@ -55,6 +60,19 @@ class Callbacks:
     def assigned_in(self, holder: Function) -> List[PassedByName]:
         """Return the callbacks that a function, or a module's top level, assigns."""
         return self._by_holder.get(holder, [])
+
+    def registered_in(self, function: Function) -> Iterator[PassedByName]:
+        """Yield the photometric L1 functions that a function registers; ``node`` is the registered callable."""
+        for call in function.flow.calls if "add_loss_metric" in function.text else ():
+            positional, keywords, _ = arguments(call)
+            name = constant(keywords.get("name", positional[0] if positional else None))
+            metric = keywords.get("metric", positional[1] if len(positional) > 1 else None)
+            is_of_images = isinstance(name, str) and kind_of_words(name) in ("image", None)
+            if call_name(call) == "add_loss_metric" and metric is not None and is_of_images:
+                targets = [reference.target for reference in self._program.resolve(function, metric)]
+                names = [str(getattr(target, "name", target)) for target in targets] or [dotted(metric) or ""]
+                if all(is_l1_name(each.split(".")[-1]) for each in names):
+                    yield PassedByName(metric, call, cst.Name("input"), cst.Name("target"), metric)
 
     def _add(self, function: Function) -> None:
         shape, calls = self._forms.functions.shape, self._training.sites[function]

@@ -1,134 +1,105 @@
 """Recognise the functions of a checkout that are 3DGS's SSIM: by their code, in a table of the forms it is met in.
 
-Of a function and of those of the checkout that it calls, a normal form keeps every operation, constant, default and
-argument; local names, annotations, comments, docstrings and how torch is imported make no difference.
+The form of a function is its text and that of the functions of the checkout that it calls, word by word: every
+operation, constant, default and argument. Local names, functions' names, comments, docstrings, spaces and how torch is
+imported make no difference.
 """
 
 from __future__ import annotations
 
 import builtins
-import dataclasses
-import functools
 import hashlib
-from typing import Any, Dict, List, Optional
+import io
+import keyword
+import tokenize
+from typing import Dict, List, Optional
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import dotted
 
 __all__ = ["FORMS", "form_of"]
 
-# The hash of a normal form, and a repository that has it. Each was evaluated on small images of several shapes:
+# The hash of a form, and a repository that has it. Each was evaluated on small images of several shapes:
 # it is the mean SSIM with an 11x11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2 and C2 = 0.03^2.
 FORMS: Dict[str, str] = {
-    "4742a8b08f0f5731": "Anttwo/SuGaR",
-    "bd80856ed24db553": "VITA-Group/FSGS",
-    "f2ac2c5303dd42c4": "zju3dv/street_gaussians",
-    "1cd3222ad3506070": "OUC-voyage/SVGS",
-    "6c10370305562e77": "dingdingcai/GSPose",
-    "e5a0078ed3934fdf": "ladvu/RiGS",
-    "f768fa8004c02263": "TQTQliu/MVSGaussian",
-    "c58ad32e448022c5": "jkulhanek/wild-gaussians",
-    "94f9941284209da0": "3DGS's order of operations, the tests' script",
+    "e902cb1fd720d8f2": "Anttwo/SuGaR",
+    "91a9ec33749c0497": "VITA-Group/LightGaussian",
+    "21f9da63921bd88b": "lzhnb/GS-IR",
+    "5f64706e613d906a": "VITA-Group/FSGS",
+    "7191a23ae8de6faa": "dingdingcai/GSPose",
+    "3b43d51ba16bf1a7": "3DGS's order of operations, the tests' script",
 }
 
 MAX_FUNCTIONS = 8
-_NO_PART = (cst.FunctionDef, cst.ClassDef, cst.Lambda, cst.Import, cst.ImportFrom, cst.Global, cst.Nonlocal)
-_WITHOUT_EFFECT = (
-    *(cst.Annotation, cst.BaseParenthesizableWhitespace, cst.EmptyLine, cst.TrailingWhitespace),
-    *(cst.Comma, cst.Semicolon, cst.LeftParen, cst.RightParen),
-)
+_LAYOUT = (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+_LEFT_OUT = (tokenize.COMMENT, tokenize.NL, tokenize.ENDMARKER, tokenize.ENCODING)
 
 
-@functools.lru_cache(maxsize=8)  # every call of a function asks
 def form_of(program: Program, function: Function) -> Optional[str]:
-    """Return the hash of a function's normal form; None where it has none, since a name in it is not resolved."""
+    """Return the hash of a function's form; None where it has none, since a name in it is not resolved."""
     functions = [function]
-    try:
-        texts = [_Writer(program, each, functions).text() for each in functions]  # which appends those it calls
-    except _NoForm:
-        return None
+    texts: List[str] = []
+    for each in functions:  # which grows
+        text = _form(program, each, functions)
+        if text is None or len(functions) > MAX_FUNCTIONS:
+            return None
+        texts.append(text)
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:16]
 
 
-class _NoForm(Exception):
-    """The function has no normal form."""
+def _form(program: Program, function: Function, functions: List[Function]) -> Optional[str]:
+    """Return the words of one function; add those of the checkout that it calls."""
+    node = function.node
+    if not isinstance(node, cst.FunctionDef) or function.owner is not None or function.decorators:
+        return None
+    if any(
+        _called(program, function, call.func) for call in function.flow.calls if any(arg.keyword for arg in call.args)
+    ):
+        return None  # a keyword is a name of the other function's
+    node = node.with_changes(body=function.body, leading_lines=())
+    if node.get_docstring(clean=False) is not None:
+        node = node.with_changes(body=function.body.with_changes(body=function.body.body[1:]))
+    words: List[str] = []
+    local: List[str] = []  # in the order of appearance
+    text = cst.Module(body=[node]).code
+    tokens = [t for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type not in _LEFT_OUT]
+    for before, token, after in zip([tokens[-1], *tokens], tokens, [*tokens[1:], tokens[-1]]):
+        word = token.string
+        is_header = "NEWLINE" not in words
+        is_keyword = after.string == "=" and before.string in ("(", ",") and not is_header
+        if token.type in _LAYOUT:
+            word = tokenize.tok_name[token.type]
+        elif token.type == tokenize.NAME and not (keyword.iskeyword(word) or before.string == "." or is_keyword):
+            if word not in function.flow.definitions:
+                known = _global(program, function, word, functions)
+                if known is None:
+                    return None
+                word = known
+            else:
+                local += [] if word in local else [word]
+                word = f"v{local.index(word)}"
+        words.append(word)
+    return " ".join(words)
 
 
-class _Writer:
-    """Writes one function; the functions that it calls are numbered in the order of their calls."""
+def _global(program: Program, function: Function, name: str, functions: List[Function]) -> Optional[str]:
+    """Return what a name that is not local stands for: a function of the checkout its number, a library's its path."""
+    node = cst.Name(name)
+    called = _called(program, function, node)
+    if called is not None:
+        functions += [] if called in functions else [called]
+        return f"<{functions.index(called)}>"
+    references = program.resolve(function, node)
+    if len(references) == 1 and references[0].kind == "external":
+        return "<" + str(references[0].target).replace(".", " . ")  # as the words of its path
+    is_builtin = not references and hasattr(builtins, name) and program.lookup(function, node) is None
+    return name if is_builtin else None
 
-    def __init__(self, program: Program, function: Function, functions: List[Function]) -> None:
-        self._program, self._function, self._functions = program, function, functions
-        self._locals: List[str] = []  # in the order of appearance
 
-    def text(self) -> str:
-        """Return the normal form of the function by itself."""
-        node, statements = self._function.node, list(self._function.body.body)
-        is_method = self._function.owner is not None and "staticmethod" not in self._function.decorators
-        if not isinstance(node, cst.FunctionDef) or node.asynchronous is not None or is_method:
-            raise _NoForm
-        if node.with_changes(body=self._function.body).get_docstring(clean=False) is not None:
-            del statements[0]
-        return self._written([node.params, node.decorators, statements])
-
-    def _written(self, part: Any) -> str:
-        if isinstance(part, (list, tuple)):
-            return f"[{' '.join(filter(None, map(self._written, part)))}]"
-        if isinstance(part, str):
-            return part
-        if not isinstance(part, cst.CSTNode) or isinstance(part, _WITHOUT_EFFECT):
-            return ""
-        if isinstance(part, _NO_PART):
-            raise _NoForm
-        place = dotted(part)
-        if place is not None and place.split(".")[0] not in self._function.flow.definitions:
-            return self._global(part, place)
-        if isinstance(part, cst.Name):
-            return self._local(part.value)
-        if isinstance(part, cst.Attribute):
-            return f"{self._written(part.value)}.{part.attr.value}"
-        if isinstance(part, cst.Call):
-            called = self._called(part.func)
-            return f"{self._written(part.func)}({', '.join(self._argument(arg, called) for arg in part.args)})"
-        parts = ", ".join(self._written(getattr(part, field.name)) for field in dataclasses.fields(part))
-        return f"{type(part).__name__}({parts})"
-
-    def _argument(self, arg: cst.Arg, called: Optional[Function]) -> str:
-        """Return an argument; its keyword as the number of the parameter, where that is of the checkout."""
-        keyword = arg.keyword.value if arg.keyword is not None else ""
-        if keyword and called is not None:
-            if keyword not in called.parameters:
-                raise _NoForm
-            keyword = f"<{called.parameters.index(keyword)}>"
-        return f"{arg.star}{keyword}={self._written(arg.value)}"
-
-    def _local(self, name: str) -> str:
-        """Return the number of a local name."""
-        if name not in self._locals:
-            self._locals.append(name)
-        return f"v{self._locals.index(name)}"
-
-    def _global(self, node: cst.CSTNode, place: str) -> str:
-        """Return a name that is not local: the full name of a library's, the number of a function of the checkout."""
-        called = self._called(node)
-        if called is not None:
-            if called not in self._functions:
-                self._functions.append(called)
-            if len(self._functions) > MAX_FUNCTIONS:
-                raise _NoForm
-            return f"<{self._functions.index(called)}>"
-        references = self._program.resolve(self._function, node)
-        if len(references) == 1 and references[0].kind == "external":
-            return f"<{references[0].target}>"
-        if references or not hasattr(builtins, place) or self._program.lookup(self._function, node) is not None:
-            raise _NoForm
-        return place
-
-    def _called(self, node: cst.CSTNode) -> Optional[Function]:
-        """Return the one function of the checkout that a name refers to."""
-        references = self._program.resolve(self._function, node)
-        target = references[0].target if len(references) == 1 else None
-        return target if isinstance(target, Function) else None
+def _called(program: Program, function: Function, node: cst.CSTNode) -> Optional[Function]:
+    """Return the one function of the checkout that a name refers to."""
+    references = program.resolve(function, node)
+    target = references[0].target if len(references) == 1 else None
+    return target if isinstance(target, Function) else None

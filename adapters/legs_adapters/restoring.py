@@ -11,14 +11,10 @@ import bisect
 import re
 from typing import Dict, Iterator, List, NamedTuple, Optional, Set, Tuple
 
-import libcst as cst
-
 from legs_adapters.code.folders import first_of
 from legs_adapters.code.limits import STRING, Budget
-from legs_adapters.code.syntax import arguments, code
 from legs_adapters.edit import apply_edits, why_not_compiled
 from legs_adapters.journal import Layer
-from legs_adapters.terms.text import on_one_line
 from legs_adapters.terms.writing import PACKAGE
 
 __all__ = ["restored", "weighted_lines"]
@@ -26,6 +22,7 @@ __all__ = ["restored", "weighted_lines"]
 _TOKEN = re.compile(rf"(?P<string>\w*{STRING})|(?P<comment>#[^\r\n]*)|\w+|[^\w\s]", re.S)
 _FREE = frozenset("(),;\\")  # what formatters add, remove and move
 _AROUND = (16, 4, 0)  # words on both sides that tell equal calls apart, as far as they are still there
+_WRITTEN = frozenset(("l1_loss", "masked", "ssim", "unweighted"))  # the functions of legs_loss that a patch calls
 _UTF8 = ("utf-8", "surrogateescape")
 
 
@@ -192,38 +189,8 @@ def _comments(text: str) -> Set[str]:
 
 
 def weighted_lines(text: str) -> List[str]:
-    """Return the lines of a file that call legs_loss, each with what was there before as far as the call shows it."""
-    words, lines = _Words(text), []
-    for at in words.weighted:
-        if words.words[at + 1 : at + 2] == ["."] and words.words[at + 2 : at + 3] != []:
-            start = words.starts[at]
-            before = _before(words.text[start : words.end(start, words.ends[at + 2])])
-            lines += [f"{words.line(start)} (before: {before})"] if before else []
-    return lines
-
-
-def _before(call: str) -> str:
-    """Return what a weighted call was, or "" if it is none."""
-    try:
-        node = cst.parse_expression(f"({call}\n)")
-    except (cst.ParserSyntaxError, RecursionError, ValueError):
-        return ""
-    if not isinstance(node, cst.Call):
-        return ""
-    if isinstance(node.func, cst.Call):  # legs_loss.unweighted(f)(a, b)
-        return on_one_line(code(node.with_changes(func=node.func.args[0].value, lpar=(), rpar=())))
-    given, named, _ = arguments(node)
-    name = on_one_line(code(node.func)).rpartition(".")[2]
-    images = [on_one_line(code(each)) for each in given]
-    if name == "ssim":
-        return f"ssim({', '.join(images)})"
-    if name == "masked":
-        return "no such line"
-    if name != "l1_loss" or len(images) < 2:
-        return ""
-    pair = ", ".join(images[:2])
-    if "own" in named:
-        return f"({on_one_line(code(named['own']))})({pair})"
-    return (
-        f"torch.abs({images[0]} - {images[1]})" if "reduction" in named else f"l1_loss({pair}), or the mean difference"
-    )
+    """Return the lines of a file that name a function of legs_loss which a patch writes, each with its number."""
+    found = _Words(text)
+    members = [at for at in found.weighted if found.words[at + 1 : at + 2] == ["."]]
+    written = [at for at in members if _WRITTEN.intersection(found.words[at + 2 : at + 3])]
+    return list(dict.fromkeys(found.line(found.starts[at]) for at in written))

@@ -135,7 +135,8 @@ def figures():
     recent = [row for row in blind if int(row["round"]) >= recent_from(blind)]
     latest = [row for row in blind if int(row["round"]) == last]
     newest = [row for row in blind if int(row["round"]) >= last - 1]
-    split = [row for row in blind if 6 <= int(row["round"]) <= 11]
+    traced = read("traced.csv")
+    ran = [row for row in traced if row["traced"]]
     first = Counter(row["first"] for row in blind)
     now = Counter(row["now"] for row in rows)
     failed = {verdict: names([row for row in rows if row["now"] == verdict]) for verdict in VERDICTS}
@@ -152,6 +153,9 @@ def figures():
         "recent_last": last,
         "recent_wrong": sum(row["first"] == "wrong term" for row in recent),
         "latest": right_of([row for row in blind if int(row["round"]) > last - 4]),
+        "traced": len(traced),
+        "ran": len(ran),
+        **{f"ran_{key}": sum(int(row[key]) for row in ran) for key in ("traced", "right", "missed", "wrong")},
         "newest": len(newest),
         "newest_rate": rate(sum(row["first"] == "right" for row in newest), len(newest)),
         "newest_fair": fair_of(newest, "first"),
@@ -163,8 +167,6 @@ def figures():
         "last_now_wrong": sum(row["now"] == "wrong term" for row in latest),
         "last_now_alarms": sum(row["now"] == "false alarm" for row in latest),
         "last_kinds": ", ".join(f"{kind} {right_of(rows)}" for kind, rows in by_kind(latest).items()),
-        "static": right_of([row for row in split if row["kind"] == "static"]),
-        "rest": right_of([row for row in split if row["kind"] != "static"]),
         "verdicts": verdict_table(blind),
         "rounds": round_table(blind),
         "known": len(known),

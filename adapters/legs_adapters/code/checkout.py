@@ -38,13 +38,13 @@ class Checkout:
         self._by_word = index_by_word((path, source.text) for path, source in self.sources.items())
 
     def module(self, path: str) -> Optional[Module]:
-        """Return a parsed file; None where it does not parse (it is then among ``unreadable``)."""
-        if path not in self._modules:
+        """Return a parsed file; None where it is none of these or does not parse (it is then among ``unreadable``)."""
+        if path in self.sources and path not in self._modules:
             parsed = parse(self.sources[path], self._budget)
             if isinstance(parsed, Unreadable):
                 self._unreadable[path] = parsed
             self._modules[path] = parsed if isinstance(parsed, Module) else None
-        return self._modules[path]
+        return self._modules.get(path)
 
     @property
     def unreadable(self) -> Dict[str, Unreadable]:

@@ -7,8 +7,9 @@ from typing import NamedTuple, Optional
 import libcst as cst
 
 from legs_adapters.code.syntax import call_name
+from legs_adapters.tensors.operations import CONSTANTS
 
-__all__ = ["AbsoluteValue", "abs_argument", "absolute_value", "is_difference", "is_distance", "mean_of"]
+__all__ = ["AbsoluteValue", "abs_argument", "absolute_value", "is_difference", "is_no_picture", "mean_of"]
 
 
 class AbsoluteValue(NamedTuple):
@@ -27,15 +28,15 @@ def absolute_value(node: cst.Call) -> Optional[AbsoluteValue]:
     return None if argument is None else AbsoluteValue(call, argument, "none" if inner is None else "mean")
 
 
-def is_difference(node: cst.CSTNode) -> bool:
-    """Return whether an expression is ``a - b``."""
+def is_difference(node: Optional[cst.CSTNode]) -> bool:
+    """Return whether an expression is ``a - b``; None is none."""
     return isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Subtract)
 
 
-def is_distance(node: cst.CSTNode) -> bool:
-    """Return whether an expression is ``abs(a - b)``."""
-    argument = abs_argument(node)
-    return argument is not None and is_difference(argument)
+def is_no_picture(node: cst.CSTNode) -> bool:
+    """Return whether an expression is ``abs(a - b)``, or one value for every pixel: ``torch.zeros_like(a)``."""
+    is_constant = isinstance(node, cst.Call) and call_name(node) in CONSTANTS
+    return is_constant or is_difference(abs_argument(node))
 
 
 def mean_of(node: cst.Call) -> Optional[cst.Call]:

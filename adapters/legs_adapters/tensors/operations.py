@@ -28,6 +28,7 @@ JOINS = word_set("cat concat concatenate hstack stack vstack")  # several values
 KEEPS_AXES = _MOVES | _LIMITS  # every value keeps its place
 LIKE = word_set("expand_as reshape_as to type_as view_as")  # uses a tensor's type or shape, not its values
 ASKS = word_set("isfinite isinf isnan ones_like zeros_like")  # tests of values
+CONSTANTS = word_set("full full_like ones ones_like zeros zeros_like")  # one value for every pixel
 SIZES = word_set("device dim dtype is_cuda ndim numel shape size")  # properties that do not depend on the values
 REDUCES = word_set("mean median std sum var")
 EXTREMES = word_set("amax amin max min")

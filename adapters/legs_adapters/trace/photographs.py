@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 from legs_loss import LegsError
@@ -15,7 +14,7 @@ SIDE = 16  # pixels of a thumbnail
 SURE = 0.94  # the correlation from which on a picture is a file's
 DETAIL = 0.6  # that of what thumbnails four times as large have beside it: less is a rendering, or another view
 MAX_FILES = 4000
-Picture = Tuple[Any, Any, Optional[Any]]
+Picture = Tuple[Any, Any, Optional[Any], Tuple[int, ...]]
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm")
 _OTHER = re.compile(  # the words of a folder, or of a file's name, whose pictures are no photographs
     r"(?i)(^|[^a-z])(normals?|nrm|depths?|disp|disparity|masks?|seg|segmentations?|semantics?|labels?|flow|edges?|"
@@ -47,7 +46,7 @@ class Photographs:
         self._tiers: List[List[str]] = [[], []]
         for path in dict.fromkeys(files):
             inside = os.path.relpath(path, self.root)
-            is_photograph = bool(photos) or (_is_listed(path, listed) if listed else not _OTHER.search(inside))
+            is_photograph = bool(photos) or (_key(path) in listed if listed else not _OTHER.search(inside))
             self._tiers[not is_photograph].append(path)
         self._known: List[Any] = [None, None]
         self._fine: Dict[Tuple[str, int], Any] = {}
@@ -73,7 +72,7 @@ class Photographs:
         """Return the correlation with a file's detail; 1 where the picture is too small to have any."""
         import numpy as np
 
-        _, kept, fine = picture
+        kept, fine = picture[1:3]
         if fine is None:
             return 1.0
         scale = round((fine.shape[1] / kept.size) ** 0.5)
@@ -91,10 +90,13 @@ class Photographs:
         if self._known[tier] is None:
             self._known[tier] = _thumbnails(self._tiers[tier])
         files, stack = self._known[tier]  # [F], [F, 3, 256]
-        thumb, kept, _ = picture
+        thumb, kept, _, shape = picture
         if not len(files) or kept.sum() < 16:
             return None
         one = _standardised(thumb[:, kept])
+        if min(shape) < SIDE:  # the files as coarse as the picture is
+            rows, columns = (_areas(n) @ _areas(SIDE, n) if n < SIDE else np.eye(SIDE) for n in shape)
+            stack = (rows @ stack.reshape(-1, 3, SIDE, SIDE) @ columns.T).reshape(stack.shape)
         others = _standardised(stack[:, :, kept])
         scores = np.maximum(others @ one.ravel(), others @ one[::-1].ravel())  # RGB, BGR
         at = int(np.argmax(scores))
@@ -112,7 +114,7 @@ def _standardised(thumbs: Any) -> Any:
 
 
 def thumbnail(picture: Any) -> Optional[Picture]:
-    """Return a picture's thumbnail [3, 256] in [0, 1] or so, which pixels of it are no flat background, and its detail.
+    """Return a picture's thumbnail [3, 256] in [0, 1] or so, what is no flat background, its detail, its size.
 
     Args:
         picture: a tensor, [3, H, W], [H, W, 3], or of such a batch; of one of four channels the first three. Of a batch
@@ -135,12 +137,12 @@ def thumbnail(picture: Any) -> Optional[Picture]:
         low = -torch.nn.functional.adaptive_max_pool2d(-image[None], SIDE)[0]
         flat = ((high - low).amax(0) < 1e-6).cpu().numpy().ravel()
     if flat.all():
-        return pool, ~flat, None
+        return pool, ~flat, None, tuple(image.shape[1:])
     ground = flat.reshape(SIDE, SIDE)
     wide = np.pad(ground, 1)  # the cells at its border have a part of it
     near = np.any([wide[i : i + SIDE, j : j + SIDE] for i in range(3) for j in range(3)], 0).ravel()
     kept = ~near if (~near).sum() >= 16 else ~flat
-    return pool, kept, None if fine is None else _high(fine, scale)
+    return pool, kept, None if fine is None else _high(fine, scale), tuple(image.shape[1:])
 
 
 def _pooled(image: Any, side: int) -> Any:
@@ -192,7 +194,7 @@ def _listed(root: str) -> Set[Tuple[str, str]]:
     """Return the photographs that a scene's model lists, each as its folder without `_4` and its stem."""
     from legs_loss.scenes import read_scene
 
-    if not any((Path(root) / name).exists() for name in ("sparse", *_transforms(root))):
+    if not any(name == "sparse" or re.match(r"transforms.*\.json$", name) for name in os.listdir(root)):
         return set()
     try:
         return {_key(str(view.path)) for view in read_scene(root).views}
@@ -200,17 +202,9 @@ def _listed(root: str) -> Set[Tuple[str, str]]:
         return set()
 
 
-def _transforms(root: str) -> List[str]:
-    return [name for name in os.listdir(root) if name.startswith("transforms") and name.endswith(".json")]
-
-
 def _key(path: str) -> Tuple[str, str]:
     folder, name = os.path.split(os.path.realpath(path))
     return re.sub(r"_\d+$", "", folder), os.path.splitext(name)[0]
-
-
-def _is_listed(path: str, listed: Set[Tuple[str, str]]) -> bool:
-    return _key(path) in listed
 
 
 def _thumbnails(files: Sequence[str], side: int = SIDE) -> Tuple[Any, Any]:

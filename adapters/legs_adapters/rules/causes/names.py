@@ -91,7 +91,7 @@ class OtherName(Rule):
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether the name may mean something else: it is reported where no other term was found."""
-        return True
+        return self.id != "robust"
 
 
 NAMES = (
@@ -105,14 +105,13 @@ NAMES = (
 def _is_of_tracking(name: str) -> bool:
     """Return whether a name is about optimising poses: for tracking, or to align a view."""
     tokens = set(words(name))
-    of_pose = "pose" in tokens and tokens & {"test", "refine"}
-    return bool(of_pose or (tokens & TRACKING and not tokens & MAPPING))
+    return bool(("pose" in tokens and tokens & {"test", "refine"}) or (tokens & TRACKING and not tokens & MAPPING))
 
 
 def _trains_its_own(term: Term) -> bool:
     """Return whether its function makes a Gaussian model and steps an optimiser: it trains, whatever its name."""
-    names = map(call_name, term.function.flow.calls)
-    return has_step(term.function) and any(name[:1].isupper() and set(words(name)) & GAUSSIANS for name in names)
+    models = [name for name in map(call_name, term.function.flow.calls) if name[:1].isupper()]
+    return has_step(term.function) and any(set(words(name)) & GAUSSIANS for name in models)
 
 
 def _is_of_training_step(term: Term) -> bool:

@@ -8,7 +8,7 @@ from legs_adapters.code.syntax import words_in
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.lexicon.words import BACKGROUND, COLORS, KIND_OF
 from legs_adapters.rules.rule import Rule, Term
-from legs_adapters.tensors.absolute import is_difference, is_distance
+from legs_adapters.tensors.absolute import is_difference, is_no_picture
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import is_beside_ssim, same_root
 
@@ -30,6 +30,8 @@ class Unknown(Rule):
     skipped:
         loss = l1_loss(model.current_rgb, sampled["target"])
     skipped:
+        loss = l1_loss(sky_image, torch.zeros_like(sky_image), mask=1 - sky)
+    skipped:
         bg_img = gt * 0 + background[:, None, None]
         loss = l1_loss(image, bg_img)
     """
@@ -44,7 +46,7 @@ class Unknown(Rule):
             pictures = not named or bool(named - COLORS) or is_beside_ssim(term.function, *term.sides)
         sure = swapped(pair.a, pair.b) is not None or pair.speaks_of_images
         changes = same_root(term.form) or all(map(is_difference, term.sides))  # of two views, or of neighbours
-        changes = changes or any(map(is_distance, term.sides))  # the error of an error: of angles
+        changes = changes or any(map(is_no_picture, term.sides))  # the error of an error, of angles; darkness
         backdrop = {pair.a.role, pair.b.role} == {"render", None} and BACKGROUND & words_in(term.target)
         return [] if pictures and sure and not (changes or backdrop) else term.here
 

@@ -8,8 +8,10 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+import legs_loss
 from tests.patcher.support import checkout, files, legs_patch, snapshot
 from tests.support import legs_environment
 
@@ -181,15 +183,48 @@ def test_a_codebase_that_was_patched_before_gets_the_line_and_nothing_twice(tmp_
     assert legs_patch(root).returncode == 0
     once = (root / "train.py").read_text()
     diff = legs_patch("--masks", "--diff", root).stdout
-    assert [line for line in diff.splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")] == [
-        f"+{LINE.rstrip()}"
-    ]
+    written = [line for line in diff.splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")]
+    assert written == [f"+{LINE.rstrip()}"]
     found = json.loads(legs_patch("--masks", "--json", root).stdout)
     assert [(site["line"], site["term"]) for site in found["sites"]] == [(21, "mask")]
     assert (root / "train.py").read_text().replace(LINE, "") == once
     assert "nothing to do" in legs_patch("--masks", root).stdout
     assert legs_patch("--undo", root).returncode == 0
     assert snapshot(root) == before
+
+
+def test_a_proven_ssim_becomes_the_mean_over_what_counts(scene, tmp_path):
+    of_3dgs = files("ssim_beside_l1_fused")["utils/loss_utils.py"]
+    masked = checkout(tmp_path / "masked", {**FILES, "utils/loss_utils.py": of_3dgs})
+    assert legs_patch("--masks", masked).returncode == 0
+    assert "0.2 * (1.0 - legs_loss.ssim(image, gt_image))" in (masked / "train.py").read_text()
+    precompute(scene)
+    rows = python("train.py", "-s", scene, cwd=masked)[0]
+    # The left half of the first photograph does not count.
+    image, target = torch.full((3, 16, 20), 0.5), Image.open(scene / "images" / "a.png")
+    target = torch.from_numpy(np.array(target)).float().div(255).movedim(-1, 0)
+    image[:, :, :10] = target[:, :, :10]
+    l1 = (legs_loss.weight_map(target) * (image - target).abs())[:, :, 10:].mean()
+    expected = 0.8 * l1 + 0.2 * legs_loss.d_ssim(image, target) / 0.5
+    assert float.fromhex(rows[0][0]) == pytest.approx(float(expected), rel=1e-3)
+
+
+def test_other_terms_of_both_images_are_named_with_what_corrects_them(tmp_path):
+    text = SCRIPT.replace("from utils.loss_utils", "from fused_ssim import fused_ssim\nfrom utils.loss_utils").replace(
+        "(1.0 - ssim(image, gt_image))",
+        "(1.0 - fused_ssim(image[None], gt_image[None])) + lpips(image, gt_image, 1) + l1_loss(gt_image, drawn)\n"
+        "        with torch.no_grad():\n            print(psnr(image, gt_image))",
+    )
+    root = checkout(tmp_path, {**FILES, "train.py": text.replace("drawn = image", "drawn = image.detach()")})
+    found = json.loads(legs_patch("--masks", "--json", root).stdout)
+    share = "legs_loss.coverage(image, gt_image)"
+    assert [entry["reason"].split("; write ")[1] for entry in found["left"] if "diluted" in entry["reason"]] == [
+        f"(1.0 - (1.0 - fused_ssim(image[None], gt_image[None])) / {share})",
+        f"lpips(image, gt_image, 1) / {share}",
+    ]
+    assert not any("SSIM" in entry["reason"] for entry in found["left"])  # --ssim was not asked for
+    assert legs_patch("--undo", root).returncode == 0
+    assert not any("diluted" in entry["reason"] for entry in json.loads(legs_patch("--json", root).stdout)["left"])
 
 
 def test_a_line_that_has_to_be_written_by_hand(tmp_path):

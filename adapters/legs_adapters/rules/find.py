@@ -47,13 +47,15 @@ def find(
         sources: its files.
         by_hand: (path, line) of the L1 terms that the user named as sites; nothing else is a site then.
         ssim: find the SSIM terms, too.
-        masks: find where their renderings are masked, too.
+        masks: find where their renderings are masked, too, and the SSIM terms that can be means over what counts.
         trace: what a run of the training script showed, which decides on the terms that ran.
     """
     analysis = Analysis.of_files(sources)
     found = _Finder(analysis, by_hand).run()
     found = with_trace(found, analysis, trace) if trace is not None and not by_hand else found
-    found = with_ssims(found, analysis, by_hand) if ssim else found
+    left = found.left
+    found = with_ssims(found, analysis, by_hand) if ssim or masks else found
+    found = found if ssim else found._replace(left=left)
     return with_masks(found, analysis) if masks else found
 
 

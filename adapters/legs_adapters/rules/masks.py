@@ -2,10 +2,12 @@
 
 It goes where rendering and photograph are both defined, before any term gets the rendering. Where a term gets the
 rendering by another way, or no such place is in the function of the L1, the line is an error, to be written by hand.
+What else compares the two there may be a mean over all pixels, masked ones too: each is named, with its correction.
 """
 
 from __future__ import annotations
 
+import re
 from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple, Union
 
 import libcst as cst
@@ -14,6 +16,7 @@ from legs_adapters.code.module import Function, blocks_of
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import (
     arguments,
+    call_name,
     children,
     constant,
     every_parameter,
@@ -21,6 +24,7 @@ from legs_adapters.code.syntax import (
     path_of,
     walk_expressions,
 )
+from legs_adapters.lexicon.words import STRUCTURAL
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.terms.findings import Decider, Findings, Left, Problem, Site
 from legs_adapters.terms.kinds.callback import PassedByName
@@ -30,7 +34,7 @@ from legs_adapters.terms.writing import PACKAGE
 
 __all__ = ["with_masks"]
 
-_MASKED = f"{PACKAGE}.masked"
+_MASKED, _COVERAGE = f"{PACKAGE}.masked", f"{PACKAGE}.coverage"
 _MOST = 100  # expressions that a rendering is followed through
 
 
@@ -48,8 +52,9 @@ def with_masks(found: Findings, analysis: Analysis) -> Findings:
             finder.look_at(pair)
     for entry in found.patched:
         finder.look_at_patched(entry)
-    sites, problems = finder.settled()
-    return found.with_more(sites=sites, problems=problems)
+    lines, problems = finder.settled()
+    left = [entry for line in lines for entry in finder.diluted(line, found.sites)]
+    return found.with_more(sites=[line.site for line in lines], problems=problems, left=left)
 
 
 class _Pair(NamedTuple):
@@ -128,7 +133,26 @@ class _Finder:
         elif not any(one.start == line.start and one.covers(pair.function, pair.prediction) for one in self.lines):
             self.lines.append(line)
 
-    def settled(self) -> Tuple[List[Site], List[Problem]]:
+    def diluted(self, line: _Line, sites: Sequence[Site]) -> Iterator[Left]:
+        """Yield the calls that get both images of a line after it, and are no terms of ours."""
+        function, resolve = line.pair.function, self.analysis.program.resolve
+        pair = {path_of(line.pair.prediction), path_of(line.pair.target)}
+        edited = [function.place(site.form.node) for site in sites if site.scope is function]
+        for call in function.flow.calls:
+            place, given = function.place(call), arguments(call)[0]
+            images = [{path_of(part) for part in _places(each)} & pair for each in given]
+            if set().union(*images) != pair or not self.analysis.training.includes(call):
+                continue
+            own = any(str(r.target).startswith(f"{PACKAGE}.") for r in resolve(function, call.func))
+            inside = any(at.start < place.end and place.start < at.end for at in edited)
+            if own or inside or any(both == pair for both in images) or not line.start <= place.start < line.end:
+                continue
+            term, share = one_line(call), f"{_COVERAGE}({one_line(line.pair.prediction)}, {one_line(line.pair.target)})"
+            is_similarity = STRUCTURAL.search(term) and not re.search("(?i)loss", call_name(call))
+            corrected = f"(1.0 - (1.0 - {term}) / {share})" if is_similarity else f"{term} / {share}"
+            yield Left.at(function, place, f"diluted by masked pixels if it is a mean over all; write {corrected}")
+
+    def settled(self) -> Tuple[List[_Line], List[Problem]]:
         """Return the lines that mask every term, and the problems; where one is not written, others may leak."""
         for line in self.lines:
             leak = self._leak(line.pair)
@@ -140,7 +164,7 @@ class _Finder:
         for pair in self.unnamed:  # image * alpha is masked where image is
             if self._leak(pair) is not None:
                 self.problems.append(pair.problem(pair.function, pair.node, "the rendering has no name"))
-        return [line.site for line in self.lines], list(dict.fromkeys(self.problems))
+        return self.lines, list(dict.fromkeys(self.problems))
 
     def _leak(self, pair: _Pair) -> Optional[Decider]:
         """Return a read that takes what a rendering is made of into the loss, and comes after no line."""

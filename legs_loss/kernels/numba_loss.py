@@ -81,7 +81,7 @@ def _differentiable(prediction: Tensor, target: Tensor, weights: Weights, share:
         target, map_, found = constants
         assert target is not None
         images = images_of(image, target)
-        source = source_of(weights._replace(map=map_, range=found), target, images)
+        source = source_of(Weights(weights.spec, found, map_), target, images)
         gradient = np.empty(images.x.size if wanted else 0, np.float32)
         loss = (_l1_alone if share == 0.0 else _l1_and_ssim)(images, source, share, gradient)
         return image.new_tensor(loss), torch.from_numpy(gradient).reshape(image.shape) if wanted else None

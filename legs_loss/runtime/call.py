@@ -59,12 +59,9 @@ class Call(NamedTuple):
             LegsError: shapes or devices that do not fit, or a layout that contradicts ``channels_last``.
         """
         layout, prediction, target = read_pair(self.prediction, self.target, self.channels_last)
-        return self._replace(
-            prediction=layout.channels_first(prediction),
-            target=layout.channels_first(target),
-            mask=layout.map_first(self.mask, target, "mask"),
-            layout=layout,
-        )
+        images = layout.channels_first(prediction), layout.channels_first(target)
+        mask = layout.map_first(self.mask, target, "mask")
+        return Call(*images, self.view, mask, self.channels_last, self.reduction, self.own, layout)
 
     def view_names(self) -> List[Optional[str]]:
         """Return the name of each image's view, None for an image without one.

@@ -764,7 +764,7 @@ class Model:
 
 def make_scene(photographs, out, size):
     """Run ``reconstruct`` with stand-ins for pycolmap's steps, and return what it raises, or ""."""
-    from legs_loss.scenes import reconstruct as module
+    from legs_loss.lab import reconstruct as module
 
     def undistort(pycolmap, model, photographs, work, *_):
         (work / "scene" / "images").mkdir(parents=True)

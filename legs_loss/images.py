@@ -38,6 +38,11 @@ def is_compiling() -> bool:
 _functorch: Any = getattr(torch._C, "_functorch", None)  # of torch.func; torch 1.12 has none
 _levels: Any = getattr(_functorch, "peek_interpreter_stack", None)
 _modes: Any = getattr(torch._C, "_len_torch_dispatch_stack", None)
+# Of the dispatch modes, those under which a tensor may have no memory; others, as torch's FlopCounterMode, only watch.
+_mode_of: Any = getattr(torch._C, "_get_dispatch_mode", None)
+_MEMORYLESS = [
+    getattr(getattr(torch._C, "_TorchDispatchModeKey", None), key, None) for key in ("FAKE", "PROXY", "FUNCTIONAL")
+]
 
 
 def is_transformed() -> bool:
@@ -48,7 +53,9 @@ def is_transformed() -> bool:
     """
     if forward_ad._current_level >= 0 or torch._C._get_tracing_state() is not None:
         return True
-    return (_levels is not None and _levels() is not None) or (_modes is not None and _modes() > 0)
+    if _levels is not None and _levels() is not None:
+        return True
+    return _modes is not None and _modes() > 0 and (None in _MEMORYLESS or any(map(_mode_of, _MEMORYLESS)))
 
 
 def is_trained(image: Tensor) -> bool:

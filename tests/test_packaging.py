@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import zipfile
 from email import message_from_string
 from pathlib import Path
 
@@ -101,6 +102,31 @@ def test_the_source_distribution_holds_what_its_tests_need(source):
         assert not missing
     for name in ("CHANGELOG.md", "CITATION.cff", "LICENSE", "Makefile", "README.md", "setup.py"):
         assert (source / name).is_file()
+
+
+def test_what_running_leaves_in_a_tree_is_not_packed(tree, tmp_path):
+    """numba's cache is pickled machine code with the builder's paths."""
+    used = tmp_path / "used"
+    shutil.copytree(str(tree), str(used))
+    left = [
+        "kernels/__pycache__/numba_l1.all_strips-17.py311.nbi",
+        "kernels/__pycache__/numba_l1.all_strips-17.py311.1.nbc",
+    ]
+    left += [
+        "kernels/__pycache__/tmp3f9c.nbi.123",
+        "__pycache__/spec.cpython-311.pyc",
+        "lab/rasterizer/__pycache__/a.1.nbc",
+    ]
+    for name in left:
+        for folder in (used / "legs_loss", used / "tests", used / "adapters" / "legs_adapters"):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(b"\x80\x04.")
+    with tarfile.open(str(build(used, "build_sdist", tmp_path / "sdist"))) as archive:
+        packed = archive.getnames()
+    with zipfile.ZipFile(str(build(used, "build_wheel", tmp_path / "wheel"))) as wheel:
+        packed += wheel.namelist()
+    assert {"legs_loss/kernels/numba_l1.py", "legs_adapters/cli.py"} <= set(packed)
+    assert not [name for name in packed if re.search(r"__pycache__|\.nb[ic]|\.py[cod]$|\.pytest_cache", name)]
 
 
 @pytest.mark.slow

@@ -22,6 +22,8 @@ from tqdm import tqdm
 
 from legs_loss.system import is_first_process, say
 
+from legs_loss.kernels.code_cache import keep
+
 # No NaN or infinity arises from checked input. Sums keep their order, and a * b + c is rounded twice unless the code
 # says otherwise: if the compiler may choose, the process that compiles and a later one that loads the cached code can
 # differ in the last bit.
@@ -33,10 +35,9 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     options = {"fastmath": FAST, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, **options}
 
     def decorate(function: Callable[..., Any]) -> Any:
-        try:
-            return numba.njit(cache=True, **options)(function)
-        except RuntimeError:  # neither the package's folder nor the user's can be written
-            return numba.njit(**options)(function)
+        dispatcher = numba.njit(**options)(function)
+        keep(function, dispatcher)
+        return dispatcher
 
     return decorate
 

@@ -153,19 +153,3 @@ class TestErrors:
         monkeypatch.setitem(sys.modules, "numba", None)
         with pytest.raises(LegsError, match=r"needs numba: pip install numba, or, .* '\.\[cpu\]'"):
             rasterize(*scene(), camera(), BACKGROUND, 3)
-
-
-def test_without_a_place_for_the_cache(monkeypatch):
-    import numba
-
-    from legs_loss.kernels.compiling import compiled
-
-    njit = numba.njit
-
-    def refuses(*arguments, **options):
-        if options.pop("cache", False):
-            raise RuntimeError("cannot cache function: no locator available")
-        return njit(*arguments, **options)
-
-    monkeypatch.setattr(numba, "njit", refuses)
-    assert compiled()(lambda x: x + 1)(2) == 3

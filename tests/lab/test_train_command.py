@@ -129,7 +129,7 @@ def test_a_process_that_compiles_and_one_that_loads_agree(
         done = command("train", tiny_scene, "--out", tmp_path / name, *flags)
         assert done.returncode == 0, done.stderr
         clouds.append((tmp_path / name / "point_cloud" / "iteration_20" / "point_cloud.ply").read_bytes())
-    assert list((tmp_path / "cache").rglob("*.nbi"))
+    assert list((tmp_path / "cache").rglob("*.nbc"))
     assert clouds[0] == clouds[1]
 
 

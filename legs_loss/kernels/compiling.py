@@ -20,9 +20,8 @@ from numba import types
 from numba.core import cgutils, event, extending
 from tqdm import tqdm
 
-from legs_loss.system import is_first_process, say
-
 from legs_loss.kernels.code_cache import keep
+from legs_loss.system import is_first_process, say
 
 # No NaN or infinity arises from checked input. Sums keep their order, and a * b + c is rounded twice unless the code
 # says otherwise: if the compiler may choose, the process that compiles and a later one that loads the cached code can

@@ -94,9 +94,13 @@ class _Files:
 
 @lru_cache(maxsize=None)
 def _stamp(folder: Path) -> str:
-    """Return a digest of all sources whose functions may be compiled into those of a folder, and numba's version."""
-    sources = sorted({*folder.glob("*.py"), *Path(__file__).parent.glob("*.py")})
-    return _digest(b"\0".join([numba.__version__.encode(), *(source.read_bytes() for source in sources)]))
+    """Return a digest of numba's version and of all sources whose functions may be compiled into those of a folder.
+
+    They stand in the folder, in those beside it and in this one, and speak of numba or of compiling.py.
+    """
+    paths = sorted({*folder.parent.glob("*/*.py"), *Path(__file__).parent.glob("*.py")})
+    texts = (path.read_bytes() for path in paths)
+    return _digest(b"\0".join([numba.__version__.encode(), *(t for t in texts if b"numba" in t or b"compiling" in t)]))
 
 
 def _digest(data: bytes) -> str:

@@ -314,8 +314,8 @@ class Checkout:
 
     def _reuse_parsed(self) -> None:
         """Let later plans use the files and syntax trees of the first; what rules do not decide is kept, too."""
-        planning, analysis = _module("plan"), _module("rules.analysis").Analysis
-        read, analyse, made = planning.read_files, analysis.of_files, {}
+        planning, finding = _module("plan"), _module("rules.find")
+        read, analyse, made = planning.read_files, finding.Analysis, {}
         self._anew = False
 
         def read_once(*given: Any) -> Any:
@@ -324,9 +324,9 @@ class Checkout:
         def analyse_once(*given: Any) -> Any:
             if "analysis" not in made:
                 made["analysis"] = analyse(*given)
-            return analysis(made["analysis"].program) if self._anew else made["analysis"]
+            return analyse(made["analysis"].program) if self._anew else made["analysis"]
 
-        planning.read_files, analysis.of_files = read_once, analyse_once
+        planning.read_files, finding.Analysis = read_once, analyse_once
 
     def ablate(self) -> Dict[str, Any]:
         """Return the plan, the parts that have a say, the plans that differ without one, and what was not reached."""

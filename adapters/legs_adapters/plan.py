@@ -65,8 +65,8 @@ def _large_trees() -> Iterator[None]:
     Raises:
         LegsError: a longer expression.
     """
-    before, collected = sys.getrecursionlimit(), gc.get_threshold()
-    gc.set_threshold(100_000, *collected[1:])  # syntax trees live to the end: looking at them again finds no garbage
+    before, collects = sys.getrecursionlimit(), gc.isenabled()
+    gc.disable()  # syntax trees live to the end: looking at them again finds no garbage
     # Before Python 3.11 a Python call takes some of the process's stack.
     sys.setrecursionlimit(max(before, 20_000 if sys.version_info >= (3, 11) else 6_000))
     try:
@@ -77,7 +77,8 @@ def _large_trees() -> Iterator[None]:
         ) from None
     finally:
         sys.setrecursionlimit(before)
-        gc.set_threshold(*collected)
+        if collects:
+            gc.enable()
 
 
 def plan(
@@ -119,7 +120,7 @@ def plan(
                 edits[name] = rewrite(findings.program, name, sites, unweighted, in_place)
             except RecursionError:
                 _give_up(findings, name, "is nested too deeply")
-        elsewhere = tuple(unsearched(root, exclude))
+        elsewhere = tuple(unsearched(root, findings.program.budget, exclude))
     findings.unreadable[:0] = unreadable
     for name, line in by_hand:
         _check_named(root, findings, name, line, exclude)

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any, Dict, Iterator, List, NamedTuple, Sequence, Tuple
 
 from legs_adapters.code.folders import SUBMODULE, VENDORED, folders_of
+from legs_adapters.code.limits import Budget
 from legs_adapters.code.sources import Source, read_files
 from legs_adapters.lexicon.words import SPLATS
 from legs_adapters.rules.find import find
+from legs_adapters.terms.findings import Line
 from legs_loss import LegsError
 
 __all__ = ["Unsearched", "unsearched"]
@@ -30,7 +32,7 @@ class Unsearched(NamedTuple):
         return f"{where}, and {self.folder} is not searched ({self.why}): {command}"
 
 
-def unsearched(root: Path, exclude: Sequence[str] = ()) -> Iterator[Unsearched]:
+def unsearched(root: Path, budget: Budget, exclude: Sequence[str] = ()) -> Iterator[Unsearched]:
     """Yield the submodules and the folders of third-party code that draw Gaussians and have a term of their own."""
     for folder, why in sorted(_skipped(root, "", exclude)):
         by_codebase: Dict[str, List[Source]] = {}
@@ -43,8 +45,9 @@ def unsearched(root: Path, exclude: Sequence[str] = ()) -> Iterator[Unsearched]:
             by_codebase.setdefault(f"{folder}/{inner}".rstrip("/"), []).append(source)
         for codebase, sources in by_codebase.items():
             if any(SPLATS.search(source.text) for source in sources):
-                found = find(sources)
-                hits: List[Any] = [*found.sites, *found.problems]
+                found = find(sources, budget=Budget(beside=budget))
+                over = [Line(each.path, 1, "") for each in found.unreadable if budget.why_none_left()]
+                hits: List[Any] = [*found.sites, *found.problems, *over]
                 yield from (Unsearched(codebase, why, f"{folder}/{hit.path}", hit.line) for hit in hits[:1])
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from legs_loss.system.terminal import is_first_process as is_first_process
     from legs_loss.system.terminal import never_fail_to_print as never_fail_to_print
     from legs_loss.system.terminal import printable as printable
+    from legs_loss.system.terminal import progress as progress
     from legs_loss.system.terminal import say as say
     from legs_loss.system.terminal import say_error as say_error
 
@@ -37,7 +38,7 @@ _NAMES = {
     "memory": ["keep_freed_memory"],
     "entry_points": ["plugins"],
     "processors": ["cores"],
-    "terminal": ["is_first_process", "never_fail_to_print", "printable", "say", "say_error"],
+    "terminal": ["is_first_process", "never_fail_to_print", "printable", "progress", "say", "say_error"],
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = [*_HOMES]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import re
 import sys
-from typing import Optional, TextIO
+from typing import Any, Optional, TextIO
 
-__all__ = ["is_first_process", "never_fail_to_print", "printable", "say", "say_error"]
+__all__ = ["is_first_process", "never_fail_to_print", "printable", "progress", "say", "say_error"]
 
 # Control characters but tab and line feed; the marks that turn the direction of text, and halves of characters.
 _OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -47,6 +47,14 @@ def say_error(command: str, error: Exception) -> None:
     say(f"{command}: error: {message}", sys.stderr)
     for text in quoted:
         say(text, sys.stderr, lines=True)
+
+
+def progress(total: int, what: str) -> Any:
+    """Return a tqdm that says on a terminal's stderr, after two seconds, how many of some things are done."""
+    from tqdm import tqdm
+
+    shown = "{n:.0f} of {total} " + what + ", {elapsed}"
+    return tqdm(total=total, bar_format=shown, delay=2, leave=False, disable=not sys.stderr.isatty())
 
 
 def is_first_process() -> bool:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
 
 import pytest
 
 cst = pytest.importorskip("libcst")
 
-from legs_adapters.code.module import Function, Module, parse  # noqa: E402
+from legs_adapters.code.module import Class, Function, Module, parse  # noqa: E402
 from legs_adapters.code.sources import Source, Unreadable  # noqa: E402
 from legs_adapters.code.syntax import code, walk_expressions  # noqa: E402
 from legs_adapters.terms.prospects import Prospects  # noqa: E402
+
+from tests.code.support import program  # noqa: E402
 
 FILES = sorted(Path(__file__).parent.glob("test_*.py"))
 
@@ -158,3 +161,76 @@ def test_what_can_lead_to_an_l1_is_found_by_its_words(text: str) -> None:
     assert prospects.may_lead(named(module, "training").text)
     if len(module.outline_text) < len(module.text):
         assert not prospects.may_lead(named(module, "render").text)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("def photo(a, b):\n    return (a - b).abs().mean()\n", "photo"),
+        ("def photo(a, b, mask):\n    for m in mask:\n        a = a * m\n    return F.l1_loss(a, b)\n", "photo"),
+        ("def inner(a, b):\n    return torch.abs(a - b)\ndef outer(a, b):\n    return inner(a, b)\n", "outer"),
+        ("class Photo:\n    def forward(self, a, b):\n        return abs(a - b)\nphoto = Photo()\n", "photo"),
+        ("class A:\n    def __init__(self):\n        self.photo, self.x = nn.L1Loss(), 1\n", "self.photo"),
+        ("def make(kind):\n    return F.l1_loss if kind else F.mse_loss\nclass A:\n    def f(self):\n"
+         "        self.photo = make(1)\n", "self.photo"),
+        ("def make(kind):\n    def difference(a, b):\n        return (a - b).abs()\n    return difference\n"
+         "photo = make(1)\n", "photo"),
+        ("def make():\n    return {\n        'photo': F.l1_loss,\n    }\nTABLE = make()\n", "TABLE"),
+        ("photo = functools.partial(F.l1_loss, reduction='none')\n", "photo"),
+        ("from losses import l1_loss as photo\n", "photo"),
+    ],
+)  # fmt: skip
+def test_what_may_be_an_l1_function_is_found_by_its_words(text: str, name: str) -> None:
+    other = "def plain(a, b):\n    return a * b\nscaled = photometric(1, 2) * 3\n"
+    assert Prospects([text + other]).may_have(name)
+    for unlike in ("plain", "scaled", "self.plain", "train"):
+        assert not Prospects([text + other]).may_have(unlike)
+
+
+def test_the_result_of_an_l1_is_none() -> None:
+    text = "def photo(a, b):\n    return (a - b).abs().mean()\nloss = photo(1, 2)\nscaled = 0.8 * photo(1, 2)\n"
+    prospects = Prospects([text])
+    assert prospects.may_have("photo") and prospects.may_lead("loss")
+    assert not prospects.may_have("loss") and not prospects.may_have("scaled")
+    assert prospects.may_hold("photo") and prospects.may_hold("nn.L1Loss()") and not prospects.may_hold("photo(1, 2)")
+
+
+STORED = """
+self.x = 1
+self.x: int = 1
+self.x += 1
+self.x **= 2
+self.x[0] = 1
+self.x[
+    0
+] = 1
+self.x[i].y = 1
+a, self.x = 1, 2
+self.x, a = 1, 2
+(self.x, a) = 1, 2
+(
+    a,
+    self.x,
+) = 1, 2
+a = self.x = 1
+self.x.append(1)
+self.x.update({1: 2})
+self.x.mul_(2)
+for self.x in a: pass
+for i, self.x in a: pass
+with a as self.x: pass
+"""
+
+
+@pytest.mark.parametrize("statement", ast.parse(STORED).body, ids=lambda node: str(node.lineno))
+def test_what_a_method_stores_is_found_by_its_text(statement: ast.stmt) -> None:
+    lines = STORED.splitlines()[statement.lineno - 1 : getattr(statement, "end_lineno", statement.lineno)]
+    body = "".join(f"        {line}\n" for line in lines)
+    made = program(
+        f"class A:\n    def f(self, a, i):\n{body}\n    def g(self, a):\n        return self.x, a == self.x\n"
+    )
+    module = made.module("main.py")
+    (owner,) = [each for each in module.by_node.values() if isinstance(each, Class)]
+    assert [method.name for method, _ in owner.stores("x")] == ["f"]
+    if owner.methods["g"]._cut is not None:  # before Python 3.8 a file is parsed as a whole
+        assert owner.methods["g"]._body is None

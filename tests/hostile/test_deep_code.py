@@ -189,6 +189,41 @@ def test_the_steps_are_few(what, tmp_path):
     assert int(kilobytes) < 300 << 10
 
 
+def test_many_files_cost_what_each_costs_and_few_bodies_are_parsed(tmp_path, monkeypatch):
+    """Ten copies of a checkout: ten times the steps, and of each only the bodies through which an L1 may be reached."""
+    from legs_adapters.code import module as read
+    from legs_adapters.plan import plan
+
+    parsed, real = [], read.body_part
+    monkeypatch.setattr(read, "body_part", lambda lines, cut: parsed.append(lines.data[cut]) or real(lines, cut))
+    unlike = "".join(f"def tool{i}(a, b):\n    return np.abs(a * {i}) + run(a, 'train', b)\n\n\n" for i in range(50))
+    texts = {"train.py": TRAIN, "utils/tools.py": unlike, **{k: v for k, v in files("common").items() if "/" in k}}
+
+    def steps(copies):
+        parsed.clear()
+        root = tmp_path / str(copies)
+        found = plan(checkout(root, {f"c{i}/{path}": text for i in range(copies) for path, text in texts.items()}))
+        assert len(found.after) == copies
+        return found.findings.program.budget._of_all[0]
+
+    one = steps(1)
+    assert not any(b"tool" in body or b"np.abs" in body for body in parsed)
+    each = len(parsed)
+    assert steps(10) <= 10.5 * one and len(parsed) == 10 * each
+
+
+def test_submodules_are_planned_under_the_one_budget(tmp_path, monkeypatch, capsys):
+    from legs_adapters.cli import main
+    from legs_adapters.code import limits
+
+    root = beside(tmp_path, {"third_party/gs/train.py": TRAIN + "# gaussian splatting\n"})
+    assert main(["--check", str(root)]) == 1
+    assert "third_party/gs/train.py:9 may be the loss" in capsys.readouterr().err
+    monkeypatch.setattr(limits, "MAX_STEPS", 5_000)
+    assert main(["--check", str(root)]) == 1
+    assert "third_party/gs/train.py:1 may be the loss" in capsys.readouterr().err  # unread, and said
+
+
 STATEMENTS = {
     "assignment": "image = image + gt\n",
     "annotated": "image: object = gt * image\n",

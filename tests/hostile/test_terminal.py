@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import subprocess
 import sys
 
@@ -35,6 +36,48 @@ def test_every_mode_prints_and_ends_well(encoding, tmp_path):
         assert b"\\x1b[2J" in done.stdout
     missing = legs_patch("nowhere\x1b[2J", encoding=encoding)
     assert (missing.returncode, missing.stderr.count(b"\x1b")) == (2, 0)
+
+
+SLOWLY = """
+import sys, time
+from legs_adapters.code import checkout
+from legs_adapters.cli import main
+real = checkout.parse
+checkout.parse = lambda *given: time.sleep(0.25) or real(*given)
+sys.exit(main(["--check", sys.argv[1]]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a pseudo terminal")
+def test_a_long_reading_says_on_a_terminal_how_far_it_is(tmp_path):
+    """After two seconds, on stderr; nothing where stderr is no terminal, and nothing of a short one."""
+    import fcntl
+    import os
+    import pty
+    import struct
+    import termios
+
+    train = files("inria")["train.py"]
+    root = checkout(tmp_path, {**files("inria"), **{f"other{i}/train.py": train for i in range(14)}})
+    command = [sys.executable, "-c", SLOWLY, str(root)]
+    quiet = subprocess.run(command, capture_output=True, env=legs_environment(), timeout=300)
+    assert quiet.returncode == 1 and b"files read" not in quiet.stdout + quiet.stderr
+
+    outer, inner = pty.openpty()
+    fcntl.ioctl(inner, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=inner, env=legs_environment()) as child:
+        os.close(inner)
+        seen = b""
+        with os.fdopen(outer, "rb", buffering=0) as stream:
+            try:
+                while True:
+                    seen += stream.read(1024)
+            except OSError:  # the other end is closed
+                pass
+        assert b"files read" not in child.stdout.read()
+    counts = [tuple(map(int, found)) for found in re.findall(rb"(\d+) of (\d+) files read, \d", seen)]
+    assert counts == sorted(counts) and len(counts) > 1 and counts[0][0] > 3
+    assert {total for _, total in counts} == {16} and counts[-1][0] <= 16
 
 
 class TestLegs:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import PurePosixPath
-from typing import Dict, Iterable, Iterator, List, Optional, Tuple
+from typing import Callable, Dict, Iterable, Iterator, List, Optional, Tuple
 
 import libcst as cst
 
@@ -15,17 +15,21 @@ from legs_adapters.code.syntax import dotted
 
 __all__ = ["Checkout", "imported_name"]
 
+_DEFINED = re.compile(r"\bdef[ \t]+(\w+)")
+
 
 class Checkout:
     """The readable files of a checkout.
 
     Args:
         sources: the readable files.
+        budget: what their analysis may take; default: a budget of its own.
     """
 
-    def __init__(self, sources: Iterable[Source]) -> None:
+    def __init__(self, sources: Iterable[Source], budget: Optional[Budget] = None) -> None:
         self.sources: Dict[str, Source] = {source.path: source for source in sources}
-        self._budget = Budget()
+        self.budget: Budget = budget or Budget()
+        self.when_read: Callable[[str], object] = len  # given the text of each file that was parsed
         self._unreadable: Dict[str, Unreadable] = {}
         self._modules: Dict[str, Optional[Module]] = {}
         self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
@@ -35,12 +39,18 @@ class Checkout:
         for path in map(PurePosixPath, self.sources):
             stem = path.parent.name if path.name == "__init__.py" else path.stem
             self._by_stem.setdefault(stem, []).append(path.as_posix())
-        self._by_word = index_by_word((path, source.text) for path, source in self.sources.items())
+        texts = [(path, source.text) for path, source in self.sources.items()]
+        self._by_word = index_by_word(texts)
+        self._by_definition: Dict[str, List[str]] = {}
+        for file, text in texts:
+            for name in set(_DEFINED.findall(text)):
+                self._by_definition.setdefault(name, []).append(file)
 
     def module(self, path: str) -> Optional[Module]:
         """Return a parsed file; None where it is none of these or does not parse (it is then among ``unreadable``)."""
         if path in self.sources and path not in self._modules:
-            parsed = parse(self.sources[path], self._budget)
+            parsed = parse(self.sources[path], self.budget)
+            self.when_read(self.sources[path].text)
             if isinstance(parsed, Unreadable):
                 self._unreadable[path] = parsed
             self._modules[path] = parsed if isinstance(parsed, Module) else None
@@ -56,12 +66,16 @@ class Checkout:
         """Record a file as unreadable."""
         self._unreadable[path] = Unreadable(path, reason)
 
-    def matching(self, pattern: re.Pattern[str], word: str = "") -> Iterator[Module]:
-        """Yield the modules whose text matches, each parsed when it is reached; on request only those with a word."""
-        for path in self._by_word.get(word, ()) if word else self.sources:
-            module = self.module(path) if pattern.search(self.sources[path].text) else None
+    def matching(self, pattern: re.Pattern[str]) -> Iterator[Module]:
+        """Yield the modules whose text matches, each parsed when it is reached."""
+        for path in self.paths_matching(pattern):
+            module = self.module(path)
             if module is not None:
                 yield module
+
+    def paths_matching(self, pattern: re.Pattern[str]) -> List[str]:
+        """Return the paths of the files whose text matches."""
+        return [path for path, source in self.sources.items() if pattern.search(source.text)]
 
     def mentioning(self, name: str, called: bool = False) -> List[Function]:
         """Return the functions and top levels whose text mentions a name, or calls it."""
@@ -74,7 +88,7 @@ class Checkout:
     def methods_named(self, name: str) -> List[Function]:
         """Return every method of this name in the checkout."""
         if name not in self._methods:
-            modules = self.matching(re.compile(rf"\bdef[ \t]+{name}\b"), name)
+            modules = filter(None, map(self.module, self._by_definition.get(name, ())))
             owners = [each for module in modules for each in module.by_node.values() if isinstance(each, Class)]
             self._methods[name] = [owner.methods[name] for owner in owners if name in owner.methods]
         return self._methods[name]

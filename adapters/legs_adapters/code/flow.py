@@ -23,10 +23,10 @@ from legs_adapters.code.syntax import (
     walk_expressions,
 )
 
-__all__ = ["Flow"]
+__all__ = ["MUTATORS", "Flow"]
 
 _PART = re.compile(r"[.\[]")
-_MUTATORS = {"append", "add", "extend", "insert", "update", "setdefault", "appendleft", "__setitem__"}
+MUTATORS = {"append", "add", "extend", "insert", "update", "setdefault", "appendleft", "__setitem__"}
 
 
 class Flow:
@@ -333,7 +333,7 @@ class Flow:
         whole = path_of(called.value) if isinstance(called, cst.Attribute) else None
         if isinstance(called, cst.Attribute) and whole is not None:
             name = called.attr.value
-            if name in _MUTATORS:
+            if name in MUTATORS:
                 self._add(env, Definition(whole, "mutate", node.value, node.value))
             elif name.endswith("_") and not name.endswith("__"):
                 self._add(env, Definition(whole, "inplace", node.value, node.value))

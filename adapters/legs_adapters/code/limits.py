@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from typing import List
+from typing import List, Optional
 
 __all__ = ["MAX_BYTES", "MAX_FILE_BYTES", "STRING", "Budget", "over_the_limits", "parsing_steps"]
 
@@ -34,14 +34,20 @@ _FIELD = re.compile(r"\{[^{}]*\}")
 
 
 class Budget:
-    """The steps that the analysis of one checkout takes, each file's on its own account."""
+    """The steps that the analysis of one checkout takes, each file's on its own account.
 
-    def __init__(self) -> None:
+    Args:
+        beside: that of a checkout around it, which the steps count to, too.
+    """
+
+    def __init__(self, beside: Optional[Budget] = None) -> None:
         self._spent: Counter[str] = Counter()
+        self._of_all: List[int] = [0] if beside is None else beside._of_all
 
     def spend(self, path: str, steps: int) -> str:
         """Count steps of a file; return why it may take no more, or ""."""
         self._spent[path] += steps
+        self._of_all[0] += steps
         return _WHY_OVER if self._spent[path] > MAX_FILE_STEPS else ""
 
     def left(self, path: str) -> int:
@@ -50,7 +56,7 @@ class Budget:
 
     def why_none_left(self) -> str:
         """Return why no further file is read, or ""; what was read before stays."""
-        if sum(self._spent.values()) <= MAX_STEPS:
+        if self._of_all[0] <= MAX_STEPS:
             return ""
         return f"all files together take more than {MAX_STEPS} steps: leave others out by --exclude"
 

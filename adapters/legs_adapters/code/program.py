@@ -10,6 +10,7 @@ from typing import Dict, Iterable, Iterator, List, NamedTuple, Optional, Tuple
 import libcst as cst
 
 from legs_adapters.code.checkout import Checkout, imported_name
+from legs_adapters.code.limits import Budget
 from legs_adapters.code.module import CALLED, Class, Function, Module
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source
@@ -39,12 +40,17 @@ class Program(Checkout):
         returning_self: methods of libraries that return the object itself, ``model.cuda()``.
         wrapping: functions that return their argument wrapped: ``DataParallel(model)``; dotted where the
             name alone is ambiguous.
+        budget: what their analysis may take; default: a budget of its own.
     """
 
     def __init__(
-        self, sources: Iterable[Source], returning_self: Iterable[str] = (), wrapping: Iterable[str] = ()
+        self,
+        sources: Iterable[Source],
+        returning_self: Iterable[str] = (),
+        wrapping: Iterable[str] = (),
+        budget: Optional[Budget] = None,
     ) -> None:
-        super().__init__(sources)
+        super().__init__(sources, budget)
         self._returning_self = frozenset(returning_self)
         self._wrapping = tuple("." + name for name in wrapping)
         # by expression and depth; each may be asked from many places, and asks for many others

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Iterable
-
 from legs_adapters.code.program import Program
-from legs_adapters.code.sources import Source
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.rules.purpose import Purposes
 from legs_adapters.rules.splats import Splats
 from legs_adapters.tensors.backward import Training
-from legs_adapters.tensors.operations import MODULE_SELF, MODULE_WRAPS
 from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.kinds.callback import Callbacks
@@ -46,8 +42,3 @@ class Analysis:
         self.purposes: Purposes = Purposes(self.program, self.training)
         self.splats: Splats = Splats(self.program, self.training, self.forms)
         self.callbacks: Callbacks = Callbacks(self.program, self.training, self.forms)
-
-    @classmethod
-    def of_files(cls, sources: Iterable[Source]) -> Analysis:
-        """Analyse the L1 terms of these files."""
-        return cls(Program(sources, MODULE_SELF, MODULE_WRAPS))

@@ -9,22 +9,27 @@ from __future__ import annotations
 import re
 from typing import Any, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
+from legs_adapters.code.limits import Budget
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
+from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import arguments
-from legs_adapters.lexicon.words import SPEAKS_OF_L1, STRUCTURAL
+from legs_adapters.lexicon.words import SPEAKS_OF_L1
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.masks import with_masks
 from legs_adapters.rules.order import RULES
 from legs_adapters.rules.ssim import with_ssims
 from legs_adapters.rules.traced import with_trace
 from legs_adapters.rules.verdict import Verdicts
+from legs_adapters.tensors.backward import TRAINS
+from legs_adapters.tensors.operations import MODULE_SELF, MODULE_WRAPS
 from legs_adapters.terms.findings import Findings, Left, Problem, Site
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.patched import patched_nodes
 from legs_adapters.terms.traced import Trace
+from legs_loss.system import progress
 
 __all__ = ["find"]
 
@@ -33,6 +38,7 @@ _Entry = Tuple[Place, Union[Site, Left, Problem]]
 _RULES = 100  # steps of all that are asked for a term; what walks over its function counts that itself
 _TEXT = 50  # letters of a text that are searched in a step
 _MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|\bunweighted\(")
+_TO_READ = re.compile(f"{_MAY_HAVE_L1.pattern}|{TRAINS.pattern}")
 
 
 def find(
@@ -41,6 +47,7 @@ def find(
     ssim: bool = False,
     masks: bool = False,
     trace: Optional[Trace] = None,
+    budget: Optional[Budget] = None,
 ) -> Findings:
     """Find the photometric terms of a checkout.
 
@@ -50,9 +57,14 @@ def find(
         ssim: find the SSIM terms, too.
         masks: find where their renderings are masked, too, and the SSIM terms that can be means over what counts.
         trace: what a run of the training script showed, which decides on the terms that ran.
+        budget: the steps that it may take; default: its own.
     """
-    analysis = Analysis.of_files(sources)
-    found = _Finder(analysis, by_hand).run()
+    program = Program(sources, MODULE_SELF, MODULE_WRAPS, budget)
+    with progress(len(program.paths_matching(_TO_READ)), "files read") as bar:
+        # A file with an L1 is done when it was judged, too.
+        program.when_read = lambda text: bar.update(0.5 if _MAY_HAVE_L1.search(text) else bool(TRAINS.search(text)))
+        analysis = Analysis(program)
+        found = _Finder(analysis, by_hand, bar).run()
     found = with_trace(found, analysis, trace) if trace is not None and not by_hand else found
     left = found.left
     found = with_ssims(found, analysis, by_hand) if ssim or masks else found
@@ -61,8 +73,9 @@ def find(
 
 
 class _Finder:
-    def __init__(self, analysis: Analysis, by_hand: Sequence[Tuple[str, int]]) -> None:
+    def __init__(self, analysis: Analysis, by_hand: Sequence[Tuple[str, int]], bar: Any) -> None:
         self.analysis = analysis
+        self.bar = bar
         self.by_hand = set(by_hand)
         self.verdicts = Verdicts(analysis)
         self.found = Findings([], [], [], [], [], [], analysis.program)
@@ -71,6 +84,7 @@ class _Finder:
     def run(self) -> Findings:
         found, program = self.found, self.analysis.program
         for module in program.matching(_MAY_HAVE_L1):
+            self.bar.update(0.5)
             over = module.budget.why_none_left()
             if over:
                 program.give_up(module.path, over)
@@ -103,7 +117,9 @@ class _Finder:
         found = self.found
         entries: List[_Entry] = []
         patched: List[Left] = []
-        for function in module.scopes(lambda text: self.analysis.prospects.may_lead(text) or STRUCTURAL.search(text)):
+        may_have = self.analysis.prospects.may_have
+        is_named = any(path == module.path for path, _ in self.by_hand)
+        for function in module.scopes(lambda text: is_named or may_have(text) or _MAY_HAVE_L1.search(text)):
             if not module.spend(len(function.text) // _TEXT):
                 return
             entries += self._entries(function)

@@ -15,9 +15,9 @@ from legs_adapters.code.syntax import arguments, call_name, children, constant, 
 from legs_adapters.tensors.operations import BACKWARD, ENDS_GRADIENT, HOOKS, SIZES
 from legs_adapters.tensors.steps import is_backward
 
-__all__ = ["Training"]
+__all__ = ["TRAINS", "Training"]
 
-_BACKWARD = re.compile(r"\b(manual_)?backward\s*\(")
+TRAINS = re.compile(r"\b(manual_)?backward\s*\(")  # a text that runs a backward pass
 _ANY = object()
 
 
@@ -42,8 +42,8 @@ class Training:
         self._met: Set[Tuple[Function, int]] = set()  # what ``sites`` has
         self._done: Set[Tuple[int, object]] = set()
         self._work: List[Tuple[Function, cst.CSTNode, object]] = []
-        for module in program.matching(_BACKWARD):
-            for function in module.scopes(_BACKWARD.search):
+        for module in program.matching(TRAINS):
+            for function in module.scopes(TRAINS.search):
                 passes = [call for call in function.flow.calls if is_backward(call)]
                 self._begin(function, [value for call in passes for value in _trained_by(call)], bool(passes))
         for method in (method for name in sorted(HOOKS) for method in program.methods_named(name)):

@@ -10,7 +10,16 @@ import libcst as cst
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import returned
-from legs_adapters.code.syntax import arguments, call_name, code, constant, key_of, walk_expressions
+from legs_adapters.code.syntax import (
+    arguments,
+    attribute_chain,
+    call_name,
+    code,
+    constant,
+    dotted,
+    key_of,
+    walk_expressions,
+)
 from legs_adapters.lexicon.names import TORCH_L1, has_perceptual_name, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
 from legs_adapters.tensors.absolute import abs_argument, is_difference, mean_of
@@ -55,6 +64,14 @@ class L1Functions:
         self._only: Dict[Function, bool] = {}
         self._shapes: Dict[Function, Optional[str]] = {}
 
+    def may_be_called(self, function: Function, node: cst.CSTNode) -> bool:
+        """Return whether an expression may be an L1 function, a variable or by its words: resolving it costs more."""
+        if self._prospects.may_have(dotted(node) or code(node)):
+            return True
+        definitions = self.program.lookup(function, list(attribute_chain(node))[-1]) or ()
+        values = [made.value for _, made in definitions if made.kind in ("assign", "element", "with")]
+        return any(value is not None and self._prospects.may_hold(code(value)) for value in values)
+
     def shape(self, function: Function) -> Optional[str]:
         """Return what a function of the checkout computes from its first two arguments.
 
@@ -67,7 +84,7 @@ class L1Functions:
         return self._shapes[function]
 
     def _shape(self, function: Function, depth: int) -> Optional[str]:
-        if len(function.parameters) < 2 or depth > _DEPTH or not self._prospects.may_lead(function.text):
+        if len(function.parameters) < 2 or depth > _DEPTH or not self._prospects.may_have(function.text):
             return None
         if function not in self._only:
             self._only[function] = False  # for recursion

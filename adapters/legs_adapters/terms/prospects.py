@@ -1,33 +1,62 @@
-"""Find by words which text can lead to an L1: the others are not parsed.
+"""Find by words which text can lead to an L1, and which can have one: the others are not parsed.
 
-A text can lead to one if it mentions one, or a name that does: of a function, of a class whose ``forward`` does, or of
-a variable that holds one (``self.criterion = nn.L1Loss()``). False positives are possible, false negatives are not;
-the search costs a hundredth of parsing.
+A text leads to one if it mentions one, or a name that does: of a function, of a class whose ``forward`` does, or of a
+variable that holds one (``self.criterion = nn.L1Loss()``). It has one if it takes an absolute value, or names what may
+be an L1 function: of two parameters, named as a loss or without branches, or what such a function is assigned to or
+returned by. False positives are possible, false negatives are not; the search costs a hundredth of parsing.
 """
 
 from __future__ import annotations
 
 import re
-from typing import Dict, Iterable, Iterator, List, Set, Tuple
+from typing import Dict, FrozenSet, Iterable, Iterator, List, NamedTuple, Set, Tuple
 
 from legs_adapters.code.module import CALLED
-from legs_adapters.lexicon.words import SPEAKS_OF_L1
-from legs_adapters.tensors.operations import HOLDERS
+from legs_adapters.lexicon.words import SPEAKS_OF_L1, SPEAKS_OF_LOSS
+from legs_adapters.tensors.operations import HOLDERS, MODULE_SELF
 
 __all__ = ["Prospects"]
 
-_WORD = re.compile(r"[^\W\d]\w*")
+_WORD = re.compile(r"(?<![\w\"'])[^\W\d]\w*(?![\"'])")  # no key, no setting: ``split="train"``
 _DEFINITION = re.compile(r"^([ \t]*)(?:async[ \t]+)?(def|class)[ \t]+(\w+)", re.M)
 # A value goes on where its line ends in an opening bracket, a comma or a backslash.
+_VALUE = r"((?:[^\n]*[\[({,\\][ \t]*(?:#[^\n]*)?\n)*[^\n]*)"
 _GIVEN = re.compile(
-    r"^(?:[ \t]*self\.)?(\w+)(?:\[[^\]\n]*\]|\.\w+)*[ \t]*(?::[^=\n]+|[-+*/])?=(?!=)[ \t]*"
-    r"((?:[^\n]*[\[({,\\][ \t]*(?:#[^\n]*)?\n)*[^\n]*)",
-    re.M,
+    r"^(?:[ \t]*self\.)?(\w+)(?:\[[^\]\n]*\]|\.\w+)*[ \t]*(?::[^=\n]+|[-+*/])?=(?!=)[ \t]*" + _VALUE, re.M
 )
+_UNPACKED = re.compile(
+    r"^(?:[ \t]+(?=[^=\n]*\bself\.))?[(\[]?((?:[\w.]+[ \t]*,[ \t]*)+[\w.]*)[)\]]?[ \t]*=(?!=)[ \t]*" + _VALUE, re.M
+)
+_TARGET = re.compile(r"(\w+)[ \t]*(?:,|$)")
+_RETURNED = re.compile(r"\breturn[ \t(]+" + _VALUE)
 _ADDED = re.compile(r"\bself\.(\w+)\.(?:append|add|extend|update|setdefault)\(([^\n]*)")
 _SINGLE_CALL = re.compile(r"([\w.]+)[ \t]*\((?:[^()]|\([^()]*\))*\)[ \t]*(?:#.*)?$")
-_RENAMED = re.compile(r"\b(\w+)[ \t]+as[ \t]+(\w+)")
+_RENAMED = re.compile(r"(?<=\w)[ \t]+as[ \t]+(\w+)")
+_LAST_WORD = re.compile(r"\w*$")
+_WITH_L1 = re.compile(r"^.*[lL]1.*$", re.M)
 _DEFAULT = re.compile(r"\b(\w+)(?:[ \t]*:[^=,()\n]+)?[ \t]*=[ \t]*([\w.]*[lL]1\w*)(?![\w.]*[ \t]*\()")
+_BRANCHES = re.compile(r"^[ \t]+(?:if|for|while|with|try|async)\b", re.M)
+# What is computed is no function: arithmetic, or what a method returns that is no module's own.
+_COMPUTED = re.compile(
+    r"^(?![^\n]*(?:lambda|[\"'])).*(?:[\w)\]][ \t]*[-+*/@][ \t]*[\w(]"
+    rf"|[)\]]\.(?!(?:{'|'.join(sorted(MODULE_SELF))})\()\w+\([^()]*\)[ \t]*$)",
+    re.S,
+)
+
+
+class _Words(NamedTuple):
+    """The names in a text, and whether it speaks of an L1."""
+
+    names: FrozenSet[str]
+    speaks: bool
+
+    @classmethod
+    def of(cls, text: str) -> _Words:
+        return cls(frozenset(_WORD.findall(text)) - {"_"}, SPEAKS_OF_L1.search(text) is not None)
+
+
+_NONE = _Words(frozenset(), False)
+_Entry = Tuple[str, _Words, _Words]  # a name, what it leads through, and what it is an L1 function through
 
 
 class Prospects:
@@ -38,47 +67,103 @@ class Prospects:
     """
 
     def __init__(self, texts: Iterable[str]) -> None:
-        definitions = [definition for text in texts for definition in _definitions(text)]
-        known = {name for name, _ in definitions}
-        speakers: Dict[str, List[str]] = {}  # by a word, the names whose definitions mention it
-        work = [name for name, text in definitions if SPEAKS_OF_L1.search(text)]
-        for name, text in definitions:
-            for word in known.intersection(_WORD.findall(text)):
-                speakers.setdefault(word, []).append(name)
-        self._names: Set[str] = set()
-        while work:
-            name = work.pop()
-            if name not in self._names:
-                self._names.add(name)
-                work += speakers.get(name, ())
-        self._answers: Dict[str, bool] = {}
+        entries = [entry for text in texts for entry in _entries(text)]
+        self._leading = _closure((name, leads) for name, leads, _ in entries)
+        self._l1 = _closure((name, l1) for name, _, l1 in entries)
+        self._answers: Dict[str, Tuple[bool, bool]] = {}
 
     def may_lead(self, text: str) -> bool:
         """Return whether a text can lead to an L1."""
+        return self._answer(text)[0]
+
+    def may_have(self, text: str) -> bool:
+        """Return whether a text can have an L1 itself."""
+        return self._answer(text)[1]
+
+    def may_hold(self, value: str) -> bool:
+        """Return whether a value can be an L1 function."""
+        words = _held(value)
+        return words.speaks or not words.names.isdisjoint(self._l1)
+
+    def _answer(self, text: str) -> Tuple[bool, bool]:
         if text not in self._answers:
-            self._answers[text] = bool(SPEAKS_OF_L1.search(text)) or not self._names.isdisjoint(_WORD.findall(text))
+            words = _Words.of(text)
+            known = (words.speaks or not words.names.isdisjoint(names) for names in (self._leading, self._l1))
+            self._answers[text] = tuple(known)  # type: ignore[assignment]
         return self._answers[text]
 
 
-def _definitions(text: str) -> Iterator[Tuple[str, str]]:
-    """Yield names, each with the text of its definition."""
+def _closure(entries: Iterable[Tuple[str, _Words]]) -> Set[str]:
+    """Return the names whose words speak of an L1, or mention such a name."""
+    entries = list(entries)
+    known, found = {name for name, _ in entries}, set()  # type: Set[str], Set[str]
+    speakers: Dict[str, List[str]] = {}  # by a word, the names whose definitions mention it
+    for name, words in entries:
+        for word in known & words.names:
+            speakers.setdefault(word, []).append(name)
+    work = [name for name, words in entries if words.speaks]
+    while work:
+        name = work.pop()
+        if name not in found:
+            found.add(name)
+            work += speakers.get(name, ())
+    return found
+
+
+def _entries(text: str) -> Iterator[_Entry]:
     classes: List[Tuple[int, str]] = []
-    definitions = list(_DEFINITION.finditer(text))
-    for i, match in enumerate(definitions):
-        end = definitions[i + 1].start() if i + 1 < len(definitions) else len(text)
-        depth, name = len(match.group(1)), match.group(3)
+    definitions = [(len(match.group(1)), match) for match in _DEFINITION.finditer(text)]
+    for i, (depth, match) in enumerate(definitions):
+        after = definitions[i + 1 :]
+        if match.group(2) == "def":  # what it defines belongs to it
+            after = [each for each in after[:50] if each[0] <= depth] or after[50:]
+        body, name = text[match.end() : after[0][1].start() if after else len(text)], match.group(3)
         classes = [entry for entry in classes if entry[0] < depth]
         if match.group(2) == "class":
             classes.append((depth, name))
-        elif not name.startswith("__") and name != "backward":
-            yield name, text[match.end() : end]
+            continue
+        words = _Words.of(body)
         if name in CALLED and classes:
-            yield classes[-1][1], text[match.end() : end]
+            yield classes[-1][1], words, words
+        if not name.startswith("__") and name != "backward":
+            returned = [_held(value) for value in _RETURNED.findall(body)]
+            yield f"{name}()", _NONE, _NONE if not returned else _joined(returned)
+            is_l1 = _takes_two(body) and (SPEAKS_OF_LOSS.search(name) or not _BRANCHES.search(body))
+            yield name, words, words if is_l1 else _Words(frozenset([f"{name}()"]), False)
     for match in _GIVEN.finditer(text):
         if not match.group(1).startswith("__") and match.group(1) != "_":
             made = _SINGLE_CALL.match(match.group(2))  # what its function makes: arguments do not change that
             single = made is not None and made.group(1) not in HOLDERS
-            yield match.group(1), made.group(1).split(".")[-1] if made and single else match.group(2)
-    for pattern in (_ADDED, _DEFAULT):
-        yield from ((match.group(1), match.group(2)) for match in pattern.finditer(text))
-    yield from ((match.group(2), match.group(1)) for match in _RENAMED.finditer(text))
+            leads = made.group(1).split(".")[-1] if made and single else match.group(2)
+            yield match.group(1), _Words.of(leads), _held(match.group(2))
+    named = _ADDED.findall(text)
+    for several, value in _UNPACKED.findall(text):
+        yield from ((target, _NONE, _held(value)) for target in _TARGET.findall(several))
+    named += [found for line in _WITH_L1.findall(text) for found in _DEFAULT.findall(line)]
+    for match in _RENAMED.finditer(text):
+        last = _LAST_WORD.search(text[max(match.start() - 80, 0) : match.start()])
+        named.append((match.group(1), last.group() if last is not None else ""))
+    yield from ((name, *[_Words.of(value)] * 2) for name, value in named)
+
+
+def _joined(several: List[_Words]) -> _Words:
+    return _Words(frozenset().union(*(each.names for each in several)), any(each.speaks for each in several))
+
+
+def _held(value: str) -> _Words:
+    """Return the words of a value that may be an L1 function."""
+    made = _SINGLE_CALL.match(value)
+    if made is not None and made.group(1) not in HOLDERS:
+        name = made.group(1).split(".")[-1]
+        is_class = name[:1].isupper()
+        return _Words(
+            frozenset([f"{name}()", *([name] if is_class else [])]), is_class and SPEAKS_OF_L1.search(name) is not None
+        )
+    return _NONE if _COMPUTED.match(value) else _Words.of(value)
+
+
+def _takes_two(body: str) -> bool:
+    """Return whether a function may have two parameters beside ``self``."""
+    header = body.partition(")")[0].lstrip()[1:]
+    names = [part.partition(":")[0].strip() for part in header.split(",")]
+    return len([name for name in names if name not in ("", "self", "cls", "*", "/")]) > 1 or "(" in header

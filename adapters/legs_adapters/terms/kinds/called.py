@@ -32,6 +32,8 @@ class Called(Form):
         """Find a call of an L1 function, by the function's body, or by its name where the body is not available."""
         if len(call.args) < 2 or arguments(call)[2]:
             return None
+        if not functions.may_be_called(function, call.func):
+            return None
         references = functions.program.resolve(function, call.func)
         if any(r.kind == "external" and str(r.target).startswith("legs_loss.") for r in references):
             return None  # patched before

@@ -13,6 +13,7 @@ import pytest
 
 from tests.patcher.support import legs_patch, snapshot
 from tests.patcher.traced import write, write_scene
+from tests.patcher.ways import UNSEEN, WAYS
 from tests.support import legs_environment
 
 pytestmark = pytest.mark.slow
@@ -34,11 +35,11 @@ def body(*lines, head=""):
     return head + LOOP + "".join(f"    {line}\n" for line in lines) + END
 
 
-def traced(tmp_path, train, *options, steps=8, scene=None, **more):
+def traced(tmp_path, train, *options, steps=8, scene=None, before="", **more):
     """Trace a codebase with this train.py; return the report, and the line that must be weighted."""
     scene = scene or write_scene(tmp_path / "scene")
     line = write(tmp_path / "code", train, **more)
-    command = f"train.py -s {scene}"
+    command = f"{before}train.py -s {scene}"
     before = snapshot(tmp_path / "code")
     done = legs_patch("--trace", command, "--json", "--check", "--steps", str(steps), *options, tmp_path / "code")
     assert done.stdout, done.stderr
@@ -167,33 +168,53 @@ class TestWhichTerm:
         assert [each["line"] for each in report["left"]] == [line[1]]
         assert "is images/00" in report["left"][0]["reason"] and "a squared loss, no L1" in report["left"][0]["reason"]
 
-    @pytest.mark.parametrize(
-        "lines",
-        [
-            ["with torch.autocast('cpu', dtype=torch.bfloat16):", "    loss = F.l1_loss(image, gt_image)  # <- here"],
-            [
-                "loss = F.l1_loss(image, gt_image)  # <- here",
-                "(loss * 0.5).backward(retain_graph=True)",
-                "loss = loss / 2",
-            ],
-        ],
-        ids=["autocast", "two backward passes a step"],
-    )
-    def test_other_ways_to_train(self, tmp_path, lines):
-        report, line, _ = traced(tmp_path, body('image = splats.draw(camera)["rgb"]', *lines))
-        assert weighted(report) == [line]
 
-    def test_gradients_by_autograd_grad(self, tmp_path):
-        train = LOOP + (
-            '    image = splats.draw(camera)["rgb"]\n'
-            "    loss = F.l1_loss(image, gt_image)  # <- here\n"
-            "    leaves = [splats.xy, splats.colour, splats.opacity]\n"
-            "    for leaf, gradient in zip(leaves, torch.autograd.grad(loss, leaves)):\n"
-            "        leaf.grad = gradient\n"
-            "    splats.optimizer.step()\n"
+class TestWaysToTrain:
+    @pytest.mark.parametrize("name", WAYS)
+    def test_the_photographs_line_and_no_other(self, tmp_path, name):
+        train, modules = WAYS[name]
+        for module in modules:
+            pytest.importorskip(module)
+        before = "torchrun --nproc_per_node 2 --master_port 29547 " if name == "torchrun" else ""
+        report, line, done = traced(tmp_path, train, before=before, steps=4)
+        assert weighted(report) == [line], done.stderr
+        assert "Traceback" not in done.stderr
+
+    def test_a_fused_loss_is_said(self, tmp_path):
+        report, line, done = traced(tmp_path, UNSEEN)
+        assert weighted(report) == []
+        fused = [each["reason"] for each in report["left"] if each["line"] == line[1]]
+        assert len(fused) == 1 and "a compiled: Fused loss, no L1" in fused[0]
+        assert "a trace cannot look into fused kernels, as these under the loss: FusedBackward" in done.stderr
+
+    def test_nothing_of_a_step_is_kept(self, tmp_path):
+        """Tensors alive after each step, by the script's own count; parameters are replaced, one is never stepped."""
+        train = body(
+            "drawn = splats.draw(camera)",
+            "loss = F.l1_loss(drawn['rgb'] + 0 * idle.sum(), gt_image)  # <- here",
+            "loss = loss + 0.1 * (drawn['depth'] - gt_image[:1]).abs().mean()",
+            "loss = loss + (drawn['rgb'] - 0.5 * gt_image).square().mean()",
+            head="import gc\nimport weakref\n\n"
+            "idle, counts, replaced = torch.nn.Parameter(torch.zeros(64, 3)), [], []\n",
         )
-        report, line, _ = traced(tmp_path, train)
-        assert weighted(report) == [line]
+        train += """
+    if step % 5 == 4:
+        replaced += [weakref.ref(splats.xy), weakref.ref(idle)]
+        idle, fresh = torch.nn.Parameter(torch.zeros(64, 3)), torch.nn.Parameter(splats.xy.detach().clone())
+        del splats.optimizer.state[splats.xy]
+        splats.xy = splats.optimizer.param_groups[0]["params"][0] = fresh
+        del fresh
+    del drawn, loss
+    gc.collect()
+    counts.append(sum(isinstance(each, torch.Tensor) for each in gc.get_objects()))
+    if step == 29:
+        print("alive", counts[5::5], sum(each() is not None for each in replaced[:-2]), flush=True)
+"""
+        _, _, done = traced(tmp_path, train, steps=31)
+        alive = next(line for line in done.stderr.splitlines() if line.startswith("alive"))
+        counts, kept = json.loads(alive[6 : alive.index("]") + 1]), int(alive.split()[-1])
+        assert len(counts) == 5 and len(set(counts)) == 1, alive
+        assert kept == 0, alive
 
 
 class TestHarmless:

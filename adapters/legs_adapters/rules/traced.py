@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Set, Tuple
 
 import libcst as cst
+import libcst.matchers as m
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import arguments, call_name, one_line
@@ -81,7 +82,7 @@ class _Join:
             inner = traced.frames[depth - 1] if depth else None
             for function in self._functions(module, line, name) if module is not None else ():
                 form = self._form(function, line, inner)
-                if form is not None:
+                if form is not None and (inner is None or self._leads_to(form, inner)):
                     target = traced.target if inner is None else self._target_of(traced, inner)
                     yield _Candidate(function, form, depth, target)
 
@@ -105,6 +106,13 @@ class _Join:
                 return Called(call, call, values[0], values[1], call.func)
         return None
 
+    def _leads_to(self, form: Form, inner: Any) -> bool:
+        """Return whether a form's own call led to a frame, and not a call in its arguments, as `render(camera)`."""
+        within = {call_name(call) for side in (form.first, form.second) for call in _calls(side)}
+        if inner[2] in ("forward", "__call__"):
+            return not within or self._is_pair(inner)
+        return inner[2] not in within or inner[2] == call_name(form.call)
+
     def _is_pair(self, frame: Any) -> bool:
         """Return whether the first two parameters of a frame's function are the two sides."""
         parameters = self._parameters(frame)
@@ -123,7 +131,9 @@ class _Join:
     # -- verdicts
 
     def _photometric(self, traced: Traced, stack: List[_Candidate]) -> None:
-        own = sorted(stack, key=self._is_definition)
+        scripted = self.trace.scripted
+        own = [c for c in stack if (c.function.module.path, c.function.name) not in scripted]
+        own.sort(key=self._is_definition)
         read = next((site for site in self.found.sites if self._is_passed_on(site, traced)), None)
         if read is not None:
             self.entries.append(read._replace(why=traced.text(self._name(traced, stack))))
@@ -177,11 +187,10 @@ class _Join:
         """Return whether the call of a form calls other losses, too: `LOSSES[name](image, gt)` in a loop."""
         callees: Set[Tuple[bool, Tuple[str, str]]] = set()
         name = call_name(candidate.form.call)
-        for traced in self.trace.terms:
-            for inner, (path, line, *_) in zip((None, *traced.frames), traced.frames):
-                if path == candidate.function.module.path and _on(candidate.function, candidate.form.node, line):
-                    called = (inner[0], inner[2]) if inner is not None else ("", traced.kind)
-                    callees.add((traced.is_photometric, called))
+        for traced, stack in self.stacks:
+            for depth in (c.depth for c in stack if c.key == candidate.key):
+                path, _, called, _ = traced.frames[depth - 1] if depth else ("", 0, traced.kind, ())
+                callees.add((traced.is_photometric, (path, called)))
         is_named = any(called[1] == name for _, called in callees) or candidate.depth == 0
         return not is_named and any(not is_loss for is_loss, _ in callees)
 
@@ -282,3 +291,7 @@ class _Join:
 def _on(function: Function, node: cst.CSTNode, line: int) -> bool:
     place = function.place(node)
     return place.line <= line <= place.last_line
+
+
+def _calls(node: cst.CSTNode) -> List[cst.Call]:
+    return [cst.ensure_type(call, cst.Call) for call in m.findall(node, m.Call())]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Dict, FrozenSet, List, NamedTuple, Optional, Sequence, Tuple
 
 __all__ = ["Trace", "Traced"]
 
@@ -104,8 +104,8 @@ class Traced(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """The terms that a traced run saw, its count of steps, and of image files."""
+    """The terms that a traced run saw, its count of steps, and its functions of TorchScript by file and name."""
 
     terms: List[Traced]
     steps: int
-    files: int
+    scripted: FrozenSet[Tuple[str, str]]

@@ -8,11 +8,14 @@ Of --verify: every backward pass of a scalar, and what ``legs_loss.l1_loss`` cou
 from __future__ import annotations
 
 import atexit
+import importlib
 import json
+import multiprocessing.spawn
 import os
 import random
 import sys
 import time
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any, Callable, Dict, List
 
@@ -20,6 +23,7 @@ from legs_loss.cli import exit_code
 from legs_loss.system import is_first_process
 
 Content = Callable[[], Dict[str, Any]]
+_over: List[bool] = []  # one for each time that a trace saw enough
 
 
 def _main(given: str, script: str, *arguments: str) -> int:
@@ -29,51 +33,71 @@ def _main(given: str, script: str, *arguments: str) -> int:
     from legs_adapters.runner import execute
 
     spec = json.loads(given)
-    root = Path(spec["root"])
-    content = _tracing(spec) if "steps" in spec else _verifying(spec)
-    code = 1
+    if "steps" in spec:
+        _tracing(spec)
+    else:
+        _verifying(spec)
     try:
-        code = exit_code("legs", lambda: execute(script, arguments, {}, root if spec["cpu"] else None))
+        return exit_code("legs", lambda: execute(script, arguments, {}, Path(spec["root"]) if spec["cpu"] else None))
     finally:
-        if is_first_process():
-            Path(spec["report"]).write_text(json.dumps(content()))
-    if content().get("is_over"):  # whatever threads of the script are left
-        atexit._run_exitfuncs()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(0)
-    return code
+        if _over:  # whatever threads of the script are left
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(0)
 
 
-def _tracing(spec: Dict[str, Any]) -> Content:
+def _report(path: str, content: Content) -> Callable[[], None]:
+    """Write the report when the process ends, or the function that is returned is called.
+
+    Of several processes the one that saw steps writes it; of several of those rank 0.
+    """
+
+    def write() -> None:
+        found = content()
+        if is_first_process() and (found.get("steps", 1) or not os.path.exists(path)):
+            Path(path).write_text(json.dumps(found))
+
+    Finalize(None, write, exitpriority=0)  # a process that multiprocessing starts has no atexit
+    return write
+
+
+class _Spawned:
+    """Unpickled it watches the process: one that the script spawns, before that does anything else."""
+
+    def __init__(self, spec: Dict[str, Any]) -> None:
+        self.spec = spec
+
+    def __reduce__(self) -> Any:
+        return importlib.import_module("legs_adapters.trace.child")._tracing, (self.spec,)  # (here it is __main__'s)
+
+
+def _tracing(spec: Dict[str, Any]) -> None:
     from legs_adapters.trace.photographs import Photographs
     from legs_adapters.trace.watching import Watch
 
-    over: List[bool] = []
-
     def ended() -> None:
-        over.append(True)
-        if len(over) > 1:  # the script went on
-            Path(spec["report"]).write_text(json.dumps(content()))
+        _over.append(True)
+        if len(_over) > 1:  # the script went on
+            write()
             os._exit(0)
         sys.exit()
 
     def content() -> Dict[str, Any]:
-        terms = list(watch.terms.values())
-        counts: Dict[str, Any] = {
-            "steps": watch.steps,
-            "backward_passes": watch.backward_passes,
-            "files": len(watch.photographs),
-        }
-        counts["failure"] = watch.failure
-        return {"terms": terms, "is_over": bool(over), **counts}
+        names = ("steps", "backward_passes", "failure")
+        found = {name: getattr(watch, name) for name in names}
+        found.update(unseen=sorted(watch.unseen), scripted=sorted(watch.scripted))
+        return {"terms": list(watch.terms.values()), "is_over": bool(_over), **found}
 
     watch = Watch(spec["root"], Photographs(spec["folders"], spec["photos"]), spec["steps"], ended)
     watch.install()
-    return content
+    write = _report(spec["report"], content)
+    start: Any = multiprocessing.spawn
+    prepare = start.get_preparation_data
+    start.get_preparation_data = lambda name: dict(prepare(name), legs_trace=_Spawned(spec))
 
 
-def _verifying(spec: Dict[str, Any]) -> Content:
+def _verifying(spec: Dict[str, Any]) -> None:
     import numpy as np
     import torch
 
@@ -99,7 +123,7 @@ def _verifying(spec: Dict[str, Any]) -> Content:
     random.seed(0)
     np.random.seed(0)
     torch.manual_seed(0)
-    return content
+    _report(spec["report"], content)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, Iterable, List, NamedTuple, Set
+import re
+from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Set, Tuple
 
 __all__ = ["KEY", "Graph"]
 
@@ -14,50 +15,64 @@ _CARRIES = (
     "Slice", "Split", "Squeeze", "Stack", "Sum", "TBackward",
     "ToCopy", "Transpose", "Unbind", "Unsafe", "Unsqueeze", "View", "Where",
 )  # fmt: skip
+_OWN_NODE = re.compile(r"Backward\d+$|AccumulateGrad$|CopyBackwards$|CopySlices$|GraphRoot$|^$")
 _REDUCES = ("Mean", "Sum", "Nansum")
 _BENDS = ("Pow", "Log", "Exp", "Sqrt", "Rsqrt", "Reciprocal", "Tanh", "Sigmoid", "HuberLoss", "SmoothL1Loss", "Square")
 
 
 class Graph(NamedTuple):
-    """The nodes under the roots of a backward pass, and which nodes use each."""
+    """The nodes under the roots of a backward pass, which nodes use each, and which of the leaves it leads to."""
 
     nodes: Dict[int, Any]
     users: Dict[int, List[Any]]
+    variables: List[Any]
+    masks: Dict[int, int]
 
     @classmethod
     def under(cls, roots: Iterable[Any]) -> Graph:
         """Walk from the roots' nodes; a node's Python object stays the same while the graph is held."""
-        nodes, users = {}, {}  # type: Dict[int, Any], Dict[int, List[Any]]
-        left = [node for node in roots if node is not None]
-        nodes.update((id(node), node) for node in left)
-        while left:
-            node = left.pop()
-            for below, _ in node.next_functions:
+        graph = cls({}, {}, [], {})
+        path: List[Tuple[Any, Iterator[Any]]] = []
+        for root in roots:
+            graph._enter(root, path)
+            while path:
+                node, belows = path[-1]
+                below = next(belows, None)
                 if below is None:
-                    continue
-                users.setdefault(id(below), []).append(node)
-                if id(below) not in nodes:
-                    nodes[id(below)] = below
-                    left.append(below)
-        return cls(nodes, users)
+                    path.pop()
+                    graph.masks[id(node)] = graph._mask(node)
+                elif below[0] is not None:
+                    graph.users.setdefault(id(below[0]), []).append(node)
+                    graph._enter(below[0], path)
+        return graph
+
+    def _enter(self, node: Any, path: List[Tuple[Any, Iterator[Any]]]) -> None:
+        if node is not None and id(node) not in self.nodes:
+            self.nodes[id(node)] = node
+            path.append((node, iter(node.next_functions)))
+
+    def _mask(self, node: Any) -> int:
+        """Return a bit for each leaf under a node whose nodes below are known."""
+        variable = getattr(node, "variable", None)  # of an AccumulateGrad
+        if variable is not None:
+            self.variables.append(variable)
+            return 1 << len(self.variables) - 1
+        found = 0
+        for below, _ in node.next_functions:
+            found |= self.masks[id(below)] if below is not None else 0
+        return found
 
     def records(self) -> Dict[int, Any]:
         """Return the records of the differences among the nodes, by the node's id."""
         return {at: node.metadata[KEY] for at, node in self.nodes.items() if KEY in node.metadata}
 
-    def leaves(self, at: int) -> Dict[int, Any]:
-        """Return the leaves under a node, by their ids."""
-        found, seen, left = {}, {at}, [self.nodes[at]]  # type: Dict[int, Any], Set[int], List[Any]
-        while left:
-            node = left.pop()
-            variable = getattr(node, "variable", None)  # of an AccumulateGrad
-            if variable is not None:
-                found[id(variable)] = variable
-            for below, _ in node.next_functions:
-                if below is not None and id(below) not in seen:
-                    seen.add(id(below))
-                    left.append(below)
-        return found
+    def leaves(self, at: int) -> List[Any]:
+        """Return the leaves under a node."""
+        return [leaf for bit, leaf in enumerate(self.variables) if self.masks[at] >> bit & 1]
+
+    def foreign(self) -> Set[str]:
+        """Return the names of the nodes that are not torch's own: fused kernels, whose differences cannot be seen."""
+        return {name for name in (node.name() for node in self.nodes.values()) if not _OWN_NODE.search(name)}
 
     def made_of(self, at: int) -> str:
         """Return what is made of a difference: "l1", "squared", "robust" (both, or a bent l1), or "signed"."""

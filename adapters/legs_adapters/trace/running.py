@@ -61,12 +61,13 @@ def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optio
 
             check_imports(root, script)
         say(f"legs-patch: running {script} in {root} for {steps} steps; it writes where it always does", sys.stderr)
+        eager = {"TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0"}  # torch.compile and TorchScript cannot be watched
         words = [*(before or [sys.executable]), "-m", CHILD, json.dumps(spec), script, *arguments]
         code = subprocess.run(
-            words, cwd=str(root), env=child_environment(cpu), stdout=2, stdin=subprocess.DEVNULL
+            words, cwd=str(root), env=child_environment(cpu, **eager), stdout=2, stdin=subprocess.DEVNULL
         ).returncode
         content = _read(report)
-    if code:
+    if code and not content.get("is_over"):  # (a rank that waits for one that has ended fails)
         message = f"{script} ended with exit code {code}; nothing was changed. By reading: legs-patch {root}"
         raise ScriptFailed(message, code if code > 0 else 128 - code)
     if content.get("failure"):
@@ -75,10 +76,18 @@ def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optio
     if not content["steps"]:
         seen = f"{content['backward_passes']} backward passes" if content["backward_passes"] else "no backward pass"
         raise LegsError(
-            f"{script} ended before an optimiser moved what it renders ({seen} seen; torch.compile, TorchScript and "
-            f"fused kernels cannot be seen): by reading: legs-patch {root}"
+            f"{script} ended before an optimiser moved what it renders ({seen} seen): by reading: legs-patch {root}",
+            *_unseen(content["unseen"]),
         )
-    return Trace([term for term in terms if term.steps or term.poses], content["steps"], content["files"])
+    known = [term for term in terms if term.steps or term.poses]
+    if not any(term.is_photometric for term in known):
+        for line in _unseen(content["unseen"]):
+            say(f"legs-patch: warning: {line}", sys.stderr)
+    return Trace(known, content["steps"], frozenset(map(tuple, content["scripted"])))
+
+
+def _unseen(names: Sequence[str]) -> List[str]:
+    return [f"a trace cannot look into fused kernels, as these under the loss: {', '.join(names)}"] if names else []
 
 
 def child_environment(cpu: bool, **settings: str) -> Dict[str, str]:
@@ -119,4 +128,4 @@ def _read(report: Path) -> Dict[str, Any]:
     try:
         return json.loads(report.read_text())
     except (OSError, ValueError):  # it was killed
-        return {"terms": [], "steps": 0, "backward_passes": 0, "files": 0}
+        return {"terms": [], "steps": 0, "backward_passes": 0, "unseen": []}

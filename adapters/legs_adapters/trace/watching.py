@@ -1,7 +1,7 @@
 """Watch torch's differences in this process: what is subtracted, under which loss, and what is stepped after it.
 
 A difference that wants a gradient leaves a record in the metadata of its graph node, so that it lives as long as the
-graph does: numbers, frames and a thumbnail. Nothing of a backward pass is kept after it but numbers.
+graph does. Nothing of a backward pass is kept after it but numbers, and weak references to the leaves.
 """
 
 from __future__ import annotations
@@ -9,24 +9,29 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Tuple
+import weakref
+from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import torch
 
+import legs_loss
+import legs_loss.runtime
 from legs_adapters.trace.graph import KEY, Graph
-from legs_adapters.trace.photographs import SURE, Photographs, thumbnail
+from legs_adapters.trace.photographs import SURE, Photographs, as_planes, thumbnail
 
 __all__ = ["Watch"]
 
 _SAMPLE = 4096  # values of a leaf that are compared over a step
 _POSE = 16  # numbers of a pose, an exposure
 _OWN = ("legs_adapters.", "legs_loss.")
-_OWNERS = (  # where torch has each difference; the operand from which is subtracted comes first but in __rsub__
+_OWNERS: Sequence[Tuple[Any, Sequence[str], str]] = (  # where torch has each; all but __rsub__ subtract from the first
     (torch.Tensor, ("__sub__", "__rsub__", "__isub__", "sub", "sub_", "subtract", "subtract_"), "difference"),
     (torch, ("sub", "subtract", "rsub"), "difference"),
     (torch.nn.functional, ("l1_loss",), "l1"),
     (torch.nn.functional, ("mse_loss",), "squared"),
     (torch.nn.functional, ("smooth_l1_loss", "huber_loss"), "robust"),
+    (legs_loss, ("l1_loss",), "weighted"),
+    (legs_loss.runtime, ("l1_loss",), "weighted"),
 )
 
 Frame = Tuple[str, int, str, Tuple[str, ...]]
@@ -50,22 +55,38 @@ def _harmless(own: Any) -> Any:
 
 
 class _Record(NamedTuple):
-    """A difference: its kind, frames, which operand is the target, and that one's thumbnail and shape."""
+    """A difference: its kind, frames, which operand is the target (-1: both are trained), that one, and its values."""
 
     kind: str
     frames: Tuple[Frame, ...]
     target: int
-    picture: Optional[Any]
-    shape: Tuple[int, ...]
+    still: Any
     values: Any
     shares: List[Any]
 
 
-class _Pending(NamedTuple):
-    """A term of a backward pass whose step is awaited, and the values of the leaves under it."""
+class _Sample(NamedTuple):
+    """Values of a leaf before its step; of the leaf a weak reference."""
 
-    term: Dict[str, Any]
-    leaves: Dict[int, Tuple[Any, Any, Any]]
+    leaf: Any
+    at: Any
+    values: Any
+
+    @classmethod
+    def of(cls, leaf: Any) -> _Sample:
+        """Take the values that the gradient moves most; without a gradient some everywhere."""
+        flat, gradient = leaf.detach().reshape(-1), leaf.grad
+        if gradient is not None and not gradient.is_sparse and gradient.numel() == flat.numel():
+            at = gradient.detach().reshape(-1).abs().topk(min(8, flat.numel())).indices
+        else:
+            at = torch.arange(0, flat.numel(), max(1, flat.numel() // _SAMPLE), device=flat.device)
+        return cls(weakref.ref(leaf), at, flat[at].clone())
+
+    def has_changed(self) -> bool:
+        leaf = self.leaf()
+        if leaf is None or leaf.numel() <= (int(self.at.max()) if self.at.numel() else 0):
+            return False
+        return not torch.equal(leaf.detach().reshape(-1)[self.at], self.values)
 
 
 class Watch:
@@ -86,22 +107,37 @@ class Watch:
         self.steps: int = 0
         self.backward_passes: int = 0
         self.terms: Dict[Any, Dict[str, Any]] = {}
-        self._pending: List[_Pending] = []
-        self._files: Dict[str, Optional[str]] = {}
-        self._inside = False
-        self._names: Dict[int, str] = {}
+        self.unseen: Set[str] = set()
+        self.scripted: Set[Tuple[str, str]] = (
+            set()
+        )  # files and names of TorchScript's functions, where nothing is edited
         self.failure = ""
+        self._waiting: Dict[Any, Set[int]] = {}  # terms whose step is awaited, with the ids of the leaves under each
+        self._samples: Dict[int, _Sample] = {}
+        self._files: Dict[str, Optional[str]] = {}
+        self._names: Dict[int, str] = {}
+        self._inside = False
 
     def install(self) -> None:
         """Wrap torch's differences, its backward passes and its optimisers, for good."""
         for owner, names, kind in _OWNERS:
             for name in names:
                 if hasattr(owner, name):
-                    own = getattr(owner, name)
-                    setattr(owner, name, self._difference(own, kind, name in ("__rsub__", "rsub")))
+                    setattr(owner, name, self._difference(getattr(owner, name), kind, name in ("__rsub__", "rsub")))
         for name in ("backward", "grad"):
             setattr(torch.autograd, name, self._backward(getattr(torch.autograd, name)))
-        self._compiled()
+        self._functions()
+        jit: Any = torch.jit
+        own_script = jit.script
+
+        def script(given: Any, *args: Any, **kwargs: Any) -> Any:
+            code: Any = getattr(getattr(given, "forward", given), "__code__", None)
+            path = self._inside_root(code.co_filename) if code is not None else None
+            if path is not None:
+                self.scripted.add((path, code.co_name))
+            return own_script(given, *args, **kwargs)
+
+        jit.script = functools.wraps(own_script)(script)
         optimiser: Any = torch.optim.Optimizer
         own_init, wrapped = optimiser.__init__, self._step
 
@@ -118,17 +154,26 @@ class Watch:
     def _difference(self, own: Any, kind: str, is_reversed: bool) -> Any:
         @functools.wraps(own, updated=())
         def watched(*args: Any, **kwargs: Any) -> Any:
-            made = own(*args, **kwargs)
-            if not self._inside and getattr(made, "requires_grad", False) and made.grad_fn is not None:
-                sides = [*args, *(kwargs[name] for name in ("input", "other", "target") if name in kwargs)][:2]
+            if self._inside:
+                return own(*args, **kwargs)
+            weighted = legs_loss.runtime.counts().weighted
+            self._inside = kind == "weighted"
+            try:
+                made = own(*args, **kwargs)
+            finally:
+                self._inside = False
+            if getattr(made, "requires_grad", False) and made.grad_fn is not None:
+                names = ("input", "other", "prediction", "target")
+                sides = [*args, *(kwargs[name] for name in names if name in kwargs)][:2]
                 if len(sides) == 2 and all(isinstance(side, torch.Tensor) for side in sides):
-                    self._record(kind, sides[::-1] if is_reversed else sides, made)
+                    is_plain = kind == "weighted" and legs_loss.runtime.counts().weighted == weighted
+                    self._record("plain" if is_plain else kind, sides[::-1] if is_reversed else sides, made)
             return made
 
         return watched
 
-    def _compiled(self) -> None:
-        """Watch autograd functions of other modules, a compiled loss say, that are given both pictures."""
+    def _functions(self) -> None:
+        """Watch autograd functions of other modules, a fused loss say, that are given both pictures."""
         function: Any = torch.autograd.Function
         own = function.__dict__.get("apply")
 
@@ -148,17 +193,13 @@ class Watch:
     def _record(self, kind: str, sides: Sequence[Any], made: Any) -> None:
         moving = [side.requires_grad for side in sides]
         largest = max(sides, key=lambda side: side.numel())
-        if largest.dim() < 2 or largest.numel() < 64 or not any(moving):
-            return
-        target = -1 if all(moving) else moving.index(False)
-        frames = self._frames(sides)
-        if not frames:
-            return
-        still = sides[target] if target >= 0 else sides[1]
-        picture = thumbnail(still) if target >= 0 else None
         node = made.grad_fn
-        record = _Record(kind, frames, target, picture, tuple(still.shape), made.detach(), [])
-        if KEY not in node.metadata:  # of nested functions the inner one
+        if largest.dim() < 2 or largest.numel() < 64 or not any(moving) or KEY in node.metadata:
+            return  # (of nested functions the inner one is kept)
+        frames = self._frames(sides)
+        if frames:
+            target = -1 if all(moving) else moving.index(False)
+            record = _Record(kind, frames, target, sides[target if target >= 0 else 1].detach(), made.detach(), [])
             node.metadata[KEY] = record
             node.register_hook(functools.partial(_share, record.shares, record.values))
 
@@ -189,7 +230,7 @@ class Watch:
         def watched(tensors: Any, *args: Any, **kwargs: Any) -> Any:
             if self._inside:
                 return own(tensors, *args, **kwargs)
-            self._settle(False)  # what was stepped without an optimiser of torch's
+            self._settle()  # what was stepped without an optimiser of torch's
             roots = list(tensors) if isinstance(tensors, (tuple, list)) else [tensors]
             seen = self._seen(roots) or []
             made = own(tensors, *args, **kwargs)
@@ -199,45 +240,46 @@ class Watch:
         return watched
 
     @_harmless
-    def _seen(self, roots: Sequence[Any]) -> List[Tuple[_Record, str, Dict[int, Any]]]:
-        """Return the records under the roots, with what is made of each and the leaves that it leads to."""
-        graph = Graph.under([getattr(root, "grad_fn", None) for root in roots])
+    def _seen(self, roots: Sequence[Any]) -> List[Tuple[_Record, Any, List[Any]]]:
+        """Return the records under the roots, the key of the term of each, and the leaves that it leads to."""
+        graph = Graph.under(getattr(root, "grad_fn", None) for root in roots)
+        self.unseen |= graph.foreign()
         found = []
         for at, record in graph.records().items():
             record.shares.clear()
             kind = graph.made_of(at) if record.kind == "difference" else record.kind
             if record.kind == "l1" and graph.made_of(at) not in ("signed", "l1"):
                 kind = "robust"
-            found.append((record, kind, graph.leaves(at)))
+            if kind == "l1" or (record.target >= 0 and (kind != "signed" or as_planes(record.still) is not None)):
+                found.append((record, self._term(record, kind), graph.leaves(at)))
         return found
 
+    def _term(self, record: _Record, kind: str) -> Any:
+        """Return the key of a term; those with the same frames, kind and target are one."""
+        picture = thumbnail(record.still) if record.target >= 0 else None
+        match = self.photographs.match(picture) if picture is not None else None
+        known = None if match is None or match.correlation < SURE else match.is_photograph
+        key = record.frames, kind, record.target, known
+        self.terms.setdefault(key, {
+            "frames": [list(frame) for frame in record.frames], "kind": kind, "target": record.target,
+            "shape": list(record.still.shape), "is_picture": picture is not None, "match": match and match._asdict(),
+            "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
+        })  # fmt: skip
+        return key
+
     @_harmless
-    def _sum_up(self, roots: Sequence[Any], seen: Sequence[Tuple[_Record, str, Dict[int, Any]]]) -> None:
+    def _sum_up(self, roots: Sequence[Any], seen: Sequence[Tuple[_Record, Any, List[Any]]]) -> None:
         self.backward_passes += 1
         loss = sum(float(root.detach().sum()) for root in roots)
-        samples: Dict[int, Tuple[Any, Any, Any]] = {}
-        for record, kind, leaves in seen:
+        for record, key, leaves in seen:
             if not record.shares:
                 continue  # its gradient was not asked for
-            term = self._term(record, kind)
             share = sum(float(part) for part in record.shares) / (loss or 1.0)
-            term["shares"].append(share / 2 if kind == "squared" else share)
-            for at, leaf in leaves.items():
-                if at not in samples:
-                    samples[at] = _sample(leaf)
-            self._pending.append(_Pending(term, {at: samples[at] for at in leaves}))
-
-    def _term(self, record: _Record, kind: str) -> Dict[str, Any]:
-        """Return the entry of a term; those with the same frames, kind and target are one."""
-        match = self.photographs.match(record.picture) if record.picture is not None else None
-        is_known = match is not None and match.correlation >= SURE
-        key = (record.frames, kind, record.target, is_known, is_known and match.is_photograph)  # type: ignore
-        fresh = {
-            "frames": [list(frame) for frame in record.frames], "kind": kind, "target": record.target,
-            "shape": list(record.shape), "is_picture": record.picture is not None, "match": match and match._asdict(),
-            "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
-        }  # fmt: skip
-        return self.terms.setdefault(key, fresh)
+            self.terms[key]["shares"].append(share / 2 if self.terms[key]["kind"] == "squared" else share)
+            self._waiting.setdefault(key, set()).update(map(id, leaves))
+            for leaf in leaves:
+                if id(leaf) not in self._samples or self._samples[id(leaf)].leaf() is not leaf:
+                    self._samples[id(leaf)] = _Sample.of(leaf)
 
     # -- steps
 
@@ -248,60 +290,53 @@ class Watch:
             if not self._inside:
                 for group in optimiser.param_groups:
                     self._names.update((id(leaf), str(group.get("name", ""))) for leaf in group["params"])
-                self._settle(True)
+                self._settle()
             return made
 
         step.legs_watched = True  # type: ignore[attr-defined]
         return step
 
-    def _settle(self, is_step: bool) -> None:
+    def _settle(self) -> None:
         """See which leaves changed since their backward pass; end the script after enough steps.
 
-        Without a step of an optimiser, as of a fused one, what has not changed waits on: gradients are accumulated.
+        What has not changed waits on: for another optimiser, or until enough gradients are accumulated.
         """
-        self._inside = True
-        try:
-            changed: Dict[int, bool] = {}
-            waiting, is_counted = [], False
-            for term, leaves in self._pending:
-                for at, sample in leaves.items():
-                    if at not in changed:
-                        changed[at] = _has_changed(sample)
-                stepped = [leaves[at][0] for at in leaves if changed[at]]
-                if stepped:
-                    is_counted = self._stepped(term, stepped) or is_counted
-                left = {at: sample for at, sample in leaves.items() if not changed[at]}
-                if left and not (stepped or is_step):
-                    waiting.append(_Pending(term, left))
-                elif left and is_step and not stepped:
-                    waiting.append(_Pending(term, left))  # of another optimiser, that steps next
-            self._pending = waiting[-64:]
-            self.steps += is_counted
-        finally:
-            self._inside = False
-        if is_counted and self.steps >= self.limit:
+        if self._changes() and self.steps >= self.limit:
             self.ended()
+
+    @_harmless
+    def _changes(self) -> bool:
+        """Count a step of the terms of which a leaf changed; return whether one is of more than poses."""
+        changed = {at for at, sample in self._samples.items() if sample.has_changed()}
+        is_counted = False
+        for key, leaves in list(self._waiting.items()):
+            if leaves & changed:
+                is_counted |= self._stepped(self.terms[key], [self._samples[at].leaf() for at in leaves & changed])
+                del self._waiting[key]
+        awaited = set().union(*self._waiting.values()) - changed
+        self._samples = {
+            at: sample for at, sample in self._samples.items() if at in awaited and sample.leaf() is not None
+        }
+        self.steps += is_counted
+        return is_counted
 
     def _stepped(self, term: Dict[str, Any], leaves: Sequence[Any]) -> bool:
         """Record what was stepped after a term; return whether it is more than poses, exposures and embeddings."""
         firsts = [leaf.shape[0] for leaf in leaves if leaf.dim() > 1]
         common = max(set(firsts), key=firsts.count) if firsts else 0
-        is_model = [leaf for leaf in leaves if not self._is_of_views(leaf, firsts)]
-        term["steps"] += bool(is_model)
+        is_model = not all(self._is_of_views(leaf, firsts) for leaf in leaves)
+        term["steps"] += is_model
         term["poses"] += not is_model
         if firsts.count(common) > 2:
             term["gaussians"] = common
-        known = {self._names.get(id(leaf)) or "" for leaf in leaves}
-        term["parameters"] = sorted({*term["parameters"], *(name for name in known if name)})
+        term["parameters"] = sorted({*term["parameters"], *(self._names.get(id(leaf), "") for leaf in leaves)} - {""})
         term["stepped"] = sorted({*map(tuple, term["stepped"]), *(tuple(leaf.shape) for leaf in leaves)})[:32]
-        return bool(is_model)
+        return is_model
 
     def _is_of_views(self, leaf: Any, firsts: Sequence[int]) -> bool:
         """Return whether a leaf is a pose or an exposure, or a table of such, or of embeddings, a row a view."""
-        if leaf.numel() <= _POSE:
-            return True
         rows = leaf.shape[0] if leaf.dim() > 1 else 0
-        return 0 < rows <= len(self.photographs) and firsts.count(rows) < 3
+        return leaf.numel() <= _POSE or (0 < rows <= len(self.photographs) and firsts.count(rows) < 3)
 
 
 def _share(shares: List[Any], values: Any, _: Any, gradients: Sequence[Any]) -> None:
@@ -318,23 +353,3 @@ def _names(frame: Any, sides: Sequence[Any]) -> Tuple[str, ...]:
             if value is side and not found[at]:
                 found[at] = name
     return tuple(found)
-
-
-def _sample(leaf: Any) -> Tuple[Any, Any, Any]:
-    """Return a leaf with values of it that its gradient moves, before the step."""
-    with torch.no_grad():
-        flat = leaf.detach().reshape(-1)
-        gradient = leaf.grad
-        if gradient is not None and not gradient.is_sparse and gradient.numel() == flat.numel():
-            at = gradient.detach().reshape(-1).abs().topk(min(8, flat.numel())).indices
-        else:
-            at = torch.arange(0, flat.numel(), max(1, flat.numel() // _SAMPLE), device=flat.device)
-        return leaf, at, flat[at].clone()
-
-
-def _has_changed(sample: Tuple[Any, Any, Any]) -> bool:
-    leaf, at, before = sample
-    if leaf.numel() <= (int(at.max()) if at.numel() else 0):
-        return False
-    with torch.no_grad():
-        return not torch.equal(leaf.detach().reshape(-1)[at], before)

@@ -78,10 +78,10 @@ def _tracing(spec: Dict[str, Any]) -> None:
 
     def ended() -> None:
         _over.append(True)
+        write()  # before Python 3.9 a spawned process forgets what it was to call at its end
         if len(_over) > 1:  # the script went on
-            write()
             os._exit(0)
-        sys.exit()
+        sys.exit(0)  # (without the 0, a process of multiprocessing fails before Python 3.8)
 
     def content() -> Dict[str, Any]:
         names = ("steps", "backward_passes", "failure")

@@ -213,6 +213,22 @@ class TestCommandLine:
         assert missing.returncode == 2
         assert "train.py:3: there is no difference, absolute value or call of two images" in missing.stderr
 
+    @pytest.mark.parametrize(
+        "call", ["fast_ssim(image, gt_image)", "F.mse_loss(image, gt_image)", "lpips_fn(image, gt_image)"]
+    )
+    def test_another_measure_named_as_the_site_is_an_error_and_not_made_an_l1(self, call, tmp_path, run):
+        text = files("inria")["train.py"].replace(
+            "        loss.backward()\n", f"        other = {call}\n        loss.backward()\n"
+        )
+        assert text.count(call) == 1
+        root = checkout(tmp_path, {**files("inria"), "train.py": text})
+        before = snapshot(root)
+        line = text[: text.index(call)].count("\n") + 1
+        done = run("--site", f"train.py:{line}", root)
+        name = call.partition("(")[0].split(".")[-1]
+        assert done.returncode == 2 and f"train.py:{line}: {name} is by its name no L1" in done.stderr
+        assert snapshot(root) == before
+
     def test_a_function_that_is_settled_at_run_time_is_weighted_by_hand(self, tmp_path, run):
         texts = files("loss_from_eval_or_getattr_error")
         root = checkout(tmp_path, texts)

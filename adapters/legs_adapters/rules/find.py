@@ -14,8 +14,8 @@ from legs_adapters.code.module import Function, Module
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
-from legs_adapters.code.syntax import arguments
-from legs_adapters.lexicon.words import SPEAKS_OF_L1
+from legs_adapters.code.syntax import arguments, call_name
+from legs_adapters.lexicon.words import NO_L1, SPEAKS_OF_L1
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.masks import with_masks
 from legs_adapters.rules.order import RULES
@@ -172,8 +172,12 @@ class _Finder:
             if not self._is_chosen(function, place) or len(values) != 2 or keywords or starred:
                 continue
             if not any(place.line <= other.last_line and other.line <= place.last_line for other in known):
-                form = Called(call, call, values[0], values[1], call.func)
-                yield place, self.verdicts.decide(function, form, place, True)
+                if NO_L1.search(call_name(call)):
+                    why = f"{call_name(call)} is by its name no L1, which alone is weighted"
+                    yield place, Problem.at(function, place, why, "name the line of the L1")
+                else:
+                    form = Called(call, call, values[0], values[1], call.func)
+                    yield place, self.verdicts.decide(function, form, place, True)
                 return
 
     def _is_chosen(self, function: Function, place: Place) -> bool:

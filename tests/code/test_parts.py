@@ -171,6 +171,7 @@ def test_what_can_lead_to_an_l1_is_found_by_its_words(text: str) -> None:
         ("def inner(a, b):\n    return torch.abs(a - b)\ndef outer(a, b):\n    return inner(a, b)\n", "outer"),
         ("class Photo:\n    def forward(self, a, b):\n        return abs(a - b)\nphoto = Photo()\n", "photo"),
         ("class A:\n    def __init__(self):\n        self.photo, self.x = nn.L1Loss(), 1\n", "self.photo"),
+        ("class A:\n    def __init__(self):\n        self.__photo = nn.L1Loss()\n", "self.__photo"),
         ("def make(kind):\n    return F.l1_loss if kind else F.mse_loss\nclass A:\n    def f(self):\n"
          "        self.photo = make(1)\n", "self.photo"),
         ("def make(kind):\n    def difference(a, b):\n        return (a - b).abs()\n    return difference\n"

@@ -125,13 +125,13 @@ def _entries(text: str) -> Iterator[_Entry]:
         words = _Words.of(body)
         if name in CALLED and classes:
             yield classes[-1][1], words, words
-        if not name.startswith("__") and name != "backward":
+        if not name.endswith("__") and name != "backward":
             returned = [_held(value) for value in _RETURNED.findall(body)]
             yield f"{name}()", _NONE, _NONE if not returned else _joined(returned)
             is_l1 = _takes_two(body) and (SPEAKS_OF_LOSS.search(name) or not _BRANCHES.search(body))
             yield name, words, words if is_l1 else _Words(frozenset([f"{name}()"]), False)
     for match in _GIVEN.finditer(text):
-        if not match.group(1).startswith("__") and match.group(1) != "_":
+        if not match.group(1).endswith("__") and match.group(1) != "_":
             made = _SINGLE_CALL.match(match.group(2))  # what its function makes: arguments do not change that
             single = made is not None and made.group(1) not in HOLDERS
             leads = made.group(1).split(".")[-1] if made and single else match.group(2)

@@ -140,7 +140,8 @@ def total_loss(
     Args:
         made: in words where the weights come from, for the first step's line; empty where there are none.
     """
-    _note(prediction, target, made)
+    if lambda_dssim < 1.0:  # else there is no L1
+        _note(prediction, target, made)
     fused = fused_loss(prediction, target, weights, lambda_dssim, padding)
     if fused is not None:
         return fused

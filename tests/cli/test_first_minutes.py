@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import shlex
 import shutil
@@ -20,7 +19,7 @@ from legs_loss.cli import main
 from legs_loss.errors import did_you_mean
 from legs_loss.precompute import precompute
 from legs_loss.scenes import read_scene
-from tests.support import ROOT, colmap_scene, legs_command, legs_environment, photograph, save
+from tests.support import ROOT, colmap_scene, legs_environment, photograph, save
 
 
 @pytest.fixture
@@ -274,24 +273,6 @@ class TestFirstQuarterOfAnHour:
         assert lines[0].endswith(
             f"needs {package}: pip install {package}, or, in the checkout of legs-loss, pip install '.[{extra}]'"
         )
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
-def test_a_screen_is_told_of_compiling_before_the_first_map(scene):
-    import pty
-
-    child, screen = pty.fork()
-    if child == 0:
-        os.execve(sys.executable, legs_command("precompute", scene, "--workers", "1"), legs_environment())
-    shown = b""
-    try:
-        while True:
-            shown += os.read(screen, 4096) or b""
-    except OSError:  # the child has closed it
-        assert os.waitpid(child, 0)[1] == 0, shown
-    os.close(screen)
-    first, _, rest = shown.partition(b"\n")
-    assert b"the first time on a machine it compiles" in first and b" made, " in rest, shown
 
 
 class TestCommandsToCopy:

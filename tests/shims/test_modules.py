@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from legs_adapters.shims.modules import diff_gaussian_rasterization as inria
 from legs_adapters.shims.modules import fused_ssim, lpips, simple_knn, torch_scatter, torchvision
 
 from legs_loss import ssim
+from legs_loss.counting import counted
 from tests.shims.support import Dense, camera, close, draw, gaussians
 from tests.support import ROOT
 
@@ -115,10 +117,16 @@ class TestOthers:
         found = fused_ssim.fused_ssim(first, second, padding)
         found.backward()
         gradient, first.grad = first.grad, None
-        wanted = ssim(first, second, ours)
+        wanted = ssim(first, second, padding=ours)
         wanted.backward()
         assert found.item() == pytest.approx(wanted.item(), abs=1e-5)
         close(gradient, first.grad, 1e-3)
+
+    def test_fused_ssim_is_no_step_of_the_loss(self):
+        first, second = torch.rand(2, 1, 3, 30, 40).unbind(0)
+        before = replace(counted)
+        fused_ssim.fused_ssim(first.requires_grad_(True), second).backward()
+        assert counted == before
 
     def test_fused_ssim_is_the_same_with_legs_off(self, monkeypatch):
         # `legs-patch --verify` compares the unpatched losses with those of LEGS_OFF=1, to the last bit.

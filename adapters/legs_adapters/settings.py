@@ -37,7 +37,7 @@ def settings_text(root: Path, given: Mapping[str, Any]) -> str:
         given: by name (preset, beta, curve, operator, store) the settings that the user gave.
 
     Raises:
-        LegsError: a setting is unknown or out of range.
+        LegsError: a setting is unknown or out of range, or the store's path is no text.
     """
     name = given.get("preset") or "legs"
     if name not in PRESETS:
@@ -49,9 +49,20 @@ def settings_text(root: Path, given: Mapping[str, Any]) -> str:
     if "store" in given:
         full = Path(os.path.abspath(os.path.expanduser(given["store"])))
         store = (full.relative_to(root) if root in (full, *full.parents) else full).as_posix()
+        if not _is_unicode(store):
+            raise LegsError(f"--store {given['store']}: its name is not in UTF-8, as legs.toml is: rename the folder")
     values = {"preset": name, "beta": spec.beta, "curve": spec.curve, "operator": spec.operator, "store": store}
     lines = [
-        f"{'' if key in given or key == 'preset' else '# '}{key} = {json.dumps(value)}  # {_COMMENTS[key]}\n"
+        f"{'' if key in given or key == 'preset' else '# '}{key} = {_toml(value)}  # {_COMMENTS[key]}\n"
         for key, value in values.items()
     ]
     return _HEAD + "".join(lines)
+
+
+def _toml(value: Any) -> str:
+    """Return a value as TOML: JSON, but characters as they are, since JSON's surrogate pairs are none of TOML."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _is_unicode(text: str) -> bool:
+    return text == text.encode("utf-8", "ignore").decode()

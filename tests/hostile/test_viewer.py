@@ -64,6 +64,22 @@ def page(request, tmp_path_factory):
     server.stop()
 
 
+@pytest.mark.parametrize(
+    ("path", "cookie"), [("/", "legs_view_{}=\u00e9\udce9"), ("/", "\u00e9"), ("//[", ""), ("//[?token=a", "")]
+)
+def test_what_is_no_text_is_refused_and_not_an_error(path, cookie):
+    from legs_loss.lab.viewer.guard import Guard
+
+    class Headers(dict):
+        def get_all(self, name):
+            return [self[name]] if name in self else []
+
+    guard = Guard("127.0.0.1")
+    headers = Headers({"Host": "127.0.0.1:8080", "Cookie": cookie.format(8080)})
+    assert "with its token" in guard.refusal(8080, path, headers)
+    assert guard.refusal(8080, f"{path}?token={guard.token}".replace("?token=a?", "?"), headers) is None
+
+
 def types(connection):
     """Return the kinds of messages that a server sends at first."""
     found = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 
@@ -212,6 +213,21 @@ class TestCommandLine:
         missing = run("--site", "train.py:3", root)
         assert missing.returncode == 2
         assert "train.py:3: there is no difference, absolute value or call of two images" in missing.stderr
+
+    @pytest.mark.parametrize("name", ["maps \U0001f600 \u00e9", 'a "quoted" \\ one', "del \x7f, tab \t"])
+    def test_a_store_of_any_name_is_read_back_from_legs_toml(self, name, tmp_path, run):
+        root = checkout(tmp_path, files("inria"))
+        done = run("--store", str(root / name), root)
+        assert done.returncode == 0, done.stderr
+        assert find_config(root / "train.py", argv=[], environ={}).store == root / name
+
+    @pytest.mark.skipif(os.name != "posix", reason="paths are bytes on POSIX only")
+    def test_a_store_that_is_no_text_is_refused_before_anything_is_written(self, tmp_path, run):
+        root = checkout(tmp_path, files("inria"))
+        before = snapshot(root)
+        done = run("--store", os.fsdecode(b"maps-\xe9"), root)
+        assert done.returncode == 2 and "its name is not in UTF-8" in done.stderr
+        assert len(done.stderr.splitlines()) == 1 and snapshot(root) == before
 
     @pytest.mark.parametrize(
         "call", ["fast_ssim(image, gt_image)", "F.mse_loss(image, gt_image)", "lpips_fn(image, gt_image)"]

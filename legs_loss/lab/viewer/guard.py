@@ -52,11 +52,12 @@ class Guard:
             return f"this page is reached by its own name and the port {port} only"
         if origins and origins != [f"http://{hosts[0]}"]:
             return "a request of another page"
-        query = parse_qs(urlsplit(path).query)
+        query = parse_qs(path.partition("?")[2])
         if "websocket" in query:  # viser's page would obey that server
             return "this page shows no other server"
         known = self.token.encode()
-        if not any(secrets.compare_digest(given.encode(), known) for given in _tokens(query, port, headers)):
+        given = (token.encode("utf-8", "surrogatepass") for token in _tokens(query, port, headers))
+        if not any(secrets.compare_digest(token, known) for token in given):
             return "open the whole address that legs view printed, with its token"
         return None
 

@@ -156,7 +156,7 @@ LABORIOUS = {
     "20 loops": (loops(20), True),
     "95 loops": (loops(95), False),  # Python compiles 20
     "a sum of 100 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 100)), True),
-    "a sum of 601 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 601)), True),
+    "a sum of 550 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 550)), True),
     "650 lambdas": ("def f():\n    g = " + "lambda: " * 650 + "0\n", True),
     "1,500 lambdas": ("def f():\n    g = " + "lambda: " * 1500 + "0\n", False),
     "1,000 functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(1000)), True),
@@ -259,7 +259,7 @@ STATEMENTS = {
 
 
 # Each reads a name that all before it may have bound: n statements, n times n ways. So their steps grow, not more.
-JOINED = {"augmented", "append", "in place", "if", "if alone", "for", "for else", "while", "try"}
+JOINED = {"augmented", "append", "in place", "if", "if alone", "for", "for else", "while", "try", "loss"}
 MANY_WAYS = {False: 4.6, True: 7}  # with --masks each of them is asked from each read
 
 

@@ -116,10 +116,6 @@ class Function:
                 self._flow = Flow(cst.Module(body=[]), parameters)
         return self._flow
 
-    def walked(self) -> bool:
-        """Count a walk over all of it that a rule takes for one term; return whether its file's analysis goes on."""
-        return self.module.spend(self.flow.steps)
-
     @property
     def parameters(self) -> List[str]:
         """Positional parameters' names, ``self`` and ``cls`` excepted."""

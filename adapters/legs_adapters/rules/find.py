@@ -35,7 +35,6 @@ __all__ = ["find"]
 
 _Entry = Tuple[Place, Union[Site, Left, Problem]]
 
-_RULES = 100  # steps of all that are asked for a term; what walks over its function counts that itself
 _TEXT = 50  # letters of a text that are searched in a step
 _MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|\bunweighted\(")
 _TO_READ = re.compile(f"{_MAY_HAVE_L1.pattern}|{TRAINS.pattern}")
@@ -147,7 +146,7 @@ class _Finder:
 
     def _of_forms(self, function: Function) -> Iterator[_Entry]:
         for form in self.analysis.forms.in_function(function):
-            if not function.module.spend(_RULES):
+            if not function.module.spend(function.flow.steps):  # some rules look at all of it
                 return
             place = function.place(form.node)
             chosen = self._is_chosen(function, place)

@@ -23,11 +23,9 @@ def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[c
     Returns:
         The reads that are the loss, and the others: a mask or a threshold is made of them.
     """
-    if not form.is_map or not function.walked():
-        return [], []
     named = [d for d in function.flow.every_definition if d.kind == "assign"]
     made = [d for d in named if d.value is form.node or _averages(d.value, form.node)]
-    if not made or "." in made[0].place:
+    if not form.is_map or not made or "." in made[0].place:
         return [], []
     unused: List[cst.CSTNode] = []
     masks: List[cst.CSTNode] = []
@@ -66,8 +64,6 @@ def _averages(value: Optional[cst.CSTNode], node: cst.CSTNode) -> bool:
 
 def is_measured(function: Function, form: Form) -> bool:
     """Return whether a term is only a number: ``error.mean().item()``, or compared, ``abs(height - wanted) > 0.1``."""
-    if not function.walked():
-        return False
     numbers = [part for call in function.flow.calls if call_name(call) in LEAVES for part in attribute_chain(call)]
     compared = [part.left for part in walk_expressions(function.body) if isinstance(part, cst.Comparison)]
     return any(part is form.node for part in (*numbers, *compared))

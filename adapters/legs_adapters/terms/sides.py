@@ -81,8 +81,6 @@ def of_rays(form: Form) -> bool:
 
 def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
     """Return whether an SSIM is computed of the same two expressions: they are images then, whatever their names."""
-    if not function.walked():
-        return False
     calls = [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
     return any(all(_is_given(function, call, side) for side in (first, second)) for call in calls)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -105,7 +106,7 @@ CASES = {
 
 class TestWhichTerm:
     @pytest.mark.parametrize("name", sorted(CASES))
-    def test_the_photographs_line_and_no_other(self, tmp_path, name):
+    def test_the_photographs_line_and_no_other(self, tmp_path, name, monkeypatch):
         report, line, done = traced(tmp_path, CASES[name])
         assert weighted(report) == [line], done.stderr
         known = [term for term in report["traced"] if term["is_photometric"]]
@@ -171,10 +172,14 @@ class TestWhichTerm:
 
 class TestWaysToTrain:
     @pytest.mark.parametrize("name", WAYS)
-    def test_the_photographs_line_and_no_other(self, tmp_path, name):
+    def test_the_photographs_line_and_no_other(self, tmp_path, name, monkeypatch):
         train, modules = WAYS[name]
         for module in modules:
             pytest.importorskip(module)
+        # Beside this Python, whose environment need not be activated.
+        monkeypatch.setenv("PATH", os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]]))
+        if name == "torchrun" and shutil.which("torchrun") is None:
+            pytest.skip("torchrun is not installed beside this Python")
         before = "torchrun --nproc_per_node 2 --master_port 29547 " if name == "torchrun" else ""
         report, line, done = traced(tmp_path, train, before=before, steps=4)
         assert weighted(report) == [line], done.stderr

@@ -138,9 +138,8 @@ class Backends:
             before = self._found.get((name, _indexed(device)))
             tried = frozenset() if before is None else before.tried
             wanted = backend.offers if operation is None else backend.offers & {operation}
-            with torch.inference_mode(
-                False
-            ), backend.preparing():  # the first call may be in an evaluation; the trial needs gradients
+            # The first call may be in an evaluation, and the trial needs gradients.
+            with torch.inference_mode(False), backend.preparing():
                 problem = difference_from_torch(backend, device, wanted - tried)
         except (NotNow, MemoryError, OUT_OF_MEMORY, DeviceFault):
             raise

@@ -11,10 +11,10 @@ import os
 import signal
 import subprocess
 import sys
-import traceback
 
 import pytest
 
+from tests.hostile.forked import forked
 from tests.support import ROOT, legs_environment
 
 pytestmark = [
@@ -51,40 +51,26 @@ def test_at_many_points(what, name, tiny_scene, tmp_path):
 
 def _fork(arguments, act=None, at=0, folder=""):
     """Run ``legs`` in a forked process that acts before its n-th operation; return its status, words and count."""
-    words, written = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.dup2(written, 1)
-        os.dup2(written, 2)
-        sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        seen = [0]
+    seen = [0]
 
-        def hook(event, found):
-            if event in EVENTS and str(found[0]).startswith(folder) and _writes(event, found):
-                seen[0] += 1
-                if seen[0] == at:
-                    act()
+    def hook(event, found):
+        if event in EVENTS and str(found[0]).startswith(folder) and _writes(event, found):
+            seen[0] += 1
+            if seen[0] == at:
+                act()
 
+    def command():
         sys.addaudithook(hook)
         from legs_loss.cli import main
 
-        code = 99
         try:
-            code = main(arguments)
-        except BaseException:
-            traceback.print_exc()
+            return main(arguments)
         finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os.write(1, f"\noperations {seen[0]}".encode())
-            os._exit(code)
-    os.close(written)
-    with os.fdopen(words, errors="replace") as file:
-        said = file.read()
-    status = os.waitpid(child, 0)[1]
+            print(f"\noperations {seen[0]}", flush=True)
+
+    status, said = forked(command)
     code = -(status & 127) if status & 127 else status >> 8
-    return code, said, int(said.rpartition("operations ")[2] or 0) if "operations " in said else 0
+    return code, said, int(said.rpartition("operations ")[2].split()[0]) if "operations " in said else 0
 
 
 def _writes(event, found):

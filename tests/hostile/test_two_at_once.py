@@ -32,6 +32,7 @@ from legs_loss.lab.ply import read_ply, write_ply
 from legs_loss.lab.training.checkpoint import read_checkpoint, write_checkpoint
 from legs_loss.scenes import Camera, PointCloud, View, load_training_image, read_scene
 from legs_loss.system import write_whole
+from tests.hostile.forked import forked
 from tests.patcher.support import checkout, legs_patch, snapshot
 from tests.support import legs_command, legs_environment
 
@@ -186,28 +187,16 @@ def at_line(number, action):
 
 def traced(arguments, number, action):
     """Run legs-patch in a child that acts on itself at the n-th line; return its status, words and line count."""
-    read, written = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.dup2(written, 1)
-        os.dup2(written, 2)
-        sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def command():
         trace, lines = at_line(number, action)
-        code = 99
-        try:
-            sys.settrace(trace)
-            code = main([str(word) for word in arguments])
-            sys.settrace(None)
-            print(f"lines {lines[0]}")
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
-    os.close(written)
-    with os.fdopen(read) as file:
-        said = file.read()
-    return os.waitpid(child, 0)[1], said
+        sys.settrace(trace)
+        code = main([str(word) for word in arguments])
+        sys.settrace(None)
+        print(f"lines {lines[0]}")
+        return code
+
+    return forked(command)
 
 
 def lines_of(arguments):
@@ -216,34 +205,21 @@ def lines_of(arguments):
 
 def interrupted(arguments, root, number):
     """Run legs-patch in a child that gets Ctrl-C before its n-th operation on files of a checkout; return its words."""
-    read, written = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.dup2(written, 1)
-        os.dup2(written, 2)
-        sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        seen = [0]
+    seen = [0]
 
-        def hook(event, found):
-            is_there = bool(found) and (str(found[0]).startswith(str(root)) or not os.path.isabs(str(found[0])))
-            if is_there and (event == "open" or event.startswith("os.")):  # a name beside a folder's descriptor, too
-                seen[0] += 1
-                if seen[0] == number:
-                    os.kill(os.getpid(), signal.SIGINT)
+    def hook(event, found):
+        is_there = bool(found) and (str(found[0]).startswith(str(root)) or not os.path.isabs(str(found[0])))
+        if is_there and (event == "open" or event.startswith("os.")):  # a name beside a folder's descriptor, too
+            seen[0] += 1
+            if seen[0] == number:
+                os.kill(os.getpid(), signal.SIGINT)
 
-        code = 99
-        try:
-            sys.addaudithook(hook)
-            code = main([str(word) for word in arguments])
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
-    os.close(written)
-    with os.fdopen(read) as file:
-        said = file.read()
-    return f"{os.waitpid(child, 0)[1] >> 8} {said}"
+    def command():
+        sys.addaudithook(hook)
+        return main([str(word) for word in arguments])
+
+    status, said = forked(command)
+    return f"{status >> 8} {said}"
 
 
 PLAIN = {name: text.encode() for name, text in SOURCES.items()}

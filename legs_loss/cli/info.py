@@ -74,12 +74,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _without_store(path: Path) -> str:
     """Return the error message for a folder that is not a store."""
+    from legs_loss.cli.shared.scene_arguments import read_noted
     from legs_loss.errors import LegsError
-    from legs_loss.scenes import read_scene
     from legs_loss.store import MANIFEST
 
     try:
-        views = read_scene(path).views
+        views = read_noted(path).views
     except LegsError as error:
         return f"{path} is neither a store of weight maps (it has no {MANIFEST}) nor a scene that can be read: {error}"
     return (

@@ -55,7 +55,7 @@ def reconstruct(
         overlap: compare each photograph with so many that follow it by name, for frames of a video; None compares all
             with all.
         threads: -1 for one a core.
-        tell: called with the name of each step as it begins.
+        tell: called with a line for each step as it begins, and one for what is left out.
 
     Raises:
         LegsError: pycolmap is missing, there are too few photographs, or no scene can be made of them.
@@ -63,7 +63,7 @@ def reconstruct(
     pycolmap = _pycolmap()
     names, left = _photographs(photographs)
     if left:
-        tell(left_out(left))
+        tell(f"legs: note: {left_out(left)}")
     if out.exists():
         raise LegsError(f"{out} exists already: choose another folder, or remove it")
     try:
@@ -71,13 +71,13 @@ def reconstruct(
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.part-", dir=str(out.parent)) as folder:
             work = Path(folder)
             database = work / "database.db"
-            tell(f"features of {len(names)} photographs")
+            tell(f"features of {len(names)} photographs ...")
             _extract(pycolmap, database, photographs, names, max_size, threads)
-            tell("features that photographs share")
+            tell("features that photographs share ...")
             _match(pycolmap, database, overlap, threads)
-            tell("cameras and points")
+            tell("cameras and points ...")
             model = _map(pycolmap, database, photographs, work / "models", threads)
-            tell("undistorted photographs")
+            tell("undistorted photographs ...")
             scene = _undistort(pycolmap, model, photographs, work, max_size, threads)
             placed = sorted(image.name for image in model.images.values() if image.has_pose)
             os.replace(str(scene), str(out))
@@ -105,9 +105,11 @@ def _photographs(folder: Path) -> Tuple[List[str], List[str]]:
         raise LegsError(f"there is no folder {folder}: give the folder of the photographs")
     found = sorted(path.relative_to(folder).as_posix() for path in files_below(folder, PHOTOGRAPHS))
     names = [name for name in found if name.lower().endswith(_READ)]
+    left = [name for name in found if name not in names]
     if len(names) < FEWEST:
-        raise LegsError(f"{folder}: {len(names)} photographs ({', '.join(_READ)}); at least {FEWEST} are needed")
-    return names, [name for name in found if name not in names]
+        known = f"{folder}: {len(names)} photographs ({', '.join(_READ)}); at least {FEWEST} are needed"
+        raise LegsError(f"{known}; {left_out(left)}" if left else known)
+    return names, left
 
 
 def _one_camera(folder: Path, names: Sequence[str]) -> bool:

@@ -40,3 +40,14 @@ class TestInfo:
         done = legs("info", tmp_path)
         assert done.returncode == 2
         assert "is neither a store" in done.stderr
+
+    def test_a_scene_without_a_store_or_that_cannot_be_read(self, scene):
+        done = legs("info", scene)
+        assert done.returncode == 2
+        assert f"6 photograph(s) and no weight maps yet: legs precompute {scene} makes them" in done.stderr
+        images = scene / "sparse" / "0" / "images.bin"
+        images.write_bytes(images.read_bytes().replace(b"2.png", b"\xe9.png"))
+        for command in ("info", "precompute"):  # one reason in both
+            done = legs(command, scene)
+            assert done.returncode == 2
+            assert "the name '\\xe9.png' of an image is not in UTF-8" in done.stderr

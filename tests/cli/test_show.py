@@ -12,6 +12,7 @@ from legs_loss.spec import PRESETS, WeightSpec
 from tests.support import legs, legs_environment, photograph, save
 
 pytest.importorskip("matplotlib")
+from matplotlib.axes import Axes
 
 
 def colours(path):
@@ -34,6 +35,20 @@ class TestSheet:
         for colour in ((250, 0, 10), (0, 0, 3), (251, 252, 191), (68, 1, 84), (253, 231, 36)):
             share = (np.abs(drawn.astype(int) - colour).max(1) <= 2).mean()
             assert share > 0.01, colour
+
+    def test_the_mean_weight_is_of_what_counts(self, tmp_path, monkeypatch):
+        """A response of 0 above and of 1 below, weighted 1 and 11; the mask leaves out the upper half's left half."""
+        seen = []
+        monkeypatch.setattr(Axes, "set_xlabel", lambda axes, text, **how: seen.append(text))
+        mask = np.ones((60, 80), np.float32)
+        mask[:30, :40] = 0
+        half = np.where(mask == 0, np.float32(0.5), mask)
+        weights = np.full((60, 80), 3, np.float32)
+        shown = [self.shown(), self.shown()._replace(mask=mask), self.shown()._replace(mask=half)]
+        save_sheet(tmp_path / "a.png", [*shown, shown[1]._replace(weights=weights)], WeightSpec(), "title")
+        # (1 + 1 + 11 + 11) / 4; (1 + 11 + 11) / 3; (0.5 + 1 + 11 + 11) / 3.5; three times (1 + 11 + 11) / 3
+        what = "mean weight of what counts"
+        assert seen[:4] == ["mean weight 6.00", f"{what} 7.67", f"{what} 6.71", f"{what} 23.00"]
 
     def test_a_column_a_view(self, tmp_path):
         save_sheet(tmp_path / "two.png", [self.shown()] * 2, WeightSpec(), "title")

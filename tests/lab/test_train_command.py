@@ -23,6 +23,7 @@ from legs_loss.lab.training.trainer import TrainConfig, train
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.system import FileLock
 from tests.lab.training import SHORT, assert_equal, run_until_killed
+from tests.support import colmap_scene
 
 pytest.importorskip("numba")
 
@@ -226,3 +227,27 @@ def test_missing_numba_is_one_clear_error(tiny_scene: Path, tmp_path: Path) -> N
     assert failed.returncode == 2
     assert "pip install numba, or, in the checkout of legs-loss, pip install '.[cpu]'" in failed.stderr
     assert "Traceback" not in failed.stderr
+
+
+@pytest.mark.parametrize("command", ["train", "demo", "compare", "view", "masks", "show", "info", "precompute"])
+def test_every_command_that_reads_a_scene_speaks_of_a_larger_model(command: str, tmp_path: Path, capsys: Any) -> None:
+    """A scene of one image beside a model of three; what else is wrong ends each command right after."""
+    root = colmap_scene(tmp_path / "scene", names=["1.png"])
+    three = colmap_scene(tmp_path / "three")
+    (three / "sparse" / "0").rename(root / "sparse" / "1")
+    (tmp_path / "run.ply").write_bytes(b"")
+    arguments = {
+        "train": [root, "-m", tmp_path / "out"],
+        "demo": [root, "-m", tmp_path / "out"],
+        "compare": [root, "-m", tmp_path / "out", "--iterations", 2],
+        "view": [tmp_path / "run.ply", "-s", root, "--host", "no such address"],
+        "masks": [root, "--from", "saturated"],
+        "show": [root, "--out", tmp_path / "sheet.png"],
+        "info": [root],
+        "precompute": [root, "--workers", 1],
+    }
+    code = main([command, *map(str, arguments[command])])
+    said = capsys.readouterr().err
+    assert f"note: {root / 'sparse' / '1'} has 3 images, and 0, which is read here as by 3DGS, 1: COLMAP" in said
+    if command in ("train", "demo", "compare"):
+        assert code == 2 and "of its 1 view(s) none is left to train on" in said

@@ -34,6 +34,19 @@ def test_a_file_above_the_script_is_found_up_to_the_checkouts_root(tmp_path):
     assert config.source == str(repo / "legs.toml")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_byte_order_mark(tmp_path, encoding):
+    (tmp_path / "legs.toml").write_text('# é\nstore = "mäps"\nbeta = 4\n', encoding=encoding)
+    config = find(tmp_path)
+    assert (config.store, config.spec.beta) == (tmp_path / "mäps", 4.0)
+
+
+def test_another_encoding_is_named_with_its_line(tmp_path):
+    (tmp_path / "legs.toml").write_bytes(b'beta = 4\nstore = "m\xe4ps"\n')
+    with pytest.raises(LegsError, match=r"legs\.toml cannot be read: line 2 is not in UTF-8: store = .m\\xe4ps"):
+        find(tmp_path)
+
+
 def test_the_environment_wins_over_the_file(tmp_path):
     (tmp_path / "legs.toml").write_text('preset = "legs-l"\nbeta = 4\n')
     config = find(tmp_path, LEGS_BETA="7", LEGS_CURVE="C5", LEGS_OPERATOR="scharr", LEGS_P="inf", LEGS_NORMALISE="mean")

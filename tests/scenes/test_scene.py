@@ -53,10 +53,18 @@ def test_errors_say_what_to_do_and_leave_nothing(tmp_path, capsys):
     assert "there is no folder" in error_of(capsys, photos, out)
     photos.mkdir()
     assert "at least 3 are needed" in error_of(capsys, photos, out)
+    for name in ("a.webp", "b.NEF"):  # COLMAP reads neither
+        (photos / name).write_bytes(b"")
+    assert "needed; 2 file(s) in a format that is not read here are left out: a.webp, b.NEF" in error_of(
+        capsys, photos, out
+    )
     rng = np.random.default_rng(0)
     for i in range(3):
         Image.fromarray(rng.integers(0, 255, (64, 64, 3), dtype=np.uint8)).save(photos / f"{i}.png")
-    assert "no scene can be made" in error_of(capsys, photos, out, "--threads", 1)
+    said = error_of(capsys, photos, out, "--threads", 1)
+    assert "no scene can be made" in said
+    assert said.startswith("legs: note: 2 file(s) in a format that is not read here are left out: a.webp, b.NEF")
+    assert "features of 3 photographs ...\n" in said
     (photos / "3.png").write_bytes(b"not a photograph")
     assert "3.png: not an image" in error_of(capsys, photos, out)
     assert "--overlap must be" in error_of(capsys, photos, out, "--overlap", 0)

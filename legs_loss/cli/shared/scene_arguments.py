@@ -6,14 +6,14 @@ import argparse
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Optional, Union
+from typing import TYPE_CHECKING, Any, Iterable, Optional, Union
 
 from legs_loss.system import cores, say
 
 if TYPE_CHECKING:
     from legs_loss.scenes import Scene
 
-__all__ = ["add_images", "add_resolution", "add_scene_arguments", "default_resolution", "read_noted"]
+__all__ = ["add_images", "add_resolution", "add_scene_arguments", "default_resolution", "read_noted", "say_notes"]
 
 AFFORDABLE = 70_000  # pixels a photograph
 
@@ -44,9 +44,14 @@ def read_noted(path: Union[str, Path], images: Optional[str] = None) -> Scene:
     from legs_loss.scenes import read_scene
 
     scene = read_scene(path, images)
-    for note in scene.notes:
-        say(f"legs: note: {note}", sys.stderr)
+    say_notes(scene.notes)
     return scene
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """Say on stderr what was left out of a scene."""
+    for note in notes:
+        say(f"legs: note: {note}", sys.stderr)
 
 
 def default_resolution(scene: Scene) -> int:

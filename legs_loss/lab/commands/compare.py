@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Dict, Sequence
 
-from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution
+from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution, read_noted
 from legs_loss.system import say
 
 HELP = "train and compare several losses on a scene, with seeds, controls and intervals"
@@ -69,7 +69,6 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.lab.experiments.running import Comparison
     from legs_loss.lab.report.tensorboard import tensorboard_log
     from legs_loss.lab.training.trainer import Progress, TrainConfig, compile_step
-    from legs_loss.scenes import read_scene
 
     set_threads(None)  # fail now if numba is missing
     if args.processes < 1:
@@ -80,9 +79,8 @@ def run(args: argparse.Namespace) -> int:
     arms = needed(parse_arms(names))
     base = TrainConfig(iterations=args.iterations, densify_grad_threshold=args.densify_grad_threshold)
     root = _embedded(args.out / "scene") if args.scene is None else Path(args.scene)
-    resolution = args.resolution
-    if resolution is None:
-        resolution = default_resolution(read_scene(root, args.images))
+    scene = read_noted(root, args.images)
+    resolution = default_resolution(scene) if args.resolution is None else args.resolution
     comparison = Comparison(root, replace(base, resolution=resolution), args.out, args.images, args.lpips)
     proof = comparison.proof
     say(

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, List
 
-from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution
+from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution, read_noted
 from legs_loss.system import say, write_whole
 
 HELP = "weight maps, four trainings, a table and pictures, on the embedded scene or your own"
@@ -50,7 +50,6 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.lab.training.side_by_side import Arm, train_side_by_side
     from legs_loss.lab.training.trainer import TrainConfig, check_trainable, compile_step
     from legs_loss.precompute import precompute
-    from legs_loss.scenes import read_scene
     from legs_loss.spec import PRESETS
 
     started = time.perf_counter()
@@ -64,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     if args.scene is None:
         say(f"making the embedded scene in {root}")
         write_embedded_scene(root)
-    scene = read_scene(root, args.images)
+    scene = read_noted(root, args.images)
     check_trainable(scene)
     resolution = args.resolution if args.resolution is not None else default_resolution(scene)
 

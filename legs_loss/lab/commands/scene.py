@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 
 from legs_loss.system import say
@@ -45,10 +46,9 @@ def run(args: argparse.Namespace) -> int:
         if not fits:
             raise LegsError(f"--{name} must be {wanted}, got {getattr(args, name)}")
 
-    def tell(step: str) -> None:
-        say(f"{step} ...", sys.stderr)
-
-    made = reconstruct(args.photographs, args.out, args.max_size, args.overlap, args.threads, tell)
+    made = reconstruct(
+        args.photographs, args.out, args.max_size, args.overlap, args.threads, partial(say, stream=sys.stderr)
+    )
     say(
         f"{made.folder}: {len(made.placed)} of {len(made.placed) + len(made.lost)} photographs, {made.points} points, "
         f"mean reprojection error {made.error:.2f} pixels"

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
 
-from legs_loss.cli.shared.scene_arguments import add_images, add_resolution
+from legs_loss.cli.shared.scene_arguments import add_images, add_resolution, read_noted
 from legs_loss.system import printable, say
 
 if TYPE_CHECKING:
@@ -70,7 +70,6 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.lab.report.tensorboard import tensorboard_log
     from legs_loss.lab.training.checkpoint import CHECKPOINT, check_new
     from legs_loss.lab.training.trainer import TrainConfig, check_trainable, compile_step, point_cloud, train
-    from legs_loss.scenes import read_scene
 
     set_threads(args.threads)
     given = {name: value for name, value in vars(args).items() if name in TrainConfig.__dataclass_fields__}
@@ -80,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     if args.checkpoint_every < 1:
         raise LegsError(f"--checkpoint_every must be at least 1, got {args.checkpoint_every}")
     config = _resumed(checkpoint, given) if args.resume else TrainConfig(**given)
-    scene = read_scene(args.scene, args.images)
+    scene = read_noted(args.scene, args.images)
     check_trainable(scene)
     check_resolution(config.resolution, scene.views)
     if not args.resume:

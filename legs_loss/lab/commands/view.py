@@ -11,6 +11,7 @@ import argparse
 import time
 from pathlib import Path
 
+from legs_loss.cli.shared.scene_arguments import say_notes
 from legs_loss.system import say
 
 HELP = "view trained Gaussians in the browser"
@@ -43,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.lab.viewer.server import serve
 
     content = find_content(args.path, args.scene)
+    say_notes(() if content.scene is None else content.scene.notes)
     server, address = serve(content, args.preset, args.host, args.port)
     say(f"{', '.join(content.methods)}: {address} (Ctrl-C ends)")
     try:

@@ -65,15 +65,14 @@ class _Pair(NamedTuple):
     prediction: cst.BaseExpression
     target: cst.BaseExpression
 
-    @property
-    def text(self) -> str:
-        """The line to write, of a rendering that has a name."""
-        return f"{one_line(self.prediction)} = {_MASKED}({one_line(self.prediction)}, {one_line(self.target)})"
+    def form(self, after: Optional[cst.CSTNode] = None, before: Optional[cst.CSTNode] = None) -> Masked:
+        """Return the line between two statements."""
+        return Masked(self.node, cst.Call(self.prediction), self.prediction, self.target, after=after, before=before)
 
     def problem(self, function: Function, node: cst.CSTNode, why: str) -> Problem:
         """Return the line as one to be written by hand, with the expression that is the reason."""
         is_named = path_of(self.prediction) is not None and path_of(self.target) is not None
-        line = self.text if is_named else "give both images names, and mask the rendering on a line of its own"
+        line = self.form().line if is_named else "give both images names, and mask the rendering on a line of its own"
         advice = f"{line} before every term that gets the rendering"
         return Problem.at(function, function.place(node), f"not masked: {why}", advice)
 
@@ -95,9 +94,8 @@ class _Line(NamedTuple):
     @property
     def site(self) -> Site:
         """The line as an edit."""
-        function, node, prediction, target = self.pair
-        form = Masked(node, cst.Call(prediction), prediction, target, after=self.after, before=self.before)
-        return Site.at(function, form, f"{self.pair.text}, before line {function.place(self.before).line}")
+        function, form = self.pair.function, self.pair.form(self.after, self.before)
+        return Site.at(function, form, f"{form.line}, before line {function.place(self.before).line}")
 
 
 class _Finder:

@@ -14,9 +14,11 @@ from legs_adapters.lexicon.masks import is_mask
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
+from legs_adapters.tensors.absolute import is_no_picture
+from legs_adapters.tensors.operations import MODULES
 from legs_adapters.terms.form import Form
 
-__all__ = ["Pair", "is_beside_ssim", "is_role", "of_rays", "pair_of", "same_root"]
+__all__ = ["Pair", "is_beside_ssim", "is_of_numbers", "is_role", "of_rays", "pair_of", "same_root"]
 
 
 class Pair(NamedTuple):
@@ -72,6 +74,15 @@ def same_root(form: Form) -> bool:
     if not (isinstance(a, cst.Subscript) and isinstance(b, cst.Subscript)) or isinstance(key_of(a), str):
         return False
     return same(a.value, b.value) and not same(a, b)
+
+
+def is_of_numbers(function: Function, side: cst.CSTNode) -> bool:
+    """Return whether a side is a tensor of numbers alone: ``torch.eye(3)``, ``torch.tensor([0.0, 1.0])[:, None]``."""
+    value = function.flow.value_of(side) or side
+    parts = set(walk_expressions(value))
+    read = {part.value for part in function.flow.reads if part in parts and isinstance(part, cst.Name)}
+    makes = any(isinstance(part, cst.Call) and call_name(part) in ("eye", "tensor") for part in parts)
+    return is_no_picture(value) or (makes and read <= MODULES | {"None", "device"})
 
 
 def of_rays(form: Form) -> bool:

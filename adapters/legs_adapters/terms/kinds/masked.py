@@ -7,6 +7,7 @@ from typing import ClassVar, List, Optional
 
 import libcst as cst
 
+from legs_adapters.code.syntax import code
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.text import Edit, Text, on_one_line
 from legs_adapters.terms.writing import PACKAGE, Writing
@@ -34,11 +35,16 @@ class Masked(Form):
     term: ClassVar[str] = "mask"
     done: ClassVar[str] = "is masked, in every term that gets the rendering,"
 
+    @property
+    def line(self) -> str:
+        """The line, for the edit and for advice."""
+        rendering, photograph = (on_one_line(code(side)) for side in (self.first, self.second))
+        return f"{rendering} = {PACKAGE}.masked({rendering}, {photograph})"
+
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Write the line; where lines have to keep their numbers, before or after a statement beside it, if one can."""
         assert self.before is not None
-        prediction, target = (on_one_line(text.written(side)) for side in (self.first, self.second))
-        line = f"{prediction} = {PACKAGE}.masked({prediction}, {target})"
+        line = self.line
         if writing.in_place and isinstance(self.before, cst.SimpleStatementLine):
             at = text.span(self.before)[0]
             return [text.replace(at, at, f"{line}; ")]

@@ -113,12 +113,10 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
             raise
         views = ()
     check_resolution(args.resolution, views)
+    for store in stores if args.scheduler is None else ():
+        check_writable(store)
     if args.out is not None:
-        check_writable(stores[0].parent)
         stores[0].parent.mkdir(parents=True, exist_ok=True)
-    if args.scheduler is None:
-        for store in stores:
-            check_writable(store)
 
     def found(named: Optional[str], scene: Path) -> Optional[str]:
         """Return a path that is in the scene as it was named, and others whole."""

@@ -152,12 +152,15 @@ def read_manifest(folder: Path) -> List[Entry]:
     """Read the manifest of the store in a folder.
 
     Raises:
-        LegsError: it cannot be read, or a newer version wrote it.
+        LegsError: there is none, it cannot be read, or a newer version wrote it.
         DamagedStoreError: it is not what was written.
     """
     path = folder / MANIFEST
     try:
         data = read_regular(path, _LARGEST)
+    except (FileNotFoundError, NotADirectoryError):
+        what = f"is not a store of weight maps: it has no {MANIFEST} (legs precompute writes one)"
+        raise LegsError(f"{folder} {what}") from None
     except OSError as error:
         raise LegsError(f"{path} cannot be read: {error.strerror}") from None
     try:

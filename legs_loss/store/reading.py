@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Tuple, Union
 
@@ -16,7 +15,7 @@ from legs_loss.scenes.model import view_names
 from legs_loss.spec import WeightSpec
 from legs_loss.store.fingerprints import fingerprint, sampled_fingerprint
 from legs_loss.store.leftovers import leftovers
-from legs_loss.store.manifest import MANIFEST, MASK, WEIGHTS, Entry, read_manifest
+from legs_loss.store.manifest import MASK, WEIGHTS, Entry, read_manifest
 from legs_loss.store.maps import is_intact, read_map
 from legs_loss.weights import weight_from_response, weight_over_scene
 
@@ -52,10 +51,6 @@ class WeightStore:
 
     def __init__(self, path: Union[str, Path]) -> None:
         self.path: Path = Path(path)
-        if not os.path.lexists(str(self.path / MANIFEST)):
-            raise LegsError(
-                f"{self.path} is not a store of weight maps: it has no {MANIFEST} (legs precompute writes one)"
-            )
         self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in read_manifest(self.path)}
         self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
         self._by_image: Dict[Tuple[Any, ...], List[Entry]] = {}

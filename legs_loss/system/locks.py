@@ -65,7 +65,8 @@ class FileLock:
     def release(self) -> None:
         """Release the lock."""
         if self._remove and os.name == "posix":  # elsewhere an open file cannot be deleted: an empty one stays
-            os.unlink(self._path)
+            with contextlib.suppress(PermissionError):  # another user's, in a folder like /tmp
+                os.unlink(self._path)
         os.close(self._descriptor)
 
     def __enter__(self) -> FileLock:
@@ -101,7 +102,12 @@ def _open(path: str) -> int:
     flags = os.O_RDWR | os.O_CREAT
     for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY", "O_NOINHERIT"):
         flags |= getattr(os, name, 0)
-    descriptor = os.open(path, flags, 0o666)
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except PermissionError:  # another user's, in a folder that both may write: to lock it, reading is enough
+        if not os.path.lexists(path):
+            raise
+        descriptor = os.open(path, flags & ~(os.O_RDWR | os.O_CREAT))
     found = os.fstat(descriptor)
     if stat.S_ISREG(found.st_mode) and found.st_nlink <= 1:
         return descriptor

@@ -8,7 +8,6 @@ import signal
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -56,8 +55,8 @@ SOURCES = {"one.py": TRAIN, "two.py": TRAIN, "utils.py": UTILS}
 PAIRS = 12
 
 
-def start(go, *arguments):
-    """Fork a process that runs legs-patch when it is told to; return its id and where its words go."""
+def start(go, command):
+    """Fork a process that runs a command when it is told to; return its id and where its words go."""
     read, written = os.pipe()
     child = os.fork()
     if child == 0:
@@ -67,7 +66,7 @@ def start(go, *arguments):
         sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
         code = 99
         try:
-            code = main([str(word) for word in arguments])
+            code = command()
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
@@ -77,9 +76,11 @@ def start(go, *arguments):
 
 
 def together(*commands):
-    """Run commands at the same moment; return each one's exit code and words."""
+    """Run legs-patch with these arguments, or functions, at the same moment; return each one's exit code and words."""
     go, tell = os.pipe()
-    children = [start(go, *arguments) for arguments in commands]
+    children = [
+        start(go, one if callable(one) else lambda one=one: main([str(word) for word in one])) for one in commands
+    ]
     os.write(tell, b"." * len(children))
     results = []
     for child, words in children:
@@ -520,60 +521,6 @@ def test_the_owner_stays(tmp_path):
         step()
         found = os.stat(str(root / "one.py"))
         assert (found.st_uid, found.st_gid, found.st_mode & 0o7777) == (1234, 2345, 0o6755)
-
-
-@pytest.mark.parametrize("writable", [True, False])
-def test_another_user_s_files(writable):
-    """With write access to the folder, patch and undo keep the mode; without it, one line, and nothing changes."""
-    if os.geteuid() != 0:
-        pytest.skip("to become another user needs root")
-    with tempfile.TemporaryDirectory() as made:  # pytest's own folder is root's alone
-        os.chmod(made, 0o755)
-        write(plan(checkout(Path(made) / "another", SOURCES)))  # which imports what nobody may not
-        (Path(made) / "state").mkdir()
-        os.chown(str(Path(made) / "state"), NOBODY, NOBODY)
-        root = checkout(Path(made) / "theirs", SOURCES)
-        os.chmod(str(root), 0o777 if writable else 0o755)
-        for name in SOURCES:
-            os.chmod(str(root / name), 0o664)
-        for arguments in ([root], ["--undo", root]):
-            code, said = as_nobody(arguments)
-            if not writable:
-                assert (code, "Permission denied; nothing was changed" in said) == (2, True), said
-                assert "Traceback" not in said
-                assert snapshot(root) == PLAIN
-                continue
-            assert code == 0, said
-            found = os.stat(str(root / "one.py"))
-            assert (found.st_uid, found.st_mode & 0o7777) == (NOBODY, 0o664)
-        assert snapshot(root) == PLAIN
-
-
-NOBODY = 65534
-
-
-def as_nobody(arguments):
-    """Run legs-patch in a fork that gives up root; return its exit code and words."""
-    read, written = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.dup2(written, 1)
-        os.dup2(written, 2)
-        sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
-        code = 99
-        try:
-            os.setgroups([])
-            os.setgid(NOBODY)
-            os.setuid(NOBODY)
-            code = main([str(word) for word in arguments])
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
-    os.close(written)
-    with os.fdopen(read, errors="replace") as file:
-        said = file.read()
-    return os.waitpid(child, 0)[1] >> 8, said
 
 
 def test_a_lock_that_is_a_link_or_a_pipe_is_refused(tmp_path):

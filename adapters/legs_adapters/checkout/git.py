@@ -18,6 +18,7 @@ from legs_loss import LegsError
 __all__ = ["changed_files"]
 
 _SECONDS = 60  # a pipe in .git would block git for ever
+_SAFE = ("-c", "safe.bareRepository=explicit", "-c", "safe.directory=*")
 _ENVIRONMENT = {
     "GIT_ALLOW_PROTOCOL": "none",  # objects that are missing on purpose are not fetched
     "GIT_NO_LAZY_FETCH": "1",
@@ -29,7 +30,7 @@ def changed_files(root: Path, files: Mapping[str, bytes]) -> List[str]:
     """Return which of these files differ from the last commit, in more than their line ends.
 
     The git of a nested checkout is asked about its files. A file that was never committed counts as unchanged; so do
-    all outside of git, where git is missing, and where it does not trust the checkout's owner.
+    all outside of git, and where git is missing. Whose the checkout is does not matter: nothing of it is run.
 
     Raises:
         LegsError: git times out.
@@ -48,7 +49,7 @@ def _changed(outer: Path, root: Path, files: Mapping[str, bytes]) -> List[str]:
     program = shutil.which("git")
     if program is None or outer in Path(os.path.realpath(program)).parents:
         return []  # a "." on the path, or Windows, finds programs in the folder one is in
-    command = [program, "--no-pager", "-c", "safe.bareRepository=explicit", "-C", str(root), "ls-tree", "-z", "HEAD"]
+    command = [program, "--no-pager", *_SAFE, "-C", str(root), "ls-tree", "-z", "HEAD"]
     try:
         listed = subprocess.run(
             [*command, "--", *files],

@@ -85,7 +85,12 @@ def replace_files(root: Path, changes: Changes, stop: Callable[[], None] = lambd
     try:
         for path, (expected, _) in changes.items():
             _check(path, read_file(root, path), expected)
-        (root / _STAGING).mkdir(mode=0o700)
+        try:
+            (root / _STAGING).mkdir(mode=0o700)
+        except FileExistsError:  # what is one's own is swept
+            raise LegsError(
+                f"{root / _STAGING} is what another user's killed legs-patch left: they can delete it"
+            ) from None
         for path, (_, data) in changes.items():
             stop()
             if data is not None:
@@ -137,13 +142,24 @@ def _stage(root: Path, path: str, data: bytes) -> str:
             with contextlib.suppress(FileNotFoundError), folder_of(root, path) as (target, old):
                 with open_regular(old, target) as before:
                     found = os.fstat(before.fileno())
-                    with contextlib.suppress(PermissionError, AttributeError):  # only root gives a file away, on POSIX
-                        os.fchown(file.fileno(), found.st_uid, found.st_gid)
+                    mode = _keep_owner(file.fileno(), found)
                     _keep_attributes(before.fileno(), file.fileno())
                 # Last: giving a file away takes bits of its mode.
-                os.chmod(file.fileno() if BY_DESCRIPTOR else name, stat.S_IMODE(found.st_mode))
+                os.chmod(file.fileno() if BY_DESCRIPTOR else name, mode)
             os.fsync(file.fileno())
     return staged
+
+
+def _keep_owner(file: int, before: os.stat_result) -> int:
+    """Give an open file owner and group of another one, or the group alone; return the mode that it may have then."""
+    for owner in (before.st_uid, -1):  # only root gives a file away, and only to one's own groups, on POSIX
+        with contextlib.suppress(PermissionError, AttributeError):
+            os.fchown(file, owner, before.st_gid)
+            break
+    made, mode = os.fstat(file), stat.S_IMODE(before.st_mode)
+    if made.st_gid != before.st_gid:  # another group may do what everybody may
+        mode = mode & ~0o2070 | (mode & 7) << 3
+    return mode if made.st_uid == before.st_uid else mode & ~0o4000
 
 
 def _keep_attributes(before: int, after: int) -> None:

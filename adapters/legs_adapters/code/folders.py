@@ -13,6 +13,7 @@ from legs_loss import LegsError
 from legs_loss.system import read_regular
 
 __all__ = [
+    "CLOSED",
     "PATCHABLE",
     "SUBMODULE",
     "VENDORED",
@@ -27,6 +28,7 @@ __all__ = [
 
 VENDORED, SUBMODULE = "third-party code", "a submodule"
 _TESTS, _WORKTREE = "a folder of tests", "another worktree of this checkout"
+CLOSED = "cannot be read: Permission denied"
 _FOREIGN = {
     name: why
     for why, names in (
@@ -34,7 +36,10 @@ _FOREIGN = {
         ("a model that it only uses", "croco dust3r mast3r vggt"),
         (_TESTS, "tests test testing"),
         ("installed packages", "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs"),
-        ("tool output", ".git .hg .svn __pycache__ .ipynb_checkpoints build dist .mypy_cache .pytest_cache"),
+        (
+            "tool output",
+            ".git .hg .svn __pycache__ .legs-patch.tmp .ipynb_checkpoints build dist .mypy_cache .pytest_cache",
+        ),
     )
     for name in names.split()
 }
@@ -108,6 +113,8 @@ def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[s
     name = ".git" if _is_dot_git(os.path.basename(path)) else os.path.basename(path)
     if path in submodules or name in _FOREIGN:
         return SUBMODULE if path in submodules else _FOREIGN[name]
+    if not os.access(str(root / path), os.R_OK | os.X_OK):
+        return CLOSED
     if (root / path / "pyvenv.cfg").exists():
         return "a virtual environment"
     return _why_not_own(root / path)

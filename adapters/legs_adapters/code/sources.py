@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import List, Sequence, Tuple
 
-from legs_adapters.code.folders import check_name, walk
+from legs_adapters.code.folders import CLOSED, check_name, folders_of
 from legs_adapters.code.limits import MAX_BYTES, MAX_FILE_BYTES
 from legs_loss import LegsError
 from legs_loss.system import read_regular
@@ -66,15 +66,16 @@ def read_files(root: Path, exclude: Sequence[str]) -> Tuple[List[Source], List[U
     readable: List[Source] = []
     unreadable: List[Unreadable] = []
     size = 0
-    for path in walk(root, exclude, (".py", ".ipynb")):
-        source = read_source(root, path)
-        if isinstance(source, Unreadable):
-            unreadable += [source] if source.reason else []
-            continue
-        readable.append(source)
-        size += len(source.data)
-        if size > MAX_BYTES:
-            raise LegsError(f"its Python files have more than {MAX_BYTES >> 20} MiB: leave some out by --exclude")
+    for files, skipped in folders_of(root, exclude, (".py", ".ipynb")):
+        unreadable += [Unreadable(folder.path, folder.why) for folder in skipped if folder.why == CLOSED]
+        for source in (read_source(root, path) for path in files):
+            if isinstance(source, Unreadable):
+                unreadable += [source] if source.reason else []
+                continue
+            readable.append(source)
+            size += len(source.data)
+            if size > MAX_BYTES:
+                raise LegsError(f"its Python files have more than {MAX_BYTES >> 20} MiB: leave some out by --exclude")
     return readable, unreadable
 
 

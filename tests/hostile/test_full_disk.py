@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import subprocess
+import tempfile
 from contextlib import contextmanager
 
 import numpy as np
@@ -18,6 +20,7 @@ from legs_loss.lab.embedded import write_embedded_scene
 from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import read_ply, write_ply
 from legs_loss.lab.training.checkpoint import read_state
+from legs_loss.scenes import View, load_training_image
 from legs_loss.store import WeightStore
 from tests.scenes.test_cluster import Cluster
 from tests.support import colmap_scene, legs
@@ -208,6 +211,51 @@ def test_demo(disk, tiny_scene, capsys, monkeypatch):
         after = disk.state()
     assert all(after[name] for name in before), "half a file"
     assert main(demo) == 0
+
+
+@pytest.mark.parametrize("room", [0, 8192])
+def test_masks_and_export(room, disk, tmp_path, capsys):
+    """Own masks, their place in a store, and maps as pictures: what is there is whole, and there is no other."""
+    scene = colmap_scene(tmp_path / "scene", names=[f"{i}.png" for i in range(4)], width=200, height=150)
+    masks, store, out = disk.path / "masks", disk.path / "store", disk.path / "out"
+    make = ["masks", str(scene), "--from", "dark", "--out", str(masks)]
+    precompute = ["precompute", str(scene), "--masks", str(masks), "--out", str(store), "--workers", "1"]
+    export = ["export", str(store), str(out)]
+    for command, written in ((make, masks), (precompute, store), (export, out)):
+        with disk.full(room):
+            one_error(capsys, main(command))
+            assert not list(disk.path.rglob("*.part"))
+            if written is store:
+                assert not (store / "manifest.json").exists() or WeightStore(store).check() == ([], [])
+            for picture in written.rglob("*.png"):
+                load_training_image(View("a", picture))
+        if written is not store and written.exists():  # only a new or an empty folder is written to
+            shutil.rmtree(str(written))
+        assert main(command) == 0
+        capsys.readouterr()
+    assert len(WeightStore(store).of_kind("mask")) == 4 and WeightStore(store).check() == ([], [])
+    assert len(list(out.rglob("*.png"))) == 12
+
+
+@pytest.mark.parametrize("what", ["--verify", "--trace"])
+def test_a_full_folder_of_temporary_files(what, disk, tmp_path, capsys, monkeypatch):
+    """It holds the copies and the reports of a run: one error, and nothing stays there."""
+    pytest.importorskip("libcst")
+    pytest.importorskip("numba")
+    from legs_adapters.cli import main as legs_patch
+
+    from tests.patcher.support import checkout, files, snapshot
+
+    root = checkout(tmp_path / "checkout", {**files("inria"), "data": bytes(100_000)})
+    before = snapshot(root)
+    monkeypatch.setattr(tempfile, "tempdir", str(disk.path))
+    more = ["--trace", "train.py", "--cpu"] if what == "--trace" else ["--verify"]
+    with disk.full(40_960):
+        one_error(capsys, legs_patch([*more, str(root)]))
+        assert disk.state() == {}
+    if what == "--verify":  # it patches first, and says so
+        assert legs_patch(["--undo", str(root)]) == 0
+    assert snapshot(root) == before
 
 
 def test_show(disk, tiny_scene, capsys):

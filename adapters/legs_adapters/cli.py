@@ -76,8 +76,8 @@ def _run(args: argparse.Namespace) -> int:
         return _patch(args)
     from legs_adapters.verify import check_verifiable
 
-    script = check_verifiable(args.folder, args.script, args.arguments)
-    return _patch(args) or _verify(args, script)
+    script, given = check_verifiable(args.folder, args.script, args.arguments, args.trace)
+    return _patch(args) or _verify(args, script, given if args.cpu else [])
 
 
 def _so_far(args: argparse.Namespace) -> str:
@@ -266,10 +266,10 @@ def _elsewhere(root: Path, exclude: Sequence[str], found: Plan) -> str:
     )
 
 
-def _verify(args: argparse.Namespace, script: str) -> int:
+def _verify(args: argparse.Namespace, script: str, given: Sequence[str]) -> int:
     from legs_adapters.verify import verify
 
-    verdict = verify(args.folder, script, args.arguments, args.iterations)
+    verdict = verify(args.folder, script, args.arguments, args.iterations, given, args.photos if args.cpu else None)
     if args.json:
         say(json.dumps({"holds": verdict.claims, "runs": {name: run._asdict() for name, run in verdict.runs.items()}}))
     else:

@@ -7,44 +7,32 @@ process of its own, see :mod:`legs_adapters.trace.child`.
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import shlex
 import shutil
-import socket
 import statistics
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
-from typing import Dict, List, NamedTuple, Optional, Sequence
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_adapters.checkout.replace import locked
 from legs_adapters.code.sources import check_root
 from legs_adapters.journal import JOURNAL
 from legs_adapters.plan import plan
 from legs_adapters.shims.packages import check_imports
-from legs_adapters.trace.running import CHILD, child_environment
+from legs_adapters.terms.traced import Traced
+from legs_adapters.trace.command import SCENE, filled, parts
+from legs_adapters.trace.running import run_watched
 from legs_adapters.undo import undo
 from legs_loss import LegsError
 
-__all__ = ["Run", "Verdict", "check_verifiable", "embedded_arguments", "verify"]
+__all__ = ["Run", "Verdict", "check_verifiable", "verify"]
 
-SCENE = {"views": 12, "width": 96, "height": 64, "points": 800, "samples": 1}  # the embedded one
 SECONDS = 1800  # that a run may take
 NOT_COPIED = (".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs")
 MAX_COPIED = 64 << 20  # bytes of a file
 FIRST_STEP, LATER_STEPS = 1e-5, 1e-3  # relative differences of losses that rounding explains
-# The arguments of a script like Inria's, where its source has these words. (Inria's options are named after attributes,
-# except those that train.py adds itself.)
-ARGUMENTS = (
-    ("source_path", "-s {scene}"),
-    ("model_path", "-m {output}"),
-    ("iterations", "--iterations {iterations}"),
-    ("--test_iterations", "--test_iterations {iterations}"),
-    ("--port", "--port {port}"),
-)
 
 
 class Run(NamedTuple):
@@ -56,6 +44,7 @@ class Run(NamedTuple):
         seconds: from each step to the next.
         weighted, plain: calls of legs_loss.l1_loss.
         stored, computed, remembered: where weight maps came from.
+        terms: the differences under its losses, as `legs_adapters.terms.traced.Traced` reads them.
         error: the last lines of its stderr.
     """
 
@@ -67,6 +56,7 @@ class Run(NamedTuple):
     stored: int = 0
     computed: int = 0
     remembered: int = 0
+    terms: Sequence[Dict[str, Any]] = ()
     error: str = ""
 
     @property
@@ -100,27 +90,43 @@ class Verdict(NamedTuple):
         return "".join(f"{name:<10} {what}\n" for name, what in rows)
 
 
-def check_verifiable(folder: str | os.PathLike[str], script: Optional[str], arguments: Optional[str]) -> str:
-    """Return the training script, after checking before anything is patched that it can be run.
+def check_verifiable(
+    folder: str | os.PathLike[str], script: Optional[str], arguments: Optional[str], command: Optional[str] = None
+) -> Tuple[str, List[str]]:
+    """Return the training script and arguments, after checking before anything is patched that it can be run.
 
     Args:
         folder: the checkout.
         script: the training script in it; None: the file of its one weighted term, or its train.py.
         arguments: as for :func:`verify`.
+        command: one that was traced: its script is the one by default, and its arguments, the folders among them by
+            their whole paths, those that are returned.
 
     Raises:
         LegsError: it is ambiguous or not there, imports what is not installed, or its arguments name what is unknown.
     """
     root = check_root(folder)
+    given: List[str] = []
+    if command is not None:
+        _, traced, given = parts(root, command)
+        given = [str((root / word).resolve()) if (root / word).is_dir() else word for word in given]
+        script = script or traced
     script = _script(root) if script is None else script
     if not (root / script).is_file():
         raise LegsError(f"there is no {script} in {root}")
     check_imports(root, script)
-    _arguments(root / script, arguments, 1, scene=root, output=root)
-    return script
+    filled(root / script, arguments, given, 1, scene=root, output=root)
+    return script, given
 
 
-def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str], iterations: int) -> Verdict:
+def verify(
+    folder: str | os.PathLike[str],
+    script: str,
+    arguments: Optional[str],
+    iterations: int,
+    given: Sequence[str] = (),
+    photos: Optional[str] = None,
+) -> Verdict:
     """Train a patched checkout and its unpatched self on the CPU, and compare.
 
     Args:
@@ -129,6 +135,8 @@ def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str]
         arguments: the script's arguments, with {scene}, {output}, {iterations} and {port} filled in; None: those of
             Inria's train.py that its source knows.
         iterations: how many steps are compared; the script is ended then.
+        given: arguments that stand before those.
+        photos: the folder of the photographs, of which the weighted terms are; default: those of the scene's model.
 
     Raises:
         LegsError: the folder is not patched any more.
@@ -154,8 +162,9 @@ def verify(folder: str | os.PathLike[str], script: str, arguments: Optional[str]
             variables["beta 0"] = {"LEGS_BETA": "0"}
         for name, settings in variables.items():
             copy = unpatched if name == "unpatched" else patched
-            given = _arguments(copy / script, arguments, iterations, scene=scene, output=Path(work) / f"output-{name}")
-            runs[name] = _run(copy, [script, *given], iterations, Path(work) / f"{name}.json", settings)
+            places = {"scene": scene, "output": Path(work) / f"output-{name}"}
+            words = [script, *given, *filled(copy / script, arguments, given, iterations, **places)]
+            runs[name] = _run(copy, words, iterations, photos, settings)
             if not runs["unpatched"].losses:
                 return Verdict(runs, {"the unpatched script trained": False})
     return Verdict(runs, _claims(runs))
@@ -175,6 +184,21 @@ def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
     if "beta 0" in runs:
         equal = _are_close(unpatched, losses["beta 0"])
         claims["with beta 0 every loss is the unpatched one, up to the rounding of the SSIM"] = equal
+    return {**claims, **_of_terms(Traced.read(runs["patched"].terms))}
+
+
+def _of_terms(terms: Sequence[Traced]) -> Dict[str, bool]:
+    """Return a claim for each L1 that was seen: that of a photograph is weighted, and no other.
+
+    Where no picture is of a file that is known, nothing is said of pictures.
+    """
+    claims: Dict[str, bool] = {}
+    is_known = any(term.is_photometric for term in terms)
+    for term in terms:
+        if term.is_l1 and (is_known or not term.is_unknown):
+            where = " from ".join(f"{path}:{line}" for path, line, *_ in term.frames[:2])
+            claim = f"{where} is {'' if term.is_photometric else 'not '}weighted: {term.text('')}"
+            claims[claim] = (term.kind == "weighted") == term.is_photometric
     return claims
 
 
@@ -190,49 +214,12 @@ def _are_close(losses: Sequence[str], others: Sequence[str]) -> bool:
 def _script(root: Path) -> str:
     found = plan(root).findings
     files = sorted({site.path for site in found.sites} | {site.path for site in found.patched})
-    trains = [name for name in files if "__main__" in _text(root / name)]
+    trains = [name for name in files if b"__main__" in (root / name).read_bytes()]
     if len(trains) == 1:
         return trains[0]
     if "train.py" in trains or (not trains and (root / "train.py").is_file()):
         return "train.py"
     raise LegsError(f"cannot tell which script trains: use --script; weighted files: {', '.join(files) or 'none'}")
-
-
-def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-
-
-def _arguments(script: Path, given: Optional[str], iterations: int, **places: Path) -> List[str]:
-    if given is None:
-        given = _words_of(script)
-    values = {"iterations": iterations, "port": _free_port(), **places}
-    try:
-        return [word.format(**values) for word in shlex.split(given)]
-    except (KeyError, IndexError, ValueError) as error:
-        raise LegsError(
-            f"--arguments {given!r}: only {{scene}}, {{output}}, {{iterations}}, {{port}}: {error}"
-        ) from None
-
-
-def embedded_arguments(script: Path, given: Sequence[str], work: Path, iterations: int) -> List[str]:
-    """Write the embedded scene to a folder, and return the arguments that name it, of those that are not given."""
-    from legs_loss.lab.embedded import write_embedded_scene
-
-    words = shlex.split(_words_of(script))
-    pairs = [pair for pair in zip(words[::2], words[1::2]) if pair[0] not in given]
-    places = {"scene": write_embedded_scene(work / "scene", **SCENE), "output": work / "output"}
-    return _arguments(script, " ".join(f"{name} {value}" for name, value in pairs), iterations, **places)
-
-
-def _words_of(script: Path) -> str:
-    source = "\n".join(_text(path) for path in (script, *script.parent.glob("arguments/*.py")))
-    return " ".join(words for word, words in ARGUMENTS if word in source)
-
-
-def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def _unneeded(folder: str, names: List[str]) -> List[str]:
@@ -242,22 +229,12 @@ def _unneeded(folder: str, names: List[str]) -> List[str]:
     return [name for name in names if name not in files and not os.path.isdir(paths.get(name, ""))]
 
 
-def _run(root: Path, words: Sequence[str], iterations: int, report: Path, settings: Dict[str, str]) -> Run:
-    spec = {"report": str(report), "root": str(root), "cpu": True, "iterations": iterations}
-    command = [sys.executable, "-m", CHILD, json.dumps(spec), *words]
-    environment = child_environment(True, PYTHONHASHSEED="0", **settings)
+def _run(root: Path, words: Sequence[str], iterations: int, photos: Optional[str], settings: Dict[str, str]) -> Run:
     with tempfile.TemporaryFile() as errors:
-        try:
-            code = subprocess.run(
-                command, cwd=str(root), env=environment, stdout=subprocess.DEVNULL, stderr=errors,
-                stdin=subprocess.DEVNULL, timeout=SECONDS,
-            ).returncode  # fmt: skip
-        except subprocess.TimeoutExpired:
-            code = -1
+        streams: Dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": errors, "timeout": SECONDS}
+        settings = {"PYTHONHASHSEED": "0", **settings}
+        code, seen = run_watched(root, words, True, photos, {"losses": iterations}, settings=settings, **streams)
         errors.seek(0)
         lines = errors.read().decode("utf-8", "replace").replace("\r", "\n").strip().splitlines()
-    try:
-        found = json.loads(report.read_text())
-    except (OSError, ValueError):  # it was killed
-        found = {}
+    found = {name: seen[name] for name in Run._fields if name in seen}
     return Run(code=code, error="\n".join(lines[-12:]), **found)

@@ -8,6 +8,7 @@ import pytest
 from legs_adapters.verify import Run, Verdict
 
 from tests.patcher.support import checkout, legs_patch, snapshot
+from tests.patcher.traced import write, write_scene
 from tests.shims.test_run import texts
 
 pytest.importorskip("numba")
@@ -55,7 +56,9 @@ class TestVerify:
         done = verify(root, "--preset", "3dgs")
         assert done.returncode == 1
         failed = {claim for claim, held in verdict(done)["holds"].items() if not held}
-        assert failed == {"with LEGS every loss is another", "every step was weighted"}
+        plain = {claim for claim in failed if claim.startswith("train.py:")}
+        assert failed - plain == {"with LEGS every loss is another", "every step was weighted"}
+        assert [" is weighted: " in claim and "is images/" in claim for claim in plain] == [True]
 
     def test_a_script_that_cannot_run_is_shown(self, tmp_path):
         found = texts()
@@ -64,6 +67,58 @@ class TestVerify:
         assert done.returncode == 1
         assert "FAILS      the unpatched script trained" in done.stdout
         assert done.stdout.count("ZeroDivisionError") == 1
+
+
+TRAIN = """
+for step in range(100):
+    camera = views[step % len(views)]
+    drawn, gt_image, target = splats.draw(camera), camera.values["images"], camera.values["normals"]
+    loss = torch.abs(drawn["rgb"] - gt_image).mean()
+    loss = loss + 0.1 * F.l1_loss(drawn["normal"], target)
+    loss = loss + 0.1 * F.l1_loss(drawn["depth"], target[:1])
+    loss.backward()
+    splats.optimizer.step()
+    splats.optimizer.zero_grad()
+"""
+
+
+@pytest.mark.slow
+class TestTerms:
+    """Each L1 of the patched run: that of a photograph is weighted, and no other."""
+
+    def holds(self, root, scene, *options):
+        options = options or ("--script", "train.py", "--arguments", f"-s {scene}")
+        done = verify(root, *options)
+        found = verdict(done)["holds"]
+        return done, {claim.split(":")[1]: held for claim, held in found.items() if claim.startswith("train.py:")}
+
+    def test_of_a_patch_and_of_two_that_were_altered(self, tmp_path):
+        write(tmp_path / "code", TRAIN)
+        scene, train = write_scene(tmp_path / "scene"), tmp_path / "code/train.py"
+        done, claims = self.holds(tmp_path / "code", scene, "--trace", f"train.py -s {scene}", "--cpu", "--steps", "4")
+        lines = train.read_text(encoding="utf-8").splitlines()
+        colour, normal, depth = (
+            next(str(at) for at, line in enumerate(lines, 1) if f'(drawn["{name}"]' in line)
+            for name in ("rgb", "normal", "depth")
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert claims == {
+            f"{colour} is weighted": True, f"{normal} is not weighted": True, f"{depth} is not weighted": True,
+        }  # fmt: skip
+        patched = train.read_text(encoding="utf-8")
+        for name, line in (("normal", normal), ("depth", depth)):
+            term = f'F.l1_loss(drawn["{name}"]'
+            assert term in patched
+            train.write_text(patched.replace(term, f"legs_loss{term[1:]}"), encoding="utf-8")
+            done, claims = self.holds(tmp_path / "code", scene)
+            assert done.returncode == 1
+            assert [claim for claim, held in claims.items() if not held] == [f"{line} is not weighted"], claims
+        term = 'legs_loss.l1_loss(drawn["rgb"]'
+        assert term in patched
+        train.write_text(patched.replace(term, 'legs_loss.unweighted(F.l1_loss)(drawn["rgb"]'), encoding="utf-8")
+        done, claims = self.holds(tmp_path / "code", scene)
+        assert done.returncode == 1
+        assert [claim for claim, held in claims.items() if not held] == [f"{colour} is weighted"], claims
 
 
 class TestReport:

@@ -47,7 +47,9 @@ class _Join:
     def __init__(self, found: Findings, analysis: Analysis, trace: Trace) -> None:
         self.found, self.analysis, self.trace = found, analysis, trace
         self.verdicts = Verdicts(analysis)
-        self.stacks: List[Tuple[Traced, List[_Candidate]]] = [(t, list(self._candidates(t))) for t in trace.terms]
+        terms = [term for term in trace.terms if not term.is_patched]
+        self.stacks: List[Tuple[Traced, List[_Candidate]]] = [(term, list(self._candidates(term))) for term in terms]
+        self.is_known: bool = any(term.is_photometric for term in trace.terms)
         self.entries: List[Any] = []
         self.settled: Set[_Place] = set()
 
@@ -58,6 +60,9 @@ class _Join:
         for traced, stack in self.stacks:
             if not traced.is_photometric:
                 self._other(traced, stack)
+        for traced in self.trace.terms:
+            if traced.kind == "weighted" and not traced.is_photometric and (self.is_known or not traced.is_unknown):
+                self._quote(traced, "it is weighted", "write what stood there before: legs-patch --undo has it", 0)
         ran = self.settled.union(candidate.key for _, stack in self.stacks for candidate in stack)
         lists: Dict[str, Any] = {}
         kinds = {"sites": Site, "left": Left, "problems": Problem}
@@ -144,13 +149,17 @@ class _Join:
             if self._others(candidate) is not None:
                 self._write(traced, candidate)
                 return
-        path, line, *_ = traced.frames[own[0].depth if own else 0]
-        module = self.analysis.program.module(path)
-        text = module.lines.text(line) if module is not None else ""
         why = "serves other terms of the trace, too" if own else "no call or difference of the two pictures is there"
         self._settle(stack)
         advice = "give the term of the photograph a line of its own, legs_loss.l1_loss(rendering, photograph)"
-        self.entries.append(Problem(path, line, text, f"{traced.text(self._name(traced, stack))}; {why}", advice))
+        self._quote(traced, why, advice, own[0].depth if own else 0, self._name(traced, stack))
+
+    def _quote(self, traced: Traced, why: str, advice: str, depth: int, name: str = "") -> None:
+        """Report a line of a term's stack as one that cannot be decided."""
+        path, line, *_ = traced.frames[depth]
+        module = self.analysis.program.module(path)
+        text = module.lines.text(line) if module is not None else ""
+        self.entries.append(Problem(path, line, text, f"{traced.text(name)}; {why}", advice))
 
     def _is_definition(self, candidate: _Candidate) -> bool:
         """Return whether a form is the body of the codebase's own L1 function, whose calls are the terms."""
@@ -244,7 +253,7 @@ class _Join:
         place, text = candidate.function.place(candidate.form.node), traced.text(self._name(traced, [candidate]))
         read = [entry for entry in self.found.sites if (entry.path, entry.line) == candidate.key[:2]]
         if traced.is_unknown and (read or not self._is_left(candidate)):
-            if read and not any(t.is_photometric for t, _ in self.stacks):
+            if read and not self.is_known:
                 return  # its pictures come from elsewhere: reading decides
             verdicts, function = self.verdicts, candidate.function
             term = Term(self.analysis, function, candidate.form)

@@ -12,7 +12,7 @@ class Traced(NamedTuple):
 
     Attributes:
         frames: (path, line, function, its names of the two sides) of the checkout, innermost first.
-        kind: "l1", "squared", "robust", "signed", or "compiled: NAME".
+        kind: "l1", "squared", "robust", "signed", "compiled: NAME"; of legs_loss.l1_loss "weighted" or "plain".
         target: which operand is the side that wants no gradient; -1: both want one.
         shape: of that side.
         share: its part of the loss.
@@ -40,24 +40,35 @@ class Traced(NamedTuple):
     is_picture: bool
 
     @classmethod
-    def read(cls, term: Dict[str, Any], sure: float) -> Traced:
-        """Return a term from a report of the traced process."""
-        frames = tuple((path, line, name, tuple(names)) for path, line, name, names in term["frames"])
-        shares, match = term["shares"] or [0.0], term["match"]
-        known = match is not None and match["correlation"] >= sure
-        own = {name: term[name] for name in ("kind", "target", "gaussians", "parameters", "stepped", "steps", "poses")}
-        rest = {"shape": tuple(term["shape"]), "share": sum(shares) / len(shares), "is_picture": term["is_picture"]}
-        return cls(frames=frames, match=match, is_known=known, **own, **rest)
+    def read(cls, terms: Sequence[Dict[str, Any]]) -> List[Traced]:
+        """Return those terms of a watched process's report after which something was stepped."""
+        found = []
+        for term in terms:
+            frames = tuple((path, line, name, tuple(names)) for path, line, name, names in term["frames"])
+            shares = term["shares"] or [0.0]
+            rest = {name: term[name] for name in cls._fields if name not in ("frames", "share")}
+            found.append(cls(frames=frames, share=sum(shares) / len(shares), **rest))
+        return [term for term in found if term.steps or term.poses]
+
+    @property
+    def is_l1(self) -> bool:
+        """Return whether it is an absolute difference, of a patch or not."""
+        return self.kind == "l1" or self.is_patched
+
+    @property
+    def is_patched(self) -> bool:
+        """Return whether it is a call of legs_loss.l1_loss."""
+        return self.kind in ("weighted", "plain")
 
     @property
     def is_photometric(self) -> bool:
         """Return whether it is the L1 of a trained rendering and a photograph."""
-        return self.kind == "l1" and not self.why_other
+        return self.is_l1 and not self.why_other
 
     @property
     def is_unknown(self) -> bool:
         """Return whether only its picture is unknown: it is of no image file."""
-        return self.kind == "l1" and self.is_picture and self.steps > 0 and not self.is_known
+        return self.is_l1 and self.is_picture and self.steps > 0 and not self.is_known
 
     @property
     def why_other(self) -> str:
@@ -90,7 +101,7 @@ class Traced(NamedTuple):
         else:
             assert self.match is not None
             parts.append(f"{target or 'the other side'} is {self.match['path']}")
-        if self.kind != "l1":
+        if not self.is_l1:
             what = {
                 "robust": "a Huber, Charbonnier or other bent loss",
                 "signed": "a signed difference",

@@ -2,7 +2,7 @@
 
     python -m legs_adapters.trace.child '{"report": PATH, "root": CHECKOUT, ...}' train.py ARGUMENTS
 
-Of --verify: every backward pass of a scalar, and what ``legs_loss.l1_loss`` counted; of --trace: every difference.
+What is recorded: every difference under a loss, the loss of every backward pass, what ``legs_loss.l1_loss`` counted.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ import multiprocessing.spawn
 import os
 import random
 import sys
-import time
 from multiprocessing.util import Finalize
 from pathlib import Path
-from typing import Any, Callable, Dict, List
+from typing import Any, Dict, List
 
 from legs_loss.cli import exit_code
 from legs_loss.system import is_first_process
 
-Content = Callable[[], Dict[str, Any]]
-_over: List[bool] = []  # one for each time that a trace saw enough
+_over: List[bool] = []  # one for each time that enough was seen
 
 
 def _main(given: str, script: str, *arguments: str) -> int:
     """Run a script and write the report to a file, also after an error."""
-    import torch  # noqa: F401  before its functions are wrapped
+    import numpy as np
+    import torch
 
     from legs_adapters.runner import execute
 
     spec = json.loads(given)
-    if "steps" in spec:
-        _tracing(spec)
-    else:
-        _verifying(spec)
+    _watched(spec)
+    if "losses" in spec:  # runs are compared
+        random.seed(0)
+        np.random.seed(0)
+        torch.manual_seed(0)
     try:
         return exit_code("legs", lambda: execute(script, arguments, {}, Path(spec["root"]) if spec["cpu"] else None))
     finally:
@@ -47,21 +47,6 @@ def _main(given: str, script: str, *arguments: str) -> int:
             os._exit(0)
 
 
-def _report(path: str, content: Content) -> Callable[[], None]:
-    """Write the report when the process ends, or the function that is returned is called.
-
-    Of several processes the one that saw steps writes it; of several of those rank 0.
-    """
-
-    def write() -> None:
-        found = content()
-        if is_first_process() and (found.get("steps", 1) or not os.path.exists(path)):
-            Path(path).write_text(json.dumps(found))
-
-    Finalize(None, write, exitpriority=0)  # a process that multiprocessing starts has no atexit
-    return write
-
-
 class _Spawned:
     """Unpickled it watches the process: one that the script spawns, before that does anything else."""
 
@@ -69,10 +54,14 @@ class _Spawned:
         self.spec = spec
 
     def __reduce__(self) -> Any:
-        return importlib.import_module("legs_adapters.trace.child")._tracing, (self.spec,)  # (here it is __main__'s)
+        return importlib.import_module("legs_adapters.trace.child")._watched, (self.spec,)  # (here it is __main__'s)
 
 
-def _tracing(spec: Dict[str, Any]) -> None:
+def _watched(spec: Dict[str, Any]) -> None:
+    """Watch this process, and write the report when it ends.
+
+    Of several processes the one that saw steps writes it; of several of those rank 0.
+    """
     from legs_adapters.trace.photographs import Photographs
     from legs_adapters.trace.watching import Watch
 
@@ -83,47 +72,17 @@ def _tracing(spec: Dict[str, Any]) -> None:
             os._exit(0)
         sys.exit(0)  # (without the 0, a process of multiprocessing fails before Python 3.8)
 
-    def content() -> Dict[str, Any]:
-        names = ("steps", "backward_passes", "failure")
-        found = {name: getattr(watch, name) for name in names}
-        found.update(unseen=sorted(watch.unseen), scripted=sorted(watch.scripted))
-        return {"terms": list(watch.terms.values()), "is_over": bool(_over), **found}
+    def write() -> None:
+        if is_first_process() and (watch.steps or not os.path.exists(spec["report"])):
+            Path(spec["report"]).write_text(json.dumps({"is_over": bool(_over), **watch.report()}))
 
-    watch = Watch(spec["root"], Photographs(spec["folders"], spec["photos"]), spec["steps"], ended)
+    photographs = Photographs(spec["folders"], spec["photos"])
+    watch = Watch(spec["root"], photographs, spec.get("steps"), spec.get("losses"), ended)
     watch.install()
-    write = _report(spec["report"], content)
+    Finalize(None, write, exitpriority=0)  # a process that multiprocessing starts has no atexit
     start: Any = multiprocessing.spawn
     prepare = start.get_preparation_data
     start.get_preparation_data = lambda name: dict(prepare(name), legs_trace=_Spawned(spec))
-
-
-def _verifying(spec: Dict[str, Any]) -> None:
-    import numpy as np
-    import torch
-
-    from legs_loss.runtime import counts
-
-    losses: List[str] = []
-    times: List[float] = []
-    own_backward = torch.Tensor.backward
-
-    def backward(tensor: Any, *args: Any, **kwargs: Any) -> Any:
-        if tensor.numel() == 1:
-            if len(losses) >= spec["iterations"]:
-                sys.exit()  # the runner lets it pass, like the script's own
-            losses.append(float(tensor.detach()).hex())
-            times.append(time.perf_counter())
-        return own_backward(tensor, *args, **kwargs)
-
-    def content() -> Dict[str, Any]:
-        counted = {name: getattr(counts(), name) for name in ("weighted", "plain", "stored", "computed", "remembered")}
-        return {"losses": losses, "seconds": [b - a for a, b in zip(times, times[1:])], **counted}
-
-    torch.Tensor.backward = backward  # type: ignore
-    random.seed(0)
-    np.random.seed(0)
-    torch.manual_seed(0)
-    _report(spec["report"], content)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -12,13 +11,16 @@ from pathlib import Path
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 from legs_adapters.terms.traced import Trace, Traced
-from legs_adapters.trace.photographs import SURE
+from legs_adapters.trace.command import SCENE, filled, folders, parts
 from legs_loss import LegsError
 from legs_loss.system import say
 
-__all__ = ["CHILD", "ScriptFailed", "child_environment", "trace"]
+__all__ = ["ScriptFailed", "run_watched", "trace"]
 
-CHILD = "legs_adapters.trace.child"
+_SETTINGS = {  # no bytecode is written into the checkout; torch.compile and TorchScript cannot be watched
+    "PYTHONDONTWRITEBYTECODE": "1", "TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0",
+}  # fmt: skip
+_NOTHING: Dict[str, Any] = {"terms": [], "steps": 0, "backward_passes": 0, "unseen": [], "scripted": []}
 
 
 class ScriptFailed(LegsError):
@@ -43,89 +45,77 @@ def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optio
         ScriptFailed: the script did.
         LegsError: the command names no script; or nothing was trained.
     """
-    before, script, arguments = _parts(root, command)
+    launcher, script, arguments = parts(root, command)
+    if photos is not None and not os.path.isdir(photos):
+        raise LegsError(f"--photos {photos}: there is no such folder")
     with tempfile.TemporaryDirectory(prefix="legs-trace-") as work:
-        folders = _folders(root, arguments)
-        if cpu and not folders:
-            from legs_adapters.verify import embedded_arguments
-
-            arguments += embedded_arguments(root / script, arguments, Path(work), 10 * steps)
-            folders = _folders(root, arguments)
-        if photos is not None and not os.path.isdir(photos):
-            raise LegsError(f"--photos {photos}: there is no such folder")
-        report = Path(work) / "report.json"
-        spec: Dict[str, Any] = {"report": str(report), "root": str(root), "cpu": cpu, "steps": steps}
-        spec.update(folders=folders, photos=photos and os.path.abspath(photos))
         if cpu:
             from legs_adapters.shims.packages import check_imports
+            from legs_loss.lab.embedded import write_embedded_scene
 
             check_imports(root, script)
+            if not folders(root, arguments):
+                places = {"scene": write_embedded_scene(Path(work) / "scene", **SCENE), "output": Path(work) / "output"}
+                arguments += filled(root / script, None, arguments, 10 * steps, **places)
         say(f"legs-patch: running {script} in {root} for {steps} steps; it writes where it always does", sys.stderr)
-        eager = {"TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0"}  # torch.compile and TorchScript cannot be watched
-        words = [*(before or [sys.executable]), "-m", CHILD, json.dumps(spec), script, *arguments]
-        code = subprocess.run(
-            words, cwd=str(root), env=child_environment(cpu, **eager), stdout=2, stdin=subprocess.DEVNULL
-        ).returncode
-        content = _read(report)
-    if code and not content.get("is_over"):  # (a rank that waits for one that has ended fails)
+        code, seen = run_watched(root, [script, *arguments], cpu, photos, {"steps": steps}, launcher, stdout=2)
+    if code and not seen.get("is_over"):  # (a rank that waits for one that has ended fails)
         message = f"{script} ended with exit code {code}; nothing was changed. By reading: legs-patch {root}"
         raise ScriptFailed(message, code if code > 0 else 128 - code)
-    if content.get("failure"):
-        say(f"legs-patch: warning: a difference could not be watched ({content['failure']})", sys.stderr)
-    terms = [Traced.read(term, SURE) for term in content["terms"]]
-    if not content["steps"]:
-        seen = f"{content['backward_passes']} backward passes" if content["backward_passes"] else "no backward pass"
+    if seen.get("failure"):
+        say(f"legs-patch: warning: a difference could not be watched ({seen['failure']})", sys.stderr)
+    names = ", ".join(seen["unseen"])
+    unseen = [f"a trace cannot look into fused kernels, as these under the loss: {names}"] if names else []
+    if not seen["steps"]:
+        passes = f"{seen['backward_passes']} backward passes" if seen["backward_passes"] else "no backward pass"
         raise LegsError(
-            f"{script} ended before an optimiser moved what it renders ({seen} seen): by reading: legs-patch {root}",
-            *_unseen(content["unseen"]),
+            f"{script} ended before an optimiser moved what it renders ({passes} seen): by reading: legs-patch {root}",
+            *unseen,
         )
-    known = [term for term in terms if term.steps or term.poses]
-    if not any(term.is_photometric for term in known):
-        for line in _unseen(content["unseen"]):
-            say(f"legs-patch: warning: {line}", sys.stderr)
-    return Trace(known, content["steps"], frozenset(map(tuple, content["scripted"])))
+    terms = Traced.read(seen["terms"])
+    for line in unseen if not any(term.is_photometric for term in terms) else ():
+        say(f"legs-patch: warning: {line}", sys.stderr)
+    return Trace(terms, seen["steps"], frozenset(map(tuple, seen["scripted"])))
 
 
-def _unseen(names: Sequence[str]) -> List[str]:
-    return [f"a trace cannot look into fused kernels, as these under the loss: {', '.join(names)}"] if names else []
+def run_watched(
+    root: Path,
+    words: Sequence[str],
+    cpu: bool,
+    photos: Optional[str],
+    limits: Dict[str, int],
+    launcher: Sequence[str] = (),
+    settings: Optional[Dict[str, str]] = None,
+    **streams: Any,
+) -> Tuple[int, Dict[str, Any]]:
+    """Run a script in a checkout, watched, and return its exit code and the report of the process.
 
-
-def child_environment(cpu: bool, **settings: str) -> Dict[str, str]:
-    """Return the environment of a watched process: legs-patch's packages, no bytecode written into the checkout."""
+    Args:
+        root: the checkout.
+        words: the script and its arguments.
+        cpu: run it with the shims, without a GPU.
+        photos: the folder of the photographs, by the user's word.
+        limits: after how many "steps" or "losses" the script is ended.
+        launcher: a program that starts it; default: this Python.
+        settings: environment variables; those of the user's that begin with LEGS_ are not passed on.
+        streams: further arguments of `subprocess.run`, whose time limit ends the script with the code -1.
+    """
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
-    environment.update(PYTHONDONTWRITEBYTECODE="1", **settings)
-    if cpu:
-        environment["CUDA_VISIBLE_DEVICES"] = ""
+    environment.update(_SETTINGS, **(settings or {}), **({"CUDA_VISIBLE_DEVICES": ""} if cpu else {}))
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
-    return environment
-
-
-def _parts(root: Path, command: str) -> Tuple[List[str], str, List[str]]:
-    """Return what stands before the script (nothing for python itself), the script, and its arguments."""
-    try:
-        words = shlex.split(command)
-    except ValueError as error:
-        raise LegsError(f"--trace {command!r}: {error}") from None
-    at = next((i for i, word in enumerate(words) if word.endswith(".py")), None)
-    if at is None:
-        raise LegsError(f'--trace {command!r} names no script: --trace "train.py -s SCENE"')
-    if not (root / words[at]).is_file():
-        raise LegsError(f"--trace: there is no {words[at]} in {root}")
-    before = [word for word in words[:at] if word != "-m"]
-    is_python = all(os.path.basename(word).startswith("python") or word == "-u" for word in before)
-    return [] if is_python else before, words[at], words[at + 1 :]
-
-
-def _folders(root: Path, arguments: Sequence[str]) -> List[str]:
-    """Return the folders that a command's words name, the outermost only; not the checkout itself, nor one of it."""
-    named = [word.partition("=")[2] if word.startswith("-") else word for word in arguments]
-    paths = [os.path.realpath(str(root / word)) for word in named if word]
-    found = [path for path in dict.fromkeys(paths) if os.path.isdir(path) and path != os.path.realpath(str(root))]
-    return [path for path in found if not any(path != other and path.startswith(other + os.sep) for other in found)]
-
-
-def _read(report: Path) -> Dict[str, Any]:
-    try:
-        return json.loads(report.read_text())
-    except (OSError, ValueError):  # it was killed
-        return {"terms": [], "steps": 0, "backward_passes": 0, "unseen": []}
+    with tempfile.TemporaryDirectory(prefix="legs-trace-") as work:
+        report = Path(work) / "report.json"
+        spec = {"report": str(report), "root": str(root), "cpu": cpu, "folders": folders(root, words[1:]), **limits}
+        spec["photos"] = photos and os.path.abspath(photos)
+        command: List[str] = [*(launcher or [sys.executable]), "-m", "legs_adapters.trace.child", json.dumps(spec)]
+        try:
+            done = subprocess.run(
+                [*command, *words], cwd=str(root), env=environment, stdin=subprocess.DEVNULL, **streams
+            )
+            code = done.returncode
+        except subprocess.TimeoutExpired:
+            code = -1
+        try:
+            return code, json.loads(report.read_text())
+        except (OSError, ValueError):  # it was killed
+            return code, _NOTHING

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
+import time
 import weakref
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
@@ -18,6 +19,7 @@ import legs_loss
 import legs_loss.runtime
 from legs_adapters.trace.graph import KEY, Graph
 from legs_adapters.trace.photographs import SURE, Photographs, as_planes, thumbnail
+from legs_loss.runtime import counts
 
 __all__ = ["Watch"]
 
@@ -95,28 +97,41 @@ class Watch:
     Args:
         root: the checkout, whose frames are kept.
         photographs: the image files that targets are compared with.
-        steps: after how many steps `ended` is called.
+        steps, losses: after how many steps, and before how many further backward passes of a scalar `ended` is called.
         ended: ends the script.
     """
 
-    def __init__(self, root: str, photographs: Photographs, steps: int, ended: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        root: str,
+        photographs: Photographs,
+        steps: Optional[int],
+        losses: Optional[int],
+        ended: Callable[[], None],
+    ) -> None:
         self.root: str = os.path.join(os.path.realpath(root), "")
         self.photographs: Photographs = photographs
-        self.limit = steps
+        self.most_steps, self.most_losses = steps, losses
         self.ended = ended
         self.steps: int = 0
         self.backward_passes: int = 0
+        self.losses: List[str] = []
+        self.times: List[float] = []
         self.terms: Dict[Any, Dict[str, Any]] = {}
         self.unseen: Set[str] = set()
-        self.scripted: Set[Tuple[str, str]] = (
-            set()
-        )  # files and names of TorchScript's functions, where nothing is edited
+        self.scripted: Set[Tuple[str, str]] = set()  # files and names of functions of TorchScript: nothing is edited
         self.failure = ""
         self._waiting: Dict[Any, Set[int]] = {}  # terms whose step is awaited, with the ids of the leaves under each
         self._samples: Dict[int, _Sample] = {}
         self._files: Dict[str, Optional[str]] = {}
         self._names: Dict[int, str] = {}
         self._inside = False
+
+    def report(self) -> Dict[str, Any]:
+        """Return what was seen so far, as JSON has it."""
+        found = {name: getattr(self, name) for name in ("steps", "backward_passes", "failure", "losses")}
+        found.update(terms=list(self.terms.values()), unseen=sorted(self.unseen), scripted=sorted(self.scripted))
+        return {**found, "seconds": [b - a for a, b in zip(self.times, self.times[1:])], **vars(counts())}
 
     def install(self) -> None:
         """Wrap torch's differences, its backward passes and its optimisers, for good."""
@@ -125,7 +140,7 @@ class Watch:
                 if hasattr(owner, name):
                     setattr(owner, name, self._difference(getattr(owner, name), kind, name in ("__rsub__", "rsub")))
         for name in ("backward", "grad"):
-            setattr(torch.autograd, name, self._backward(getattr(torch.autograd, name)))
+            setattr(torch.autograd, name, self._backward(getattr(torch.autograd, name), name == "backward"))
         self._functions()
         jit: Any = torch.jit
         own_script = jit.script
@@ -156,7 +171,7 @@ class Watch:
         def watched(*args: Any, **kwargs: Any) -> Any:
             if self._inside:
                 return own(*args, **kwargs)
-            weighted = legs_loss.runtime.counts().weighted
+            weighted = counts().weighted
             self._inside = kind == "weighted"
             try:
                 made = own(*args, **kwargs)
@@ -166,7 +181,7 @@ class Watch:
                 names = ("input", "other", "prediction", "target")
                 sides = [*args, *(kwargs[name] for name in names if name in kwargs)][:2]
                 if len(sides) == 2 and all(isinstance(side, torch.Tensor) for side in sides):
-                    is_plain = kind == "weighted" and legs_loss.runtime.counts().weighted == weighted
+                    is_plain = kind == "weighted" and counts().weighted == weighted
                     self._record("plain" if is_plain else kind, sides[::-1] if is_reversed else sides, made)
             return made
 
@@ -209,8 +224,9 @@ class Watch:
         frame = sys._getframe(4)
         while frame is not None:
             path = self._inside_root(frame.f_code.co_filename)
-            if path is None and not found and frame.f_globals.get("__name__", "").startswith(_OWN):
-                return ()  # a shim's, or one of the loss that is there already
+            name = frame.f_globals.get("__name__", "")
+            if path is None and not found and name.startswith(_OWN) and name != legs_loss.runtime.__name__:
+                return ()  # a shim's, or one of another loss (the run time's `unweighted` calls the script's)
             if path is not None:
                 found.append((path, frame.f_lineno, frame.f_code.co_name, _names(frame, sides)))
             frame = frame.f_back  # type: ignore[assignment]
@@ -225,13 +241,18 @@ class Watch:
 
     # -- backward passes
 
-    def _backward(self, own: Any) -> Any:
+    def _backward(self, own: Any, is_step: bool) -> Any:
         @functools.wraps(own)
         def watched(tensors: Any, *args: Any, **kwargs: Any) -> Any:
             if self._inside:
                 return own(tensors, *args, **kwargs)
             self._settle()  # what was stepped without an optimiser of torch's
             roots = list(tensors) if isinstance(tensors, (tuple, list)) else [tensors]
+            if is_step and len(roots) == 1 and roots[0].numel() == 1:
+                if self.most_losses is not None and len(self.losses) >= self.most_losses:
+                    self.ended()
+                self.losses.append(float(roots[0].detach()).hex())
+                self.times.append(time.perf_counter())
             seen = self._seen(roots) or []
             made = own(tensors, *args, **kwargs)
             self._sum_up(roots, seen)
@@ -261,8 +282,8 @@ class Watch:
         known = None if match is None or match.correlation < SURE else match.is_photograph
         key = record.frames, kind, record.target, known
         self.terms.setdefault(key, {
-            "frames": [list(frame) for frame in record.frames], "kind": kind, "target": record.target,
-            "shape": list(record.still.shape), "is_picture": picture is not None, "match": match and match._asdict(),
+            "frames": record.frames, "kind": kind, "target": record.target, "shape": list(record.still.shape),
+            "is_picture": picture is not None, "match": match and match._asdict(), "is_known": known is not None,
             "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
         })  # fmt: skip
         return key
@@ -301,7 +322,7 @@ class Watch:
 
         What has not changed waits on: for another optimiser, or until enough gradients are accumulated.
         """
-        if self._changes() and self.steps >= self.limit:
+        if self._changes() and self.most_steps is not None and self.steps >= self.most_steps:
             self.ended()
 
     @_harmless

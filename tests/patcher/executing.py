@@ -72,7 +72,7 @@ class _Leaves(ast.NodeTransformer):
             self.names[name] = self.names[text]
             return ast.Name(name, ast.Load())
         with contextlib.suppress(Exception):
-            return node if callable(eval(text, self.names)) else None
+            return node if text != "input" and callable(eval(text, self.names)) else None
         return None
 
     def visit_Name(self, node):

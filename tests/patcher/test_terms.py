@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("libcst")
 
 from legs_adapters.plan import plan
+from legs_adapters.report import as_table
 from legs_adapters.terms import kinds
 from legs_adapters.terms.form import Form
 
@@ -91,3 +92,15 @@ def test_every_kind_is_found_by_itself():
         "Reread",
         "Ssim",
     }
+
+
+@pytest.mark.parametrize(
+    ("case", "why"),
+    [
+        ("l1_function_as_value_weighted", "image and gt_image, the photograph, at train.py:14"),
+        ("registered_callable_weighted", "input and target, the photograph"),
+    ],
+)
+def test_what_is_passed_by_name_names_both_sides(case, why, tmp_path):
+    found = plan(checkout(tmp_path, files(case)))
+    assert f"passed by name, and called with {why}\n" in as_table(found)

@@ -91,9 +91,11 @@ class Verdicts:
         return self.callable(holder, form)
 
     @staticmethod
-    def callable(function: Function, form: Form) -> Site:
+    def callable(function: Function, form: PassedByName) -> Site:
         """Return a function that is passed by name as a site."""
-        return Site.at(function, form, "passed by name")
+        caller, sides = form.caller, f"{one_line(form.first)} and {one_line(form.second)}, the photograph"
+        at = "" if caller is None else f", at {caller.module.path}:{caller.place(form.call).line}"
+        return Site.at(function, form, f"passed by name, and called with {sides}{at}")
 
     def doubt(self, function: Function, form: Form, place: Place, left: Left) -> Optional[Problem]:
         """Return the warning of a skipped term that may be the loss, if nothing else is found; None of any other."""

@@ -15,6 +15,27 @@ FILTER = """document.querySelector(".filter").addEventListener("input", (event) 
     row.hidden = !row.textContent.toLowerCase().includes(word);
 });"""
 
+# A host shows it in place of a page in any folder, so it refers to no file, and looks for the site's folder upwards.
+NOT_FOUND = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Not found - legs-loss</title>
+<style>
+:root { color-scheme: light dark }
+body { font: 1.1rem/1.6 sans-serif; max-width: 34rem; margin: 15vh auto; padding: 0 1rem }
+</style>
+<h1>There is no such page</h1>
+<p><a id="start" href="index.html">The first page of legs-loss</a> has a search and lists the others.</p>
+<script>
+(async () => {
+  for (let at = new URL(".", location); ; at = new URL("..", at)) {
+    const found = await fetch(new URL("objects.inv", at), {method: "HEAD"}).catch(() => ({}));
+    if (found.ok) document.getElementById("start").href = new URL("index.html", at);
+    if (found.ok || at.pathname === "/") return;
+  }
+})();
+</script>
+"""
+
 
 def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
     """Drop links to folders and to files outside of docs/; their text stays."""
@@ -28,8 +49,15 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
     return re.sub(r"(?<!!)\[([^\]]*)\]\((?!https?:|#)([^)\s]+)\)", kept, markdown)
 
 
+def _with_breaks(cell: re.Match[str]) -> str:
+    """Let the code in a cell of a table break after a bracket, a dot, a stroke: a telephone is narrow."""
+    return re.sub(r"<code>[^<]*", lambda code: re.sub(r"((?!\(\))[(_=./])", r"\1<wbr>", code.group()), cell.group())
+
+
 def on_page_content(content: str, page: Any, config: Any, **_: Any) -> str:
-    """Show names that docstrings refer to as code, and append to its page the table of codebases with a filter."""
+    """Keep options on one line, show names of docstrings as code, and append the table of codebases to its page."""
+    content = re.sub(r"<code>(--?\w[^<\s]{0,30})</code>", r'<code class="whole">\1</code>', content)  # an option
+    content = re.sub(r"<t[dh][ >].*?</t[dh]>", _with_breaks, content, flags=re.S)
     content = re.sub(r":\w+:<code>~?(?:[\w.]+\.)?(\w+)</code>", r"<code>\1</code>", content)  # `:func:` is Sphinx's
     if page.file.src_uri != "compatibility.md":
         return content
@@ -49,8 +77,4 @@ def on_post_build(config: Any, **_: Any) -> None:
     """Write the index of the search as a script, too: a page that is opened from the disk cannot read the other."""
     index = Path(config["site_dir"], "search", "search_index.json")
     index.with_suffix(".js").write_text(f"var __index = {index.read_text(encoding='utf-8')}", encoding="utf-8")
-    # Without an address of the site the page for what is not found links to the root of the host.
-    lost = Path(config["site_dir"], "404.html")
-    if lost.is_file():
-        text = re.sub(r'(href|src)="/(?!/)', r'\1="./', lost.read_text(encoding="utf-8"))
-        lost.write_text(text.replace('"base": "/"', '"base": "."'), encoding="utf-8")
+    Path(config["site_dir"], "404.html").write_text(NOT_FOUND, encoding="utf-8")

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -61,6 +65,34 @@ class TestSite:
         page.locator("input.md-search__input").first.type("precompute", delay=50)
         page.wait_for_selector(".md-search-result__item", state="attached", timeout=60_000)
         assert troubles == []
+        page.close()
+
+    def test_what_is_not_found_leads_back_from_any_folder_of_any_host(self, site, browser, tmp_path):
+        shutil.copytree(str(site), str(tmp_path / "below" / "legs"))
+
+        class Host(SimpleHTTPRequestHandler):
+            def send_error(self, code, *more):
+                self.send_response(code)
+                self.end_headers()
+                self.wfile.write((site / "404.html").read_bytes() if self.command == "GET" else b"")
+
+        server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Host, directory=str(tmp_path)))
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page = browser.new_page()
+        for lost in ("nothing.html", "evidence/deep/nothing"):
+            page.goto(f"http://127.0.0.1:{server.server_port}/below/legs/{lost}")
+            page.wait_for_function("document.getElementById('start').href.endsWith('/below/legs/index.html')")
+        page.click("#start")
+        assert page.title() == "legs-loss"
+        page.close()
+        server.shutdown()
+        server.server_close()
+
+    def test_no_page_is_wider_than_a_telephone(self, site, browser):
+        page = browser.new_page(viewport={"width": 400, "height": 900})
+        for name in ("index", "patching", "evidence", "cpu", "masks", "api", "codebases/fastgs"):
+            page.goto((site / f"{name}.html").as_uri())
+            assert page.evaluate("document.documentElement.scrollWidth") <= 400, name
         page.close()
 
 

@@ -29,7 +29,8 @@ def masked(prediction: Tensor, target: Tensor) -> Tensor:
     else is a mean over the whole image is diluted: :func:`coverage`.
 
     Args:
-        prediction, target: the rendering and the photograph, as for :func:`l1_loss`.
+        prediction: the rendering, as for :func:`l1_loss`.
+        target: the photograph.
 
     Returns:
         The prediction's shape; the prediction itself, the same tensor, where no mask leaves anything out: no store with
@@ -86,8 +87,9 @@ def ssim(
     (docs/performance.md): equal up to rounding, differentiable once; with LEGS_OFF=1 they are 3DGS's own there, too.
 
     Args:
-        img1, img2: the two images, in either order, by 3DGS's names: floats in [0, 1], of one shape, [H, W],
+        img1: one of the two images, in either order, by 3DGS's names: floats in [0, 1], of one shape, [H, W],
             [C, H, W], [H, W, C] or batches of these; or an image beside a batch of one image, as 3DGS's takes them.
+        img2: the other.
         window_size: the window's side in pixels, odd.
         size_average: the mean over all images; False is one value an image, [B].
         padding: "zeros" as in 3DGS's code, "reflect", "replicate", or "valid" (only windows inside the image).

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from PIL import Image
 from legs_loss.lab.embedded.colmap_writer import write_colmap
 from legs_loss.runtime import state
 from legs_loss.scenes import Camera, PointCloud
+from tests.preloaded import PATH, run
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -48,17 +48,12 @@ def legs_command(*arguments):
 
 def legs_environment():
     """Return an environment in which the child imports the same package as the tests."""
-    return dict(os.environ, OMP_NUM_THREADS="1", PYTHONPATH=os.pathsep.join(p for p in sys.path if p))
+    return dict(os.environ, OMP_NUM_THREADS="1", PYTHONPATH=PATH)
 
 
 def legs(*arguments, **options):
-    """Run ``legs`` as a real subprocess and return the completed process, with text output."""
-    return subprocess.run(
-        legs_command(*arguments),
-        capture_output=True,
-        text=True,
-        **{"cwd": str(ROOT), "env": legs_environment(), "timeout": 900, **options},
-    )
+    """Run ``legs`` in a process of its own and return the completed process, with text output."""
+    return run(legs_command(*arguments), **{"cwd": str(ROOT), "env": legs_environment(), "timeout": 900, **options})
 
 
 def without_times(metrics):

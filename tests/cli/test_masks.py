@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from PIL import Image
 
 from legs_loss.cli.shared.sheet import Shown, save_sheet
 from legs_loss.spec import PRESETS
+from tests import support
 
 
 def legs(*arguments, code=0):
-    command = [sys.executable, "-m", "legs_loss", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = support.legs(*arguments)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     return done.stdout + done.stderr

@@ -246,7 +246,9 @@ LABORIOUS = {
 
 
 @pytest.mark.skipif(not hasattr(signal, "alarm"), reason="needs a clock that ends it")
-@pytest.mark.parametrize("what", LABORIOUS, ids=lambda what: what.replace(" ", "_"))
+@pytest.mark.parametrize(
+    "what", [pytest.param(what, marks=[pytest.mark.slow] * (what == "50,000 edits")) for what in LABORIOUS]
+)
 def test_a_journal_that_would_take_days(what, attack):
     """The refusal advises to look at the effects of a stranger's journal: that ends, whatever is in it."""
     folder, ran = attack

@@ -13,6 +13,7 @@ from legs_loss import LegsError
 from legs_loss.store import WeightStore
 from legs_loss.system import say_error
 from tests.patcher.support import checkout, files
+from tests.preloaded import run
 from tests.support import colmap_scene, legs_command, legs_environment, photograph, save
 
 
@@ -87,7 +88,7 @@ class TestLegs:
 
     def legs(self, *arguments, code, encoding="ascii"):
         environment = dict(legs_environment(), PYTHONIOENCODING=encoding)
-        done = subprocess.run(legs_command(*arguments), capture_output=True, env=environment, timeout=300)
+        done = run(legs_command(*arguments), env=environment, text=False)
         assert done.returncode == code, done.stderr
         printed = done.stdout + done.stderr
         assert b"\x1b" not in printed and b"\x07" not in printed and b"Traceback" not in printed
@@ -154,7 +155,7 @@ class TestLegs:
             assert b"\\n" in self.run(*arguments, code=2).stderr, arguments
 
     def run(self, *arguments, code):
-        done = subprocess.run(legs_command(*arguments), capture_output=True, env=legs_environment(), timeout=300)
+        done = run(legs_command(*arguments), env=legs_environment(), text=False)
         assert done.returncode == code, done.stderr
         printed = done.stdout + done.stderr
         assert b"\x1b[31m" not in printed and b"Traceback" not in printed

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import subprocess
 import sys
 import textwrap
 
@@ -13,6 +12,7 @@ import torch
 
 from legs_loss import LegsError, weight_map
 from legs_loss.runtime import state
+from tests.preloaded import run
 from tests.support import ROOT, legs_environment
 
 FAKE = {
@@ -222,9 +222,7 @@ def test_whichever_is_imported_first(nerfstudio, first):
         "assert plugin.splatfacto_legs.config.method_name == 'splatfacto-legs'\n"
         "assert plugin.SplatfactoLegsModel is all_methods['splatfacto-legs'].pipeline.model._target\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=str(nerfstudio), env=legs_environment(), capture_output=True, text=True
-    )
+    done = run([sys.executable, "-c", program], cwd=nerfstudio, env=legs_environment())
     assert done.returncode == 0, done.stderr
 
 
@@ -235,7 +233,7 @@ def test_without_nerfstudio_nothing_of_it_is_imported():
         "try:\n    plugin.splatfacto_legs\nexcept ModuleNotFoundError as error:\n    print(error.name)\n"
         "print(hasattr(plugin, 'something_else'))\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], env=legs_environment(), capture_output=True, text=True)
+    done = run([sys.executable, "-c", program], env=legs_environment())
     assert done.stdout.split() == ["nerfstudio", "False"], done.stderr
 
 

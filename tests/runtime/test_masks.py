@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import numpy as np
@@ -16,6 +15,7 @@ from legs_loss.precompute import OwnMaps, precompute
 from legs_loss.runtime import active, counts, state
 from legs_loss.scenes import read_scene
 from legs_loss.similarity import ssim_map
+from tests.preloaded import run
 from tests.runtime.support import plain
 from tests.support import legs_environment
 
@@ -292,9 +292,7 @@ class TestNoSilence:
             f"        image = legs_loss.masked(image, one) if {hidden} else image\n"
             "        legs_loss.l1_loss(image, one)\n"
         )
-        done = subprocess.run(
-            [sys.executable, "-c", code], env=legs_environment(), capture_output=True, text=True, check=True
-        )
+        done = run([sys.executable, "-c", code], env=legs_environment(), check=True)
         lines = done.stderr.splitlines()
         whole = (
             "legs-loss: masks: 2 view(s) masked, 1 without a mask counted whole, "

@@ -12,6 +12,7 @@ import torch
 
 from legs_loss import LegsError, WeightSpec, configure, l1_loss, weight_map
 from legs_loss.runtime import counts, memo, state
+from tests.preloaded import run
 from tests.runtime.support import pair, plain, weighted
 from tests.support import legs_environment
 
@@ -216,7 +217,7 @@ print(bool(l1_loss(image, target) > (image - target).abs().mean() + 1e-3))
         environment = {name: value for name, value in legs_environment().items() if not name.startswith("LEGS_")}
         environment.update(variables, LEGS_BACKEND="torch")
         command = [sys.executable, str(tmp_path / "train.py")]
-        return subprocess.run(command, env=environment, capture_output=True, text=True)
+        return run(command, env=environment)
 
     @pytest.mark.parametrize(("value", "weighted"), [("false", True), ("no", True), ("yes", False), ("1", False)])
     def test_legs_off(self, tmp_path, value, weighted):

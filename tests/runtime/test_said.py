@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import pytest
@@ -10,6 +9,7 @@ import torch
 
 from legs_loss import LegsError, LEGSLoss, configure, l1_loss, legs_loss, ssim, unweighted, weight_map, weighted_l1
 from legs_loss.config import find_config
+from tests.preloaded import run
 from tests.runtime.support import pair, plain
 from tests.support import legs_environment
 
@@ -73,7 +73,7 @@ BETA = ", beta 0; settings from environment variable "
 def said(code: str, folder, **variables: str):
     """The lines on stderr of a process that runs a script."""
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=folder, env={**legs_environment(), **variables}, capture_output=True, text=True)
+    done = run(command, cwd=folder, env={**legs_environment(), **variables})
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""
     return done.stderr.splitlines()

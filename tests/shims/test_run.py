@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from legs_loss.lab.embedded import write_embedded_scene
+from tests import preloaded
 from tests.patcher.support import checkout, snapshot
 from tests.support import legs_environment
 
@@ -33,9 +34,7 @@ def texts():
 def run(root, *arguments, cpu=True, **variables):
     environment = {name: value for name, value in legs_environment().items() if not name.startswith("LEGS_")}
     command = [sys.executable, "-m", "legs_loss", "run", *(["--cpu"] if cpu else []), *map(str, arguments)]
-    return subprocess.run(
-        command, cwd=str(root), env=dict(environment, **variables), capture_output=True, text=True, timeout=600
-    )
+    return preloaded.run(command, cwd=root, env=dict(environment, **variables), timeout=600)
 
 
 def result(done):

@@ -1,6 +1,6 @@
 """Find what a call depicts: a rendering, a loaded photograph, or a function of an image.
 
-`_READINGS` are asked in their order; the first that knows a call decides. What stands earlier is more certain: what
+The readings are asked in their order; the first that knows a call decides. What stands earlier is more certain: what
 torch's operations do, then what a name says, then what the arguments are, then what the called function returns.
 """
 
@@ -27,7 +27,7 @@ from legs_adapters.tensors.operations import (
     REDUCES,
 )
 
-__all__ = ["CallReading", "MeaningOf", "meaning_of_call"]
+__all__ = ["CallReading", "MeaningOf", "meaning_of_call", "meaning_returned"]
 
 
 MeaningOf = Callable[[Function, cst.CSTNode], Meaning]  # of an expression of a function
@@ -71,9 +71,10 @@ class CallReading:
         return node.value in MODULES or (bool(found) and all(isinstance(d.value, cst.Import) for _, d in found or ()))
 
 
-def meaning_of_call(call: CallReading) -> Meaning:
-    """Return what a call depicts, from its name, its arguments and the definition of the function."""
-    return next((known for known in (reading(call) for reading in _READINGS) if known is not None), UNKNOWN)
+def meaning_of_call(call: CallReading, by_arguments: bool = True) -> Meaning:
+    """Return what a call depicts, from its name and what the function returns; on request from its arguments, too."""
+    readings = (*_SURE, *((_of_images, meaning_returned, _of_owner) if by_arguments else (meaning_returned,)))
+    return next((known for known in (reading(call) for reading in readings) if known is not None), UNKNOWN)
 
 
 def _number(call: CallReading) -> Optional[Meaning]:
@@ -149,7 +150,7 @@ def _of_images(call: CallReading) -> Optional[Meaning]:
     return mix(images) if images else None
 
 
-def _returned(call: CallReading) -> Optional[Meaning]:
+def meaning_returned(call: CallReading) -> Optional[Meaning]:
     """Return what the called function returns."""
     for reference in call.program.resolve(call.function, call.node.func):
         target = reference.target
@@ -165,8 +166,7 @@ def _of_owner(call: CallReading) -> Optional[Meaning]:
     return Meaning(kind, call.ask(call.owner).role if kind and call.owner is not None else None)
 
 
-_READINGS: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
+_SURE: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
     *(_number, _extreme, _reduced, _statistic, _filtered, _moved),
     *(_rendered, _named),
-    *(_of_images, _returned, _of_owner),
 )

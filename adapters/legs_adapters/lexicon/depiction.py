@@ -36,13 +36,11 @@ class Meanings:
 
     Args:
         program, training: the program, and what its backward passes depend on.
-        by_name: whether a name decides on the role before what is assigned to it.
     """
 
-    def __init__(self, program: Program, training: Training, by_name: bool = True) -> None:
+    def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
-        self._by_name = by_name
         self.rows: Dict[Tuple[int, int], bool] = {}  # see `is_rows`
         self._known: Dict[_Question, Meaning] = {}
         self._here: Dict[_Question, Tuple[Meaning, int]] = {}
@@ -112,7 +110,7 @@ class Meanings:
         """Return the meaning of a name, of its words and of what is assigned to it."""
         shown = "image_" if flow.kind == "image" else ""
         kind, role = kind_of_words(shown + node.value), role_of_words(node.value)
-        role = role or flow.role if self._by_name else flow.role or role
+        role = role or flow.role
         if kind == "image" and flow.kind == "feature":
             return Meaning("image", role)  # `rgb = outputs["features"]`: colours, there
         if kind == "mask" and flow.kind in ("flow", "depth"):
@@ -173,8 +171,6 @@ class Meanings:
 
     def _definition(self, function: Function, definition: Definition) -> Meaning:
         value = definition.value
-        if not self._by_name and definition.kind in ("parameter", "store"):
-            return UNKNOWN  # only its name says which of several it is
         if definition.kind == "parameter":
             return self._parameter(function, definition)
         if value is None or definition.kind in ("import", "function", "class"):

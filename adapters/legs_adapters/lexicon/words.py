@@ -90,12 +90,13 @@ DATA = CAMERAS | word_set(
 POSES = _CAMERA | word_set("pose poses so se extrinsic extrinsics camtoworld camtoworlds tracking")
 EMBEDDING = word_set("embedding embeddings")
 GAUSSIANS = word_set("gaussian gaussians gs splat splats")
-MODELS = GAUSSIANS | word_set(
+TENSORS = word_set(
     """
-    xyz means opacity opacities scaling scalings scales features shn model models net network mlp scene deform anchor
-    anchors primitives points parameters params variables
+    xyz means opacity opacities scaling scalings scales features shn anchor anchors primitives points parameters params
+    variables
     """
-)
+)  # of Gaussians
+MODELS = GAUSSIANS | TENSORS | word_set("model models net network mlp scene deform")
 PLUMBING = word_set("torch optim adam params parameters lr name eps self")  # around what an optimiser is given
 
 # -- purposes

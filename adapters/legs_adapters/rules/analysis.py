@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from legs_adapters.code.program import Program
 from legs_adapters.lexicon.depiction import Meanings
+from legs_adapters.lexicon.ways import Ways
 from legs_adapters.rules.purpose import Purposes
 from legs_adapters.rules.splats import Splats
 from legs_adapters.tensors.backward import Training
@@ -25,7 +26,7 @@ class Analysis:
         program: its files, linked by names.
         prospects: which text can lead to an L1.
         training: what its backward passes depend on.
-        meanings, origins: what its expressions depict: by their names, and by what is assigned to them.
+        meanings, ways: what its expressions depict: by their names, too, and by the way they came alone.
         forms: its L1 expressions.
         purposes: the purposes of its backward passes.
         callbacks: the L1 functions that are passed by name.
@@ -37,7 +38,7 @@ class Analysis:
         self.prospects: Prospects = Prospects(source.text for source in program.sources.values())
         self.training: Training = Training(self.program, self.prospects.may_lead)
         self.meanings: Meanings = Meanings(self.program, self.training)
-        self.origins: Meanings = Meanings(self.program, self.training, by_name=False)
+        self.ways: Ways = Ways(self.program, self.training)
         self.forms: Forms = Forms(L1Functions(self.program, self.prospects))
         self.purposes: Purposes = Purposes(self.program, self.training)
         self.splats: Splats = Splats(self.program, self.training, self.forms)

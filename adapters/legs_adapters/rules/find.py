@@ -23,7 +23,7 @@ from legs_adapters.rules.ssim import with_ssims
 from legs_adapters.rules.traced import with_trace
 from legs_adapters.rules.verdict import Verdicts
 from legs_adapters.tensors.backward import TRAINS
-from legs_adapters.tensors.operations import MODULE_SELF, MODULE_WRAPS
+from legs_adapters.tensors.operations import HOOKS, MODULE_SELF, MODULE_WRAPS
 from legs_adapters.terms.findings import Findings, Left, Problem, Site
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.called import Called
@@ -37,7 +37,7 @@ _Entry = Tuple[Place, Union[Site, Left, Problem]]
 
 _TEXT = 50  # letters of a text that are searched in a step
 _MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|\bunweighted\(")
-_TO_READ = re.compile(f"{_MAY_HAVE_L1.pattern}|{TRAINS.pattern}")
+_TO_READ = re.compile(f"{_MAY_HAVE_L1.pattern}|{TRAINS.pattern}|{'|'.join(sorted(HOOKS))}")
 
 
 def find(
@@ -82,8 +82,12 @@ class _Finder:
 
     def run(self) -> Findings:
         found, program = self.found, self.analysis.program
-        for module in program.matching(_MAY_HAVE_L1):
-            self.bar.update(0.5)
+        may_have = self.analysis.prospects.may_have  # of an L1 that its callers do not name so
+        for module in program.matching(_TO_READ):
+            is_named = _MAY_HAVE_L1.search(module.text) is not None
+            if not is_named and not may_have(module.text):
+                continue
+            self.bar.update(0.5 * is_named)
             over = module.budget.why_none_left()
             if over:
                 program.give_up(module.path, over)

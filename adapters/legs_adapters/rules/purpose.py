@@ -13,15 +13,30 @@ import libcst as cst
 from legs_adapters.code.calls import callees, given_to, likely_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import call_name, dotted, walk_expressions, words, words_in
-from legs_adapters.lexicon.words import EMBEDDING, MODELS, PLUMBING, POSES
+from legs_adapters.code.reaching import Definition
+from legs_adapters.code.syntax import (
+    arguments,
+    attribute_chain,
+    call_name,
+    constant,
+    dotted,
+    walk_expressions,
+    words,
+    words_in,
+)
+from legs_adapters.lexicon.words import EMBEDDING, GAUSSIANS, MODELS, PLUMBING, POSES, RENDERERS, TENSORS
 from legs_adapters.tensors.backward import Training
+from legs_adapters.tensors.operations import NEW_TENSORS
 from legs_adapters.tensors.steps import has_step, is_backward, is_step, may_step, reads_gradients
 from legs_adapters.terms.findings import Evidence
 
 __all__ = ["Purposes"]
 
 _DEPTH = 3
+_Step = Tuple[Function, cst.Call, Set[str]]  # with the words of whose method runs it
+_Value = Tuple[Function, cst.CSTNode]
+_STEPS = re.compile(r"step\w*\s*\(")
+_CALLED = re.compile(r"(\w+)\s*\(")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 
 
@@ -31,35 +46,85 @@ class Purposes:
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
+        self._may_step: Optional[Set[str]] = None
         self._known: Dict[Tuple[Function, Tuple[int, ...], int], Optional[Evidence]] = {}
 
     def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Evidence]:
         """Return the evidence that the backward pass of an expression trains no Gaussians; None where it may."""
+        score = self.training.scores(node)
+        if score is not None:
+            return Evidence("no-step", "scoring", [score])
         known = function, tuple(map(id, function.flow.loops_around(node))), depth
         if known not in self._known:
             self._known[known] = self._purpose(function, node, depth)
         return self._known[known]
 
+    def moves_gaussians(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
+        """Return whether an optimiser that steps after the backward pass of an expression is known to have them."""
+        if not any(map(is_backward, function.flow.calls)):
+            sites = self.training.sites.get(function, []) if depth < _DEPTH else []
+            return any(self.moves_gaussians(caller, call, depth + 1) for caller, call in sites)
+        return any(self._moved(step) & (GAUSSIANS | TENSORS) for step in self._after(function, node)[1])
+
     def _purpose(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[Evidence]:
-        passes = [call for call in function.flow.calls if is_backward(call)]
-        if not passes:
+        if not any(map(is_backward, function.flow.calls)):
             return self._of_callers(function, depth)
+        own, steps = self._after(function, node)
+        if own is not None:
+            return Evidence("no-step", "scoring", [(function, own)])
+        moved, first = [self._moved(step) for step in steps], [step[:2] for step in steps[:1]]
+        if steps and all(some & (POSES | EMBEDDING) and not some & MODELS for some in moved):
+            return Evidence("pose-step", "tracking", first)
+        if steps and not any(some & MODELS for some in moved) and self._draws_a_model(function, 0):
+            return Evidence("other-step", "tracking", first) if all(map(self._is_beside, steps)) else None
+        return None
+
+    def _after(self, function: Function, node: cst.CSTNode) -> Tuple[Optional[cst.Call], List[_Step]]:
+        """Return the steps after the backward pass of an expression; and that pass, where none follows it."""
+        passes = [call for call in function.flow.calls if is_backward(call)]
         at = function.place(node).start
         own = next((call for call in passes if function.place(call).end > at), passes[0])
         may_train = self._may_train(function, own, 0, False)
         inner: List[cst.Call] = []  # the backward passes of the innermost loop that has one
         for scope in [*function.flow.loops_around(node), function.body]:
             inside = {id(part) for part in walk_expressions(scope)}
-            steps = [call for call in function.flow.calls if id(call) in inside and is_step(call)]
             within = [call for call in passes if id(call) in inside]
             if inner and len(within) > len(inner) and not may_train:
                 break  # the step is of the other backward pass
             inner = inner or within
-            if steps and within:
-                moved = [self._moved(function, step) for step in steps]
-                is_other = all(some & (POSES | EMBEDDING) and not some & MODELS for some in moved)
-                return Evidence("pose-step", "tracking", [(function, steps[0])]) if is_other else None
-        return None if may_train else Evidence("no-step", "scoring", [(function, own)])
+            calls = [call for call in function.flow.calls if id(call) in inside] if within else []
+            steps = [step for call in calls for step in self._steps(function, call)]
+            if steps:
+                return None, steps
+        return None if may_train else own, []
+
+    def _steps(self, function: Function, call: cst.Call, depth: int = 0) -> List[_Step]:
+        """Return the steps of a call: its own, or those of the functions that it calls and that take no gradient."""
+        if is_step(call):
+            return [(function, call, set())]
+        name = call_name(call)
+        if name not in self._stepping() or depth > _DEPTH:
+            return []
+        found = callees(self.program, function, call)
+        if not found and isinstance(call.func, cst.Attribute):
+            found = self.program.methods_named(name)  # one of them may run
+        runs = [each for each in found if not any(map(is_backward, each.flow.calls))]
+        steps = [step for each in runs for inner in each.flow.calls for step in self._steps(each, inner, depth + 1)]
+        receiver = words_in(call.func.value) if isinstance(call.func, cst.Attribute) else set()
+        return [(where, step, said | receiver) for where, step, said in steps]
+
+    def _stepping(self) -> Set[str]:
+        """Return the names of the functions with a step in them, and of those that call one in its file."""
+        if self._may_step is None:
+            known: Set[str] = {"step"}
+            for module in self.program.matching(_STEPS):
+                calls = [(each.name, set(_CALLED.findall(each.text))) for each in module.scopes(bool) if each.name]
+                found = {name for name, called in calls if any("step" in each for each in called)}
+                while not found <= known:
+                    known |= found
+                    found = {name for name, called in calls if called & found}
+            self._may_step = known
+        return self._may_step
 
     def _of_callers(self, function: Function, depth: int) -> Optional[Evidence]:
         sites = self.training.sites.get(function, []) if depth < _DEPTH else []
@@ -89,21 +154,73 @@ class Purposes:
         sites = list(likely_calls(self.program, function)) if depth < _DEPTH else []
         return not sites or any(self._may_train(caller, site, depth + 1, read) for caller, site in sites)
 
-    def _moved(self, function: Function, step: cst.Call) -> Set[str]:
+    def _moved(self, step: _Step) -> Set[str]:
         """Return the words in an optimiser's name, and in the parameters that it was made with."""
-        assert isinstance(step.func, cst.Attribute)
-        optimiser = step.func.value
+        function, call, said = step
+        assert isinstance(call.func, cst.Attribute)
+        optimiser = call.func.value
         name = set(words(optimiser.attr.value)) if isinstance(optimiser, cst.Attribute) else set()
-        found = name if name & POSES else words_in(optimiser)  # gaussians.optimizer_cam moves cameras
-        definitions = self.program.lookup(function, optimiser)
-        owner = self.program.owner_of(function)
-        if not definitions and owner is not None and isinstance(optimiser, cst.Attribute):
-            definitions = owner.stores(optimiser.attr.value) if dotted(optimiser.value) == "self" else None
-        for where, definition in definitions or ():
-            made = definition.value
-            if definition.kind == "parameter":
-                given = [value for _, value in given_to(self.program, where, definition.place) if value is not None]
-                found |= words_in(*given)
-            if isinstance(made, cst.Call) and _OPTIMISER.search(call_name(made)) and made.args:
-                found |= words_in(made.args[0].value)
+        found = said | (name if name & POSES else words_in(optimiser))  # gaussians.optimizer_cam moves cameras
+        for where, given in self._given(function, optimiser):
+            found |= words_in(given, *(where.flow.assigned(given)))
         return found - PLUMBING
+
+    def _given(self, function: Function, optimiser: cst.CSTNode, depth: int = 0) -> List[_Value]:
+        """Return what an optimiser was made with, or what is passed for it where that is not known."""
+        found: List[_Value] = []
+        for where, definition in _definitions(self.program, function, optimiser):
+            made = definition.value
+            if definition.kind == "parameter" and depth < _DEPTH:
+                passed = given_to(self.program, where, definition.place)
+                for caller, value in ((caller, value) for caller, value in passed if value is not None):
+                    found += self._given(caller, value, depth + 1) or [(caller, value)]
+            if isinstance(made, cst.Call) and _OPTIMISER.search(call_name(made)) and made.args:
+                positional, keywords, _ = arguments(made)
+                found.append((where, keywords.get("params") or positional[0]))
+        return found
+
+    def _is_beside(self, step: _Step) -> bool:
+        """Return whether an optimiser has tensors alone that are made for it, none for each Gaussian."""
+        assert isinstance(step[1].func, cst.Attribute)
+        leaves = [leaf for given in self._given(step[0], step[1].func.value) for leaf in self._leaves(*given)]
+        made = [_definitions(self.program, *leaf) for leaf in leaves]
+        values = [definition.value for definitions in made for _, definition in definitions]
+        return bool(leaves) and all(made) and all(map(_is_own_tensor, values))
+
+    def _leaves(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[_Value]:
+        """Return the parameters in ``[{"params": [a, b]}, c]``, or in a name of such a list."""
+        entries: List[cst.CSTNode] = []
+        if isinstance(node, (cst.List, cst.Tuple)):
+            entries = [element.value for element in node.elements]
+        elif isinstance(node, cst.Dict):
+            literal = [each for each in node.elements if isinstance(each, cst.DictElement)]
+            entries = [each.value for each in literal if constant(each.key) == "params"]
+        elif isinstance(node, cst.Name):
+            entries = [value for value in function.flow.assigned(node) if isinstance(value, (cst.List, cst.Tuple))]
+        if not entries or depth > _DEPTH:
+            return [(function, node)]
+        return [leaf for entry in entries for leaf in self._leaves(function, entry, depth + 1)]
+
+    def _draws_a_model(self, function: Function, depth: int) -> bool:
+        """Return whether a function gives a renderer Gaussians by their name, or calls one that does."""
+        calls = function.flow.calls
+        if any(set(words(call_name(call))) & RENDERERS and words_in(call) & GAUSSIANS for call in calls):
+            return True
+        inner = [each for call in calls for each in callees(self.program, function, call)] if depth < 2 else []
+        return any(self._draws_a_model(each, depth + 1) for each in inner)
+
+
+def _definitions(program: Program, function: Function, node: cst.CSTNode) -> List[Tuple[Function, Definition]]:
+    """Return the definitions of a name, or of what the methods of its class assign to ``self.name``."""
+    found, owner = program.lookup(function, node), program.owner_of(function)
+    if not found and owner is not None and isinstance(node, cst.Attribute) and dotted(node.value) == "self":
+        found = owner.stores(node.attr.value)
+    return found or []
+
+
+def _is_own_tensor(value: Optional[cst.CSTNode]) -> bool:
+    """Return whether a value is a new tensor whose values and sizes are none of Gaussians."""
+    made = [part for part in attribute_chain(value) if isinstance(part, cst.Call)] if value is not None else []
+    if not made or call_name(made[-1]) not in NEW_TENSORS:
+        return False
+    return not words_in(*(arg.value for arg in made[-1].args)) & TENSORS

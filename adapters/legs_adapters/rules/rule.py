@@ -45,7 +45,7 @@ class Term:
         self.function = function
         self.form = form
         self.here: List[Decider] = [(function, form.node)]
-        self.pair: Pair = pair_of(analysis.meanings, function, form)
+        self.pair: Pair = pair_of(analysis.meanings, analysis.ways, function, form)
         sides = self.pair.first, self.pair.second
         self.target: cst.BaseExpression
         self.prediction: cst.BaseExpression
@@ -55,6 +55,11 @@ class Term:
     def sides(self) -> Sequence[cst.BaseExpression]:
         """Both sides as they are written."""
         return self.form.first, self.form.second
+
+    @property
+    def trains_gaussians(self) -> bool:
+        """Return whether both sides are proven, and what an optimiser then moves is known to have Gaussians."""
+        return self.pair.is_proven and self.analysis.purposes.moves_gaussians(self.function, self.form.call)
 
     @property
     def has_rows(self) -> bool:

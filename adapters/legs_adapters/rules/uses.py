@@ -14,6 +14,7 @@ from legs_adapters.rules.causes.distillation import is_rendered
 from legs_adapters.rules.causes.kinds import KINDS
 from legs_adapters.rules.order import RULES
 from legs_adapters.terms.findings import Evidence, Use
+from legs_adapters.terms.sides import surest
 
 __all__ = ["uses_of"]
 
@@ -29,7 +30,9 @@ def uses_of(analysis: Analysis, function: Function, prediction: cst.CSTNode, tar
         if arguments(call)[2]:  # starred
             found.append(Use(caller, call, None, False))
         elif sides[-1] is not None:
-            given = [analysis.meanings.meaning(caller, side) for side in sides if side is not None]
+            both = [side for side in sides if side is not None]
+            answers = surest(analysis.meanings, analysis.ways, caller, both)
+            given = [answers.meaning(caller, side) for side in both]
             other = _why_other(analysis, caller, call, given, is_rendered(analysis, caller, sides[-1]))
             is_loss = given[0].kind == "image" and given[-1].role == "target"
             is_loss = is_loss and (len(given) == 1 or swapped(*given) is False)

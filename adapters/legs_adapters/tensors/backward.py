@@ -9,15 +9,15 @@ import libcst as cst
 
 from legs_adapters.code.calls import given_to, handed
 from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program
+from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.syntax import arguments, call_name, children, constant, key_of
-from legs_adapters.tensors.operations import BACKWARD, ENDS_GRADIENT, HOOKS, SIZES
+from legs_adapters.code.syntax import arguments, call_name, children, constant, key_of, walk_expressions
+from legs_adapters.tensors.operations import APPLIES, BACKWARD, ENDS_GRADIENT, HOOKS, LOSSES, SIZES, depends
 from legs_adapters.tensors.steps import is_backward
 
 __all__ = ["TRAINS", "Training"]
 
-TRAINS = re.compile(r"\b(manual_)?backward\s*\(")  # a text that runs a backward pass
+TRAINS = re.compile(r"\b((manual_)?backward|grad)\s*\(")  # a text that runs a backward pass
 _ANY = object()
 
 
@@ -28,7 +28,8 @@ class Training:
         matters: a predicate on the text of a function: the slice does not enter functions where it is false.
 
     Attributes:
-        roots: the functions that call ``.backward()`` or return what a framework trains on.
+        roots: the functions that call ``.backward()`` or return what a framework trains on. A call of
+            ``torch.autograd.grad`` is one where a parameter gets its result; else it only scores.
         sites: for a function that contributes, the calls (each with its caller) through which it does.
     """
 
@@ -38,21 +39,41 @@ class Training:
         self.roots: List[Function] = []
         self.sites: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
         self._trained: Set[int] = set()
+        self._scored: Dict[int, Tuple[Function, cst.Call]] = {}
+        self._scoring: Optional[Tuple[Function, cst.Call]] = None  # the call from which the slice begins now
         self._touched: Set[Function] = set()
         self._met: Set[Tuple[Function, int]] = set()  # what ``sites`` has
         self._done: Set[Tuple[int, object]] = set()
         self._work: List[Tuple[Function, cst.CSTNode, object]] = []
+        scoring: List[Tuple[Function, cst.Call]] = []
         for module in program.matching(TRAINS):
             for function in module.scopes(TRAINS.search):
+                grads = [call for call in function.flow.calls if self._is_grad(function, call)]
                 passes = [call for call in function.flow.calls if is_backward(call)]
+                passes += [call for call in grads if _is_applied(function, call)]
+                scoring += [(function, call) for call in grads if call not in passes]
                 self._begin(function, [value for call in passes for value in _trained_by(call)], bool(passes))
         for method in (method for name in sorted(HOOKS) for method in program.methods_named(name)):
             self._begin(method, method.flow.returns, True)
+        self._follow()
+        for self._scoring in scoring:
+            self._begin(self._scoring[0], _trained_by(self._scoring[1]), False)
+            self._follow()
+
+    def _follow(self) -> None:
         while self._work:
             function, node, key = self._work.pop()
             if function.module.spend(1):
                 self._touched.add(function)
                 self._visit(function, node, key)
+
+    def scores(self, node: cst.CSTNode) -> Optional[Tuple[Function, cst.Call]]:
+        """Return the call of ``torch.autograd.grad`` that alone takes the gradient of this expression, to be read."""
+        return self._scored.get(id(node))
+
+    def _is_grad(self, function: Function, call: cst.Call) -> bool:
+        """Return whether a call is ``torch.autograd.grad(...)``."""
+        return call_name(call) == "grad" and any(map(_takes_gradient, self.program.resolve(function, call.func)))
 
     def includes(self, node: cst.CSTNode) -> bool:
         """Return whether a backward pass reaches this expression."""
@@ -85,7 +106,10 @@ class Training:
             self._push(function, entry)
         if entries:
             return
-        self._trained.add(id(node))
+        if self._scoring is None:
+            self._trained.add(id(node))
+        else:
+            self._scored[id(node)] = self._scoring
         if isinstance(node, cst.Call):
             self._call(function, node, key)
         elif isinstance(node, cst.Attribute) and node.attr.value in SIZES:
@@ -115,6 +139,8 @@ class Training:
             self._push(function, owner, literal)
             return
         references = self.program.resolve(function, node.func) or handed(self.program, function, node.func)
+        if any(map(_takes_gradient, references)):
+            return
         for reference in references:
             if isinstance(reference.target, cst.Lambda):
                 self._push(function, reference.target.body)
@@ -165,9 +191,25 @@ class Training:
             self._push(function, value, key)
 
 
+def _takes_gradient(reference: Reference) -> bool:
+    return reference.kind == "external" and str(reference.target).endswith("autograd.grad")
+
+
+def _is_applied(function: Function, call: cst.Call) -> bool:
+    """Return whether a function steps by a gradient that it takes: ``p.grad = g``, ``p -= rate * g``."""
+    made = [(each, each.value) for each in function.flow.every_definition if each.value is not None]
+    names = {each.place for each, value in made if call in walk_expressions(value)}
+    is_less = [isinstance(getattr(each.node, "operator", None), cst.SubtractAssign) for each, _ in made]
+    given = [value for (each, value), less in zip(made, is_less) if less or each.place.endswith(".grad")]
+    given += [arg.value for each in function.flow.calls if call_name(each) in APPLIES for arg in each.args]
+    return any(call in walk_expressions(value) or depends(function, value, names) for value in given)
+
+
 def _trained_by(call: cst.Call) -> List[cst.BaseExpression]:
     """Return the value whose gradients a backward pass takes."""
-    values = [arg.value for arg in call.args if arg.keyword is None or arg.keyword.value in ("loss", "tensors")]
+    values = [arg.value for arg in call.args if arg.keyword is None or arg.keyword.value in LOSSES]
+    if call_name(call) == "grad":
+        return values[:1]
     return [*values, call.func.value] if isinstance(call.func, cst.Attribute) else values
 
 

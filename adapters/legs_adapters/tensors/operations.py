@@ -29,6 +29,7 @@ KEEPS_AXES = _MOVES | _LIMITS  # every value keeps its place
 LIKE = word_set("expand_as reshape_as to type_as view_as")  # uses a tensor's type or shape, not its values
 ASKS = word_set("isfinite isinf isnan ones_like zeros_like")  # tests of values
 CONSTANTS = word_set("full full_like ones ones_like zeros zeros_like")  # one value for every pixel
+NEW_TENSORS = CONSTANTS | _MAKES | word_set("Parameter empty eye rand randn")
 SIZES = word_set("device dim dtype is_cuda ndim numel shape size")  # properties that do not depend on the values
 REDUCES = word_set("mean median std sum var")
 EXTREMES = word_set("amax amin max min")
@@ -37,6 +38,8 @@ LEAVES = word_set("item numpy tolist")  # conversions of a tensor to numbers or 
 ENDS_GRADIENT = LEAVES | {"detach"}
 NO_GRAD = word_set("inference_mode no_grad")  # contexts and decorators
 BACKWARD = word_set("backward manual_backward")  # the second is Lightning's
+LOSSES = word_set("loss outputs tensors")  # the keywords of what they take the gradient of
+APPLIES = word_set("add_ copy_ step sub_")  # a parameter changes by what these are given
 TRANSFORMS = word_set(
     "exp log log10 log1p log2 maximum minimum pow sigmoid sqrt square tanh"
 )  # no longer an absolute error
@@ -57,6 +60,7 @@ _COMPUTES = word_set("add cumsum div div_ masked_fill mean mul mul_ pow sub sum"
 _FILTERS = word_set("abs conv2d einsum gather masked_select relu sigmoid")
 _RESAMPLES = word_set("avg_pool2d center_crop crop gaussian_blur grid_sample interpolate max_pool2d pad resize")
 _PASSES_ON = word_set("DataLoader checkpoint enumerate iter list next no_grad reversed tqdm tuple zip")
+VIEWS = word_set("T data mT")  # attributes that are the same values
 PICTURE_METHODS = KEEPS_AXES | _AXES | _PICKS | _COMPUTES  # of an image, they return an image
 PICTURE_FUNCTIONS = PICTURE_METHODS | _MAKES | _FILTERS | _RESAMPLES | _PASSES_ON
 

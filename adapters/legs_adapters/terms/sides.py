@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import List, NamedTuple
+from typing import List, NamedTuple, Sequence
 
 import libcst as cst
 
@@ -13,12 +13,13 @@ from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.masks import is_mask
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
+from legs_adapters.lexicon.ways import PHOTOGRAPH, RENDERING, Ways
 from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
 from legs_adapters.tensors.absolute import is_no_picture
 from legs_adapters.tensors.operations import MODULES
 from legs_adapters.terms.form import Form
 
-__all__ = ["Pair", "is_beside_ssim", "is_of_numbers", "is_role", "of_rays", "pair_of", "same_root"]
+__all__ = ["Pair", "is_beside_ssim", "is_of_numbers", "is_role", "of_rays", "pair_of", "same_root", "surest"]
 
 
 class Pair(NamedTuple):
@@ -28,6 +29,7 @@ class Pair(NamedTuple):
         first, second: the two sides, without an index by a mask that both carry.
         selection: that index as written, with its brackets; empty without.
         a, b: the meanings of the two, without a factor that both have.
+        is_proven: the way of each shows a rendering and a photograph, whatever the names are.
     """
 
     first: cst.BaseExpression
@@ -35,6 +37,7 @@ class Pair(NamedTuple):
     selection: str
     a: Meaning
     b: Meaning
+    is_proven: bool = False
 
     @property
     def speaks_of_images(self) -> bool:
@@ -42,7 +45,12 @@ class Pair(NamedTuple):
         return _speaks_of_images(self.first) and _speaks_of_images(self.second)
 
 
-def pair_of(meanings: Meanings, function: Function, form: Form) -> Pair:
+def surest(meanings: Meanings, ways: Ways, function: Function, sides: Sequence[cst.CSTNode]) -> Meanings:
+    """Return what answers for the sides of a term: their ways, where these prove both; else their names, too."""
+    return ways if {ways.meaning(function, side) for side in sides} == {RENDERING, PHOTOGRAPH} else meanings
+
+
+def pair_of(meanings: Meanings, ways: Ways, function: Function, form: Form) -> Pair:
     """Return the two sides of a form, with their meanings."""
     first, second, selection = form.first, form.second, ""
     if isinstance(first, cst.Subscript) and isinstance(second, cst.Subscript):
@@ -51,8 +59,10 @@ def pair_of(meanings: Meanings, function: Function, form: Form) -> Pair:
         if squeezed[0] == squeezed[1] and any(is_mask(meanings, function, element) for element in first.slice):
             # the weight map needs the whole image
             first, second, selection = first.value, second.value, inner[0].strip()
-    left, right = _without_shared_factors(first, second)
-    return Pair(first, second, selection, meanings.meaning(function, left), meanings.meaning(function, right))
+    sides = _without_shared_factors(first, second)
+    answers = surest(meanings, ways, function, sides)
+    a, b = (answers.meaning(function, side) for side in sides)
+    return Pair(first, second, selection, a, b, answers is ways)
 
 
 def _without_shared_factors(first: cst.BaseExpression, second: cst.BaseExpression) -> List[cst.BaseExpression]:

@@ -40,5 +40,5 @@ class Distillation(Rule):
 
 def is_rendered(analysis: Analysis, function: Function, target: cst.CSTNode) -> bool:
     """Return whether what is assigned to a target is a rendering, whatever its name."""
-    origin, flow = analysis.meanings.origin(function, target), analysis.origins.meaning(function, target)
-    return "render" in (origin.role, flow.role)
+    origin, way = analysis.meanings.origin(function, target), analysis.ways.meaning(function, target)
+    return "render" in (origin.role, way.role)

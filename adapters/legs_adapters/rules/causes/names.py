@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import AbstractSet, List
 
-from legs_adapters.code.syntax import call_name, root_of, words
+from legs_adapters.code.syntax import root_of, words
 from legs_adapters.lexicon.words import (
     EVALUATING,
-    GAUSSIANS,
     LOSS,
     MAPPING,
     MESH,
@@ -19,7 +18,6 @@ from legs_adapters.lexicon.words import (
     WARPED,
 )
 from legs_adapters.rules.rule import Rule, Term, header
-from legs_adapters.tensors.steps import has_step
 from legs_adapters.terms.findings import Decider
 
 __all__ = ["NAMES", "EvaluationName", "OtherName", "Tracking"]
@@ -39,7 +37,8 @@ class Tracking(Rule):
     id = reason = "tracking"
 
     def evidence(self, term: Term) -> List[Decider]:
-        named = [decider for name, decider in term.names_around if _is_of_tracking(name)]
+        names = () if term.trains_gaussians else term.names_around
+        named = [decider for name, decider in names if _is_of_tracking(name)]
         tests = reversed(term.function.flow.conditions.get(id(term.form.call), ()))
         return [*named, *((term.function, part) for part in tests if _is_of_tracking(root_of(part)))][:1]
 
@@ -58,9 +57,9 @@ class EvaluationName(Rule):
     def evidence(self, term: Term) -> List[Decider]:
         first, *others = words(term.function.name) or ("",)
         folders, _, file = term.function.module.path.rpartition("/")
-        shows = first in NOT_TRAINING and bool(others) and not LOSS & set(others) and not _is_of_training_step(term)
+        shows = first in NOT_TRAINING and bool(others) and not LOSS & set(others)
         shows = shows or bool(set(folders.split("/")) & EVALUATING) or words(file)[0] in EVALUATING
-        return [header(term.function)] if shows and not _trains_its_own(term) else []
+        return [header(term.function)] if shows and not term.trains_gaussians else []
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether the function is named as a loss: only some of its callers may evaluate."""
@@ -83,11 +82,19 @@ class OtherName(Rule):
         self.__doc__ = str(OtherName.__doc__).format(why=why, name=name)
 
     def evidence(self, term: Term) -> List[Decider]:
-        """Return the first name that has one of the words."""
+        """Return the first name that has one of the words, unless both sides are proven."""
+        if term.pair.is_proven and self._is_outweighed(term):
+            return []
         module = term.function.module
         names = [(name, decider) for name, decider in term.names_around if not SPLATS.search(name)]
         names += [] if "gaussian" in module.text.lower() else [(module.path.rpartition("/")[2], header(term.function))]
         return [decider for name, decider in names if self.words & set(words(name))][:1]
+
+    def _is_outweighed(self, term: Term) -> bool:
+        """Return whether it is the plain L1: no threshold may be taken of it, nor features beside it."""
+        others = [form for form in term.analysis.forms.in_function(term.function) if form is not term.form]
+        beside = [Term(term.analysis, term.function, form) for form in others] if self.id == "perceptual" else []
+        return (self.id != "robust" or not term.form.is_map) and all(other.pair.is_proven for other in beside)
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether the name may mean something else: it is reported where no other term was found."""
@@ -106,15 +113,3 @@ def _is_of_tracking(name: str) -> bool:
     """Return whether a name is about optimising poses: for tracking, or to align a view."""
     tokens = set(words(name))
     return bool(("pose" in tokens and tokens & {"test", "refine"}) or (tokens & TRACKING and not tokens & MAPPING))
-
-
-def _trains_its_own(term: Term) -> bool:
-    """Return whether its function makes a Gaussian model and steps an optimiser: it trains, whatever its name."""
-    models = [name for name in map(call_name, term.function.flow.calls) if name[:1].isupper()]
-    return has_step(term.function) and any(set(words(name)) & GAUSSIANS for name in models)
-
-
-def _is_of_training_step(term: Term) -> bool:
-    """Return whether it returns a loss to functions whose names say that they train: ``render_batch``."""
-    callers = [caller for caller, _ in term.analysis.training.sites.get(term.function, [])]
-    return bool(callers) and all("train" in words(caller.name) for caller in callers)

@@ -7,10 +7,10 @@ from typing import List
 from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.terms.findings import Decider
 
-__all__ = ["NoStep", "PoseStep"]
+__all__ = ["NoStep", "OtherStep", "PoseStep"]
 
 
-class _OtherStep(Rule):
+class _ByPurpose(Rule):
     """Skip a term by the purpose of its backward pass."""
 
     def evidence(self, term: Term) -> List[Decider]:
@@ -19,7 +19,7 @@ class _OtherStep(Rule):
         return list(purpose.deciders) if purpose is not None and purpose.rule == self.id else []
 
 
-class PoseStep(_OtherStep):
+class PoseStep(_ByPurpose):
     """By the names of what it is given, the optimiser updates camera poses, or an embedding, and no Gaussians.
 
     skipped:
@@ -34,7 +34,26 @@ class PoseStep(_OtherStep):
     reason = "tracking"
 
 
-class NoStep(_OtherStep):
+class OtherStep(_ByPurpose):
+    """The optimiser has new tensors alone, and no Gaussians were found among them, though a model of some is drawn.
+
+    skipped:
+        def fit(gaussians, camera, num_parts):
+            part_deltas = torch.nn.Parameter(torch.zeros(num_parts, 6))
+            optimizer = torch.optim.Adam([part_deltas], lr=0.001)
+            image = render(camera, gaussians.moved(part_deltas), None, None)["render"]
+            l1_loss(image, camera.original_image).backward()
+            optimizer.step()
+    """
+
+    id = "other-step"
+    reason = "tracking"
+
+    def may_be_loss(self, term: Term) -> bool:
+        return True
+
+
+class NoStep(_ByPurpose):
     """No optimiser was found that uses the gradients: code that only reads them scores the Gaussians.
 
     skipped:

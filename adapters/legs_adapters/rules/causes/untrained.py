@@ -78,6 +78,7 @@ def _is_untrained(term: Term) -> bool:
     """Return whether no backward pass reaches a term, or it is under ``no_grad``."""
     training, form = term.analysis.training, term.form
     trained = training.includes(form.node) or training.includes(form.call) or _is_called_by_framework(term)
+    trained = trained or training.scores(form.node) is not None  # see `NoStep`
     sites = training.sites.get(term.function, [])  # a caller may drop its gradient: an error map for the next mask
     without = bool(sites) and all(no_grad_around(caller, call) for caller, call in sites)
     without = without or no_grad_around(term.function, form.call, form.node) is not None or is_detached(term.prediction)

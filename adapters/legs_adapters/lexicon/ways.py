@@ -1,0 +1,133 @@
+"""Find what an expression depicts by the way it came alone: the renderer that draws it, the camera that holds it.
+
+No name of a variable counts. What is not followed for certain is not known.
+"""
+
+from __future__ import annotations
+
+from typing import List
+
+import libcst as cst
+
+from legs_adapters.code.calls import sure_calls
+from legs_adapters.code.module import Function
+from legs_adapters.code.reaching import Definition
+from legs_adapters.code.syntax import call_name, code, constant, root_of, words, words_in
+from legs_adapters.lexicon.calls import CallReading, meaning_of_call, meaning_returned
+from legs_adapters.lexicon.depiction import Meanings
+from legs_adapters.lexicon.meaning import UNKNOWN, Meaning
+from legs_adapters.lexicon.names import kind_of_words, role_of_words
+from legs_adapters.lexicon.words import BACKGROUND, DATA, GAUSSIANS, RENDERERS, SPLATS
+from legs_adapters.tensors.operations import PICTURE_FUNCTIONS, VIEWS
+
+__all__ = ["PHOTOGRAPH", "RENDERING", "Ways"]
+
+RENDERING = Meaning("image", "render")
+PHOTOGRAPH = Meaning("image", "target")
+_DEPTH = 4
+
+
+class Ways(Meanings):
+    """Answer for the expressions of one program as `Meanings` does, without the names of variables."""
+
+    def _name(self, function: Function, node: cst.Name, flow: Meaning) -> Meaning:
+        return flow
+
+    def _of(self, function: Function, node: cst.CSTNode) -> Meaning:
+        if isinstance(node, cst.Call):
+            call = CallReading(self.program, function, node, self.meaning)
+            if RENDERERS & set(words(call.name)) and not self._draws_splats(function, node):
+                return meaning_returned(call) or UNKNOWN
+            known = meaning_of_call(call, by_arguments=False)
+            is_method = known == UNKNOWN and isinstance(node.func, cst.Attribute)
+            return self._member(function, node.func, call.name) if is_method else known  # type: ignore[arg-type]
+        known = super()._of(function, node)
+        if isinstance(node, cst.BinaryOperation) and not isinstance(node.operator, (cst.Add, cst.Multiply)):
+            is_of_two = UNKNOWN not in (self.meaning(function, node.left), self.meaning(function, node.right))
+            return UNKNOWN if is_of_two else known  # a difference of two pictures is none
+        return known
+
+    def _subscript(self, function: Function, node: cst.Subscript) -> Meaning:
+        known = super()._subscript(function, node)
+        return known if all(map(_keeps_colours, node.slice)) else known._replace(kind=None)
+
+    def _member(self, function: Function, node: cst.Attribute | cst.Subscript, name: str) -> Meaning:
+        kept = self._kept(function, node)
+        if kept != UNKNOWN or name in VIEWS:
+            return kept if kept != UNKNOWN else self.meaning(function, node.value)
+        kind, says, role = kind_of_words(name), role_of_words(name), self.meaning(function, node.value).role
+        if role is not None:  # a renderer may hand on what it was given
+            is_other = says == "target" or BACKGROUND & set(words(name)) or self._holds_data(function, node.value)
+            return Meaning(kind, None if is_other else role)
+        is_photograph = kind == "image" and says != "render" and self._holds_data(function, node.value)
+        return Meaning(kind, "target" if is_photograph else None)
+
+    def _kept(self, function: Function, node: cst.Attribute | cst.Subscript) -> Meaning:
+        """Return the meaning of what is assigned to a member here, or to ``self.name`` anywhere in its class."""
+        if function.flow.reaching(node):
+            return self._flow(function, node)
+        owner = self.program.owner_of(function)
+        if owner is None or not isinstance(node, cst.Attribute) or not isinstance(node.value, cst.Name):
+            return UNKNOWN
+        stores = owner.stores(node.attr.value) if node.value.value == "self" else []
+        return _agreed([self._definition(method, definition) for method, definition in stores])
+
+    def _draws_splats(self, function: Function, call: cst.Call) -> bool:
+        """Return whether a renderer is known to draw Gaussians: by what it is given, or where and how it is defined."""
+        found = self.program.resolve(function, call.func)
+        texts = [code(call), *(str(reference.target) for reference in found if isinstance(reference.target, str))]
+        texts += [run.module.path + run.text for reference in found for run in self.program.run_by(reference)]
+        return bool(GAUSSIANS & words_in(call)) or any(map(SPLATS.search, texts))
+
+    def _holds_data(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
+        """Return whether an object is a camera or a dataset's entry, by its name or those of what it is taken from."""
+        while True:
+            if isinstance(node, cst.Subscript):
+                node = node.value
+            elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
+                if DATA & set(words(call_name(node))):
+                    return True
+                node = node.func.value
+            else:
+                break
+        if isinstance(node, cst.Call):
+            given = node.args[:1] if call_name(node) in PICTURE_FUNCTIONS else []
+            return bool(DATA & set(words(call_name(node)))) or any(
+                self._holds_data(function, arg.value, depth) for arg in given
+            )
+        if not isinstance(node, (cst.Name, cst.Attribute)) or depth > _DEPTH or not function.module.spend(1):
+            return False
+        if DATA & set(words(root_of(node))):
+            return self._role_of_holder(function, node) == "target"
+        made = [(where, each.value) for where, each in self.program.lookup(function, node) or ()]
+        return any(value is not None and self._holds_data(where, value, depth + 1) for where, value in made)
+
+    # -- definitions
+
+    def _defined(self, function: Function, node: cst.CSTNode) -> Meaning:
+        definitions = self.program.lookup(function, node) or ()
+        if not function.module.spend(2 * len(definitions)):
+            return UNKNOWN
+        found = [(definition.kind, self._definition(where, definition)) for where, definition in definitions]
+        return _agreed([meaning for kind, meaning in found if kind != "store" or meaning != UNKNOWN])
+
+    def _parameter(self, function: Function, definition: Definition) -> Meaning:
+        if definition.place not in function.parameters:
+            return UNKNOWN
+        calls = self.training.sites.get(function) or list(sure_calls(self.program, function))
+        given = [(caller, function.given(call, definition.place)) for caller, call in calls[:12]]
+        return _agreed([UNKNOWN if value is None else self.meaning(caller, value) for caller, value in given])
+
+
+def _agreed(ways: List[Meaning]) -> Meaning:
+    return ways[0] if len(set(ways)) == 1 else UNKNOWN
+
+
+def _keeps_colours(element: cst.SubscriptElement) -> bool:
+    """Return whether an index leaves an image what it is: no channel behind the third, no second result."""
+    index = element.slice
+    if not isinstance(index, cst.Slice):
+        value = constant(index.value, 0) if isinstance(index, cst.Index) else 0
+        return isinstance(value, (str, tuple)) or value in (0, None)
+    start, end = constant(index.lower, 0), constant(index.upper, 3)
+    return index.lower is None or (start == 0 and not 0 <= end < 3)

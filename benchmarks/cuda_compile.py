@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any, Dict, List, Sequence, Tuple
 
 from benchmarks import cuda_instructions
-from legs_loss.kernels.cuda.backend import NORMS, STENCILS, VALUES
+from legs_loss.kernels.codes import NORMS, STENCILS
+from legs_loss.kernels.cuda.backend import VALUES
 from legs_loss.kernels.cuda.modules import Variant, options, source
 from legs_loss.kernels.cuda.nvrtc import Compiler, NotFound, find_compiler, resources
 

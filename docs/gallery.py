@@ -12,6 +12,7 @@ from torch import Tensor
 
 from legs_loss import WeightSpec, response, weight_map
 from legs_loss.cli.masks import mask_of
+from legs_loss.curves import curve_names
 from legs_loss.lab.embedded import write_embedded_scene
 from legs_loss.operators import OPERATORS
 from legs_loss.responses import gaussian_blur, normalise_response
@@ -46,9 +47,7 @@ def main() -> None:
     strengths = [(name, normalise_response(response(image, name))) for name in OPERATORS]
     most = float(torch.quantile(strengths[0][1], 0.99))
     sheet("operators", 3, [photograph, *((name, strength, "magma", most) for name, strength in strengths)])
-    curves = [
-        (f"{name}, beta 10", weight_map(image, WeightSpec(curve=name))) for name in ("C1", "C2", "C3", "C4", "C5")
-    ]
+    curves = [(f"{name}, beta 10", weight_map(image, WeightSpec(curve=name))) for name in curve_names()]
     titled = [(f"{name}: mean {float(weight.mean()):.2f}", weight, "viridis", 11.0) for name, weight in curves]
     sheet("curves", 3, [photograph, *titled])
     betas = [(beta, weight_map(image, WeightSpec(beta=float(beta)))) for beta in (1, 4, 10, 20)]

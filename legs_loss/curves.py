@@ -6,46 +6,33 @@ this project's identification of that picture, not the paper's text; docs/method
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Callable, Dict, Tuple
+from typing import TYPE_CHECKING, Any, Callable, Dict, Tuple
 
 from legs_loss.errors import LegsError, did_you_mean
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["Curve", "curve", "curve_names", "register_curve"]
+__all__ = ["FORMULAS", "Curve", "curve", "curve_names", "register_curve"]
 
 Curve = Callable[["Tensor"], "Tensor"]
 
-
-def _linear(x: Tensor) -> Tensor:
-    return x
-
-
-def _square(x: Tensor) -> Tensor:
-    return x * x
-
-
-def _square_root(x: Tensor) -> Tensor:
-    return x.sqrt()
-
-
-def _smoothstep(x: Tensor) -> Tensor:
-    return x * x * (3.0 - 2.0 * x)
-
-
-def _inverse_smoothstep(x: Tensor) -> Tensor:
-    # Rounding can leave the unit interval by one ulp at its ends.
-    return (0.5 - ((1.0 - 2.0 * x).asin() / 3.0).sin()).clamp(0.0, 1.0)
-
-
-_CURVES: Dict[str, Curve] = {
-    "C1": _linear,
-    "C2": _square,
-    "C3": _square_root,
-    "C4": _smoothstep,
-    "C5": _inverse_smoothstep,
+# The curves, each written once: torch's function, numba's and CUDA's code are made from it. A formula has numbers,
+# + - * / and brackets, x, and the functions of _TORCH; a backend that lacks one of these leaves that curve to torch.
+FORMULAS: Dict[str, str] = {
+    "C1": "x",
+    "C2": "x * x",
+    "C3": "sqrt(x)",
+    "C4": "x * x * (3 - 2 * x)",  # smoothstep
+    "C5": "unit(0.5 - sin(asin(1 - 2 * x) / 3))",  # its inverse; rounding can leave [0, 1] by one ulp at its ends
 }
+_TORCH: Dict[str, Any] = {
+    "sqrt": lambda x: x.sqrt(),
+    "sin": lambda x: x.sin(),
+    "asin": lambda x: x.asin(),
+    "unit": lambda x: x.clamp(0.0, 1.0),
+}
+_CURVES: Dict[str, Curve] = {name: eval(f"lambda x: {formula}", _TORCH) for name, formula in FORMULAS.items()}
 
 
 def curve(name: str) -> Curve:
@@ -69,7 +56,7 @@ def curve(name: str) -> Curve:
 
 
 def curve_names() -> Tuple[str, ...]:
-    """Return the names of all registered curves, C1 to C5 first."""
+    """Return the names of all registered curves, the built-in ones first."""
     return tuple(_CURVES)
 
 

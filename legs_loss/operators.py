@@ -1,6 +1,6 @@
 """The operators of a response, by name: their stencils as numbers, and their help texts.
 
-To add an operator, add a record. Kernels (``kernels/``) that do not declare it use torch.
+To add an operator, add a record. What a backend does not compute is left to torch (``kernels/codes.py``).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import Dict, NamedTuple, Tuple
 
 from legs_loss.errors import LegsError, did_you_mean
 
-__all__ = ["NORMS", "OPERATORS", "Operator", "Stencil", "check_operator"]
+__all__ = ["NORMS", "OPERATORS", "Operator", "Stencil", "check_operator", "gradient"]
 
 # Rows of weights, an odd number of rows and as many columns. A stencil is even (it equals its own mirror images, as a
 # second derivative does) or odd in one direction (a first derivative). Its centre is minus the sum of all others, so
@@ -36,7 +36,8 @@ class Operator(NamedTuple):
         return len(self.stencils[0]) // 2
 
 
-def _gradient(across: Stencil) -> Tuple[Stencil, ...]:
+def gradient(across: Stencil) -> Tuple[Stencil, ...]:
+    """Return the two stencils of a gradient from that across the columns."""
     return across, tuple(zip(*across))
 
 
@@ -57,17 +58,17 @@ OPERATORS: Dict[str, Operator] = _by_name(
     ),
     Operator(
         "sobel",
-        _gradient(((-1, 0, 1), (-2, 0, 2), (-1, 0, 1))),
+        gradient(((-1, 0, 1), (-2, 0, 2), (-1, 0, 1))),
         "gradient, rows weighted 1 2 1",
     ),
     Operator(
         "scharr",
-        _gradient(((-3, 0, 3), (-10, 0, 10), (-3, 0, 3))),
+        gradient(((-3, 0, 3), (-10, 0, 10), (-3, 0, 3))),
         "gradient, rows weighted 3 10 3",
     ),
     Operator(
         "central",
-        _gradient(((0, 0, 0), (-0.5, 0, 0.5), (0, 0, 0))),
+        gradient(((0, 0, 0), (-0.5, 0, 0.5), (0, 0, 0))),
         "gradient, central differences",
     ),
 )

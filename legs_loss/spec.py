@@ -29,7 +29,7 @@ class WeightSpec:
     Attributes:
         operator: of the response, a name of :data:`legs_loss.OPERATORS`.
         p: the norm over channels (and over a gradient's directions): 1, 2 or inf.
-        curve: a registered curve's name, "C1" to "C5" or one of your own.
+        curve: a registered curve's name, such as "C3", or one of your own.
         beta: in [0, 1e6], the weight of the strongest response, minus 1; 0 is 3DGS's own loss.
         percentile: in (0, 100]: the response that counts as 1; 100 is the maximum, as in the paper. Stronger
             responses are clamped to 1.

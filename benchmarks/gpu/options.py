@@ -61,11 +61,11 @@ def emulate() -> None:
     from legs_loss.kernels.available import BACKENDS, Availability, Known
 
     sys.path.insert(0, str(ROOT))
-    from tests.cuda_emulation import emulated
+    from tests.cuda_emulation import TRIED, emulated
 
     BACKENDS._known = {"cuda": Known("tests.cuda_emulation", "cpu")}
     backend = emulated()
-    known = Availability(backend, True, "emulated on the CPU", backend.offers)
+    known = Availability(backend, True, "emulated on the CPU", TRIED)
     BACKENDS._found = {("cuda", torch.device("cpu")): known}
 
 

@@ -1,9 +1,9 @@
 """Choose backends: one is available on a device where it is installed and gave torch's own results in a trial.
 
-The trial of an operation runs once before its first use on a device, on a small image: what is not used is not
-compiled. A backend that is not installed is skipped silently; one that fails, then or later, is reported once on
-stderr, and torch is used instead. ``LEGS_BACKEND=torch|numba|cuda`` forces one; images that it does not support are
-computed by torch.
+The trial of an operation runs once on a device for each operator, norm and curve, before their first use, on a small
+image: what is not used is not compiled. A backend that is not installed is skipped silently; one that fails, then or
+later, is reported once on stderr, and torch is used instead. ``LEGS_BACKEND=torch|numba|cuda`` forces one; images that
+it does not support are computed by torch.
 """
 
 from __future__ import annotations
@@ -19,11 +19,14 @@ import torch
 
 from legs_loss.errors import LegsError
 from legs_loss.kernels.contract import Backend, DeviceFault, NotNow
+from legs_loss.spec import WeightSpec
 
 __all__ = ["BACKENDS", "OUT_OF_MEMORY", "Availability", "Backends", "Known", "forced_backend", "is_capturing"]
 
 OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 _NAMES = ("torch", "numba", "cuda")
+# An operation (None: all that there are), and the operator, norm and curve of the weights to be made (None: none are).
+_Case = Tuple[Optional[str], Optional[Tuple[str, float, str]]]
 
 
 class Known(NamedTuple):
@@ -40,13 +43,13 @@ class Availability(NamedTuple):
         backend: None where it is not.
         installed: whether its package is installed.
         reason: why it is, or is not, available.
-        tried: the operations whose trial it passed.
+        tried: the cases whose trial it passed.
     """
 
     backend: Optional[Backend]
     installed: bool
     reason: str
-    tried: FrozenSet[str] = frozenset()
+    tried: FrozenSet[_Case] = frozenset()
 
 
 class Backends:
@@ -68,6 +71,8 @@ class Backends:
     def chosen(self, device: torch.device, operation: Optional[str] = None) -> str:
         """Return which backend computes an operation for images on a device: "torch" or the name of another.
 
+        It is tried with the default spec.
+
         Raises:
             LegsError: LEGS_BACKEND is none of these.
         """
@@ -75,41 +80,51 @@ class Backends:
         name = forced or (names[0] if names else "torch")
         return name if name in names and self.availability(name, device, operation).backend is not None else "torch"
 
-    def ready(self, device: torch.device, operation: Optional[str] = None) -> Optional[Backend]:
-        """Return the backend of an operation on a device, None where that is torch: also where no trial may run now."""
+    def ready(
+        self, device: torch.device, operation: Optional[str] = None, spec: Optional[WeightSpec] = None
+    ) -> Optional[Backend]:
+        """Return the backend of an operation on a device, None where that is torch: also where no trial may run now.
+
+        Args:
+            device: of the images.
+            operation: as for :meth:`availability`.
+            spec: of the weights that it is to make.
+        """
         names = [name for name, known in self._known.items() if known.device == device.type]
-        if is_capturing(device) and any(self._known_already(name, device, operation) is None for name in names):
+        case = operation, None if spec is None else (spec.operator, spec.p, spec.curve)
+        if is_capturing(device) and any(self._known_already(name, device, case) is None for name in names):
             return None  # a trial waits for the device, which would break a capture
         name = forced_backend() or (names[0] if names else "torch")
-        return self.availability(name, device, operation).backend if name in names else None
+        return self._answer(name, device, case).backend if name in names else None
 
     def availability(self, name: str, device: torch.device, operation: Optional[str] = None) -> Availability:
         """Return whether a backend is available on a device for an operation ("loss", "l1", "ssim"; None: all it has).
 
-        A trial of the operation runs once for each device. On a card that is full it is not available now, and the next
-        call tries it again.
+        A trial of the operation, with the default spec, runs once for each device. On a card that is full it is not
+        available now, and the next call tries it again.
 
         Raises:
             DeviceFault: the device computes nothing any more, since a kernel has failed before.
         """
-        found = self._known_already(name, device, operation)
+        spec = WeightSpec()
+        return self._answer(name, device, (operation, (spec.operator, spec.p, spec.curve)))
+
+    def _answer(self, name: str, device: torch.device, case: _Case) -> Availability:
+        found = self._known_already(name, device, case)
         if found is None:
             with self._lock:
-                found = self._known_already(name, device, operation)
+                found = self._known_already(name, device, case)
                 if found is None:
                     try:
-                        found = self._tried(name, device, operation)
+                        found = self._tried(name, device, case)
                     except (NotNow, MemoryError, OUT_OF_MEMORY) as error:
                         return Availability(None, True, _in_words(error))
                     self._record((name, _indexed(device)), found)
         return found
 
-    def _known_already(self, name: str, device: torch.device, operation: Optional[str]) -> Optional[Availability]:
+    def _known_already(self, name: str, device: torch.device, case: _Case) -> Optional[Availability]:
         found = self._found.get((name, _indexed(device)))
-        if found is None or found.backend is None:
-            return found
-        wanted = found.backend.offers if operation is None else found.backend.offers & {operation}
-        return found if wanted <= found.tried else None
+        return found if found is None or found.backend is None or case in found.tried else None
 
     def give_up(self, name: str, device: torch.device, error: Exception) -> None:
         """Leave a backend that failed after its trial."""
@@ -119,37 +134,38 @@ class Backends:
         """Take a lock that no thread holds."""
         self._lock = threading.RLock()
 
-    def _tried(self, name: str, device: torch.device, operation: Optional[str]) -> Availability:
+    def _tried(self, name: str, device: torch.device, case: _Case) -> Availability:
         missing = _why_missing(name)
         if missing:
             return Availability(None, False, missing)
         try:
-            return self._trial(name, device, operation)
+            return self._trial(name, device, case)
         except (NotNow, OUT_OF_MEMORY):  # torch's allocator holds what is free
             if device.type == "cuda":
                 torch.cuda.empty_cache()
-            return self._trial(name, device, operation)
+            return self._trial(name, device, case)
 
-    def _trial(self, name: str, device: torch.device, operation: Optional[str]) -> Availability:
+    def _trial(self, name: str, device: torch.device, case: _Case) -> Availability:
         from legs_loss.kernels.trial import difference_from_torch
 
         try:
             backend = importlib.import_module(self._known[name].module).BACKEND
             before = self._found.get((name, _indexed(device)))
             tried = frozenset() if before is None else before.tried
-            wanted = backend.offers if operation is None else backend.offers & {operation}
+            operation, settings = case
+            operations = [each for each in sorted(backend.offers) if operation in (None, each)]
+            spec = None if settings is None else WeightSpec(*settings)
             # The first call may be in an evaluation, and the trial needs gradients.
             with torch.inference_mode(False), backend.preparing():
-                problem = difference_from_torch(backend, device, wanted - tried)
+                problem = difference_from_torch(backend, device, operations, spec)
         except (NotNow, MemoryError, OUT_OF_MEMORY, DeviceFault):
             raise
         except Exception as error:  # anything that a broken install, compiler or driver raises
             if "CUDA error" in str(error):
                 raise DeviceFault(str(error)) from error  # torch's own: it computes nothing on this device either
             return Availability(None, True, _in_words(error))
-        return Availability(
-            None if problem else backend, True, problem or "its trial agreed with torch", tried | wanted
-        )
+        cases = {case, *((each, settings) for each in operations)}
+        return Availability(None if problem else backend, True, problem or "its trial agreed with torch", tried | cases)
 
     def _record(self, key: Tuple[str, torch.device], found: Availability) -> None:
         self._found[key] = found

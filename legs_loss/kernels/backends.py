@@ -82,7 +82,7 @@ def _fused(
 ) -> Optional[Tensor]:
     if is_compiling() or is_transformed() or not _plain_tensors(prediction, target, weights.map, weights.range):
         return None
-    backend = BACKENDS.ready(prediction.device, operation)
+    backend = BACKENDS.ready(prediction.device, operation, weights.spec)
     if backend is None or operation not in backend.offers:
         return None
     channels, height, width = prediction.shape[-3:]

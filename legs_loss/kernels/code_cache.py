@@ -96,11 +96,14 @@ class _Files:
 def _stamp(folder: Path) -> str:
     """Return a digest of numba's version and of all sources whose functions may be compiled into those of a folder.
 
-    They stand in the folder, in those beside it and in this one, and speak of numba or of compiling.py.
+    They stand in the folder, in those beside it and in this one, and speak of numba or of compiling.py; and the tables
+    whose numbers are compiled in.
     """
-    paths = sorted({*folder.parent.glob("*/*.py"), *Path(__file__).parent.glob("*.py")})
-    texts = (path.read_bytes() for path in paths)
-    return _digest(b"\0".join([numba.__version__.encode(), *(t for t in texts if b"numba" in t or b"compiling" in t)]))
+    here = Path(__file__).parent
+    paths = sorted({*folder.parent.glob("*/*.py"), *here.glob("*.py")})
+    texts = [text for text in (path.read_bytes() for path in paths) if b"numba" in text or b"compiling" in text]
+    tables = [(here.parent / name).read_bytes() for name in ("curves.py", "operators.py", "similarity.py")]
+    return _digest(b"\0".join([numba.__version__.encode(), *texts, *tables]))
 
 
 def _digest(data: bytes) -> str:

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legs_loss.kernels.codes import NORMS, STENCILS
 from legs_loss.kernels.compiling import in_threads, said
 from legs_loss.kernels.contract import Backend
 from legs_loss.kernels.differentiable import differentiable
 from legs_loss.kernels.numba_l1 import ROWS, all_strips
-from legs_loss.kernels.numba_response import NORMS, STENCILS
 from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles
-from legs_loss.kernels.numba_weights import CURVES, Images, WeightSource, images_of, response_range, source_of
+from legs_loss.kernels.numba_weights import FORMULAS, Images, WeightSource, images_of, response_range, source_of
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights, weight_map
 
@@ -28,7 +28,7 @@ class _NumbaBackend(Backend):
     offers: FrozenSet[str] = frozenset({"loss", "l1", "ssim"})
     operators: FrozenSet[str] = frozenset(STENCILS)
     norms: FrozenSet[float] = frozenset(NORMS)
-    curves: FrozenSet[str] = frozenset(CURVES)
+    curves: FrozenSet[str] = frozenset(FORMULAS)
 
     def preparing(self) -> ContextManager[Any]:
         # In somebody's training script: where nobody looks, nothing is said.

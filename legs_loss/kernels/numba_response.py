@@ -5,25 +5,15 @@ The loops are plain and short, a channel at a time, so that LLVM makes vectors o
 
 from __future__ import annotations
 
-from typing import Dict, NamedTuple, Tuple
+from typing import NamedTuple
 
 import numpy as np
 
+from legs_loss.kernels.codes import EIGHT, GRADIENT, NORMS, STENCILS
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined, part
 from legs_loss.spec import WeightSpec
 
-__all__ = ["NORMS", "STENCILS", "Operator", "Shape", "extremes", "operator_of", "photograph_response", "response_row",
-           "supports_response"]  # fmt: skip
-
-# The operators that are written here: kind of stencil, the weights of a gradient's outer and middle rows
-STENCILS: Dict[str, Tuple[int, float, float]] = {
-    "laplacian": (0, 0.0, 0.0),
-    "laplacian8": (1, 0.0, 0.0),
-    "central": (2, 0.0, 0.5),
-    "sobel": (2, 1.0, 2.0),
-    "scharr": (2, 3.0, 10.0),
-}
-NORMS = {1.0: 1, 2.0: 2, float("inf"): 3}
+__all__ = ["Operator", "Shape", "extremes", "operator_of", "photograph_response", "response_row", "supports_response"]
 
 _ROWS = 32  # of a task
 _ZERO, _ONE, _FOUR, _EIGHT = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(8.0)
@@ -41,9 +31,8 @@ class Shape(NamedTuple):
 class Operator(NamedTuple):
     """The operator of a response and its norm.
 
-    stencil: 0 the Laplacian of four neighbours, 1 of eight, 2 a gradient.
-    side, middle: the weights of a gradient's outer rows and of its middle one.
-    norm: over the channels, as in NORMS.
+    stencil, side, middle: as in STENCILS of codes.py: a kind, the weights of a gradient's outer rows and of its middle.
+    norm: over the channels, as in NORMS there.
     """
 
     stencil: int
@@ -183,7 +172,7 @@ def _join_inner(above, here, below, count, operator, out):  # type: ignore[no-un
 @inlined
 def _joined(sum, above, here, below, west, j, east, operator):  # type: ignore[no-untyped-def]
     # Differences are taken in torch's order, which is exactly zero on a constant image.
-    if operator.stencil == 2:
+    if operator.stencil == GRADIENT:
         across = operator.middle * (here[east] - here[west])
         down = operator.middle * (below[j] - above[j])
         if operator.side != _ZERO:
@@ -193,7 +182,7 @@ def _joined(sum, above, here, below, west, j, east, operator):  # type: ignore[n
         value = down
     else:
         cross = (above[j] + below[j]) + (here[west] + here[east])
-        if operator.stencil == 1:
+        if operator.stencil == EIGHT:
             diagonal = (above[west] + below[east]) + (above[east] + below[west])
             value = (cross + diagonal) - _EIGHT * here[j]
         else:

@@ -6,7 +6,7 @@ view. With them the weights are made row by row where they are used, from pixels
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Dict, NamedTuple
 
 import numpy as np
 import torch
@@ -14,17 +14,18 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, shape_of
-from legs_loss.kernels.compiling import part
+from legs_loss.kernels.codes import CURVES, formulas_in
+from legs_loss.kernels.compiling import inlined, part
 from legs_loss.kernels.numba_response import Operator, Shape, extremes, operator_of, response_row
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
-__all__ = ["CURVES", "Images", "WeightSource", "images_of", "response_range", "source_of", "weights_of_row"]
+__all__ = ["FORMULAS", "Images", "WeightSource", "images_of", "response_range", "source_of", "weights_of_row"]
 
-# C5 needs a sine; it and curves of the user's own are applied by torch, to a map.
-CURVES = {"C1": 1, "C2": 2, "C3": 3, "C4": 4}
-
-_ONE, _TWO, _THREE = np.float32(1.0), np.float32(2.0), np.float32(3.0)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+# No sine, since numba's is slow: C5, as curves of the user's own, is applied by torch, to a map.
+_WORDS = {"x": "x", "sqrt": "np.sqrt", "unit": "_unit"}
+FORMULAS: Dict[str, str] = formulas_in(_WORDS, "np.float32({})".format)
 
 
 class Images(NamedTuple):
@@ -100,6 +101,22 @@ def response_range(target: Tensor, spec: WeightSpec) -> Tensor:
     return torch.from_numpy(found[:, :2])
 
 
+@inlined
+def _unit(x):  # type: ignore[no-untyped-def]
+    return min(max(x, _ZERO), _ONE)
+
+
+def _made() -> Any:
+    """Return the function that applies the curve of a number, compiled into its callers."""
+    cases = (f"if curve == {CURVES[name]}:\n        x = {formula}\n    " for name, formula in FORMULAS.items())
+    made: Dict[str, Any] = {}
+    exec(f"def curved(curve, x):\n    {'el'.join(cases)}return x", globals(), made)
+    return inlined(made["curved"])
+
+
+_curved = _made()
+
+
 @part(fastmath=False)
 def weights_of_row(images, source, view, row, left, right, out):  # type: ignore[no-untyped-def]
     """Write the weights of the pixels left <= j < right of a row of a view to out."""
@@ -120,14 +137,7 @@ def weights_of_row(images, source, view, row, left, right, out):  # type: ignore
 @part(fastmath=False)
 def _weigh(out, count, curve, beta, low, scale):  # type: ignore[no-untyped-def]
     for j in range(count):
-        x = (out[j] - low) * scale
-        if curve == 2:
-            x = x * x
-        elif curve == 3:
-            x = np.sqrt(x)
-        elif curve == 4:
-            x = x * x * (_THREE - _TWO * x)
-        out[j] = _ONE + beta * x
+        out[j] = _ONE + beta * _curved(curve, (out[j] - low) * scale)
 
 
 @part(fastmath=False)

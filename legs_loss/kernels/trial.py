@@ -18,8 +18,12 @@ _SHARE = 0.2
 _Loss = Callable[[Tensor], Tensor]
 
 
-def difference_from_torch(backend: Backend, device: torch.device, operations: Collection[str]) -> Optional[str]:
+def difference_from_torch(
+    backend: Backend, device: torch.device, operations: Collection[str], spec: Optional[WeightSpec] = None
+) -> Optional[str]:
     """Run operations of a backend ("loss", "l1", "ssim") on a small image; describe the first wrong result.
+
+    They run without weights, with a map, and with weights of a spec, if the backend makes these.
 
     The image has two tiles each way, where tiles are small. The reference is in float64, since a GPU's convolutions in
     float32 may be tf32's.
@@ -27,7 +31,7 @@ def difference_from_torch(backend: Backend, device: torch.device, operations: Co
     rows, columns = torch.arange(50.0).reshape(1, 50, 1), torch.arange(60.0).reshape(1, 1, 60)
     channels = torch.arange(1.0, 4.0).reshape(3, 1, 1)
     target = (0.5 + 0.4 * torch.sin(channels * (0.3 * rows + 0.2 * columns))).to(device)
-    for name, function, reference in _operations(backend, target, operations):
+    for name, function, reference in _operations(backend, target, operations, spec):
         results = []
         for loss_of, dtype in ((function, torch.float32), (reference, torch.float64)):
             image = (0.9 * target + 0.02).to(dtype).requires_grad_()
@@ -45,12 +49,15 @@ def difference_from_torch(backend: Backend, device: torch.device, operations: Co
     return None
 
 
-def _operations(backend: Backend, target: Tensor, operations: Collection[str]) -> Iterator[Tuple[str, _Loss, _Loss]]:
+def _operations(
+    backend: Backend, target: Tensor, operations: Collection[str], spec: Optional[WeightSpec]
+) -> Iterator[Tuple[str, _Loss, _Loss]]:
     """Yield of operations with each kind of weight: its name, the backend's function, and the reference."""
     exact = target.double()
-    spec = WeightSpec()
-    weights = weight_map(target, spec)
-    kinds = ((Weights(), torch.ones_like(weights)), (Weights(spec), weights), (Weights(map=weights), weights))
+    weights = weight_map(target, spec or WeightSpec())
+    kinds = [(Weights(), torch.ones_like(weights)), (Weights(map=weights), weights)]
+    if spec is not None and backend.makes_weights_of(spec):
+        kinds.append((Weights(spec), weights))
 
     def l1(weight: Tensor) -> _Loss:
         return lambda image: (weight * (image - exact).abs()).mean()

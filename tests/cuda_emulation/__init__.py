@@ -13,7 +13,7 @@ import tempfile
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, FrozenSet, List, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 
@@ -22,7 +22,7 @@ from legs_loss.kernels.cuda.driver import CudaDriver
 from legs_loss.kernels.cuda.modules import BinaryCache, Modules
 from legs_loss.kernels.cuda.nvrtc import Compiler
 
-__all__ = ["COMPILER", "EmulatedDriver", "Libraries", "RecordingDriver", "Runtime", "emulated", "libraries"]
+__all__ = ["COMPILER", "TRIED", "EmulatedDriver", "Libraries", "RecordingDriver", "Runtime", "emulated", "libraries"]
 
 COMPILER = shutil.which("g++")
 # Locals start as a large negative number, so that what is read before it is written shows.
@@ -36,6 +36,14 @@ FLAGS = [
     "-fPIC",
 ]
 HERE = Path(__file__).parent
+
+
+class _Everything(FrozenSet[Any]):
+    def __contains__(self, case: object) -> bool:
+        return True
+
+
+TRIED = _Everything()  # of an Availability: the trial of whatever is asked for has passed
 
 
 class Libraries(NamedTuple):

@@ -223,7 +223,8 @@ class TestAvailability:
     def test_a_card_that_is_full_later_is_torchs_once(self, on_cpu, capfd):
         assert used(legs_loss(*images((3, 20, 30)))) == "fused"
         on_cpu.test_fail(b"cuModuleLoadData", 2, 2)
-        losses = [legs_loss(*images((3, 20, 30)), "eggs") for _ in range(2)]
+        halves = [image.detach().half().requires_grad_(image.requires_grad) for image in images((3, 20, 30))]
+        losses = [legs_loss(*halves) for _ in range(2)]
         assert [used(loss) for loss in losses] == ["torch", "fused"]
         assert capfd.readouterr().err == ""
 
@@ -246,7 +247,7 @@ class TestAvailability:
         monkeypatch.setattr(BACKENDS, "_found", {})
         monkeypatch.setattr(available, "_why_missing", lambda name: None)
         problems = {torch.device("cuda", 0): "its card is odd", torch.device("cuda", 1): None}
-        monkeypatch.setattr(trial, "difference_from_torch", lambda backend, device, operations: problems[device])
+        monkeypatch.setattr(trial, "difference_from_torch", lambda backend, device, *_: problems[device])
         found = [BACKENDS.availability("cuda", torch.device("cuda", index)) for index in (0, 1)]
         assert found[0].backend is None and found[1].backend is not None
         assert capfd.readouterr().err == "legs-loss: cuda is unavailable, torch is used: its card is odd\n"
@@ -264,7 +265,7 @@ def test_a_forked_process_uses_both():
         "if child == 0:\n"
         "    assert BACKENDS.chosen(cpu) == 'numba'\n"
         "    available._why_missing = lambda name: None\n"
-        "    trial.difference_from_torch = lambda backend, device, operations: None\n"
+        "    trial.difference_from_torch = lambda *_: None\n"
         "    assert BACKENDS.chosen(card) == 'cuda'\n"
         "    os._exit(0)\n"
         "assert os.waitpid(child, 0)[1] == 0\n"

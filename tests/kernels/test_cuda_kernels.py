@@ -27,15 +27,16 @@ from legs_loss import (
     weight_map,
     weighted_l1,
 )
+from legs_loss.curves import FORMULAS
 from legs_loss.kernels import backends
 from legs_loss.kernels.available import BACKENDS, Availability, Known
-from legs_loss.kernels.cuda.backend import STENCILS
+from legs_loss.kernels.codes import STENCILS
 from legs_loss.kernels.trial import difference_from_torch
 from legs_loss.responses import response
 from legs_loss.runtime import state
 from legs_loss.spec import PRESETS
 from legs_loss.weights import Weights
-from tests.cuda_emulation import COMPILER
+from tests.cuda_emulation import COMPILER, TRIED
 from tests.kernels.on_device import DEVICE, MISSING, new_backend, new_driver
 from tests.kernels.support import compare, images, used
 from tests.support import legs_environment
@@ -56,7 +57,7 @@ def chosen(monkeypatch):
     """Make the backend under test the one for images on the device, and return it and its driver."""
     driver = new_driver()
     backend = new_backend(driver)
-    found = Availability(backend, True, "", backend.offers)
+    found = Availability(backend, True, "", TRIED)
     device = torch.empty(0, device=DEVICE).device
     monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", DEVICE.type)})
     monkeypatch.setattr(BACKENDS, "_found", {("cuda", device): found})
@@ -117,7 +118,7 @@ class TestLoss:
     def test_every_operator_and_norm(self, backend, operator, p):
         compare(by_signature(backend), *images((3, 31, 45)), WeightSpec(operator=operator, p=p))
 
-    @pytest.mark.parametrize("curve", ["C1", "C2", "C3", "C4", "C5"])
+    @pytest.mark.parametrize("curve", FORMULAS)
     def test_every_curve(self, backend, curve):
         compare(by_signature(backend), *images((2, 3, 31, 145)), WeightSpec(curve=curve, beta=3.0))
 
@@ -342,7 +343,7 @@ class TestAutograd:
 
 class TestSelection:
     def test_its_trial_agrees_with_torch(self, backend):
-        assert difference_from_torch(backend, DEVICE, backend.offers) is None
+        assert difference_from_torch(backend, DEVICE, backend.offers, LEGS) is None
 
     @pytest.mark.parametrize("channels_last", [False, True])
     def test_the_front_ends_mean_the_same_as_torch(self, chosen, channels_last):

@@ -19,6 +19,7 @@ from legs_loss.runtime import counts, sources, state
 from legs_loss.runtime.memo import _OVERHEAD
 from legs_loss.spec import PRESETS
 from legs_loss.weights import Weights
+from tests.cuda_emulation import TRIED
 from tests.kernels.parts import FakeCompiler, FakeDriver
 from tests.kernels.support import images, used
 
@@ -75,7 +76,7 @@ class Watched(TorchDispatchMode):
 @pytest.fixture
 def on_meta(monkeypatch, parts):
     """The backend for tensors on torch's meta device, which have no values that could be read."""
-    known = Availability(CudaBackend(lambda _: parts[2]), True, "", CudaBackend.offers)
+    known = Availability(CudaBackend(lambda _: parts[2]), True, "", TRIED)
     monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "meta")})
     monkeypatch.setattr(BACKENDS, "_found", {("cuda", torch.device("meta")): known})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
@@ -178,7 +179,7 @@ class TestCapture:
         driver = FakeDriver()
         backend = CudaBackend(lambda _: Modules(driver, FakeCompiler(), BinaryCache(tmp_path)))
         monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "cpu")})
-        known = Availability(backend, True, "", backend.offers)
+        known = Availability(backend, True, "", TRIED)
         monkeypatch.setattr(BACKENDS, "_found", {("cuda", torch.device("cpu")): known})
         prediction, target = images((3, 20, 30))
         driver.captures = True

@@ -16,6 +16,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from legs_loss import LegsError, LEGSLoss, WeightSpec, l1_loss, legs_loss, ssim, weight_map
+from legs_loss.curves import FORMULAS
 from legs_loss.kernels.available import BACKENDS
 from legs_loss.operators import OPERATORS, Operator
 from legs_loss.precompute import normalised_map
@@ -53,7 +54,7 @@ class TestFusedLoss:
     def test_every_operator_and_norm(self, operator, p):
         compare(fused_loss, *images((3, 31, 45)), WeightSpec(operator=operator, p=p))
 
-    @pytest.mark.parametrize("curve", ["C1", "C2", "C3", "C4", "C5"])
+    @pytest.mark.parametrize("curve", FORMULAS)
     def test_every_curve(self, curve):
         compare(fused_loss, *images((2, 3, 31, 45)), WeightSpec(curve=curve, beta=3.0))
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import pytest
 import torch
 
 from legs_loss import LegsError, WeightSpec, register_curve, weight_map
-from legs_loss.curves import curve, curve_names
+from legs_loss.curves import FORMULAS, curve, curve_names
 
 BY_HAND = {
     "C1": lambda x: x,
@@ -36,6 +38,24 @@ def test_unit_interval_is_kept_and_order_too(name, dtype):
     assert float(y.min()) >= 0.0
     assert float(y.max()) <= 1.0
     assert bool((y[1:] >= y[:-1] - 1e-6).all())
+
+
+def test_every_curve_has_its_values_by_hand():
+    assert set(BY_HAND) == set(FORMULAS)
+
+
+def test_the_formulas_of_the_documentation_are_those_of_the_table():
+    page = (Path(__file__).parents[2] / "docs" / "method.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| (C\d+) \| (.+?) \|", page, re.MULTILINE))
+    assert list(rows) == list(FORMULAS)
+    for name, text in rows.items():
+        text = re.sub(r" \([^()x]+\)$", "", text)  # its name in words
+        for sign, meant in (("√x", "sqrt(x)"), ("½", "0.5"), ("−", "-"), ("²", "**2"), ("³", "**3")):
+            text = text.replace(sign, meant)
+        text = re.sub(r"(\d)(x|sqrt)", r"\1*\2", text)
+        for x in (0.0, 0.1, 0.5, 0.8, 1.0):
+            expected = eval(text, {"sqrt": math.sqrt, "sin": math.sin, "asin": math.asin, "x": x})
+            assert float(curve(name)(torch.tensor(x, dtype=torch.float64))) == pytest.approx(expected, abs=1e-12)
 
 
 def test_c5_undoes_c4():
@@ -70,4 +90,4 @@ def test_what_is_no_curve_is_refused(name, function, message):
 
 def test_an_unknown_name_lists_what_there_is():
     with pytest.raises(LegsError, match="C1, C2, C3, C4, C5"):
-        WeightSpec(curve="C6")
+        WeightSpec(curve="C0")

@@ -13,9 +13,10 @@ from typing import Any, Callable, Dict, FrozenSet, NamedTuple, Optional, Sequenc
 import torch
 from torch import Tensor
 
+from legs_loss.kernels.codes import CURVES, NORMS, STENCILS
 from legs_loss.kernels.contract import Backend
 from legs_loss.kernels.cuda.driver import CudaDriver
-from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules, Variant, cache_folder
+from legs_loss.kernels.cuda.modules import FORMULAS, PLAIN, BinaryCache, Modules, Variant, cache_folder
 from legs_loss.kernels.cuda.nvrtc import find_compiler
 from legs_loss.kernels.differentiable import differentiable
 from legs_loss.spec import WeightSpec
@@ -23,8 +24,6 @@ from legs_loss.weights import Weights
 
 __all__ = [
     "BACKEND",
-    "NORMS",
-    "STENCILS",
     "THREADS",
     "VALUES",
     "CudaBackend",
@@ -37,16 +36,6 @@ __all__ = [
 THREADS = 256
 RUN = 8  # rows of a thread of the pixelwise passes
 VALUES = {torch.float32: 0, torch.float16: 1, torch.bfloat16: 2}
-# kind of stencil, the weights of a gradient's outer and middle rows
-STENCILS: Dict[str, Tuple[int, float, float]] = {
-    "laplacian": (1, 0.0, 0.0),
-    "laplacian8": (2, 0.0, 0.0),
-    "central": (3, 0.0, 0.5),
-    "sobel": (3, 1.0, 2.0),
-    "scharr": (3, 3.0, 10.0),
-}
-NORMS = {1.0: 1, 2.0: 2, float("inf"): 3}
-CURVES = {"C1": 1, "C2": 2, "C3": 3, "C4": 4, "C5": 5}
 
 _REACH = 5  # of SSIM's window
 _BLOCKS_AT_A_TIME = 2  # of a multiprocessor: 128 registers a thread
@@ -99,7 +88,7 @@ class CudaBackend(Backend):
     most_channels = 1 << 16
     operators: FrozenSet[str] = frozenset(STENCILS)
     norms: FrozenSet[float] = frozenset(NORMS)
-    curves: FrozenSet[str] = frozenset(CURVES)
+    curves: FrozenSet[str] = frozenset(FORMULAS)
 
     def __init__(self, open_device: Callable[[torch.device], Modules]) -> None:
         self._open = open_device

@@ -1,9 +1,10 @@
 // The weighted L1 and SSIM, value and gradient, in one pass. For NVRTC: no includes, C++14.
 //
-// Compiled with -DVALUE=0|1|2 (images of float32, float16, bfloat16), -DSTENCIL=0|1|2|3 (weights from a map or none;
-// from the target's response to the 4-neighbour Laplacian, the 8-neighbour one, a gradient) and -DNORM=1|2|3 (the norm
-// over channels: 1, 2, infinity). a * b + c is rounded twice unless fmaf says otherwise (--fmad=false), so that every
-// compiler gives the same bits.
+// Compiled with -DVALUE=0|1|2 (images of float32, float16, bfloat16), -DSTENCIL=0|FOUR|EIGHT|GRADIENT (weights from a map
+// or none; from the target's response to a Laplacian of 4 neighbours, of 8, a gradient) and -DNORM=1|2|3 (the norm over
+// channels: 1, 2, infinity). a * b + c is rounded twice unless fmaf says otherwise (--fmad=false), so that every compiler
+// gives the same bits. modules.py puts in front what it makes of the package's tables: the kinds of stencils, and CURVES,
+// of each curve CURVE(its number, its formula of x).
 //
 // A block is a sequence of phases. Within one no thread reads what another writes; between two all threads wait. So the
 // same source runs on a CPU, as a loop over the threads of each phase (tests/cuda_emulation).
@@ -94,7 +95,7 @@ struct Task {
     long long count;       // values (scale); blocks whose sums are to be added (finish)
     int views, channels, height, width;
     int strip;    // rows of a block of the streaming pass
-    int curve;    // 1 to 5
+    int curve;    // its number
     int chunks;   // blocks a view of the pixelwise passes
     int map_view;  // whether each view has a map of its own
     float side, middle;  // of a gradient's stencil: the outer and middle rows
@@ -177,7 +178,7 @@ DEVICE void responses(const Task& k, const Value* at, int row, int before, int a
         };
         const Value* here = line(0);
         float north = read(line(-1)), middle = read(here);
-#if STENCIL > 1
+#if STENCIL != FOUR
         float north_west = read(line(-1) + before), north_east = read(line(-1) + after);
         float west = read(here + before), east = read(here + after);
 #endif
@@ -185,11 +186,11 @@ DEVICE void responses(const Task& k, const Value* at, int row, int before, int a
         for (int r = 0; r < RUN; ++r) {
             const Value* below = line(r + 1);
             const float south = read(below);
-#if STENCIL == 1
+#if STENCIL == FOUR
             e[r] = joined(e[r], fmaf(-4.f, middle, (north + south) + (read(here + before) + read(here + after))));
 #else
             const float south_west = read(below + before), south_east = read(below + after);
-#if STENCIL == 2
+#if STENCIL == EIGHT
             const float corners = (north_west + south_east) + (north_east + south_west);
             e[r] = joined(e[r], fmaf(-8.f, middle, ((north + south) + (west + east)) + corners));
 #else
@@ -238,32 +239,32 @@ DEVICE Weights weights_of(const Task& k, int view) {
     return w;
 }
 
+// Of an angle of at most 30 degrees.
+DEVICE float short_sine(float angle) {
+    const float square = angle * angle;
+    const float high = fmaf(square, fmaf(square, 1.f / 362880.f, -1.f / 5040.f), 1.f / 120.f);
+    return angle * fmaf(square, fmaf(square, high, -1.f / 6.f), 1.f);
+}
+
 // Turns responses into weights.
 template <int N>
-DEVICE void weigh(const Task& k, const Weights& w, float (&x)[N]) {
+DEVICE void weigh(const Task& k, const Weights& w, float (&values)[N]) {
 #pragma unroll
-    for (int r = 0; r < N; ++r) x[r] = saturated((x[r] - w.low) * w.scale);
-    if (k.curve == 3) {
-#pragma unroll
-        for (int r = 0; r < N; ++r) x[r] = root(x[r]);
-    } else if (k.curve == 2) {
-#pragma unroll
-        for (int r = 0; r < N; ++r) x[r] *= x[r];
-    } else if (k.curve == 4) {
-#pragma unroll
-        for (int r = 0; r < N; ++r) x[r] = x[r] * x[r] * fmaf(-2.f, x[r], 3.f);
-    } else if (k.curve == 5) {
-        // 1/2 - sin(asin(1 - 2x) / 3); the sine of an angle of at most 30 degrees is a short polynomial.
-#pragma unroll
-        for (int r = 0; r < N; ++r) {
-            const float angle = asinf(fmaf(-2.f, x[r], 1.f)) * (1.f / 3.f), square = angle * angle;
-            const float high = fmaf(square, fmaf(square, 1.f / 362880.f, -1.f / 5040.f), 1.f / 120.f);
-            x[r] = saturated(0.5f - angle * fmaf(square, fmaf(square, high, -1.f / 6.f), 1.f));
-        }
+    for (int r = 0; r < N; ++r) values[r] = saturated((values[r] - w.low) * w.scale);
+#define CURVE(number, formula)                                \
+    else if (k.curve == number) {                             \
+        _Pragma("unroll")                                     \
+        for (int r = 0; r < N; ++r) {                         \
+            const float x = values[r];                        \
+            values[r] = formula;                              \
+        }                                                     \
     }
+    if (false) {}
+    CURVES
+#undef CURVE
     const float one = fmaf(0.f, w.scale, 1.f);  // not a number where the range is none: then no weight is one
 #pragma unroll
-    for (int r = 0; r < N; ++r) x[r] = fmaf(k.beta, x[r], one);
+    for (int r = 0; r < N; ++r) values[r] = fmaf(k.beta, values[r], one);
 }
 
 // The weights of N pixels of a column, from a row on, 0 outside the image. Responses are in `x` already, or in memory.

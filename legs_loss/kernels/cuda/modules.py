@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import sys
 import tempfile
 import threading
@@ -11,11 +12,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, NamedTuple, Optional
 
+from legs_loss.kernels import codes
 from legs_loss.kernels.contract import NotNow
 from legs_loss.kernels.cuda.driver import UNSUPPORTED_PTX, DriverError
+from legs_loss.spec import WeightSpec
 
-__all__ = ["PLAIN", "BinaryCache", "Modules", "Variant", "cache_folder", "options", "source"]
+__all__ = ["FORMULAS", "PLAIN", "BinaryCache", "Modules", "Variant", "cache_folder", "options", "source"]
 
+_WORDS = {"x": "x", "sqrt": "root", "unit": "saturated", "sin": "short_sine", "asin": "asinf"}
+FORMULAS: Dict[str, str] = codes.formulas_in(_WORDS, "{}f".format)
 _DIGEST = hashlib.sha256().digest_size
 _OF_OTHERS = 0o022  # may be written by the group, or by all
 
@@ -25,8 +30,8 @@ class Variant(NamedTuple):
 
     Attributes:
         value: the images' type: 0 float32, 1 float16, 2 bfloat16.
-        stencil: 0: weights from a map, or none; 1 to 3: from the response to a stencil of that kind.
-        norm: of the response: 1, 2, 3 for infinity.
+        stencil: a kind of codes.py, of the response that weights come from; 0: they come from a map, or there are none.
+        norm: of the response, a number of codes.py.
     """
 
     value: int
@@ -46,8 +51,13 @@ PLAIN = Variant(0)
 
 
 def source() -> bytes:
-    """Return the text of legs.cu."""
-    return (Path(__file__).parent / "legs.cu").read_bytes()
+    """Return the text of legs.cu, after the tables that it reads."""
+    first = sorted(FORMULAS, key=lambda name: name != WeightSpec.curve)  # the default is found by one comparison
+    curves = " ".join(f"CURVE({codes.CURVES[name]}, {FORMULAS[name]})" for name in first)
+    curves = re.sub(r"/ ([\d.]+f)", r"* (1.0f / \1)", curves)  # a product is faster
+    kinds = [f"#define {name} {getattr(codes, name)}" for name in ("FOUR", "EIGHT", "GRADIENT")]
+    tables = "\n".join([*kinds, f"#define CURVES {curves}", '#line 1 "legs.cu"\n'])
+    return tables.encode() + (Path(__file__).parent / "legs.cu").read_bytes()
 
 
 def options(variant: Variant) -> List[str]:

@@ -14,7 +14,7 @@ import json
 import torch
 from losses.contenders import LAMBDA, LEGS, Contenders, reference_ssim
 from losses.images import Pairs, in_turns, some_images
-from losses.machine import machine, set_threads
+from losses.machine import machine
 from losses.tables import side_by_side
 from torch import Tensor
 
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--json", help="write everything to this file")
     args = parser.parse_args()
-    set_threads(args.threads)
+    torch.set_num_threads(args.threads)
     configure("legs")
     pairs = some_images(args.size, args.device)
     print(f"\nforward and backward, {args.size[0]}x{args.size[1]} RGB, {args.threads} thread(s), {args.device}")

@@ -31,7 +31,7 @@ from typing import Any, Dict, List, Tuple
 import torch
 from losses.contenders import losses, weightings
 from losses.images import images, some_images
-from losses.machine import machine, set_threads
+from losses.machine import machine
 from losses.tables import TOO_LONG, at_bandwidth, side_by_side
 from losses.timing import timed
 
@@ -106,7 +106,7 @@ def growth(args: argparse.Namespace) -> Any:
         for name in [name for name in contenders if name in left and (not args.only or name in args.only)]:
             row: Dict[str, Any] = {"size": f"{size[0]}x{size[1]}", "megapixels": size[0] * size[1] / 1e6, "name": name}
             for threads in sorted({1, os.cpu_count() or 1}) if args.device.type == "cpu" else (1,):
-                set_threads(threads)
+                torch.set_num_threads(threads)
                 first = timed(contenders[name], args.device)
                 rounds = 1 if first > 1.0 else args.rounds
                 seconds = statistics.median(timed(contenders[name], args.device) for _ in range(rounds))
@@ -117,7 +117,7 @@ def growth(args: argparse.Namespace) -> Any:
             found.append(row)
             values = "  ".join(f"{key} {value:.4g}" for key, value in row.items() if isinstance(value, float))
             print(f"{row['size']:<10} {name:<28} {values}", flush=True)
-    set_threads(args.threads)
+    torch.set_num_threads(args.threads)
     return found
 
 
@@ -131,7 +131,7 @@ def threads(args: argparse.Namespace) -> Any:
         rounds: Dict[int, List[float]] = {1: [], args.threads: []}
         for _ in range(args.rounds + 1):
             for count, seconds in rounds.items():
-                set_threads(count)
+                torch.set_num_threads(count)
                 before = time.perf_counter()
                 step()
                 seconds.append(time.perf_counter() - before)
@@ -181,7 +181,7 @@ def parse() -> argparse.Namespace:
     args = parser.parse_args()
     if args.device.type == "cuda" and not torch.cuda.is_available():
         parser.error("torch finds no CUDA GPU here")
-    set_threads(args.threads)
+    torch.set_num_threads(args.threads)
     return args
 
 

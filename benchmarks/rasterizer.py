@@ -197,7 +197,6 @@ def main():
     import numba
 
     torch.set_num_threads(options.threads)
-    numba.set_num_threads(options.threads)
     command = shlex.join(["python", *sys.argv])
     print(command)
     print(f"{platform.processor() or platform.machine()}, torch {torch.__version__}, numba {numba.__version__}")

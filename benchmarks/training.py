@@ -74,12 +74,10 @@ def measure(args):
     """Run iterations in this process: the milliseconds of each part, the facts of the scene, the speed of a copy."""
     import importlib
 
-    import numba
     import numpy as np
     import torch
 
     torch.set_num_threads(args.threads)
-    numba.set_num_threads(args.threads)
     from legs_loss.lab.rasterizer import strips
     from legs_loss.lab.training import trainer
     from legs_loss.lab.training.checkpoint import read_state

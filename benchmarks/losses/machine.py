@@ -8,7 +8,7 @@ from typing import Dict
 
 import torch
 
-__all__ = ["machine", "set_threads"]
+__all__ = ["machine"]
 
 
 def machine(device: torch.device) -> Dict[str, str]:
@@ -26,13 +26,3 @@ def machine(device: torch.device) -> Dict[str, str]:
         except ImportError:
             versions[package] = "not installed"
     return {"processor": name, "cores": str(os.cpu_count()), **versions}
-
-
-def set_threads(threads: int) -> None:
-    torch.set_num_threads(threads)
-    try:
-        import numba
-
-        numba.set_num_threads(threads)
-    except ImportError:
-        pass

@@ -13,7 +13,6 @@ import argparse
 import json
 from pathlib import Path
 
-import numba
 import torch
 
 from legs_loss.lab.experiments.arms import ArmSpec, needed, parse_arm, parse_arms
@@ -29,7 +28,6 @@ def main() -> None:
     """Train what is missing."""
     args = arguments(str(__doc__))
     torch.set_num_threads(1)  # one thread an arm: several scripts, each with arms of its own, use more cores
-    numba.set_num_threads(1)
     for milestone in (at for at in args.milestones if at <= args.until):
         for arm in needed(parse_arms(args.arms)):
             path = args.out / arm.folder / f"metrics-{milestone}.json"

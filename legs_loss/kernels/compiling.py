@@ -5,6 +5,8 @@ And a multiply-add, and the threads of a call.
 
 from __future__ import annotations
 
+import gc
+import operator
 import os
 import sys
 import time
@@ -18,6 +20,8 @@ import torch
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils, event, extending
+from numba.core.typing import arraydecl
+from numba.core.typing.templates import infer_global
 from tqdm import tqdm
 
 from legs_loss.kernels.code_cache import keep
@@ -52,6 +56,31 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function into its callers, with their settings."""
     return numba.njit(inline="always")(function)
+
+
+class _NoCollector(event.Listener):
+    """Keep Python's garbage collector off while numba compiles: it walked all that torch imported, again and again."""
+
+    depth, was_on = 0, False
+
+    def on_start(self, event: Any) -> None:
+        if self.depth == 0:
+            self.was_on = gc.isenabled()
+            gc.disable()
+        self.depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self.depth -= 1
+        if self.depth == 0 and self.was_on:
+            gc.enable()
+
+
+event.register("numba:compile", _NoCollector())
+
+# numba types an array's element last, after seven overloads for strings and lists, with literals and without; what is
+# of this processor, not of any, it tries first.
+for _symbol, _template in ((operator.getitem, arraydecl.GetItemBuffer), (operator.setitem, arraydecl.SetItemBuffer)):
+    infer_global(_symbol)(type("First" + _template.__name__, (_template,), {"metadata": {"target": "cpu"}}))
 
 
 @contextmanager

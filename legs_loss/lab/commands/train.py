@@ -123,7 +123,6 @@ def set_threads(count: Optional[int]) -> None:
     most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     if not 1 <= count <= most:
         raise LegsError(f"--threads must be between 1 and {most}, the number of cores, got {count}")
-    numba.set_num_threads(count)
     torch.set_num_threads(count)
 
 

@@ -15,10 +15,9 @@ import math
 from typing import Tuple
 
 import numpy as np
-from numba import prange
 from torch import Tensor
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import claimed, compiled, in_threads, part
 from legs_loss.lab.conventions import TILE
 from legs_loss.lab.rasterizer.geometry import conic
 from legs_loss.lab.rasterizer.projection import BLOCK, TALL, WIDE
@@ -50,14 +49,15 @@ class CompactBox:
         radii: np.ndarray,
     ) -> None:
         """Take the rows outside the boxes from the slots, and the radii of Gaussians that enter no tile."""
-        _clip(splats, self.opacities, self.mult, tiles, boxes, slots, firsts, reached, radii)
+        blocks = -(-len(slots) // BLOCK)
+        in_threads(_clip, blocks, splats, self.opacities, self.mult, tiles, boxes, slots, firsts, reached, radii)
         # For FastGS a Gaussian that reaches no pixel's centre is visible if it enters a tile.
         faint = np.nonzero((slots == 0) & (radii > 0))[0]
         opacities = self.opacities[faint, 0].astype(np.float64)
         radii[faint[~_touches(splats[faint, :5], opacities, self.mult, tiles)]] = 0
 
 
-@compiled()
+@part()
 def _crossings(a, b, c, disc, t, u0, v0, at):
     """Return the two v at which the ellipse crosses the line u = at; c is the coefficient of v."""
     h = at - u0
@@ -65,13 +65,13 @@ def _crossings(a, b, c, disc, t, u0, v0, at):
     return (-b * h - root) / c + v0, (-b * h + root) / c + v0
 
 
-@compiled()
+@part()
 def _tile(value, tiles):
     """Return the tile of a coordinate, truncated as C does, within the image."""
     return min(max(np.int64(value), 0), tiles)
 
 
-@compiled()
+@part()
 def _slices(a, b, c, t, u0, v0, least, most, u_tiles, v_tiles, spans):
     """Fill, for each tile along u, the first tile along v and the one past the last; the ellipse is given in (u, v).
 
@@ -101,7 +101,7 @@ def _slices(a, b, c, t, u0, v0, least, most, u_tiles, v_tiles, spans):
     return first, end, count
 
 
-@compiled()
+@part()
 def _reach(splats, i, opacity, mult, tiles, spans):
     """Return which tiles a splat is drawn in: whether ``spans`` go by rows, their first and end, how many tiles."""
     x, y = splats[i, 0], splats[i, 1]
@@ -136,52 +136,44 @@ def _touches(splats, opacities, mult, tiles):
 
 
 @compiled()
-def _clip_block(start, stop, splats, opacities, mult, tiles, boxes, slots, firsts, reached, radii):
-    spans = np.empty((max(tiles[0], tiles[1]), 2), np.int64)
-    for i in range(start, stop):
-        if slots[i] == 0:
-            continue
-        by_rows, first, end, count = _reach(splats, i, np.float64(opacities[i, 0]), mult, tiles, spans)
-        if count == 0:
-            radii[i] = 0
-        slot = firsts[i, FIRST_SLOT]
-        for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
-            for strip_x in range(boxes[i, 0], boxes[i, 2]):
-                if reached[slot, STRIP] >= 0:
-                    # A strip is half a tile wide and two tiles tall.
-                    tile_x, upper = strip_x * WIDE // TILE, strip_y * TALL // TILE
-                    row, last, band = unpacked(reached[slot, ROWS])
-                    kept, kept_end = last, row
-                    for tile_y in range(upper, min(upper + TALL // TILE, tiles[1])):
-                        if by_rows:
-                            inside = first <= tile_y < end and spans[tile_y, 0] <= tile_x < spans[tile_y, 1]
-                        else:
-                            inside = first <= tile_x < end and spans[tile_x, 0] <= tile_y < spans[tile_x, 1]
-                        if inside:
-                            kept = min(kept, (tile_y - upper) * TILE)
-                            kept_end = max(kept_end, (tile_y - upper + 1) * TILE)
-                    row, last = max(row, kept), min(last, kept_end)
-                    if row < last:
-                        reached[slot, ROWS] = packed(row, last, band)
-                    else:
-                        reached[slot, STRIP] = -1
-                slot += 1
-
-
-@compiled(parallel=True)
-def _clip(splats, opacities, mult, tiles, boxes, slots, firsts, reached, radii):
+def _clip(counter, blocks, splats, opacities, mult, tiles, boxes, slots, firsts, reached, radii):
     """Take from every slot the rows outside the compact box; a Gaussian with slots and no tile gets radius 0.
 
     Args:
-        splats, boxes, slots, firsts, reached, radii: as the reference rasterizer has them after
-            `find_rows`.
+        counter, blocks: of `in_threads`; a block is BLOCK Gaussians.
+        splats, boxes, slots, firsts, reached, radii: as the rasterizer has them after `find_rows`.
         opacities: [N, 1].
         mult: the share of the squared distance.
         tiles: how many tiles are across, and down.
     """
-    count = len(slots)
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        start = block * BLOCK
-        _clip_block(
-            start, min(start + BLOCK, count), splats, opacities, mult, tiles, boxes, slots, firsts, reached, radii,
-        )  # fmt: skip
+    spans, block = np.empty((max(tiles[0], tiles[1]), 2), np.int64), claimed(counter)
+    while block < blocks:
+        for i in range(block * BLOCK, min((block + 1) * BLOCK, len(slots))):
+            if slots[i] == 0:
+                continue
+            by_rows, first, end, count = _reach(splats, i, np.float64(opacities[i, 0]), mult, tiles, spans)
+            if count == 0:
+                radii[i] = 0
+            slot = firsts[i, FIRST_SLOT]
+            for strip_y in range(boxes[i, 1] // TALL, (boxes[i, 3] - 1) // TALL + 1):
+                for strip_x in range(boxes[i, 0], boxes[i, 2]):
+                    if reached[slot, STRIP] >= 0:
+                        # A strip is half a tile wide and two tiles tall.
+                        tile_x, upper = strip_x * WIDE // TILE, strip_y * TALL // TILE
+                        row, last, band = unpacked(reached[slot, ROWS])
+                        kept, kept_end = last, row
+                        for tile_y in range(upper, min(upper + TALL // TILE, tiles[1])):
+                            if by_rows:
+                                inside = first <= tile_y < end and spans[tile_y, 0] <= tile_x < spans[tile_y, 1]
+                            else:
+                                inside = first <= tile_x < end and spans[tile_x, 0] <= tile_y < spans[tile_x, 1]
+                            if inside:
+                                kept = min(kept, (tile_y - upper) * TILE)
+                                kept_end = max(kept_end, (tile_y - upper + 1) * TILE)
+                        row, last = max(row, kept), min(last, kept_end)
+                        if row < last:
+                            reached[slot, ROWS] = packed(row, last, band)
+                        else:
+                            reached[slot, STRIP] = -1
+                    slot += 1
+        block = claimed(counter)

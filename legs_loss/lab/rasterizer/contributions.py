@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined
 from legs_loss.lab.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from legs_loss.lab.rasterizer.projection import WIDE
 from legs_loss.lab.rasterizer.sorting import OWNER
@@ -20,7 +19,7 @@ COUNT, WEIGHT, VALUE, DISTANCE, MOST, SLOPES, FIELDS = 0, 1, 2, 3, 4, 5, 6
 _MAX, _MIN, _LAST, _ONE = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE), np.float32(1)
 
 
-@compiled()
+@inlined
 def _strip(strip, across, begin, end, splats, draws, entries, values, image, g_image, sums):
     """Fill the sums of one strip's entries, [entries, FIELDS]."""
     before, finished = np.ones(PIXELS, np.float32), np.zeros(PIXELS, np.bool_)
@@ -68,19 +67,22 @@ def _strip(strip, across, begin, end, splats, draws, entries, values, image, g_i
             sums[k, MOST] += 1
 
 
-@compiled(parallel=True)
-def contribute(across, ranges, ends, splats, draws, entries, values, image, g_image, sums):
-    """Fill sums [N, FIELDS], over the pixels that each Gaussian is blended into.
+@compiled()
+def _strips(counter, strips, across, ranges, ends, splats, draws, entries, values, image, g_image, sums):
+    strip = claimed(counter)
+    while strip < strips:
+        _strip(strip, across, ranges[strip], ends[strip], splats, draws, entries, values, image, g_image, sums)
+        strip = claimed(counter)
+
+
+def contribute(across, ranges, ends, splats, draws, entries, values, image, g_image):
+    """Return sums [N, FIELDS], over the pixels that each Gaussian is blended into.
 
     COUNT: how many; WEIGHT: of transmittance times alpha; VALUE: of ``values`` [H, W] there; DISTANCE: from its centre,
     in pixels; MOST: how many in which no other weighs more; SLOPES: of the squared derivative by the Gaussian's alpha
     there, ``g_image`` being the image's.
     """
     parts = np.zeros((len(entries), FIELDS))
-    for strip in prange(len(ends)):
-        _strip(strip, across, ranges[strip], ends[strip], splats, draws, entries, values, image, g_image, parts)
-    sums[:] = 0
-    for strip in range(len(ends)):
-        for k in range(ranges[strip], ends[strip]):
-            for field in range(FIELDS):
-                sums[draws[k, OWNER], field] += parts[k, field]
+    in_threads(_strips, len(ends), across, ranges, ends, splats, draws, entries, values, image, g_image, parts)
+    owners = draws[: len(entries), OWNER]
+    return np.stack([np.bincount(owners, part, len(splats)) for part in parts.T], 1)

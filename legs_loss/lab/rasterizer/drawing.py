@@ -110,12 +110,13 @@ class Drawn:
         return torch.where(slopes > 0, opacity.square() * slopes, slopes)
 
     def _summed(self, plane: Tensor, gradient: Tensor) -> Tensor:
-        it, sums = self._drawing, np.empty((len(self.radii), contributions.FIELDS))
+        it = self._drawing
         values, g_image = (tensor.detach().to(torch.float32).contiguous().numpy() for tensor in (plane, gradient))
-        contributions.contribute(
-            it.across, it.ranges, it.ends, it.splats, it.draws, it.entries, values, it.image, g_image, sums
+        return torch.from_numpy(
+            contributions.contribute(
+                it.across, it.ranges, it.ends, it.splats, it.draws, it.entries, values, it.image, g_image
+            )
         )
-        return torch.from_numpy(sums)
 
     def reaching(self) -> Tensor:
         """Return bool [N]: which Gaussians reach a pixel."""

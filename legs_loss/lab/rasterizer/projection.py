@@ -41,13 +41,13 @@ CENTRE, COVARIANCE, DETERMINANT, LARGEST = 0, 2, 5, 6
 STATE = 10, BLOCK + 8  # a row ends 64 bytes past a power of two: else all rows would fall into one set of the cache
 
 
-@compiled()
+@part()
 def floor(value):
     """Return the greatest integer below, within 1e8 of 0."""
     return np.int64(math.floor(max(min(value, 1e8), -1e8)))
 
 
-@compiled()
+@part()
 def ceil(value):
     """Return the greatest integer below, within 1e8 of 0."""
     return -floor(-value)
@@ -141,7 +141,7 @@ def _in_the_image(scales, covariances, count, intrinsics, pose, dilation, state)
         _covariances(count, intrinsics, pose, dilation, state)
 
 
-@part()
+@inlined
 def _project_block(first, end, parameters, camera, footprint, found):
     means, scales, quaternions, opacities, sh, covariances = parameters
     degree, intrinsics, pose, position, size = camera
@@ -160,7 +160,7 @@ def _project_block(first, end, parameters, camera, footprint, found):
         before_camera[count] = i
         count += 1
     _in_the_image(scales, covariances, count, intrinsics, pose, dilation, state)
-    drawn, seen = before_camera, 0
+    drawn, seen = before_camera, np.int64(0)
     for j in range(np.uint64(count)):
         i = np.uint64(before_camera[j])
         centre_x, centre_y = state[CENTRE, j], state[CENTRE + 1, j]
@@ -209,47 +209,42 @@ def project(counter, blocks, parameters, camera, footprint, found):
         block = claimed(counter)
 
 
-@part()
-def _find_rows_block(first, end, splats, boxes, slots, firsts, across, reached):
-    for i in range(np.uint64(first), np.uint64(end)):
-        if slots[i] == 0:
-            continue
-        u, v, p, q, r = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
-        a, b, c = conic(p, q, r)
-        determinant = 1 / (q * r) ** 2  # the covariance's: 1 / D below
-        x0, y0, x1, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
-        level = 2 * (splats[i, 5] - FAINTEST)
-        # The ellipse's upper and lower edge over dx are (-B dx +- sqrt(C level - D dx^2)) / C, D = A C - B^2. Their
-        # extreme points are at dx = summit and -summit, or, where the strip does not have them, at its nearer side.
-        level_d, inverse = level * determinant, 1 / c
-        wide = math.sqrt(level_d * c)
-        summit = -b * math.sqrt(level_d / a)
-        tall, slope, bend = level * inverse, -b * inverse, inverse * inverse / determinant
-        slot = np.uint64(firsts[i, FIRST_SLOT])
-        band, bands = -band_at(x0), bands_across(x0, x1)
-        for strip_y in range(y0 // TALL, (y1 - 1) // TALL + 1):
-            top = strip_y * TALL
-            first_row, last_row = float(max(top, y0)), float(min(top + TALL, y1) - 1)
-            for strip_x in range(x0, x1):
-                near, far = max(strip_x * WIDE - u, -wide), min(strip_x * WIDE + (WIDE - 1) - u, wide)
-                reached[slot, STRIP] = -1
-                if near <= far:
-                    at = min(max(-summit, near), far)
-                    row = math.ceil(max(first_row, v + slope * at - math.sqrt(max(tall - bend * at * at, 0.0))))
-                    at = min(max(summit, near), far)
-                    end_row = math.floor(min(last_row, v + slope * at + math.sqrt(max(tall - bend * at * at, 0.0)))) + 1
-                    if row < end_row:
-                        reached[slot, STRIP] = strip_y * across + strip_x
-                        reached[slot, ROWS] = packed(row - top, end_row - top, band + band_at(strip_x))
-                slot += np.uint64(1)
-            band += bands
-
-
 @compiled()
 def find_rows(counter, blocks, splats, boxes, slots, firsts, across, reached):
     """Fill the slots, one for each strip in each Gaussian's box: the strip, or -1, and its rows: `in_threads`."""
     count, block = len(slots), claimed(counter)
     while block < blocks:
-        first = block * BLOCK
-        _find_rows_block(first, min(first + BLOCK, count), splats, boxes, slots, firsts, across, reached)
+        for i in range(np.uint64(block * BLOCK), np.uint64(min((block + 1) * BLOCK, count))):
+            if slots[i] == 0:
+                continue
+            u, v, p, q, r = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3], splats[i, 4]
+            a, b, c = conic(p, q, r)
+            determinant = 1 / (q * r) ** 2  # the covariance's: 1 / D below
+            x0, y0, x1, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
+            level = 2 * (splats[i, 5] - FAINTEST)
+            # The ellipse's upper and lower edge over dx are (-B dx +- sqrt(C level - D dx^2)) / C, D = A C - B^2. Their
+            # extreme points are at dx = summit and -summit, or, where the strip does not have them, at its nearer side.
+            level_d, inverse = level * determinant, 1 / c
+            wide = math.sqrt(level_d * c)
+            summit = -b * math.sqrt(level_d / a)
+            tall, slope, bend = level * inverse, -b * inverse, inverse * inverse / determinant
+            slot = np.uint64(firsts[i, FIRST_SLOT])
+            band, bands = -band_at(x0), bands_across(x0, x1)
+            for strip_y in range(y0 // TALL, (y1 - 1) // TALL + 1):
+                top = strip_y * TALL
+                first_row, last_row = float(max(top, y0)), float(min(top + TALL, y1) - 1)
+                for strip_x in range(x0, x1):
+                    near, far = max(strip_x * WIDE - u, -wide), min(strip_x * WIDE + (WIDE - 1) - u, wide)
+                    reached[slot, STRIP] = -1
+                    if near <= far:
+                        at = min(max(-summit, near), far)
+                        row = math.ceil(max(first_row, v + slope * at - math.sqrt(max(tall - bend * at * at, 0.0))))
+                        at = min(max(summit, near), far)
+                        lowest = v + slope * at + math.sqrt(max(tall - bend * at * at, 0.0))
+                        end_row = math.floor(min(last_row, lowest)) + 1
+                        if row < end_row:
+                            reached[slot, STRIP] = strip_y * across + strip_x
+                            reached[slot, ROWS] = packed(row - top, end_row - top, band + band_at(strip_x))
+                    slot += np.uint64(1)
+                band += bands
         block = claimed(counter)

@@ -155,19 +155,19 @@ def _backward(scales, covariances, count, intrinsics, pose, state):
         _covariances_backward(count, intrinsics, pose, state)
 
 
-@part()
+@inlined
 def _project_backward_block(first, end, parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
     means, scales, quaternions, opacities, sh, covariances = parameters
     degree, intrinsics, pose, position, size = camera
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances = gradients
     half = size[0] / 2, size[1] / 2
     state, drawn, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
-    for i in range(first, end):
-        if firsts[i, FIRST_SUM] == firsts[i + 1, FIRST_SUM]:
+    for i in range(np.uint64(first), np.uint64(end)):
+        if firsts[i, FIRST_SUM] == firsts[i + np.uint64(1), FIRST_SUM]:
             _no_gradient(i, g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances)
             g_view[i] = 0
             continue
-        _collect(firsts[i, FIRST_SUM], firsts[i + 1, FIRST_SUM], sums, state, count)
+        _collect(firsts[i, FIRST_SUM], firsts[i + np.uint64(1), FIRST_SUM], sums, state, count)
         lay_out(means, scales, quaternions, covariances, i, state, count)
         for k in range(3):
             state[AXES + k, count] = splats[i, 2 + k]

@@ -15,7 +15,7 @@ from typing import Tuple
 import numpy as np
 
 from legs_loss.errors import LegsError
-from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined, part
+from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined
 
 BAND = 16  # strips
 MOST_BANDS = 1 << 15  # in an image: of 8 x 32 pixel strips, 134 million pixels
@@ -127,15 +127,16 @@ def _by_strip(depths, firsts, reached, ranges, keys, draws):
                 draws[place, SUM] = first_sum + band
 
 
-@part()
+@inlined
 def _sort_strip(keys, draws):
     """Sort the entries of a strip, front to back; equal depths keep their order: a radix sort by bytes.
 
     Depths are positive: their bits, as integers, sort as they do.
     """
     count, entries, starts = np.uint64(len(keys)), draws.copy(), np.zeros((4, 256), np.uint32)
-    order, other = np.arange(len(keys), dtype=np.uint32), np.empty(len(keys), np.uint32)
+    order, other = np.empty(len(keys), np.uint32), np.empty(len(keys), np.uint32)
     for i in range(count):
+        order[i] = i
         for digit in range(4):
             starts[digit, keys[i] >> 8 * digit & 255] += 1
     for digit in range(4):

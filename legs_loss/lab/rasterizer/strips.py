@@ -104,7 +104,7 @@ def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
 # Blending
 
 
-@compiled()
+@part()
 def place(strip, across, image, xs, transmittance):
     """Return a strip's first column and row, and how many of each are in an image [3, H, W] of so many strips across.
 
@@ -120,7 +120,7 @@ def place(strip, across, image, xs, transmittance):
     return left, top, columns, rows
 
 
-@compiled()
+@part()
 def unfinished(transmittance):
     """Return whether a pixel of the strip still takes colour: as a rule, already the first one does."""
     for pixel in range(len(transmittance)):  # noqa: SIM110 (numba compiles no any() of a generator)
@@ -174,7 +174,7 @@ def _cover(state, i):
     return weight, alpha, before
 
 
-@compiled()
+@part()
 def _blend(state, begin, end, draws, entries):
     """Blend entries of a strip, in their order."""
     for k in range(begin, end):
@@ -188,7 +188,7 @@ def _blend(state, begin, end, draws, entries):
             store(state, BLUE + i, multiply_add(weight, blue, load(state, BLUE + i)))
 
 
-@part()
+@inlined
 def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image):
     left, top, wide, tall = place(strip, across, image, state[X:], state[T : T + PIXELS])
     state[RED : RED + 3 * PIXELS] = 0
@@ -216,7 +216,7 @@ def render(counter, tasks, bands, across, ranges, splats, draws, entries, ends, 
         band = claimed(counter)
 
 
-@compiled()
+@part()
 def _blend_backward(state, begin, end, draws, entries, moments, sums):
     """Go front to back as `_blend`, adding to the owners' sums: moments of h = dL/dpower, and the colour's gradient.
 
@@ -260,7 +260,7 @@ def _blend_backward(state, begin, end, draws, entries, moments, sums):
             sums[at + 10] += total(along_v) * entries[k, 3]
 
 
-@part()
+@inlined
 def _render_backward_strip(strip, across, state, ranges, draws, entries, ends, image, g_image, moments, sums):
     left, top, wide, tall = place(strip, across, image, state[X:], state[T : T + PIXELS])
     state[RED:X] = 0

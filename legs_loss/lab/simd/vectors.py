@@ -42,8 +42,14 @@ class _VectorModel(models.PrimitiveModel):
         super().__init__(manager, kind, kind.lanes)
 
 
+class _First(ConcreteTemplate):
+    """Cases of an operator that numba tries before its own: what is of this processor, not of any, comes first."""
+
+    metadata = {"target": "cpu"}
+
+
 def _operator(symbol: Any, kind: Any, instruction: str) -> None:
-    class Template(ConcreteTemplate):
+    class Template(_First):
         cases = [signature(kind, kind, kind)]
 
     infer_global(symbol)(Template)
@@ -65,7 +71,7 @@ for _symbol, _kind, _instruction in (
     _operator(_symbol, _kind, _instruction)
 
 
-class _Scaled(ConcreteTemplate):
+class _Scaled(_First):
     cases = [signature(float8, types.float32, float8)]
 
 
@@ -78,7 +84,7 @@ def _scaled(context: Any, builder: Any, sig: Any, args: Sequence[Any]) -> Any:
     return builder.fmul(builder.shuffle_vector(first, first, ir.Constant(INTEGERS, [0] * LANES)), args[1])
 
 
-class _Negative(ConcreteTemplate):
+class _Negative(_First):
     cases = [signature(float8, float8)]
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Optional, Tuple
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from legs_loss.kernels.compiling import in_threads
 from legs_loss.lab.rasterizer import sorting
 from legs_loss.lab.rasterizer.groups import room
 from legs_loss.lab.surfels import projection, projection_backward, strips
@@ -42,7 +42,7 @@ class _Render(torch.autograd.Function):
             height=height,
         )
         found = room(Splats, count, projection.SPLAT, projection.EXTENT)
-        projection.project(discs, camera, found)
+        in_threads(projection.project, -(-count // projection.BLOCK), discs, camera, found)
 
         across, down = -(-width // projection.WIDE), -(-height // projection.TALL)
         firsts, reached = sorting.make_slots(found.boxes, found.slots, projection.TALL)
@@ -54,7 +54,7 @@ class _Render(torch.autograd.Function):
         work = Work(bands, across, ranges, draws, entries, np.empty(across * down, np.int64))
         kept, background = np.empty((3, height, width), np.float32), _array(view.background)
         pictures = Pictures(image.numpy(), others.numpy(), kept)
-        strips.render(numba.get_num_threads(), work, found.rows, background, pictures)
+        in_threads(strips.render, len(bands), work, found.rows, background, pictures)
 
         radii_tensor = torch.from_numpy(found.radii)
         ctx.mark_non_differentiable(radii_tensor)
@@ -77,12 +77,15 @@ class _Render(torch.autograd.Function):
         if of_others is not None and not strips.matters(of_others, others):
             of_others = None
         pictures = Pictures(image, others, kept)
-        threads = numba.get_num_threads()
-        strips.render_backward(threads, work, background, pictures, of_image, of_others, sums.reshape(-1))
+        backward = of_image, of_others, sums.reshape(-1)
+        in_threads(strips.render_backward, len(work.bands), work, background, pictures, *backward)
         results = [torch.empty(array.shape) for array in discs]
         viewspace = torch.empty(len(discs.means), 3)
         gradients = Discs(*(result.numpy() for result in results))
-        projection_backward.project_backward(discs, camera, *drawn, sums, gradients, viewspace.numpy())
+        blocks = -(-len(discs.means) // projection.BLOCK)
+        in_threads(
+            projection_backward.project_backward, blocks, discs, camera, *drawn, sums, gradients, viewspace.numpy()
+        )
         wanted = ctx.needs_input_grad
         found = [result if wanted[2 + k] else None for k, result in enumerate(results)]
         return (viewspace if wanted[0] else None, None, *found)

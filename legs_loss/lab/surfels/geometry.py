@@ -15,44 +15,44 @@ from __future__ import annotations
 
 import numpy as np
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import part
 from legs_loss.lab.rasterizer.geometry import rotation
 
 # No promise that numbers are finite: a disc that is seen from its edge has a homography without inverse.
 CAREFUL = {"nsz"}
 
 
-@compiled()
+@part()
 def cross(a, b):
     """Return the cross product of two rows."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@compiled()
+@part()
 def dot(a, b):
     """Return the dot product of two rows."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled()
+@part()
 def plus(a, b):
     """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@compiled()
+@part()
 def less(a, b, factor):
     """Return a - factor * b."""
     return a[0] - factor * b[0], a[1] - factor * b[1], a[2] - factor * b[2]
 
 
-@compiled()
+@part()
 def signed(a, b, cutoff):
     """Return the product of two rows under the signature (c^2, c^2, -1), whose null set is the circle of radius c."""
     return cutoff * cutoff * (a[0] * b[0] + a[1] * b[1]) - a[2] * b[2]
 
 
-@compiled(fastmath=CAREFUL)
+@part(fastmath=CAREFUL)
 def ellipse(x, y, w, cutoff):
     """Return the ellipse in which a disc's circle of radius `cutoff` is seen: centre, a, b, c, denominator.
 
@@ -67,19 +67,19 @@ def ellipse(x, y, w, cutoff):
     return u, v, -a * inverse, -b * inverse, -c * inverse, determinant
 
 
-@compiled()
+@part()
 def point(means, i):
     """Return a mean in float64."""
     return np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
 
 
-@compiled()
+@part()
 def through(vector, matrix, k):
     """Return column `k` of a vector times a matrix's first three rows."""
     return vector[0] * matrix[0, k] + vector[1] * matrix[1, k] + vector[2] * matrix[2, k]
 
 
-@compiled()
+@part()
 def _row(axes, long, short, mean, pixels, k):
     """Return row `k` of T: the disc's two axes, and its centre."""
     return (
@@ -89,7 +89,7 @@ def _row(axes, long, short, mean, pixels, k):
     )
 
 
-@compiled()
+@part()
 def turned(quaternions, i):
     """Return a disc's rotation matrix, normalised quaternion and the length that this had."""
     w, x = np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1])
@@ -97,13 +97,13 @@ def turned(quaternions, i):
     return rotation(w, x, y, z)
 
 
-@compiled()
+@part()
 def _given(homographies, i, k):
     k *= 3
     return np.float64(homographies[i, k]), np.float64(homographies[i, k + 1]), np.float64(homographies[i, k + 2])
 
 
-@compiled()
+@part()
 def shape(means, scales, quaternions, homographies, i, pose, pixels):
     """Return rows x, y, w of T, the normal in the camera's axes and its sign towards the camera (0: seen edge on)."""
     mean = point(means, i)
@@ -124,7 +124,7 @@ def shape(means, scales, quaternions, homographies, i, pose, pixels):
     return x, y, w, (nx, ny, nz), turn
 
 
-@compiled()
+@part()
 def ray_map(x, y, w, u, v):
     """Return p about the centre (u, v), unscaled: constant, along, down; its scale; and the centred rows x and y."""
     centred_x, centred_y = less(x, w, u), less(y, w, v)

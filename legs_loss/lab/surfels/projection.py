@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import claimed, compiled, inlined, part
 from legs_loss.lab.conventions import FARTHEST, MIN_ALPHA, NEAR, TILE
 from legs_loss.lab.rasterizer.harmonics import shade
 from legs_loss.lab.rasterizer.projection import BLOCK, FAINTEST, WIDE, ceil, floor, tile_range
@@ -29,7 +28,7 @@ P, CENTRE, OPACITY, COLOUR, NORMAL, SPLAT = 0, 9, 11, 12, 15, 18
 ELLIPSE, CIRCLE, REACH, EXTENT = 0, 5, 7, 8
 
 
-@compiled(fastmath=CAREFUL)
+@inlined
 def _project_block(begin, end, discs, camera, found):
     means, scales, quaternions, homographies, opacities, sh, colours = discs
     degree, pose, pixels, position, width, height = camera
@@ -96,16 +95,17 @@ def _project_block(begin, end, discs, camera, found):
         shade(drawn, count, means, position, degree, sh, clamped, splats, COLOUR)
 
 
-@compiled(parallel=True)
-def project(discs, camera, found):
-    """Fill the `Splats` that `Discs` become to a `Camera` (groups.py)."""
-    count = len(discs.means)
-    for block in prange((count + BLOCK - 1) // BLOCK):
+@compiled(fastmath=CAREFUL)
+def project(counter, blocks, discs, camera, found):
+    """Fill the `Splats` that `Discs` become to a `Camera` (groups.py): `in_threads`."""
+    count, block = len(discs.means), claimed(counter)
+    while block < blocks:
         begin = block * BLOCK
         _project_block(begin, min(begin + BLOCK, count), discs, camera, found)
+        block = claimed(counter)
 
 
-@compiled()
+@part()
 def _rows(extents, i, left, right):
     """Return the first and last row (any numbers) that a disc reaches in the columns from `left` to `right`."""
     first, last = 1e9, -1e9

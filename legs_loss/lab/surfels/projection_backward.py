@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled
+from legs_loss.kernels.compiling import claimed, compiled, inlined, part
 from legs_loss.lab.rasterizer.geometry import quaternion_partials
 from legs_loss.lab.rasterizer.harmonics import shade_gradient
 from legs_loss.lab.rasterizer.projection import BLOCK
@@ -22,7 +21,7 @@ from legs_loss.lab.surfels.projection import CENTRE
 G_DEPTH, G_CENTRE, G_DIRECT, G_OPACITY, G_COLOUR, G_NORMAL, GRADIENTS = 9, 10, 12, 15, 16, 19, 22
 
 
-@compiled()
+@part()
 def _box_gradient(x, y, w, gu, gv):
     """Return the gradients of the rows from those of the box's centre at CUTOFF."""
     inverse = 1 / signed(w, w, CUTOFF)
@@ -40,7 +39,7 @@ def _box_gradient(x, y, w, gu, gv):
     )
 
 
-@compiled()
+@part()
 def _rows_gradient(x, y, w, u, v, sums):
     """Return the gradients of T's rows from those of p, of the depths, and of what came through w alone."""
     _, along, down, scale, centred_x, centred_y = ray_map(x, y, w, u, v)
@@ -56,7 +55,7 @@ def _rows_gradient(x, y, w, u, v, sums):
     return gx, gy, (gw[0] + sums[G_DIRECT], gw[1] + sums[G_DIRECT + 1], gw[2] + sums[G_DIRECT + 2])
 
 
-@compiled()
+@part()
 def _to_world(gx, gy, gw, pixels, k):
     """Return the gradient to what row-wise became column `k` of T: an axis of the disc, or its centre."""
     return (
@@ -66,7 +65,7 @@ def _to_world(gx, gy, gw, pixels, k):
     )
 
 
-@compiled()
+@inlined
 def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, sums_of_bands, gradients, g_view):
     means, scales, quaternions, homographies, opacities, sh, colours = discs
     degree, pose, pixels, position, width, height = camera
@@ -142,11 +141,12 @@ def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, 
             g_means[drawn[j], k] += towards[k, j]
 
 
-@compiled(parallel=True)
-def project_backward(discs, camera, splats, clamped, firsts, sums, gradients, g_view):
+@compiled()
+def project_backward(counter, blocks, discs, camera, splats, clamped, firsts, sums, gradients, g_view):
     """Fill the gradients of each disc from its sums in the bands; those of what was not given stay empty.
 
     Args:
+        counter, blocks: of `in_threads`; a block is BLOCK discs.
         discs, gradients: `Discs`.
         camera: `Camera`.
         splats: [N, SPLAT], as projected.
@@ -155,8 +155,9 @@ def project_backward(discs, camera, splats, clamped, firsts, sums, gradients, g_
         sums: [bands, GRADIENTS].
         g_view: [N, 3], the view-space gradient.
     """
-    count = len(discs.means)
-    for block in prange((count + BLOCK - 1) // BLOCK):
+    count, block = len(discs.means), claimed(counter)
+    while block < blocks:
         begin = block * BLOCK
         end = min(begin + BLOCK, count)
         _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, sums, gradients, g_view)
+        block = claimed(counter)

@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
-from legs_loss.kernels.compiling import compiled, inlined
+from legs_loss.kernels.compiling import claimed, compiled, inlined, part
 from legs_loss.lab.conventions import MAX_ALPHA, MIN_ALPHA, NEAR
 from legs_loss.lab.rasterizer.projection import WIDE, origin
 from legs_loss.lab.rasterizer.sorting import OWNER, ROWS, SUM
@@ -52,7 +51,7 @@ _LOG2 = np.float32(-0.5 / math.log(2))
 _SCALE = np.float32(FAR * NEAR / (FAR - NEAR))
 
 
-@compiled()
+@part()
 def _expand(begin, end, strip_x, strip_y, splats, draws, entries):
     """Write a strip's entries."""
     for e in range(np.uint64(begin), np.uint64(end)):
@@ -114,7 +113,7 @@ def _add_sums(sums, at, values):
     store(sums, at, load(sums, at) + values)
 
 
-@compiled(fastmath=CAREFUL)
+@part(fastmath=CAREFUL)
 def _blend(state, start, begin, end, draws, entries):
     """Blend entries of a strip, whose first is `start`, in their order."""
     none, one = splat(_ZERO), splat(_ONE)
@@ -146,7 +145,7 @@ def _blend(state, start, begin, end, draws, entries):
             store(state, WHICH + i, where(half, which, maximum(none, load(state, WHICH + i))))
 
 
-@compiled(fastmath=CAREFUL)
+@inlined
 def _render_strip(strip, state, work, splats, background, pictures):
     _, across, ranges, draws, entries, ends = work
     image, others, kept = pictures
@@ -170,17 +169,17 @@ def _render_strip(strip, state, work, splats, background, pictures):
             kept[0, v, u], kept[1, v, u], kept[2, v, u] = state[M1 + i], state[M2 + i], state[WHICH + i]
 
 
-@compiled(parallel=True, fastmath=CAREFUL)
-def render(workers, work, splats, background, pictures):
-    """Fill the `Pictures` of splats [N, SPLAT], and of the `Work` the entries and the ends."""
-    for worker in prange(workers):
-        state = np.empty(STATE, np.float32)
-        for turn in range(worker, len(work.bands), workers):
-            for strip in range(work.bands[turn, 0], work.bands[turn, 1]):
-                _render_strip(strip, state, work, splats, background, pictures)
-
-
 @compiled(fastmath=CAREFUL)
+def render(counter, bands, work, splats, background, pictures):
+    """Fill the `Pictures` of splats [N, SPLAT], and of the `Work` the entries and the ends: `in_threads`."""
+    state, band = np.empty(STATE, np.float32), claimed(counter)
+    while band < bands:
+        for strip in range(work.bands[band, 0], work.bands[band, 1]):
+            _render_strip(strip, state, work, splats, background, pictures)
+        band = claimed(counter)
+
+
+@part(fastmath=CAREFUL)
 def _blend_backward(state, begin, end, draws, entries, g_others, sums):
     """Go front to back as `_blend`, adding to the discs' sums; `g_others` is None where there is none.
 
@@ -261,7 +260,7 @@ def _blend_backward(state, begin, end, draws, entries, g_others, sums):
         _add_sums(sums, at + np.uint64(8), totals(p2y, det, gu, gv, w0, w1, w2, none))
 
 
-@compiled(fastmath=CAREFUL)
+@inlined
 def _render_backward_strip(strip, state, work, background, pictures, g_image, g_others, sums):
     _, across, ranges, draws, entries, ends = work
     image, others, kept = pictures
@@ -293,14 +292,14 @@ def _render_backward_strip(strip, state, work, background, pictures, g_image, g_
     _blend_backward(state, ranges[strip], ends[strip], draws, entries, g_others, sums)
 
 
-@compiled(parallel=True, fastmath=CAREFUL)
-def render_backward(workers, work, background, pictures, g_image, g_others, sums):
+@compiled(fastmath=CAREFUL)
+def render_backward(counter, bands, work, background, pictures, g_image, g_others, sums):
     """Add the gradient of every entry to its disc's sums, one array; `g_others` may be None."""
-    for worker in prange(workers):
-        state = np.empty(BACKWARD_STATE, np.float32)
-        for turn in range(worker, len(work.bands), workers):
-            for strip in range(work.bands[turn, 0], work.bands[turn, 1]):
-                _render_backward_strip(strip, state, work, background, pictures, g_image, g_others, sums)
+    state, band = np.empty(BACKWARD_STATE, np.float32), claimed(counter)
+    while band < bands:
+        for strip in range(work.bands[band, 0], work.bands[band, 1]):
+            _render_backward_strip(strip, state, work, background, pictures, g_image, g_others, sums)
+        band = claimed(counter)
 
 
 @compiled(fastmath=CAREFUL)

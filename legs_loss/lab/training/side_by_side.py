@@ -79,11 +79,9 @@ def train_side_by_side(
 
 def train_arm(arm: Arm, on_progress: Callable[[Progress], None]) -> Dict[str, Any]:
     """Train one arm in this process, with one thread from here on; return its metrics."""
-    import numba
     import torch
 
     torch.set_num_threads(1)
-    numba.set_num_threads(1)
     use_lpips(arm.lpips)
     return train(
         read_scene(arm.scene, arm.images),

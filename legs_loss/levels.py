@@ -25,7 +25,7 @@ __all__ = ["NEEDS_LEVELS", "levels_of", "over_scene", "percentile", "response_le
 
 NEEDS_LEVELS = (
     "weights that are normalised over the scene need the levels of all its views, which {where}: run legs precompute "
-    "SCENE --preset legs-robust, with the training's -r, {then}; or take a preset of single images, as legs"
+    "SCENE --preset legs-robust, with the training's -r, {then}; or take a preset for single images, such as legs"
 )
 
 

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
             views = tuple(view for view in views if not is_below(view.path, args.scene, OwnMaps(kind)))
             folders[kind], strays = find_maps(args.scene, kind, views)
             if strays:
-                say(f"legs: note: {kind}: of no photograph: {', '.join(map(str, strays[:3]))}", sys.stderr)
+                say(f"legs: note: {kind}: these match no photograph: {', '.join(map(str, strays[:3]))}", sys.stderr)
     names = file_names(view.name for view in views)
     mostly: List[str] = []
     skipped = 0

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="DIR",
-        help="the store's folder, or of several scenes the folder of their stores; default: SCENE/legs_weights, where "
+        help="the store's folder, or for several scenes the folder of their stores; default: SCENE/legs_weights, where "
         "a training finds it",
     )
     parser.add_argument(
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers",
         type=int,
         metavar="N",
-        help=f"processes a scene; default: one a core ({cores()}), with --scheduler 1",
+        help=f"processes per scene; default: one per core ({cores()}), with --scheduler 1",
     )
 
 
@@ -169,13 +169,13 @@ def _say(store: Path, done: SceneDone) -> int:
     if done.alike:
         say(
             f"legs: note: {done.alike} views share a name in 3DGS, which drops folders and extensions; "
-            "codebases that name views so compute their weights instead",
+            "codebases that use these names compute their weights instead",
             sys.stderr,
         )
     unsharp = unsharp_views(WeightStore(report.store)) if (report.store / MANIFEST).is_file() else []
     if unsharp:
         say(
-            f"legs: note: {', '.join(unsharp)}: probably out of focus, moved or noisy beside the others; each "
+            f"legs: note: {', '.join(unsharp)}: probably out of focus, moved or noisy compared with the others; each "
             "map is normalised by its own range, so such photographs get larger weights",
             sys.stderr,
         )

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("path", metavar="SCENE|STORE|IMAGE", help="what to show")
     parser.add_argument("--views", nargs="+", metavar="VIEW", help=f"names of views; default: {_AT_MOST} spread evenly")
-    parser.add_argument("--masks", metavar="DIR|FILE|alpha", help="as of legs precompute; default: those of a store")
+    parser.add_argument("--masks", metavar="DIR|FILE|alpha", help="as for legs precompute; default: those of the store")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="default: legs")
     parser.add_argument("--out", default="sheet.png", metavar="PNG", help="default: sheet.png")
 

@@ -61,14 +61,14 @@ def _find(given: Sequence[str], lists: Sequence[Path]) -> List[Path]:
         path = Path(one)
         if path.suffix == ".txt" and path.is_file():
             if path.resolve() in lists:
-                raise LegsError(f"{path} is in a list that it names itself")
+                raise LegsError(f"{path} is a list that names itself")
             found += _find(_listed(path), [*lists, path.resolve()])
         elif path.exists() or not glob.has_magic(one):
             found.append(path)
         else:
             matches = sorted(Path(match) for match in glob.glob(one, recursive=True) if os.path.isdir(match))
             if not matches:
-                raise LegsError(f"no folder fits {one}")
+                raise LegsError(f"no folder matches {one}")
             found += matches
     return found
 
@@ -80,7 +80,7 @@ def _listed(path: Path) -> List[str]:
         raise LegsError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from None
     scenes = [str(path.parent / line) for line in lines if line and not line.startswith("#")]
     if not scenes:
-        raise LegsError(f"{path} names no scene: it should have a folder a line")
+        raise LegsError(f"{path} names no scene: it should have one folder per line")
     return scenes
 
 
@@ -97,7 +97,7 @@ def stores_of(scenes: Sequence[Path], out: Optional[str]) -> List[Path]:
     names = Counter(scene.resolve().name for scene in scenes)
     twice = [name for name, count in names.items() if count > 1]
     if twice:
-        raise LegsError(f"--out {out}: {names[twice[0]]} scenes have the name {twice[0]}: leave --out away for them")
+        raise LegsError(f"--out {out}: {names[twice[0]]} scenes have the name {twice[0]}: leave out --out for them")
     return [Path(out) / scene.resolve().name for scene in scenes]
 
 

@@ -76,7 +76,7 @@ def stage_own(
     result = Staged([], [], [], [])
     masked = sum(view.mask is not None for view in views)
     if masked and maps.masks is None:
-        result.notes.append(f"transforms.json names masks of {masked} photograph(s): with --masks mask_path they count")
+        result.notes.append(f"transforms.json names masks of {masked} photograph(s): --masks mask_path applies them")
     given = {kind: named for kind, named in ((MASK, maps.masks), (WEIGHTS, maps.weights)) if named is not None}
     for entry in known:
         if entry.is_own and entry.operator not in given:

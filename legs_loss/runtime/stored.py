@@ -31,7 +31,7 @@ _UNMASKED = (
 )
 _OTHER_SIZE = "the store has {sizes}; give legs precompute the training's -r and --images"
 _OTHER_PIXELS = (
-    "its pixels are no photograph's that legs precompute read, so it was changed on the way: augmented, shifted, "
+    "its pixels match no photograph that legs precompute read, so it was changed on the way: augmented, shifted, "
     "resized or laid on another background"
 )
 

@@ -121,8 +121,8 @@ def _larger_models(root: Path, model: Path, count: int) -> Tuple[str, ...]:
     if sizes.get(name, 0) <= count:
         return ()
     return (
-        f"{root / 'sparse' / name} has {sizes[name]} images, and {model.name}, which is read here as by 3DGS, {count}: "
-        f"COLMAP made several models; for the larger one rename it to 0",
+        f"COLMAP made several models: {root / 'sparse' / name} has {sizes[name]} images, and {model.name}, which is "
+        f"read here as 3DGS does, has {count}; to use the larger one, rename it to 0",
     )
 
 
@@ -202,11 +202,8 @@ def _cameras_bin(file: BinaryIO) -> Dict[int, _Intrinsics]:
     for _ in range(cursor.take("Q")[0]):
         number, model, width, height = cursor.take("iiQQ")
         if not 0 <= model < len(MODELS):
-            known = f"0 to {len(MODELS) - 1}"
-            raise ValueError(
-                f"camera {number} has model {model}, and known here are {known}; as text (colmap model_converter) it "
-                "can be read"
-            )
+            known = f"known here are 0 to {len(MODELS) - 1}"
+            raise ValueError(f"camera {number} has model {model}; {known}: convert it to text (colmap model_converter)")
         name = list(MODELS)[model]
         cameras[number] = _intrinsics(name, width, height, cursor.take(f"{MODELS[name][0]}d"))
     cursor.finish()

@@ -69,7 +69,7 @@ def find_maps(
     else:
         raise LegsError(f"there is no folder or file {path}")
     if strays and not found:
-        missing = f"{strays[0]} is the map of no photograph; maps have the name of theirs, 0001.png or 0001.jpg.png"
+        missing = f"{strays[0]} belongs to no photograph: a map has the name of its own, 0001.png or 0001.jpg.png"
     if not found:
         raise LegsError(f"{named}: {missing}")
     return found, strays
@@ -220,10 +220,10 @@ def _array(path: Path, size: Tuple[int, int]) -> np.ndarray:
             data = file.read(shape[0] * shape[1] * kind.itemsize)
         values = np.frombuffer(data, kind).reshape(shape).astype(np.float32)
         if not (np.isfinite(values).all() and values.min() >= 0):
-            raise LegsError("it has negative values, or ones that are no finite numbers")
+            raise LegsError("it has negative values, or values that are not finite")
     except LegsError as error:
         raise LegsError(f"{path}: {error}") from None
     except Exception as error:  # numpy reads a header as Python, whose tokenizer and parser raise many kinds
         why = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise LegsError(f"{path}: no array that can be read ({why})") from None
+        raise LegsError(f"{path}: not an array that can be read ({why})") from None
     return values

@@ -121,7 +121,7 @@ def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
     if camera_to_world.shape == (3, 4):
         camera_to_world = np.vstack([camera_to_world, [0, 0, 0, 1]])
     if camera_to_world.shape != (4, 4) or not np.isfinite(camera_to_world).all():
-        raise ValueError(f"the transform_matrix of {str(image)!r} is no 4x4 matrix of numbers")
+        raise ValueError(f"the transform_matrix of {str(image)!r} is not a 4x4 matrix of numbers")
     pose = np.linalg.inv(camera_to_world @ _OPENGL_TO_OPENCV)
     if not np.isfinite(pose).all():
         raise ValueError(f"the transform_matrix of {str(image)!r} cannot be inverted")

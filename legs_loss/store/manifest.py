@@ -180,6 +180,6 @@ def read_manifest(folder: Path) -> List[Entry]:
         intact = False
     if not intact:
         raise DamagedStoreError(
-            f"{path} is damaged: delete that file and run legs precompute again, which makes the maps anew"
+            f"{path} is damaged: delete that file and run legs precompute again, which makes the maps again"
         )
     return entries

@@ -46,7 +46,7 @@ class TestWhichScenes:
         (tmp_path / "list.txt").write_text("# nothing\n")
         with pytest.raises(LegsError, match="names no scene"):
             find_scenes([str(tmp_path / "list.txt")])
-        with pytest.raises(LegsError, match="no folder fits"):
+        with pytest.raises(LegsError, match="no folder matches"):
             find_scenes([str(tmp_path / "x*")])
 
     def test_lists_in_lists(self, scenes, tmp_path):
@@ -61,7 +61,7 @@ class TestWhichScenes:
         (tmp_path / "bytes.txt").write_bytes(b"\xe9t\xe9")
         assert find_scenes([str(tmp_path / "all.txt")]) == [scenes[0], scenes[2]]
         for name in ("self", "one", "other"):
-            with pytest.raises(LegsError, match="is in a list that it names itself"):
+            with pytest.raises(LegsError, match="is a list that names itself"):
                 find_scenes([str(tmp_path / f"{name}.txt")])
         with pytest.raises(LegsError, match=r"cannot read .*bytes\.txt"):
             find_scenes([str(tmp_path / "bytes.txt")])

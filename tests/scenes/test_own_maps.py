@@ -128,7 +128,7 @@ class TestReading:
         frames[0]["mask_path"] = "masks/a.png"
         (scene / "transforms.json").write_text(json.dumps({"fl_x": 9, "w": 12, "h": 8, "frames": frames}))
         report = precompute(read_scene(scene))
-        assert "masks of 1 photograph(s): with --masks mask_path they count" in report.notes[0]
+        assert "masks of 1 photograph(s): --masks mask_path applies them" in report.notes[0]
         report = precompute(read_scene(scene), maps=OwnMaps("mask_path"))
         assert (report.own, report.unmasked, report.notes) == ({MASK: 1}, ["images/b.png"], [])
         np.testing.assert_array_equal(mask_of(scene, masks="mask_path"), third() / 255)
@@ -235,7 +235,7 @@ class TestRefused:
 
     def test_of_no_photograph(self, scene):
         os.replace(scene / "masks/a.png", scene / "masks/z.png")
-        self.refuse(scene, r"z\.png is the map of no photograph; maps have the name")
+        self.refuse(scene, r"z\.png belongs to no photograph: a map has the name")
 
     def test_two_of_one_photograph(self, scene):
         Image.fromarray(third()).save(scene / "masks/a.png.png")
@@ -282,7 +282,7 @@ class TestRefused:
         (scene / "mine").mkdir()
         for values, message in (
             (np.full((8, 12), -1.0), "negative values"),
-            (np.full((8, 12), np.nan), "no finite numbers"),
+            (np.full((8, 12), np.nan), "not finite"),
             (np.ones((8, 12), object), "not floats"),
             (np.ones((12, 8)), "ratio of sides"),
             (np.ones(96), "not floats of"),
@@ -292,9 +292,9 @@ class TestRefused:
             self.refuse(scene, rf"a\.npy: .*{message}", weights="mine")
         np.save(scene / "mine/a.npy", np.ones((8, 12)))
         (scene / "mine/a.npy").write_bytes((scene / "mine/a.npy").read_bytes()[:-8])
-        self.refuse(scene, r"a\.npy: no array that can be read", weights="mine")
+        self.refuse(scene, r"a\.npy: not an array that can be read", weights="mine")
         (scene / "mine/a.npy").write_bytes(b"\x93NUMPY\x01\x00\x10\x00{'descr': open(")
-        self.refuse(scene, r"a\.npy: no array that can be read", weights="mine")
+        self.refuse(scene, r"a\.npy: not an array that can be read", weights="mine")
         self.refuse(scene, "weight_scale must be above 0", scale=float("nan"))
 
     def test_a_store_with_masks_asks_for_them_again(self, scene):

@@ -172,7 +172,7 @@ class TestModels:
         root = colmap_scene(tmp_path)
         camera = struct.pack("<IiQQ4d", 3, 18, 40, 30, 50, 51, 20, 15)
         (root / "sparse" / "0" / "cameras.bin").write_bytes(struct.pack("<Q", 1) + camera)
-        with pytest.raises(LegsError, match=r"cameras\.bin .*camera 3 has model 18, and known here are 0 to 17"):
+        with pytest.raises(LegsError, match=r"cameras\.bin .*camera 3 has model 18; known here are 0 to 17"):
             read_scene(root)
 
 
@@ -190,7 +190,7 @@ class TestColmapBinary:
         (larger / "sparse" / "0").rename(root / "sparse" / "1")
         scene = read_scene(root)
         assert len(scene.views) == 3
-        assert "1 has 4 images, and 0, which is read here as by 3DGS, 3" in scene.notes[0]
+        assert "1 has 4 images, and 0, which is read here as 3DGS does, has 3;" in scene.notes[0]
         (root / "sparse" / "1").rename(root / "sparse" / "2")
         (root / "sparse" / "2" / "images.bin").write_bytes(b"damaged")
         assert read_scene(root).notes == ()

@@ -35,7 +35,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     add_images(parser)
     add_resolution(parser, f"about {AFFORDABLE:,} pixels, which a CPU trains in minutes")
     parser.add_argument(
-        "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one a core"
+        "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one per core"
     )
 
 

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="compare each photograph with the N that follow it by name, for frames of a video; default: all with all",
     )
-    parser.add_argument("--threads", type=int, default=-1, metavar="N", help="default: one a core")
+    parser.add_argument("--threads", type=int, default=-1, metavar="N", help="default: one per core")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     settings.add_argument("--preset", dest="spec", choices=PRESETS, help="the loss; default: legs")
     settings.add_argument("--iterations", type=int, metavar="N", help="default: 2000")
     add_resolution(settings)
-    settings.add_argument("-w", "--white_background", action="store_true", help="white in place of black")
+    settings.add_argument("-w", "--white_background", action="store_true", help="a white background, not a black one")
     settings.add_argument("--max_gaussians", type=int, metavar="N", help="a cap on their number; default: none")
     settings.add_argument("--seed", type=int, metavar="N", help="default: 0")
     advanced = parser.add_argument_group("advanced: the training", argument_default=argparse.SUPPRESS)
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     places = parser.add_argument_group("advanced: files and threads")
     places.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")
     places.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
-    places.add_argument("--threads", type=int, metavar="N", help="default: one a core")
+    places.add_argument("--threads", type=int, metavar="N", help="default: one per core")
     places.add_argument(
         "--checkpoint_every", type=int, default=500, metavar="N", help="iterations between checkpoints; default: 500"
     )

@@ -141,7 +141,7 @@ def _verdict(rows: Sequence[Row], arms: Sequence[str], arm: str) -> str:
     split = "train" if any(row["metrics"]["test"] is None for row in rows) else "test"
     found = difference(rows, arm, BASELINE, split) if BASELINE in arms and arm != BASELINE else None
     if found is None:
-        return "There is nothing to compare yet: a second arm with the seeds of 3dgs makes it a comparison."
+        return "There is nothing to compare yet: train a second arm with the seeds of 3dgs."
     times = times_gaussians(rows, arm, BASELINE)
     cost = "" if times is None else f", with {times:.1f} times the Gaussians"
     where = "on held-out views" if split == "test" else "on training views"

@@ -50,7 +50,7 @@ def by_iterations(rows: Rows, arms: Sequence[str]) -> str:
         panel.fill_between(x, y.min(0), y.max(0), color=style[arm][0], alpha=0.12, linewidth=0)
     panel.set(xlabel="iterations", ylabel="held-out PSNR, dB")
     _legend(panel)
-    return _svg(figure, "iterations", "Held-out PSNR by iterations, a line an arm; the last values are in the table")
+    return _svg(figure, "iterations", "Held-out PSNR by iterations, one line per arm; the last values are in the table")
 
 
 def by_gaussians(rows: Rows, arms: Sequence[str]) -> List[str]:
@@ -76,7 +76,7 @@ def by_gaussians(rows: Rows, arms: Sequence[str]) -> List[str]:
         panel.locator_params(axis="x", nbins=5)
         panel.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         _legend(panel)
-        says = f"PSNR of {title} by number of Gaussians, a point an arm; the values are in the table"
+        says = f"PSNR of {title} by number of Gaussians, one point per arm; the values are in the table"
         plots.append(_svg(figure, f"gaussians-{split}", says))
     return plots
 

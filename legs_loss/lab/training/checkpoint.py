@@ -38,7 +38,7 @@ def read_checkpoint(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:
     try:
         with open_regular(path) as raw, np.load(raw, allow_pickle=False) as file:
             if any(member.compress_type for member in file.zip.infolist()):
-                raise ValueError("compressed, which none is: it could be of any size")
+                raise ValueError("it is compressed, and no checkpoint is: it could be of any size")
             arrays = {name: file[name] for name in file.files}
         facts = json.loads(arrays.pop("__facts__").tobytes().decode())
     except FileNotFoundError:
@@ -89,7 +89,7 @@ _GAUSSIANS: Dict[str, Tuple[Any, ...]] = {
 def _what_is_wrong(arrays: Mapping[str, np.ndarray], facts: Any) -> Optional[str]:
     """Return why a checkpoint is not a training's state; None where it is valid."""
     if not isinstance(facts, dict):
-        return "its facts are none"
+        return "its facts are missing"
     for name, fits in FACTS.items():
         if name not in facts or not fits(facts[name]):
             return f"no {name}" if name not in facts else f"{name} is {facts[name]!r:.40}"
@@ -110,7 +110,7 @@ def _what_is_wrong(arrays: Mapping[str, np.ndarray], facts: Any) -> Optional[str
             return f"{name} is {array.dtype} of shape {list(array.shape)}"
         least = 0.0 if name.startswith("moment2.") else -_MOST
         if kind == np.float32 and not ((array >= least) & (array <= _MOST)).all():
-            return f"{name} has values that none can have"
+            return f"{name} has impossible values"
     if not 0 <= int(arrays["steps"]) < 1 << 31:
         return f"{arrays['steps']} steps"
     if coefficients not in (1, 4, 9, 16):

@@ -138,7 +138,7 @@ def _read(path: Path) -> LPIPS:
     except TypeError:
         raise LegsError(f"{path}: reading weights without unpickling them needs torch 1.13 or newer") from None
     except Exception:  # torch, pickle and zipfile raise nearly anything on a damaged file
-        raise LegsError(f"{path}: this is no file of tensors alone{_MAKE}") from None
+        raise LegsError(f"{path}: this file holds more than tensors{_MAKE}") from None
     state = state if isinstance(state, dict) else {}
     found = {name[9:]: value for name, value in state.items() if str(name).startswith("features.")}
     for make in (_squeeze, _alex, _vgg):

@@ -49,7 +49,7 @@ class Guard:
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_ours(hosts[0], port):
-            return f"this page is reached by its own name and the port {port} only"
+            return f"this page is reached only by its own name and port {port} only"
         if origins and origins != [f"http://{hosts[0]}"]:
             return "a request of another page"
         query = parse_qs(path.partition("?")[2])

@@ -71,14 +71,14 @@ def test_a_wrong_file_is_one_line_and_is_never_run(tmp_path: Path) -> None:
     with pytest.raises(LegsError, match="cannot read"):
         use_lpips(path)
     path.write_bytes(b"no weights")
-    with pytest.raises(LegsError, match="no file of tensors alone: give a state dict of torchvision's squeezenet1_1"):
+    with pytest.raises(LegsError, match="more than tensors: give a state dict of torchvision's squeezenet1_1"):
         use_lpips(path)
     for wrong in ({"features.0.weight": torch.zeros(2)}, {1: 2}, [torch.zeros(2)], {"features.0.weight": "text"}):
         torch.save(wrong, str(path))
         with pytest.raises(LegsError, match="weights of another network"):
             use_lpips(path)
     torch.save({"features.0.weight": _Harm()}, str(path))
-    with pytest.raises(LegsError, match="no file of tensors alone"):
+    with pytest.raises(LegsError, match="this file holds more than tensors"):
         use_lpips(path)
     use_lpips(state_dict(tmp_path))
     with pytest.raises(LegsError, match="at least 32 pixels a side"):

@@ -8,10 +8,16 @@ import re
 import sys
 from pathlib import Path
 
-from legs_adapters.rules.document import table
+from legs_adapters.rules.order import RULES
 
 PAGE = Path(__file__).resolve().parent / "patching.md"
 PART = re.compile("(<!-- rules: .*? -->\n).*?(<!-- end of the rules -->)", re.S)
+
+
+def table():
+    """Return the table of rules."""
+    rows = [f"| `{rule.id}` | {rule.sentence()} | {rule.reason} |" for rule in RULES.values()]
+    return "\n".join(["| rule | why it skips a term | `reason` |", "| --- | --- | --- |", *rows, ""])
 
 
 def main(arguments):

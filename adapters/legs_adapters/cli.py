@@ -89,18 +89,6 @@ def _so_far(args: argparse.Namespace) -> str:
     return f"; the patch was already written; undo it with: legs-patch --undo {args.folder}"
 
 
-class _Explain(argparse.Action):
-    """Print the explanation of a rule, or without a name the list of rules, and exit; FOLDER is not required."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *given: object) -> None:
-        check_libcst()
-        from legs_adapters.rules.document import explain, listed
-
-        rule = given[1]
-        say(explain(rule) if isinstance(rule, str) else listed(), end="", lines=True)
-        parser.exit()
-
-
 _MODES = {
     "--diff": "show what would change as a unified diff; write nothing",
     "--check": "exit with 1 if something would change; write nothing",
@@ -120,7 +108,6 @@ _GROUPS = {
         "--exclude GLOB": "files or folders to ignore; repeatable",
         "--ssim": "also rewrite the training step's SSIM to legs_loss.ssim, which is faster, where it is that of 3DGS",
         "--masks": "also write the line that hides masked pixels from every other term of the step",
-        "--explain RULE": "explain a rule, or list the rules, and exit",
     },
     "advanced: with --trace": {
         "--steps N": "end the script after N steps that move what is rendered; default: 30",
@@ -143,7 +130,6 @@ _KINDS: Dict[str, Dict[str, Any]] = {  # of those that are more than a text or a
     "--beta": {"type": float},
     "--site": {"action": "append", "default": []},
     "--exclude": {"action": "append", "default": []},
-    "--explain": {"action": _Explain, "nargs": "?"},
     "--iterations": {"type": int, "default": 40},
     "--steps": {"type": int, "default": 30},
 }

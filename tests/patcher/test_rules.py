@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from textwrap import dedent, indent
 
 import pytest
 from legs_adapters.plan import plan
-from legs_adapters.rules.document import explain, table
 from legs_adapters.rules.order import RULES
 from legs_adapters.rules.rule import Rule
 
 from tests.patcher.support import checkout, files, legs_patch
+from tests.support import legs_environment
 
 IMPORTS = """\
 import torch
@@ -159,27 +161,12 @@ def test_a_default_that_decides_is_shown_by_the_def_it_stands_in(tmp_path):
     assert [line.line for line in left.because] == [first]
 
 
-def test_explain_prints_a_rule_or_all_of_a_reason_or_the_list():
-    done = legs_patch("--explain", "robust")
-    assert done.returncode == 0
-    assert done.stdout.startswith("robust: A name is of a robust loss")
-    assert "\nskipped:\n" + indent(examples(RULES["robust"], "skipped")[0], "    ") in done.stdout
-    assert [line.split(":")[0] for line in explain("regulariser").splitlines()[:1]] == ["parameter"]
-    assert explain("tracking").count("tracking: ") == 1
-    listing = legs_patch("--explain")
-    assert listing.returncode == 0
-    assert all(f"  {name} " in listing.stdout for name in RULES)
-
-
-def test_explain_of_an_unknown_rule_is_one_line():
-    done = legs_patch("--explain", "dept")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "legs-patch: error: there is no rule 'dept'; legs-patch --explain lists them\n"
-
-
 def test_the_table_of_reasons_in_the_documents_is_current():
-    page = (Path(__file__).parents[2] / "docs" / "patching.md").read_text(encoding="utf-8")
-    assert f"-->\n{table()}<!-- end of the rules -->" in page
+    page = Path(__file__).parents[2] / "docs" / "patching.md"
+    assert (
+        subprocess.run([sys.executable, page.parent / "reasons.py", "--check"], env=legs_environment()).returncode == 0
+    )
+    assert all(f"\n| `{name}` | " in page.read_text(encoding="utf-8") for name in RULES)
 
 
 def test_a_loss_of_modules_in_a_list_is_quoted_and_what_stands_beside_it_is_not(tmp_path):

@@ -72,7 +72,7 @@ from model import Splats
 
 parser = argparse.ArgumentParser()
 parser.add_argument("-s")
-views = cameras(parser.parse_args().s)
+views = cameras(parser.parse_known_args()[0].s)
 splats = Splats()
 """
 

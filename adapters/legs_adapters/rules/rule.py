@@ -80,7 +80,7 @@ class Rule:
     """One cause to skip a term.
 
     Attributes:
-        id: its name, for ``--explain`` and the report.
+        id: its name, for the report.
         reason: the word in the JSON report; several rules may share it.
         needs_target: warn of the term only if a side is known to be the photograph.
         is_doubted_beside_sites: warn of the term also where the codebase has other terms.

@@ -19,6 +19,8 @@ class Traced(NamedTuple):
         match: the image file that side is most like: "path", "correlation", "is_photograph"; None: there is no file, or
             the side is no picture of three or four channels.
         is_known: whether it is that file.
+        is_rival: whether another term under the same loss has a picture that is more like that file, and this
+            one is no part of it, nor an exposure: a rendering by a teacher, say.
         gaussians: how many Gaussians are stepped after it; 0 where that cannot be told.
         parameters, stepped: names and shapes of what is stepped after it.
         steps, poses: how many steps moved more than poses, exposures and embeddings; and how many only those.
@@ -32,6 +34,7 @@ class Traced(NamedTuple):
     share: float
     match: Optional[Dict[str, Any]]
     is_known: bool
+    is_rival: bool
     gaussians: int
     parameters: Sequence[str]
     stepped: Sequence[Sequence[int]]
@@ -68,7 +71,7 @@ class Traced(NamedTuple):
     @property
     def is_unknown(self) -> bool:
         """Return whether only its picture is unknown: it is of no image file."""
-        return self.is_l1 and self.is_picture and self.steps > 0 and not self.is_known
+        return self.is_l1 and self.is_picture and self.steps > 0 and (self.is_rival or not self.is_known)
 
     @property
     def why_other(self) -> str:
@@ -88,6 +91,8 @@ class Traced(NamedTuple):
         if not self.is_known:
             like = f"the nearest, {self.match['path']}, correlates at {self.match['correlation']:.2f}"
             return f"{{target}} is of no image file ({like})"
+        if self.is_rival:
+            return f"{{target}} is less like {self.match['path']} than the picture of another term"
         if not self.match["is_photograph"]:
             return f"{{target}} is {self.match['path']}, no photograph"
         return ""

@@ -8,7 +8,7 @@ from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 from legs_loss import LegsError
 
-__all__ = ["SIDE", "SURE", "Match", "Photographs", "thumbnail"]
+__all__ = ["SIDE", "SURE", "Match", "Photographs", "as_planes", "is_another", "thumbnail", "uncut"]
 
 SIDE = 16  # pixels of a thumbnail
 SURE = 0.94  # the correlation from which on a picture is a file's
@@ -20,14 +20,26 @@ _OTHER = re.compile(  # the words of a folder, or of a file's name, whose pictur
     r"(?i)(^|[^a-z])(normals?|nrm|depths?|disp|disparity|masks?|seg|segmentations?|semantics?|labels?|flow|edges?|"
     r"renders?|renderings?|features?|albedo|alpha|matte|monodepth|omnidata|dsine|teacher|pseudo|generated)([^a-z]|$)"
 )
+_PHOTOS = re.compile(r"(?i)(^|[^a-z])(images?|rgb|colou?rs?|photos?|photographs?|frames|inputs?|train)([^a-z]|$)")
+_GREY = 0.1  # the part of a file's colours from which on a picture is no grey copy of it
+
+_EQUAL, _REST = 0.2, 0.005  # equal pixels of a part of a photograph; the variance that an exposure leaves, at most
 
 
 class Match(NamedTuple):
-    """The image file that a picture is most like, the correlation of the two, and whether it is a photograph."""
+    """The image file that a picture is most like.
+
+    Attributes:
+        path: the file.
+        correlation: of the two, by thumbnails.
+        is_photograph: whether the file is one, and the picture no grey copy of it.
+        detail: the correlation of what larger thumbnails have beside it.
+    """
 
     path: str
     correlation: float
     is_photograph: bool
+    detail: float = 1.0
 
 
 class Photographs:
@@ -41,32 +53,42 @@ class Photographs:
     def __init__(self, folders: Sequence[str], photos: Optional[str] = None) -> None:
         roots = [photos] if photos else list(folders)
         self.root: str = os.path.commonpath([os.path.realpath(root) for root in roots]) if roots else ""
-        files = [path for root in roots for path in _image_files(root)][:MAX_FILES]
-        listed = set() if photos else {key for root in roots for key in _listed(root)}
+        files = list(dict.fromkeys(path for root in roots for path in _image_files(root)))[:MAX_FILES]
+        listed: Dict[str, Set[Tuple[str, str]]] = {}  # by folder: what the model in it lists
+        for path in files if not photos else ():
+            for folder in _folders(path, roots):
+                if folder not in listed:
+                    listed[folder] = _listed(folder)
+        every = set().union(*listed.values())
         self._tiers: List[List[str]] = [[], []]
-        for path in dict.fromkeys(files):
-            inside = os.path.relpath(path, self.root)
-            is_photograph = bool(photos) or (_key(path) in listed if listed else not _OTHER.search(inside))
-            self._tiers[not is_photograph].append(path)
+        for path in files:
+            inside, models = os.path.relpath(path, self.root), [listed.get(at) for at in _folders(path, roots)]
+            is_photograph = _key(path) in every or not (any(models) or _OTHER.search(inside))
+            is_photograph = is_photograph and (_key(path) in every or not every or bool(_PHOTOS.search(inside)))
+            self._tiers[not (photos or is_photograph)].append(path)
         self._known: List[Any] = [None, None]
         self._fine: Dict[Tuple[str, int], Any] = {}
 
     def __len__(self) -> int:
         return sum(map(len, self._tiers))
 
-    def match(self, picture: Picture) -> Optional[Match]:
+    def match(self, picture: Optional[Picture]) -> Optional[Match]:
         """Return the file that a picture's thumbnail is most like: a photograph first; None without files."""
         best: Optional[Match] = None
         for tier, files in enumerate(self._tiers):
-            found = self._best(tier, picture) if files else None
+            found = self._best(tier, picture) if files and picture is not None else None
             if found is not None and (best is None or found[1] > best.correlation):
                 best = Match(os.path.relpath(files[found[0]], self.root), found[1], not tier)
             if best is not None and best.correlation >= SURE:
                 break
-        if best is None or best.correlation < SURE:
+        if best is None or picture is None or best.correlation < SURE:
             return best
-        detail = self._detail(os.path.join(self.root, best.path), picture)
-        return best if detail >= DETAIL else best._replace(correlation=min(best.correlation, SURE * max(detail, 0.0)))
+        path = os.path.join(self.root, best.path)
+        detail = self._detail(path, picture)
+        if detail < DETAIL:
+            return best._replace(correlation=min(best.correlation, SURE * max(detail, 0.0)))
+        is_grey = _colours(picture[0]) + 1e-4 < _GREY * max(map(_colours, self._fine_of(path, 1)))
+        return best._replace(detail=detail, is_photograph=best.is_photograph and not is_grey)
 
     def _detail(self, path: str, picture: Picture) -> float:
         """Return the correlation with a file's detail; 1 where the picture is too small to have any."""
@@ -78,11 +100,14 @@ class Photographs:
         scale = round((fine.shape[1] / kept.size) ** 0.5)
         inside = kept.reshape(SIDE, SIDE).repeat(scale, 0).repeat(scale, 1).ravel()
         one = _standardised(fine[:, inside]).ravel()
-        key = path, scale
-        if key not in self._fine:
-            self._fine[key] = _thumbnails([path], scale * SIDE)[1]
-        scores = [_standardised(_high(other, scale)[:, inside]) for other in self._fine[key]]
+        scores = [_standardised(_high(other, scale)[:, inside]) for other in self._fine_of(path, scale)]
         return max((float(np.dot(score[::way].ravel(), one)) for score in scores for way in (1, -1)), default=0.0)
+
+    def _fine_of(self, path: str, scale: int) -> Any:
+        """Return a file's thumbnails of so many times the side, each file's but once."""
+        if (path, scale) not in self._fine:
+            self._fine[path, scale] = _thumbnails([path], scale * SIDE)[1]
+        return self._fine[path, scale]
 
     def _best(self, tier: int, picture: Picture) -> Optional[Tuple[int, float]]:
         import numpy as np
@@ -101,6 +126,11 @@ class Photographs:
         scores = np.maximum(others @ one.ravel(), others @ one[::-1].ravel())  # RGB, BGR
         at = int(np.argmax(scores))
         return int(files[at]), float(scores[at])
+
+
+def _colours(thumb: Any) -> float:
+    """Return how far a thumbnail's channels are from each other."""
+    return float((thumb - thumb.mean(0)).std())
 
 
 def _standardised(thumbs: Any) -> Any:
@@ -180,6 +210,43 @@ def as_planes(tensor: Any) -> Optional[Any]:
     return tensor.permute(2, 0, 1) if tensor.shape[-1] in (3, 4) and min(tensor.shape[:2]) > 4 else None
 
 
+def uncut(picture: Any) -> Optional[Any]:
+    """Return the whole picture [C, H, W] of which a tensor was cut out by its indices; None where that is not known."""
+    planes = as_planes(picture)
+    base = None if planes is None else planes._base
+    if planes is None or base is None or any(base.stride().count(step) != 1 for step in planes.stride()):
+        return None
+    strides, at = base.stride(), planes.storage_offset() - base.storage_offset()
+    dims = [strides.index(step) for step in planes.stride()]
+    rest = sorted(set(range(base.dim())) - set(dims))
+    for dim in sorted(range(base.dim()), key=lambda dim: -strides[dim]):
+        index, at = divmod(at, max(1, strides[dim]))
+        if dim not in dims[1:]:
+            base = base.narrow(dim, index, len(planes) if dim == dims[0] else 1)
+    whole = base.permute(*rest, *dims).reshape(-1, *(base.shape[dim] for dim in dims))[0]
+    return None if whole.shape == planes.shape else whole
+
+
+def is_another(picture: Any, best: Any) -> bool:
+    """Return whether a picture is no part of another one, under a mask say, and no exposure of it: a rendering.
+
+    The pictures are [C, H, W], in [0, 1]; an exposure is a polynomial of second degree of the three colours.
+    """
+    import torch
+
+    if picture.shape != best.shape:
+        return False
+    one, other = (each[:3].double().reshape(3, -1) for each in (picture, best))
+    inside = ((one > 0) & (one < 1) & (other > 0) & (other < 1)).all(0)
+    one, other = one[:, inside], other[:, inside]
+    if one.shape[1] < 64 or float((one == other).all(0).double().mean()) > _EQUAL:
+        return False
+    terms = torch.cat([other, other**2, torch.ones_like(other[:1])])
+    matrix = terms @ terms.t() + 1e-9 * torch.eye(7, dtype=terms.dtype, device=terms.device)
+    rest = one - torch.linalg.solve(matrix, terms @ one.t()).t() @ terms
+    return float((rest**2).mean()) > _REST * float(((one - one.mean(1, keepdim=True)) ** 2).mean())
+
+
 def _image_files(root: str) -> List[str]:
     found: List[str] = []
     for folder, folders, names in os.walk(root):
@@ -187,6 +254,15 @@ def _image_files(root: str) -> List[str]:
         found += [os.path.join(folder, name) for name in sorted(names) if name.lower().endswith(_SUFFIXES)]
         if len(found) > MAX_FILES:
             break
+    return found
+
+
+def _folders(path: str, roots: Sequence[str]) -> List[str]:
+    """Return the folders that a file lies in, up to the first of these."""
+    found: List[str] = []
+    while path not in roots and path != os.path.dirname(path):
+        path = os.path.dirname(path)
+        found.append(path)
     return found
 
 

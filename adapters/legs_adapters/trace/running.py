@@ -66,13 +66,13 @@ def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optio
         say(f"legs-patch: warning: a difference could not be watched ({seen['failure']})", sys.stderr)
     names = ", ".join(seen["unseen"])
     unseen = [f"a trace cannot look into fused kernels, as these under the loss: {names}"] if names else []
-    if not seen["steps"]:
+    terms = Traced.read(seen["terms"])
+    if not terms:
         passes = f"{seen['backward_passes']} backward passes" if seen["backward_passes"] else "no backward pass"
         raise LegsError(
             f"{script} ended before an optimiser moved what it renders ({passes} seen): by reading: legs-patch {root}",
             *unseen,
         )
-    terms = Traced.read(seen["terms"])
     for line in unseen if not any(term.is_photometric for term in terms) else ():
         say(f"legs-patch: warning: {line}", sys.stderr)
     return Trace(terms, seen["steps"], frozenset(map(tuple, seen["scripted"])))

@@ -18,7 +18,7 @@ import torch
 import legs_loss
 import legs_loss.runtime
 from legs_adapters.trace.graph import KEY, Graph
-from legs_adapters.trace.photographs import SURE, Photographs, as_planes, thumbnail
+from legs_adapters.trace.photographs import SURE, Photographs, as_planes, is_another, thumbnail, uncut
 from legs_loss.runtime import counts
 
 __all__ = ["Watch"]
@@ -114,6 +114,7 @@ class Watch:
         self.most_steps, self.most_losses = steps, losses
         self.ended = ended
         self.steps: int = 0
+        self.pose_steps: int = 0
         self.backward_passes: int = 0
         self.losses: List[str] = []
         self.times: List[float] = []
@@ -214,7 +215,8 @@ class Watch:
         frames = self._frames(sides)
         if frames:
             target = -1 if all(moving) else moving.index(False)
-            record = _Record(kind, frames, target, sides[target if target >= 0 else 1].detach(), made.detach(), [])
+            still = sides[target] if target >= 0 else sides[1].detach()
+            record = _Record(kind, frames, target, still, made.detach(), [])
             node.metadata[KEY] = record
             node.register_hook(functools.partial(_share, record.shares, record.values))
 
@@ -273,17 +275,29 @@ class Watch:
                 kind = "robust"
             if kind == "l1" or (record.target >= 0 and (kind != "signed" or as_planes(record.still) is not None)):
                 found.append((record, self._term(record, kind), graph.leaves(at)))
+        self._rivals([(record, self.terms[key]) for record, key, _ in found if record.target >= 0])
         return found
+
+    def _rivals(self, found: List[Tuple[_Record, Dict[str, Any]]]) -> None:
+        """Mark what is less like a file than another picture under the same loss, and no part or exposure of that."""
+        known = [(as_planes(record.still), term) for record, term in found if term["is_known"] and not term["is_rival"]]
+        known.sort(key=lambda each: -each[1]["match"]["detail"])
+        for at, (picture, term) in enumerate(known):
+            best = next((b for b, other in known[:at] if other["match"]["path"] == term["match"]["path"]), None)
+            term["is_rival"] = best is not None and is_another(picture, best)
 
     def _term(self, record: _Record, kind: str) -> Any:
         """Return the key of a term; those with the same frames, kind and target are one."""
         picture = thumbnail(record.still) if record.target >= 0 else None
-        match = self.photographs.match(picture) if picture is not None else None
+        match = self.photographs.match(picture)
+        whole = uncut(record.still) if match is not None and match.correlation < SURE else None
+        match = match if whole is None else self.photographs.match(thumbnail(whole))
         known = None if match is None or match.correlation < SURE else match.is_photograph
         key = record.frames, kind, record.target, known
         self.terms.setdefault(key, {
             "frames": record.frames, "kind": kind, "target": record.target, "shape": list(record.still.shape),
             "is_picture": picture is not None, "match": match and match._asdict(), "is_known": known is not None,
+            "is_rival": False,
             "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
         })  # fmt: skip
         return key
@@ -322,24 +336,26 @@ class Watch:
 
         What has not changed waits on: for another optimiser, or until enough gradients are accumulated.
         """
-        if self._changes() and self.most_steps is not None and self.steps >= self.most_steps:
+        if self._changes() and self.most_steps is not None and self.steps + self.pose_steps // 20 >= self.most_steps:
             self.ended()
 
     @_harmless
     def _changes(self) -> bool:
-        """Count a step of the terms of which a leaf changed; return whether one is of more than poses."""
+        """Count a step of the terms of which a leaf changed, one of poses alone apart; return whether there is one."""
         changed = {at for at, sample in self._samples.items() if sample.has_changed()}
-        is_counted = False
+        stepped: List[bool] = []
         for key, leaves in list(self._waiting.items()):
             if leaves & changed:
-                is_counted |= self._stepped(self.terms[key], [self._samples[at].leaf() for at in leaves & changed])
+                leaves = leaves & changed
+                stepped.append(self._stepped(self.terms[key], [self._samples[at].leaf() for at in leaves]))
                 del self._waiting[key]
         awaited = set().union(*self._waiting.values()) - changed
         self._samples = {
             at: sample for at, sample in self._samples.items() if at in awaited and sample.leaf() is not None
         }
-        self.steps += is_counted
-        return is_counted
+        self.steps += any(stepped)
+        self.pose_steps += bool(stepped) and not any(stepped)
+        return bool(stepped)
 
     def _stepped(self, term: Dict[str, Any], leaves: Sequence[Any]) -> bool:
         """Record what was stepped after a term; return whether it is more than poses, exposures and embeddings."""

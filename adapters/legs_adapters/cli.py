@@ -111,7 +111,7 @@ _GROUPS = {
     },
     "advanced: with --trace": {
         "--steps N": "end the script after N steps that move what is rendered; default: 30",
-        "--cpu": "run it without a GPU, with shims for CUDA modules; without a scene on the embedded one",
+        "--cpu": "run it without a GPU, with shims for CUDA modules; on the embedded scene if it names none",
         "--photos DIR": "the folder of the photographs; default: those that the scene's model lists",
     },
     "advanced: safety and scripts": {

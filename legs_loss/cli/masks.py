@@ -1,9 +1,9 @@
-"""Make masks of a scene's photographs by what needs no network, one PNG a photograph; white counts, black does not.
+"""Make masks of a scene's photographs without a neural network, one PNG per photograph; white counts, black does not.
 
 WHAT is a folder of masks of your own, alpha (of the photographs), saturated or dark (over- or under-exposed in all
 channels; black borders of undistorted photographs are dark), or sharpness (regions without contrast: out of focus, and
-flat ones, too). With several a pixel counts where it counts in all. A program that finds people or a paint program
-writes the same folder: legs precompute SCENE --masks DIR reads it.
+flat ones, too). With several, a pixel counts if it counts in all. A program that finds people, or a
+paint program, can make such a folder, too: legs precompute SCENE --masks DIR reads it.
 """
 
 from __future__ import annotations

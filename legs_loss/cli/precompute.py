@@ -1,7 +1,7 @@
 """Compute the weight maps of scenes once, for every later training.
 
 SCENE is a folder with a COLMAP model, with transforms.json, or just with images; a glob pattern of such folders; or a
-.txt file with one of these a line. The maps go to SCENE/legs_weights, where a training script on that scene finds them.
+.txt file with one of these per line. The maps go to SCENE/legs_weights, where a script that trains on SCENE finds them.
 Give -r, -w and --images as for the training: a map is used only for exactly the image that it was made from. With
 --scheduler the workers of a dask cluster compute the scenes, which must have the same paths on all of them.
 

@@ -19,7 +19,7 @@ from typing import Any, Dict, List
 from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution, read_noted
 from legs_loss.system import say, write_whole
 
-HELP = "weight maps, four trainings, a table and pictures, on the embedded scene or your own"
+HELP = "train four losses on the embedded scene or your own: weight maps, a table and pictures"
 
 METHODS = ("3dgs", "eggs", "legs-l", "legs")
 

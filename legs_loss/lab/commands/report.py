@@ -11,7 +11,7 @@ from pathlib import Path
 
 from legs_loss.system import say
 
-HELP = "a comparison as one HTML page"
+HELP = "write a comparison as one HTML page"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

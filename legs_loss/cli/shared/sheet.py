@@ -44,25 +44,15 @@ def save_sheet(path: Union[str, Path], views: Sequence[Shown], spec: WeightSpec,
     require("a picture", "report", "matplotlib")
     from matplotlib.figure import Figure
 
-    many = len(views) > 1
     rows = 4 if any(view.mask is not None for view in views) else 3
     aspect = max(view.normalised.shape[0] / view.normalised.shape[1] for view in views)
-    column = min(4.2, 3.6 / aspect) if many else min(4.8, 5.0 / aspect)
-    width, height = (
-        (column * len(views) + 1.4, rows * column * aspect) if many else (rows * column, column * aspect + 0.6)
-    )
+    column = min(4.2, 3.6 / aspect)
+    width, height = column * len(views) + 1.4, rows * column * aspect
     figure: Any = Figure(figsize=(max(7.0, width), height + 4.4), constrained_layout=True)
     figure.suptitle(label(title), fontsize=13, color=_INK)
     maps, below = figure.subfigures(2, 1, height_ratios=[height + 0.8, 3.4])
-    if many:  # a column a view
-        grid = maps.subplots(
-            rows, len(views) + 1, squeeze=False, gridspec_kw={"width_ratios": [1] * len(views) + [0.06]}
-        )
-        cells, bars = grid[:, :-1], grid[:, -1]
-    else:  # side by side
-        grid = maps.subplots(2, rows, gridspec_kw={"height_ratios": [1, 0.03]})
-        cells, bars = grid[:1].T, grid[1]
-    _draw_maps(cells, bars, views, spec)
+    grid = maps.subplots(rows, len(views) + 1, gridspec_kw={"width_ratios": [1] * len(views) + [0.06]})
+    _draw_maps(grid[:, :-1], grid[:, -1], views, spec)
     _draw_curves(below.subplots(), spec)
     save_figure(figure, path, 140)
 
@@ -95,17 +85,15 @@ def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) 
         mean = weight.sum() / (weight.size if view.mask is None else max(float(view.mask.sum()), 1e-9))
         over = "" if view.mask is None else " of what counts"
         weighted.set_xlabel(f"mean weight{over} {mean:.2f}", fontsize=9, color=_INK)
-        if len(views) > 1:
-            photograph.set_title(label(view.label), fontsize=10, color=_INK)
+        photograph.set_title(label(view.label), fontsize=10, color=_INK)
     names = ["photograph", *(["mask"] if masked else []), r"response  $\hat{E}$", "weight  $W$"]
     for axes, name in zip(cells[:, 0], names):
-        (axes.set_ylabel if len(views) > 1 else axes.set_title)(name, fontsize=11, color=_INK)
-    along = "vertical" if len(views) > 1 else "horizontal"
+        axes.set_ylabel(name, fontsize=11, color=_INK)
     figure = cells[0, 0].figure
     for bar in bars[:-2]:
         bar.axis("off")
-    figure.colorbar(strengths, cax=bars[-2], orientation=along, extend="max" if brightest < 1 else "neither")
-    figure.colorbar(weights, cax=bars[-1], orientation=along)
+    figure.colorbar(strengths, cax=bars[-2], extend="max" if brightest < 1 else "neither")
+    figure.colorbar(weights, cax=bars[-1])
 
 
 def _draw_curves(axes: Any, spec: WeightSpec) -> None:
@@ -115,9 +103,6 @@ def _draw_curves(axes: Any, spec: WeightSpec) -> None:
         style = {"linewidth": 2.6, "zorder": 3} if chosen else {"linewidth": 1.3, "alpha": 0.75}
         axes.plot(x.numpy(), curve(name)(x).numpy(), label=f"{name} (this sheet)" if chosen else name, **style)
     axes.set_title(r"curves $f$:  $W = 1 + \beta\, f(\hat{E})$", fontsize=11, color=_INK)
-    axes.set_xlabel(r"normalised response $\hat{E}$")
-    axes.set_ylabel(r"$f(\hat{E})$")
-    axes.set_xlim(0, 1)
-    axes.set_ylim(0, 1)
+    axes.set(xlabel=r"normalised response $\hat{E}$", ylabel=r"$f(\hat{E})$", xlim=(0, 1), ylim=(0, 1))
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))

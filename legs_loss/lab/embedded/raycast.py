@@ -75,12 +75,8 @@ class Quad:
         round: bool = False,
         casts_shadow: bool = True,
     ) -> None:
-        self.corner: np.ndarray = np.asarray(corner, float)
-        self.across: np.ndarray = np.asarray(across, float)
-        self.down: np.ndarray = np.asarray(down, float)
-        self.texture: np.ndarray = texture
-        self.round: bool = round
-        self.casts_shadow: bool = casts_shadow
+        self.corner, self.across, self.down = (np.asarray(vector, float) for vector in (corner, across, down))
+        self.texture, self.round, self.casts_shadow = texture, round, casts_shadow
         self.normal: np.ndarray = _unit(np.cross(self.across, self.down))
         # Rows: the dual basis, so that row @ (point - corner) is u, v and the height over the plane.
         self._dual = np.linalg.inv(np.stack([self.across, self.down, self.normal], axis=1))
@@ -121,9 +117,14 @@ class _Curved:
     texture: np.ndarray
     gloss: float
 
-    def _shade(
-        self, hits: Hits, normal: np.ndarray, point: np.ndarray, direction: np.ndarray, lamp: Lamp
-    ) -> np.ndarray:
+    def normal(self, hits: Hits, point: np.ndarray) -> np.ndarray:
+        """Return the normals [N, 3] at the hit points."""
+        raise NotImplementedError
+
+    def shade(self, hits: Hits, origin: np.ndarray, direction: np.ndarray, lamp: Lamp) -> np.ndarray:
+        """Return colours [N, 3] of the hit points of rays."""
+        point = origin + hits.distance[:, None] * direction
+        normal = self.normal(hits, point)
         to_lamp = _unit(lamp.centre - point)
         facing = (normal * to_lamp).sum(1)
         wrapped = np.clip((facing + 0.25) / 1.25, 0, None)  # a large lamp lights past the terminator
@@ -141,10 +142,7 @@ class Sphere(_Curved):
 
     def __init__(self, centre: Vector, radius: float, texture: np.ndarray, gloss: float = 0.0) -> None:
         self.centre: np.ndarray = np.asarray(centre, float)
-        self.radius: float = radius
-        self.texture: np.ndarray = texture
-        self.gloss: float = gloss
-        self.casts_shadow: bool = True
+        self.radius, self.texture, self.gloss, self.casts_shadow = radius, texture, gloss, True
 
     def hull(self) -> np.ndarray:
         """Return points whose convex hull holds the surface."""
@@ -166,10 +164,9 @@ class Sphere(_Curved):
         v = np.arccos(np.clip(normal[:, 2], -1, 1)) / np.pi
         return Hits(distance, u, v)
 
-    def shade(self, hits: Hits, origin: np.ndarray, direction: np.ndarray, lamp: Lamp) -> np.ndarray:
-        """Return colours [N, 3] of the hit points of rays."""
-        point = origin + hits.distance[:, None] * direction
-        return self._shade(hits, (point - self.centre) / self.radius, point, direction, lamp)
+    def normal(self, hits: Hits, point: np.ndarray) -> np.ndarray:
+        """Return the normals [N, 3] at the hit points."""
+        return (point - self.centre) / self.radius
 
 
 class Tube(_Curved):
@@ -177,11 +174,8 @@ class Tube(_Curved):
 
     def __init__(self, start: Vector, end: Vector, radius: float, texture: np.ndarray, gloss: float = 0.0) -> None:
         self.start: np.ndarray = np.asarray(start, float)
-        self.radius: float = radius
-        self.texture: np.ndarray = texture
-        self.gloss: float = gloss
         # The shadow of a thin wire under a wide lamp is too faint to see.
-        self.casts_shadow: bool = radius > 0.02
+        self.radius, self.texture, self.gloss, self.casts_shadow = radius, texture, gloss, radius > 0.02
         axis = np.asarray(end, float) - self.start
         self.length: float = float(np.linalg.norm(axis))
         axis = axis / self.length
@@ -209,12 +203,10 @@ class Tube(_Curved):
         u = angle / (2 * np.pi) + 0.5
         return Hits(np.where(hit, distance, np.inf), u, np.clip(along / self.length, 0, 1))
 
-    def shade(self, hits: Hits, origin: np.ndarray, direction: np.ndarray, lamp: Lamp) -> np.ndarray:
-        """Return colours [N, 3] of the hit points of rays."""
+    def normal(self, hits: Hits, point: np.ndarray) -> np.ndarray:
+        """Return the normals [N, 3] at the hit points."""
         angle = (hits.u - 0.5) * 2 * np.pi
-        normal = np.cos(angle)[:, None] * self.frame[0] + np.sin(angle)[:, None] * self.frame[1]
-        point = origin + hits.distance[:, None] * direction
-        return self._shade(hits, normal, point, direction, lamp)
+        return np.cos(angle)[:, None] * self.frame[0] + np.sin(angle)[:, None] * self.frame[1]
 
 
 def bake_light(surfaces: Sequence[Any], lamp: Lamp, cell: float = 0.06, lamp_points: int = 12) -> None:

@@ -19,6 +19,7 @@ __all__ = ["TrainConfig", "default_threshold"]
 ADDED_SETTINGS = ("over", "noise_floor", "smooth")
 SWITCHES = ("shuffled", "sparse_adam")  # for the same reason absent where they are off, as are the next ones
 WINDOW = ("weights_from", "weights_until")
+COUNTS = (*WINDOW, "position_lr_max_steps", "max_gaussians")
 
 
 @dataclass(frozen=True)
@@ -69,18 +70,12 @@ class TrainConfig:
             ("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "in [0, 1]"),
             ("l1_scale", 0.0 <= self.l1_scale < float("inf"), "at least 0"),
             (
-                "position_lr_max_steps",
-                self.position_lr_max_steps is None or self.position_lr_max_steps >= 1,
-                "at least 1",
-            ),
-            (
                 "densify_grad_threshold",
                 self.densify_grad_threshold is None or self.densify_grad_threshold > 0.0,
                 "above 0",
             ),
             *((name, type(getattr(self, name)) is bool, "True or False") for name in SWITCHES),
-            *((name, getattr(self, name) is None or getattr(self, name) >= 1, "at least 1") for name in WINDOW),
-            ("max_gaussians", self.max_gaussians is None or self.max_gaussians >= 1, "at least 1"),
+            *((name, getattr(self, name) is None or getattr(self, name) >= 1, "at least 1") for name in COUNTS),
             ("seed", -(1 << 63) <= self.seed < 1 << 63, "an integer of 64 bits"),
         ):
             if not fits:

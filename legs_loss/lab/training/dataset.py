@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import List, Mapping, NamedTuple, Optional, Tuple
+from typing import List, NamedTuple, Optional, Tuple
 
 import numpy as np
 import torch
@@ -90,7 +90,6 @@ def load_dataset(
     resolution: int = -1,
     white_background: bool = False,
     store: Optional[Path] = None,
-    weights: Optional[Mapping[str, Tensor]] = None,
 ) -> Dataset:
     """Load every view of a scene.
 
@@ -102,23 +101,20 @@ def load_dataset(
         store: a store of weight maps; default: ``legs_weights`` in the scene folder, if it is there. A map is used
             only for exactly the image that it was made from, else it is computed. Masks and weights of the user's in
             it have to be found.
-        weights: explicit maps [1, H, W] by view name, in place of the spec's: for experiments.
 
     Raises:
-        LegsError: a view has no pinhole camera, a photograph cannot be read, an explicit map is missing or does not
-            fit, or the store has masks or weights of the user's, and does not know a photograph.
+        LegsError: a view has no pinhole camera, a photograph cannot be read, or the store has masks or weights of the
+            user's, and does not know a photograph.
     """
     train, test = (
         [load_view(scene, view, resolution, white_background) for view in views] for views in split_views(scene)
     )
     opened = open_store(scene, store)
-    if weights is not None:
-        train = [replace(view, weight=_explicit(weights, view)) for view in train]
-    elif not spec.unweighted:
+    if not spec.unweighted:
         train = [replace(view, weight=weight) for view, weight in zip(train, _weights(opened, train, spec))]
     if opened is None or not any(entry.is_own for entry in opened.entries.values()):
         return Dataset(train, test)
-    train = [with_own_maps(view, opened, own_weights=weights is None) for view in train]
+    train = [with_own_maps(view, opened, own_weights=True) for view in train]
     return Dataset(train, [with_own_maps(view, opened) for view in test])
 
 
@@ -234,15 +230,3 @@ def _entry(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional
 
 def _found(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional[Found]:
     return store.find_image(view.image, spec) or store.find_image(view.image[:1], spec)  # a gray photograph
-
-
-def _explicit(weights: Mapping[str, Tensor], view: TrainingView) -> Tensor:
-    if view.name not in weights:
-        raise LegsError(f"no weight map was given for the view {view.name}")
-    weight = torch.as_tensor(weights[view.name], dtype=torch.float32)
-    if weight.shape != view.image[:1].shape:
-        raise LegsError(
-            f"the weight map given for {view.name} has the shape {list(weight.shape)}; "
-            f"its photograph needs {list(view.image[:1].shape)}"
-        )
-    return weight

@@ -121,7 +121,6 @@ def train(
     out: Optional[Union[str, Path]] = None,
     resume: Optional[bool] = False,
     store: Optional[Path] = None,
-    weights: Optional[Mapping[str, Tensor]] = None,
     checkpoint_every: int = 500,
     on_progress: Optional[Callable[[Progress], None]] = None,
     caps: Optional[Mapping[int, int]] = None,
@@ -138,12 +137,11 @@ def train(
         resume: resume from the checkpoint in ``out``; with the same arguments the result is bit-equal to that of an
             uninterrupted run. None: where there is one.
         store: the store of the weight maps, see :func:`load_dataset`.
-        weights: explicit maps instead, see there.
         checkpoint_every: iterations between checkpoints. Another one is written on Ctrl-C.
         on_progress: called every 10 iterations.
         caps: the most Gaussians that a densification may lead to, before it prunes, by its iteration; in place of
             ``config.max_gaussians``. Another run's ``metrics["growth"]`` gives this one that run's numbers: for
-            experiments. A resumed run needs the same ``weights`` and ``caps``.
+            experiments. A resumed run needs the same ``caps``.
         evaluate_every: score the held-out views every so many iterations into ``metrics["history"]``, outside of the
             run's time; None: only at the end.
         stop: end after this iteration of the schedule; the run goes on from its checkpoint when it is resumed.
@@ -155,7 +153,7 @@ def train(
     """
     if not resume:
         check_trainable(scene)
-    data = load_dataset(scene, config.weights, config.resolution, config.white_background, store, weights)
+    data = load_dataset(scene, config.weights, config.resolution, config.white_background, store)
     if config.shuffled:
         data = data._replace(train=shuffled(data.train, config.seed))
     folder = None if out is None else Path(out)

@@ -12,12 +12,12 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.images import is_compiling, is_transformed, read_pair, shape_of
 
-__all__ = ["SIGMA", "SSIM_C1", "SSIM_C2", "WINDOW_SIZE", "d_ssim", "ssim_map"]
+__all__ = ["CONTRAST_CONSTANT", "LUMINANCE_CONSTANT", "SIGMA", "WINDOW_SIZE", "d_ssim", "ssim_map"]
 
 WINDOW_SIZE = 11
 SIGMA = 1.5
-SSIM_C1 = 0.01**2
-SSIM_C2 = 0.03**2
+LUMINANCE_CONSTANT = 0.01**2  # the C1 and C2 of Wang et al., where a curve has these names
+CONTRAST_CONSTANT = 0.03**2
 
 
 def ssim_map(
@@ -59,8 +59,8 @@ def _ssim_map(first: Tensor, second: Tensor, padding: str, window_size: int) -> 
     variance1 = blur(first * first) - mean1_sq
     variance2 = blur(second * second) - mean2_sq
     covariance = blur(first * second) - mean12
-    scale = (mean1_sq + mean2_sq + SSIM_C1) * (variance1 + variance2 + SSIM_C2)
-    return ((2 * mean12 + SSIM_C1) * (2 * covariance + SSIM_C2)) / scale
+    scale = (mean1_sq + mean2_sq + LUMINANCE_CONSTANT) * (variance1 + variance2 + CONTRAST_CONSTANT)
+    return ((2 * mean12 + LUMINANCE_CONSTANT) * (2 * covariance + CONTRAST_CONSTANT)) / scale
 
 
 _windows: Dict[Tuple[Any, ...], Tensor] = {}  # made on the CPU once, not uploaded at every call

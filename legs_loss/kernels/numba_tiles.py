@@ -20,7 +20,7 @@ import numpy as np
 
 from legs_loss.kernels.compiling import claimed, compiled, inlined, multiply_add, part
 from legs_loss.kernels.numba_weights import weights_of_row
-from legs_loss.similarity import SIGMA, SSIM_C1, SSIM_C2, WINDOW_SIZE
+from legs_loss.similarity import CONTRAST_CONSTANT, LUMINANCE_CONSTANT, SIGMA, WINDOW_SIZE
 
 __all__ = ["TILE_HEIGHT", "TILE_WIDTH", "all_tiles", "error_row"]
 
@@ -28,7 +28,7 @@ _REACH = WINDOW_SIZE // 2
 _TAPS = np.exp(-((np.arange(WINDOW_SIZE) - _REACH) ** 2) / (2 * SIGMA**2))
 _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32)
 _T0, _T1, _T2, _T3, _T4, _T5 = (np.float32(tap) for tap in _TAPS[: _REACH + 1])
-_C1, _C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
+_LUMINANCE, _CONTRAST = np.float32(LUMINANCE_CONSTANT), np.float32(CONTRAST_CONSTANT)
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 # A tile's inner size; it repeats ten rows and columns of its neighbours' work on each side.
@@ -260,8 +260,8 @@ def _similarity(means1, means2, squares, products, slope1, slope2, slope3, value
     for j in range(means1.size):
         mean1, mean2 = means1[j], means2[j]
         mean12, means = mean1 * mean2, multiply_add(mean1, mean1, mean2 * mean2)
-        above1, above2 = multiply_add(_TWO, mean12, _C1), multiply_add(_TWO, products[j] - mean12, _C2)
-        below1, below2 = means + _C1, (squares[j] - means) + _C2
+        above1, above2 = multiply_add(_TWO, mean12, _LUMINANCE), multiply_add(_TWO, products[j] - mean12, _CONTRAST)
+        below1, below2 = means + _LUMINANCE, (squares[j] - means) + _CONTRAST
         scale = _ONE / (below1 * below2)
         slope = above1 * scale
         similarity = above2 * slope

@@ -78,9 +78,9 @@ def precompute(
     """
     from tqdm import tqdm
 
-    own = scene.root / STORE_FOLDER
-    out = own if out is None else Path(out)
-    if out.is_symlink() and os.path.abspath(str(out)) == os.path.abspath(str(own)):  # the scene's, not the user's
+    default = scene.root / STORE_FOLDER
+    out = default if out is None else Path(out)
+    if out.is_symlink() and os.path.abspath(str(out)) == os.path.abspath(str(default)):  # the scene's, not the user's
         raise LegsError(f"{out} is a link, which is not followed: name the folder behind it with --out")
     spec = as_spec(spec)
     training_size(1 << 20, 1 << 20, resolution)  # a bad resolution is one error, not one a view

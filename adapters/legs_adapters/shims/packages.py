@@ -55,8 +55,8 @@ def missing(script: Path, built: Iterable[str] = (), root: Path | None = None) -
             new = {path for path in _local(script.parent, name) if path.is_file()} - seen
             seen |= new
             files += sorted(new)
-            own = (script.parent / top).is_dir() or (script.parent / f"{top}.py").is_file()
-            if not own and top not in known and importlib.util.find_spec(top) is None:
+            is_local = (script.parent / top).is_dir() or (script.parent / f"{top}.py").is_file()
+            if not is_local and top not in known and importlib.util.find_spec(top) is None:
                 lacking.add(top)
     return sorted(lacking)
 

@@ -52,8 +52,8 @@ def _specification() -> Any:
 
     trainer = copy.deepcopy(method_configs["splatfacto"])
     trainer.method_name = METHOD
-    this, own = sys.modules[__name__], trainer.pipeline.model
-    values = {field.name: getattr(own, field.name) for field in dataclasses.fields(own) if field.init}
+    this, model = sys.modules[__name__], trainer.pipeline.model
+    values = {field.name: getattr(model, field.name) for field in dataclasses.fields(model) if field.init}
     trainer.pipeline.model = this.SplatfactoLegsModelConfig(**{**values, "_target": this.SplatfactoLegsModel})
     return MethodSpecification(config=trainer, description=DESCRIPTION)
 

@@ -60,7 +60,7 @@ def save_sheet(path: Union[str, Path], views: Sequence[Shown], spec: WeightSpec,
 def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) -> None:
     """Fill cells [rows, views] and the colour bars of the rows: photograph, mask if there is one, response, weight."""
     masked = len(cells) == 4
-    own = [factor for view in views for factor in (view.mask, view.weights) if factor is not None]
+    factors = [factor for view in views for factor in (view.mask, view.weights) if factor is not None]
     most = max([float(view.weights.max()) for view in views if view.weights is not None], default=1.0)
     # A few pixels own the maximum: shown up to it, a response is all black.
     brightest = max(float(np.quantile(view.normalised.astype(np.float32), 0.99)) for view in views) or 1.0
@@ -81,7 +81,7 @@ def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) 
             unit = view.photograph / np.float32(np.iinfo(view.photograph.dtype).max)
             photograph.imshow(unit.squeeze(-1) if unit.shape[-1] == 1 else unit, cmap="gray", vmin=0, vmax=1)
         strengths = response.imshow(view.normalised.astype(np.float32), cmap="magma", vmin=0, vmax=brightest)
-        weights = weighted.imshow(weight, cmap="viridis", vmin=0 if own else 1, vmax=(1 + (spec.beta or 1)) * most)
+        weights = weighted.imshow(weight, cmap="viridis", vmin=0 if factors else 1, vmax=(1 + (spec.beta or 1)) * most)
         mean = weight.sum() / (weight.size if view.mask is None else max(float(view.mask.sum()), 1e-9))
         over = "" if view.mask is None else " of what counts"
         weighted.set_xlabel(f"mean weight{over} {mean:.2f}", fontsize=9, color=_INK)

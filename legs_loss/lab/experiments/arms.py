@@ -89,8 +89,8 @@ class ArmSpec:
         if "scale" in self.changes:
             return replace(base, spec="3dgs", l1_scale=base.l1_scale * mean_weight, densify_grad_threshold=threshold)
         shuffled = "shuffled" in self.changes
-        own: Dict[str, Any] = dict(self.settings)
-        return replace(base, spec=self.spec, shuffled=shuffled, densify_grad_threshold=threshold, **own)
+        named: Dict[str, Any] = dict(self.settings)
+        return replace(base, spec=self.spec, shuffled=shuffled, densify_grad_threshold=threshold, **named)
 
 
 def parse_arm(name: str) -> ArmSpec:
@@ -105,8 +105,8 @@ def parse_arm(name: str) -> ArmSpec:
     >>> parse_arm("C1").name, parse_arm("beta=0").name, parse_arm("beta=5").name
     ('legs-l', '3dgs', 'beta=5')
     """
-    own, at_sign, at = name.partition("@")
-    loss, *changes = own.split(":")
+    before, at_sign, at = name.partition("@")
+    loss, *changes = before.split(":")
     settings = _settings(name, changes)
     for change in changes:
         if change not in CHANGES and ("=" not in change or change.partition("=")[0] not in _NUMBERS):
@@ -122,10 +122,10 @@ def parse_arm(name: str) -> ArmSpec:
         raise LegsError(f"{name}: {loss} has no weights to change")
     leader = parse_arm(at).name if at_sign else None
     preset = next((preset for preset, known in PRESETS.items() if known == spec), loss)
-    own_name = ":".join([preset, *changes])
+    changed = ":".join([preset, *changes])
     if "mean1" in changes:
         spec = replace(spec, normalise="mean")
-    return ArmSpec(own_name if leader is None else f"{own_name}@{leader}", spec, tuple(changes), leader, settings)
+    return ArmSpec(changed if leader is None else f"{changed}@{leader}", spec, tuple(changes), leader, settings)
 
 
 def parse_arms(names: Sequence[str]) -> List[ArmSpec]:
@@ -148,9 +148,9 @@ def these_arms(names: Sequence[str]) -> List[str]:
     >>> these_arms(["C4", "3dgs@legs"])
     ['3dgs', 'legs', 'C4', '3dgs@legs']
     """
-    own = {parse_arm(name).name: name for name in names}
+    given = {parse_arm(name).name: name for name in names}
     arms = sorted(needed(parse_arms([BASELINE, *names])), key=lambda arm: arm.name != BASELINE)  # else as they were
-    return [own.get(arm.name, arm.name) for arm in arms]
+    return [given.get(arm.name, arm.name) for arm in arms]
 
 
 def _settings(name: str, changes: Sequence[str]) -> Tuple[Tuple[str, float], ...]:

@@ -124,7 +124,7 @@ def summarise(rows: Rows) -> Summary:
 
 def summarise_all(rows: Rows, arms: Sequence[str]) -> List[Summary]:
     """Return the summaries of the arms that have rows, in this order."""
-    return [summarise(own) for own in (_of(rows, arm) for arm in arms) if own]
+    return [summarise(found) for found in (_of(rows, arm) for arm in arms) if found]
 
 
 def difference(rows: Rows, arm: str, reference: str, split: str = "test", score: str = "psnr") -> Optional[Difference]:

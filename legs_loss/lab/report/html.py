@@ -129,7 +129,7 @@ def _page(
         by_gaussians=[Markup(plot) for plot in by_gaussians(rows, arms)],
         seed=first[arms[0]]["seed"],
         settings=_settings(settings, rows),
-        arms=_own_settings(arms, first),
+        arms=_settings_of_arms(arms, first),
         command=_command(settings, arms, seeds, run),
         data=data,  # as JSON in which no "</script>" ends the element
         script=base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii"),
@@ -186,7 +186,7 @@ def _differences(rows: Sequence[Row], arms: Sequence[str]) -> Table:
     return with_values(["arm", *columns, "Gaussians"], body)
 
 
-def _own_settings(arms: Sequence[str], first: Mapping[str, Row]) -> List[Dict[str, str]]:
+def _settings_of_arms(arms: Sequence[str], first: Mapping[str, Row]) -> List[Dict[str, str]]:
     lines = []
     for arm in arms:
         config = first[arm]["config"]
@@ -211,8 +211,8 @@ def _settings(settings: Mapping[str, Any], rows: Sequence[Row]) -> Dict[str, str
         "proof of the baseline": _proof(settings["baseline"]),
     }
     if "upstream" in settings:  # the other settings are the package's own trainer's
-        own = {**settings["upstream"], "iterations": base["iterations"]}
-        for name, value in own.items():
+        upstream = {**settings["upstream"], "iterations": base["iterations"]}
+        for name, value in upstream.items():
             shared[f"upstream {name}"] = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     else:
         shared.update({name: str(base[name]) for name in base if name not in ("spec", "seed", "max_gaussians")})
@@ -237,13 +237,13 @@ def _command(settings: Mapping[str, Any], arms: Sequence[str], seeds: Sequence[i
     words = [*program, settings["path"], *(["CHECKOUT"] if "upstream" in settings else [])]
     words += ["--arms", *(arm for arm in arms if arm != BASELINE), "--seeds", str(seeds[-1] + 1)]
     words += ["--images", settings["images"]] if settings["images"] is not None else []
-    own = settings.get("upstream", base)
+    trained = settings.get("upstream", base)
     for flag, name in (("-r", "resolution"), ("--iterations", "iterations")):
-        words += [flag, str(own[name])] if own[name] is not None else []
+        words += [flag, str(trained[name])] if trained[name] is not None else []
     if "upstream" in settings:
-        words += ["--profile", own["profile"], *(["--cpu"] if own["cpu"] else [])]
-        words += ["--gaussians", str(own["gaussians"])] if own["gaussians"] is not None else []
-        words += ["--extra=" + " ".join(map(shlex.quote, own["extra"]))] if own["extra"] else []
+        words += ["--profile", trained["profile"], *(["--cpu"] if trained["cpu"] else [])]
+        words += ["--gaussians", str(trained["gaussians"])] if trained["gaussians"] is not None else []
+        words += ["--extra=" + " ".join(map(shlex.quote, trained["extra"]))] if trained["extra"] else []
         return " ".join(shlex.quote(word) for word in [*words, "--out", str(run)])
     words += ["--densify_grad_threshold", f"{base['densify_grad_threshold']!r}", "--out", str(run)]
     return " ".join(shlex.quote(word) for word in words)

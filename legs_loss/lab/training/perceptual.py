@@ -143,9 +143,9 @@ def _read(path: Path) -> LPIPS:
     found = {name[9:]: value for name, value in state.items() if str(name).startswith("features.")}
     for make in (_squeeze, _alex, _vgg):
         network = make()
-        own = network.features.state_dict()
-        if all(getattr(found.get(name), "shape", None) == value.shape for name, value in own.items()):
-            network.features.load_state_dict({name: found[name] for name in own})
+        needed = network.features.state_dict()
+        if all(getattr(found.get(name), "shape", None) == value.shape for name, value in needed.items()):
+            network.features.load_state_dict({name: found[name] for name in needed})
             return LPIPS(network)
     raise LegsError(f"{path}: these are the weights of another network{_MAKE}")
 

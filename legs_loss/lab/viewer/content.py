@@ -46,9 +46,9 @@ def find_content(path: Path, scene: Optional[Path] = None) -> Content:
 
 def _runs(path: Path) -> Iterator[Tuple[str, Path]]:
     """Return the folder's own last .ply, or those of the folders in it."""
-    own = _last(path)
-    if own is not None:
-        yield path.resolve().name, own
+    last = _last(path)
+    if last is not None:
+        yield path.resolve().name, last
         return
     for folder in sorted(path.iterdir()):
         found = _last(folder)

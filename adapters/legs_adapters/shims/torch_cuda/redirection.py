@@ -20,8 +20,8 @@ class Redirection:
         """Set an attribute if it exists, and remember the old one."""
         if not hasattr(owner, name):
             return
-        own = name in vars(owner)
-        self._replaced.append((owner, name, vars(owner)[name] if own else None, own))
+        is_there = name in vars(owner)
+        self._replaced.append((owner, name, vars(owner)[name] if is_there else None, is_there))
         setattr(owner, name, new)
 
     def wrap(self, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
@@ -33,8 +33,8 @@ class Redirection:
     def restore(self) -> None:
         """Restore all original values."""
         while self._replaced:
-            owner, name, old, own = self._replaced.pop()
-            if own:
+            owner, name, old, was_there = self._replaced.pop()
+            if was_there:
                 setattr(owner, name, old)
             else:
                 delattr(owner, name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import sys
 import time
 from contextlib import redirect_stdout
@@ -96,7 +97,9 @@ def serve(content: Content, preset: str = "legs", host: str = "127.0.0.1", port:
     check_address(host, port)
     loaded = {name: _read(path) for name, path in content.methods.items()}
     server, address = _start(host, port)
-    server.gui.add_markdown(f"### {content.title}")
+    # A folder may be named by a stranger: viser loads pictures that text names, and older ones run what is in braces.
+    title = re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(content.title.split()))
+    server.gui.add_markdown(f"### {title}")
     _Methods(server, loaded)
     _add_dark_mode(server)
     if content.scene is not None:

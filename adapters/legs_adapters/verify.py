@@ -23,7 +23,7 @@ from legs_adapters.plan import plan
 from legs_adapters.shims.packages import check_imports
 from legs_adapters.terms.traced import Traced
 from legs_adapters.trace.command import SCENE, filled, parts
-from legs_adapters.trace.running import run_watched
+from legs_adapters.trace.running import folder_for_runs, run_watched
 from legs_adapters.undo import undo
 from legs_loss import LegsError
 
@@ -147,10 +147,10 @@ def verify(
 
     root = check_root(folder)
     runs: Dict[str, Run] = {}
-    with tempfile.TemporaryDirectory(prefix="legs-verify-") as work:
-        scene = write_embedded_scene(Path(work) / "scene", **SCENE)
+    with folder_for_runs("legs-verify-") as work:
+        scene = write_embedded_scene(work / "scene", **SCENE)
         precompute(read_scene(scene), scene / "legs_weights")
-        patched, unpatched = (Path(work) / name / root.name for name in ("patched", "unpatched"))
+        patched, unpatched = (work / name / root.name for name in ("patched", "unpatched"))
         with locked(root, f"legs-patch --verify {folder}") as stop:
             for copy in (patched, unpatched):
                 shutil.copytree(str(root), str(copy), symlinks=True, ignore=lambda *at: stop() or _unneeded(*at))
@@ -162,9 +162,9 @@ def verify(
             variables["beta 0"] = {"LEGS_BETA": "0"}
         for name, settings in variables.items():
             copy = unpatched if name == "unpatched" else patched
-            places = {"scene": scene, "output": Path(work) / f"output-{name}"}
+            places = {"scene": scene, "output": work / f"output-{name}"}
             words = [script, *given, *filled(copy / script, arguments, given, iterations, **places)]
-            runs[name] = _run(copy, words, iterations, photos, settings)
+            runs[name] = _run(copy, words, iterations, photos, settings, work)
             if not runs["unpatched"].losses:
                 return Verdict(runs, {"the unpatched script trained": False})
     return Verdict(runs, _claims(runs))
@@ -229,11 +229,13 @@ def _unneeded(folder: str, names: List[str]) -> List[str]:
     return [name for name in names if name not in files and not os.path.isdir(paths.get(name, ""))]
 
 
-def _run(root: Path, words: Sequence[str], iterations: int, photos: Optional[str], settings: Dict[str, str]) -> Run:
+def _run(
+    root: Path, words: Sequence[str], iterations: int, photos: Optional[str], settings: Dict[str, str], work: Path
+) -> Run:
     with tempfile.TemporaryFile() as errors:
         streams: Dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": errors, "timeout": SECONDS}
         settings = {"PYTHONHASHSEED": "0", **settings}
-        code, seen = run_watched(root, words, True, photos, {"losses": iterations}, settings=settings, **streams)
+        code, seen = run_watched(root, work, words, True, photos, {"losses": iterations}, settings=settings, **streams)
         errors.seek(0)
         lines = errors.read().decode("utf-8", "replace").replace("\r", "\n").strip().splitlines()
     found = {name: seen[name] for name in Run._fields if name in seen}

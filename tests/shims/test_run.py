@@ -224,10 +224,9 @@ class TestTheScriptIsNotBent:
         root = checkout(tmp_path, dict(texts(), **{"free.py": FREE}))
         done = run(root, "free.py")
         assert done.returncode == 3
-        *found, folder = done.stdout.splitlines()
+        found = done.stdout.splitlines()
         assert found[:3] == ["[0]", "['memory.used [MiB]', '0 MiB', '']", "['0, 0', '']"]
         assert found[3] == "1  legs: error: nvidia-smi --gpu-reset has no shim on the CPU"
-        assert not os.path.exists(folder)
 
     @pytest.mark.slow
     @pytest.mark.parametrize("body", ["sys.exit(7)", "sys.exit('a message')", "raise RuntimeError('here')", "x = = 3"])
@@ -307,7 +306,6 @@ print(json.dumps({"psnr": psnr.item(), "lpips": [str(x.item()) for x in found], 
 """
 
 FREE = """
-import os
 import subprocess
 import sys
 
@@ -321,7 +319,6 @@ print(ask("nvidia-smi --query-gpu=memory.used --format=csv")[1].split("\\n"))
 print(ask("nvidia-smi --query-gpu=index,utilization.gpu --format=csv,noheader,nounits")[1].split("\\n"))
 code, out, error = ask("nvidia-smi --gpu-reset")
 print(code, out, error)
-print(os.environ["PATH"].split(os.pathsep)[-1])
 sys.exit(3)
 """
 

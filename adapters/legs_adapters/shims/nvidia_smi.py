@@ -1,17 +1,13 @@
 """A replacement of `nvidia-smi` for scripts that look for a free GPU: it reports one with unused memory.
 
-As a program it needs only the standard library. `offer` puts it on PATH where there is no other.
+As a program it needs only the standard library. `offer` puts `bin/nvidia-smi`, which runs it, on PATH, where it
+is found if there is no other.
 """
 
 from __future__ import annotations
 
-import atexit
 import os
-import shlex
-import shutil
 import sys
-import tempfile
-from pathlib import Path
 from typing import List, Sequence
 
 __all__ = ["answer", "memory", "offer"]
@@ -60,17 +56,9 @@ def answer(arguments: Sequence[str]) -> str:
 
 
 def offer() -> None:
-    """Put this program on PATH, for this process's children, until it ends; unless there is a real one."""
-    if os.name != "posix" or shutil.which("nvidia-smi"):
-        return
-    folder = tempfile.mkdtemp(prefix="legs-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    program = Path(folder, "nvidia-smi")
-    program.write_text(
-        f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -I {shlex.quote(os.path.abspath(__file__))} "$@"\n'
-    )
-    program.chmod(0o755)
-    os.environ["PATH"] = os.environ.get("PATH", os.defpath) + os.pathsep + folder
+    """Put this program last on PATH, and the Python that runs it, for this process's children."""
+    folders = (os.path.join(os.path.dirname(os.path.abspath(__file__)), "bin"), os.path.dirname(sys.executable))
+    os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", os.defpath), *folders])
 
 
 if __name__ == "__main__":

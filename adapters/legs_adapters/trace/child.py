@@ -13,13 +13,17 @@ import json
 import multiprocessing.spawn
 import os
 import random
+import shutil
+import signal
 import sys
+import threading
+import time
 from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any, Dict, List
 
 from legs_loss.cli import exit_code
-from legs_loss.system import is_first_process
+from legs_loss.system import is_first_process, is_held
 
 _over: List[bool] = []  # one for each time that enough was seen
 
@@ -32,6 +36,7 @@ def _main(given: str, script: str, *arguments: str) -> int:
     from legs_adapters.runner import execute
 
     spec = json.loads(given)
+    threading.Thread(target=_end_with_parent, args=(spec,), daemon=True).start()
     _watched(spec)
     if "losses" in spec:  # runs are compared
         random.seed(0)
@@ -45,6 +50,15 @@ def _main(given: str, script: str, *arguments: str) -> int:
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(0)
+
+
+def _end_with_parent(spec: Dict[str, Any]) -> None:
+    """Wait until nobody holds the parent's lock; then delete what it left, and end all processes of the script."""
+    lock = f"{spec['report']}.lock"
+    while os.path.exists(lock) and is_held(lock):
+        time.sleep(1.0)
+    shutil.rmtree(spec["work"], ignore_errors=True)
+    os.killpg(0, signal.SIGKILL) if os.name == "posix" else os._exit(1)
 
 
 class _Spawned:

@@ -35,7 +35,7 @@ def parts(root: Path, command: str) -> Tuple[List[str], str, List[str]]:
         raise LegsError(f'--trace {command!r} names no script: --trace "train.py -s SCENE"')
     if not (root / words[at]).is_file():
         raise LegsError(f"--trace: there is no {words[at]} in {root}")
-    before = [word for word in words[:at] if word != "-m"]
+    before = words[: at - 1 if words[at - 1 : at] == ["-m"] else at]
     is_python = all(os.path.basename(word).startswith("python") or word == "-u" for word in before)
     return [] if is_python else before, words[at], words[at + 1 :]
 

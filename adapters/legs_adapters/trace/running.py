@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
 
 from legs_adapters.terms.traced import Trace, Traced
 from legs_adapters.trace.command import SCENE, filled, folders, parts
 from legs_loss import LegsError
-from legs_loss.system import say
+from legs_loss.system import FileLock, say
 
-__all__ = ["ScriptFailed", "run_watched", "trace"]
+__all__ = ["ScriptFailed", "folder_for_runs", "run_watched", "trace"]
 
 _SETTINGS = {  # no bytecode is written into the checkout; torch.compile and TorchScript cannot be watched
     "PYTHONDONTWRITEBYTECODE": "1", "TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0",
@@ -48,17 +51,17 @@ def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optio
     launcher, script, arguments = parts(root, command)
     if photos is not None and not os.path.isdir(photos):
         raise LegsError(f"--photos {photos}: there is no such folder")
-    with tempfile.TemporaryDirectory(prefix="legs-trace-") as work:
+    with folder_for_runs("legs-trace-") as work:
         if cpu:
             from legs_adapters.shims.packages import check_imports
             from legs_loss.lab.embedded import write_embedded_scene
 
             check_imports(root, script)
             if not folders(root, arguments):
-                places = {"scene": write_embedded_scene(Path(work) / "scene", **SCENE), "output": Path(work) / "output"}
+                places = {"scene": write_embedded_scene(work / "scene", **SCENE), "output": work / "output"}
                 arguments += filled(root / script, None, arguments, 10 * steps, **places)
         say(f"legs-patch: running {script} in {root} for {steps} steps; it writes where it always does", sys.stderr)
-        code, seen = run_watched(root, [script, *arguments], cpu, photos, {"steps": steps}, launcher, stdout=2)
+        code, seen = run_watched(root, work, [script, *arguments], cpu, photos, {"steps": steps}, launcher, stdout=2)
     if code and not seen.get("is_over"):  # (a rank that waits for one that has ended fails)
         message = f"{script} ended with exit code {code}; nothing was changed. By reading: legs-patch {root}"
         raise ScriptFailed(message, code if code > 0 else 128 - code)
@@ -80,6 +83,7 @@ def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optio
 
 def run_watched(
     root: Path,
+    work: Path,
     words: Sequence[str],
     cpu: bool,
     photos: Optional[str],
@@ -90,32 +94,54 @@ def run_watched(
 ) -> Tuple[int, Dict[str, Any]]:
     """Run a script in a checkout, watched, and return its exit code and the report of the process.
 
+    It ends with this process, and all that it started: if this one is killed, the script's finds the lock beside its
+    report free, and deletes the work folder.
+
     Args:
         root: the checkout.
+        work: of :func:`folder_for_runs`.
         words: the script and its arguments.
         cpu: run it with the shims, without a GPU.
         photos: the folder of the photographs, by the user's word.
         limits: after how many "steps" or "losses" the script is ended.
         launcher: a program that starts it; default: this Python.
         settings: environment variables; those of the user's that begin with LEGS_ are not passed on.
-        streams: further arguments of `subprocess.run`, whose time limit ends the script with the code -1.
+        streams: further arguments of `subprocess.Popen`; and a "timeout" that ends the script with the code -1.
     """
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
     environment.update(_SETTINGS, **(settings or {}), **({"CUDA_VISIBLE_DEVICES": ""} if cpu else {}))
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
-    with tempfile.TemporaryDirectory(prefix="legs-trace-") as work:
-        report = Path(work) / "report.json"
-        spec = {"report": str(report), "root": str(root), "cpu": cpu, "folders": folders(root, words[1:]), **limits}
-        spec["photos"] = photos and os.path.abspath(photos)
-        command: List[str] = [*(launcher or [sys.executable]), "-m", "legs_adapters.trace.child", json.dumps(spec)]
+    report, seconds = Path(tempfile.mkdtemp(dir=str(work))) / "report.json", streams.pop("timeout", None)
+    spec = {"report": str(report), "root": str(root), "cpu": cpu, "folders": folders(root, words[1:]), **limits}
+    spec.update(photos=photos and os.path.abspath(photos), work=str(work))
+    command: List[str] = [*(launcher or [sys.executable]), "-m", "legs_adapters.trace.child", json.dumps(spec), *words]
+    streams.update(cwd=str(root), env=environment, stdin=subprocess.DEVNULL, start_new_session=True)
+    with FileLock(f"{report}.lock"):
+        child = subprocess.Popen(command, **streams)
         try:
-            done = subprocess.run(
-                [*command, *words], cwd=str(root), env=environment, stdin=subprocess.DEVNULL, **streams
-            )
-            code = done.returncode
+            code = child.wait(seconds)
         except subprocess.TimeoutExpired:
             code = -1
-        try:
-            return code, json.loads(report.read_text())
-        except (OSError, ValueError):  # it was killed
-            return code, _NOTHING
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL) if os.name == "posix" else child.kill()
+            child.wait()
+    try:
+        return code, json.loads(report.read_text())
+    except (OSError, ValueError):  # it was killed
+        return code, _NOTHING
+
+
+@contextlib.contextmanager
+def folder_for_runs(prefix: str) -> Iterator[Path]:
+    """Make a temporary folder, and delete it at the end, also where that comes by SIGTERM or SIGHUP."""
+
+    def leave(number: int, _: object) -> None:
+        sys.exit(128 + number)
+
+    with contextlib.ExitStack() as after:
+        if threading.current_thread() is threading.main_thread():
+            for number in (getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)):
+                if signal.getsignal(number) is signal.SIG_DFL:
+                    after.callback(signal.signal, number, signal.signal(number, leave))
+        yield Path(after.enter_context(tempfile.TemporaryDirectory(prefix=prefix)))

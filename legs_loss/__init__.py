@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from legs_loss.runtime import configure as configure
     from legs_loss.runtime import l1_loss as l1_loss
     from legs_loss.runtime import unweighted as unweighted
-    from legs_loss.runtime.module import LEGSLoss as LEGSLoss
+    from legs_loss.runtime.terms import LEGSLoss as LEGSLoss
     from legs_loss.runtime.terms import coverage as coverage
     from legs_loss.runtime.terms import masked as masked
     from legs_loss.runtime.terms import ssim as ssim
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "OPERATORS": "operators",
     "PRESETS": "spec",
-    "LEGSLoss": "runtime.module",
+    "LEGSLoss": "runtime.terms",
     "LegsError": "errors",
     "WeightSpec": "spec",
     "__version__": "_version",

@@ -9,7 +9,7 @@ from typing import Set
 
 from legs_loss.system import is_first_process, say
 
-__all__ = ["Counts", "counted", "note_graph", "note_step", "reset_counts", "say_first"]
+__all__ = ["Counts", "counted", "note_graph", "reset_counts", "said", "say_first"]
 
 
 @dataclass
@@ -42,39 +42,25 @@ class Counts:
 
 
 counted: Counts = Counts()
-_said: Set[str] = set()
+said: Set[str] = set()  # the line of the first training step, when it was said
 
 
 def reset_counts() -> None:
     """Set all counts to 0."""
     vars(counted).update(vars(Counts()))
-    _said.clear()
+    said.clear()
 
 
 def say_first(message: str) -> None:
     """Print what the process's first training step is, once, on rank 0."""
-    if not _said:
-        _said.add(message)
+    if not said:
+        said.add(message)
         if is_first_process():
             say(f"legs-loss: {message}", sys.stderr)
 
 
-def note_step(weights: str) -> None:
-    """Count a training step of a loss whose weight is given in the call.
-
-    Args:
-        weights: in words where they come from, for the first step's line; empty where there are none.
-    """
-    if weights:
-        counted.weighted += 1
-    else:
-        counted.plain_steps += 1
-    if not _said:
-        say_first(f"L1 weighted: {weights}" if weights else "L1 plain: beta 0, or no weight is given")
-
-
-def note_graph(version: int) -> None:
-    """Count a graph of torch.compile with a weight; ``version`` is of the settings."""
+def note_graph() -> None:
+    """Count a graph of torch.compile with a weight."""
     counted.graphs += 1
 
 

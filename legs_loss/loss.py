@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Optional
+from typing import Optional, Tuple
 
 import torch
 from torch import Tensor
 
-from legs_loss.counting import note_graph, note_step
+from legs_loss.autograd import check_order, is_compiling, is_trained
+from legs_loss.counting import counted, note_graph, said, say_first
 from legs_loss.errors import LegsError
-from legs_loss.images import check_order, is_compiling, is_trained, read_pair
-from legs_loss.kernels.backends import fused_loss
+from legs_loss.images import read_pair
+from legs_loss.kernels.backends import Plan, fused, plan_of
 from legs_loss.levels import NEEDS_LEVELS
 from legs_loss.similarity import WINDOW_SIZE, d_ssim
-from legs_loss.spec import Spec, as_spec
+from legs_loss.spec import PRESETS, Spec, WeightSpec, as_spec
 from legs_loss.weights import Weights
 
-__all__ = ["legs_loss", "mean_error", "total_loss", "weighted_l1"]
+__all__ = ["legs_loss", "mean_error", "total_loss", "weighted_l1", "whole_plan"]
 
 
 def weighted_l1(
@@ -53,13 +54,13 @@ def weighted_l1(
         >>> weighted_l1(prediction, target, weight=torch.tensor([[1.0, 3.0]]))
         tensor(2.)
     """
-    layout, prediction, target = read_pair(prediction, target, channels_last)
+    layout, first, second = read_pair(prediction, target, channels_last)
     weights = Weights().times(layout.map_first(weight, target, "weight"))
     weights = weights.masked(layout.map_first(mask, target, "mask"), renormalise)
-    _note(prediction, target, "" if weight is None else "the map given to weighted_l1")
+    _note(first, second, Weights(), "" if weight is None else "the map given to weighted_l1")
     if weights.map is None:
         return torch.abs(prediction - target).mean()
-    return mean_error(layout.channels_first(prediction), layout.channels_first(target), weights)
+    return mean_error(first, second, weights)
 
 
 def mean_error(prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
@@ -114,49 +115,69 @@ def legs_loss(
         >>> prediction.grad.shape
         torch.Size([3, 16, 16])
     """
-    spec = as_spec(spec)
+    spec = PRESETS[spec] if spec.__class__ is str and spec in PRESETS else as_spec(spec)
     if not 0.0 <= lambda_dssim <= 1.0:
         raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
-    if weight is None and spec.over == "scene" and not spec.unweighted:
+    own = None if weight is not None or spec.beta == 0.0 else spec
+    if own is not None and own.over == "scene":
         raise LegsError(NEEDS_LEVELS.format(where="one call does not know", then="and give LEGSLoss that store="))
-    layout, prediction, target = read_pair(prediction, target, channels_last)
-    if weight is None and not spec.unweighted:
+    plan, image, photograph = whole_plan(own, prediction, target, lambda_dssim, padding, channels_last)
+    if own is not None and not (prediction.requires_grad and torch.is_grad_enabled()):
         check_order(prediction, target)
-    made = "the map given to legs_loss"
-    if weight is None and not is_compiling():  # a graph may have numbers that no text can have
-        made = f"{spec.operator}, {spec.curve}, beta {spec.beta:g}, by legs_loss"
-    weight, mask = layout.map_first(weight, target, "weight"), layout.map_first(mask, target, "mask")
-    weights = (Weights(spec) if weight is None else Weights().times(weight)).masked(mask, renormalise)
-    prediction, target = layout.channels_first(prediction), layout.channels_first(target)
-    made = "" if weight is None and spec.unweighted else made
-    return total_loss(prediction, target, weights, lambda_dssim, padding, made)
+    weights, made = Weights(own), "" if own is None else "by legs_loss"
+    if weight is not None:
+        weights, made = weights.times(plan.layout.map_first(weight, photograph, "weight")), "the map given to legs_loss"
+    if mask is not None:
+        weights = weights.masked(plan.layout.map_first(mask, photograph, "mask"), renormalise)
+    return total_loss(plan, image, photograph, weights, lambda_dssim, padding, made)
+
+
+def whole_plan(
+    spec: Optional[WeightSpec],
+    prediction: Tensor,
+    target: Tensor,
+    lambda_dssim: float,
+    padding: str,
+    channels_last: Optional[bool],
+) -> Tuple[Plan, Tensor, Tensor]:
+    """Return :func:`~legs_loss.kernels.backends.plan_of` for :func:`total_loss`."""
+    operation = "loss" if padding == "zeros" and lambda_dssim > 0.0 and not is_compiling() else None
+    return plan_of(operation, lambda_dssim, spec, prediction, target, channels_last)
 
 
 def total_loss(
-    prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float, padding: str, made: str
+    plan: Plan, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float, padding: str, made: str
 ) -> Tensor:
     """Return :func:`legs_loss` of images [C, H, W] or [B, C, H, W], and count the step.
 
     Args:
-        made: in words where the weights come from, for the first step's line; empty where there are none.
+        made: in words, for the first step's line, where a map comes from or who makes the weights of a spec; empty
+            where there are none.
     """
     if lambda_dssim < 1.0:  # else there is no L1
-        _note(prediction, target, made)
-    fused = fused_loss(prediction, target, weights, lambda_dssim, padding)
-    if fused is not None:
-        return fused
+        _note(prediction, target, weights, made)
+    seen = weights.hidden(prediction, target) if weights.seen is not None else prediction
+    loss = fused(plan, seen, target, weights)
+    if loss is not None:
+        return loss
     photometric = mean_error(prediction, target, weights.with_map(target))
     if lambda_dssim == 0.0:
         return photometric
-    structural = d_ssim(weights.hidden(prediction, target), target, padding, False)
+    structural = d_ssim(seen, target, padding, False)
     structural = weights.of_what_counts(structural, WINDOW_SIZE // 2 if padding == "valid" else 0)
     return (1.0 - lambda_dssim) * photometric + lambda_dssim * structural
 
 
-def _note(prediction: Tensor, target: Tensor, weights: str) -> None:
-    if not (torch.is_grad_enabled() and (is_trained(prediction) or is_trained(target))):
+def _note(prediction: Tensor, target: Tensor, weights: Weights, made: str) -> None:
+    if not (torch.is_grad_enabled() and (prediction.requires_grad or is_trained(prediction) or is_trained(target))):
         return
-    if not is_compiling():
-        note_step(weights)
-    elif weights:
-        note_graph(0)
+    if is_compiling():
+        if made:
+            note_graph()
+        return
+    counted.weighted += made != ""
+    counted.plain_steps += made == ""
+    if not said:
+        spec = weights.spec
+        made = made if spec is None else f"{spec.operator}, {spec.curve}, beta {spec.beta:g}, {made}"
+        say_first(f"L1 weighted: {made}" if made else "L1 plain: beta 0, or no weight is given")

@@ -9,8 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from legs_loss.autograd import is_compiling, is_transformed
 from legs_loss.errors import LegsError
-from legs_loss.images import is_compiling, is_transformed, read_pair, shape_of
+from legs_loss.images import read_pair, shape_of
 
 __all__ = ["CONTRAST_CONSTANT", "LUMINANCE_CONSTANT", "SIGMA", "WINDOW_SIZE", "d_ssim", "ssim_map"]
 
@@ -31,8 +32,7 @@ def ssim_map(
 
     Padding "valid" leaves out the pixels whose window is not inside the image.
     """
-    layout, prediction, target = read_pair(prediction, target, channels_last)
-    first, second = layout.channels_first(prediction), layout.channels_first(target)
+    _, first, second = read_pair(prediction, target, channels_last)
     dtype = torch.promote_types(torch.promote_types(first.dtype, second.dtype), torch.float32)
     with _no_autocast(first):
         return _ssim_map(first.to(dtype), second.to(dtype), padding, window_size)

@@ -16,9 +16,10 @@ from typing import Iterable, List, NamedTuple, Optional, Tuple
 import torch
 from torch import Tensor
 
+from legs_loss.autograd import is_compiling, is_transformed
 from legs_loss.curves import curve
 from legs_loss.errors import LegsError
-from legs_loss.images import check_values, is_compiling, is_transformed, read_layout
+from legs_loss.images import check_values, read_layout
 from legs_loss.levels import levels_of, over_scene, percentile
 from legs_loss.responses import normalise_response, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
@@ -177,7 +178,7 @@ class Weights(NamedTuple):
 
     def with_map(self, target: Tensor) -> Weights:
         """Return these weights with the spec's factor in their map; target [C, H, W] or [B, C, H, W]."""
-        made = None if self.spec is None or self.spec.unweighted else weight_map(target, self.spec, False)
+        made = None if self.spec is None or self.spec.beta == 0.0 else weight_map(target, self.spec, False)
         return self._replace(spec=None, range=None).times(made)
 
     def hidden(self, prediction: Tensor, target: Tensor) -> Tensor:

@@ -75,7 +75,7 @@ def test_the_code_is_within_its_budget(part):
 def test_a_file_counts_to_its_parts():
     assert parts_of(Path("adapters/legs_adapters/shims/finder.py")) == ["adapters"]
     assert parts_of(Path("adapters/legs_adapters/plan.py")) == ["adapters", "patcher"]
-    places = ("loss.py", "runtime/call.py", "scenes/colmap.py", "lab/ply.py")
+    places = ("loss.py", "runtime/l1.py", "scenes/colmap.py", "lab/ply.py")
     assert [parts_of(Path("legs_loss", place)) for place in places] == [["core"], ["core"], ["offline"], ["lab"]]
 
 

@@ -109,8 +109,8 @@ def test_what_running_leaves_in_a_tree_is_not_packed(tree, tmp_path):
     used = tmp_path / "used"
     shutil.copytree(str(tree), str(used))
     left = [
-        "kernels/__pycache__/numba_l1.all_strips-17.py311.nbi",
-        "kernels/__pycache__/numba_l1.all_strips-17.py311.1.nbc",
+        "kernels/__pycache__/numba_loss.all_strips-17.py311.nbi",
+        "kernels/__pycache__/numba_loss.all_strips-17.py311.1.nbc",
     ]
     left += [
         "kernels/__pycache__/tmp3f9c.nbi.123",
@@ -125,7 +125,7 @@ def test_what_running_leaves_in_a_tree_is_not_packed(tree, tmp_path):
         packed = archive.getnames()
     with zipfile.ZipFile(str(build(used, "build_wheel", tmp_path / "wheel"))) as wheel:
         packed += wheel.namelist()
-    assert {"legs_loss/kernels/numba_l1.py", "legs_adapters/cli.py"} <= set(packed)
+    assert {"legs_loss/kernels/numba_loss.py", "legs_adapters/cli.py"} <= set(packed)
     assert not [name for name in packed if re.search(r"__pycache__|\.nb[ic]|\.py[cod]$|\.pytest_cache", name)]
 
 

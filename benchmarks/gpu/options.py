@@ -66,7 +66,7 @@ def emulate() -> None:
     BACKENDS._known = {"cuda": Known("tests.cuda_emulation", "cpu")}
     backend = emulated()
     known = Availability(backend, True, "emulated on the CPU", TRIED)
-    BACKENDS._found = {("cuda", torch.device("cpu")): known}
+    BACKENDS.found = {("cuda", torch.device("cpu")): known}
 
 
 def first_line(error: Any) -> str:

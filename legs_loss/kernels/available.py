@@ -13,7 +13,8 @@ import importlib.util
 import os
 import sys
 import threading
-from typing import Dict, FrozenSet, List, NamedTuple, Optional, Tuple
+from functools import partial
+from typing import Any, Callable, Dict, FrozenSet, List, NamedTuple, Optional, Tuple
 
 import torch
 
@@ -21,7 +22,16 @@ from legs_loss.errors import LegsError
 from legs_loss.kernels.contract import Backend, DeviceFault, NotNow
 from legs_loss.spec import WeightSpec
 
-__all__ = ["BACKENDS", "OUT_OF_MEMORY", "Availability", "Backends", "Known", "forced_backend", "is_capturing"]
+__all__ = [
+    "BACKENDS",
+    "OUT_OF_MEMORY",
+    "Availability",
+    "Backends",
+    "Known",
+    "backend_setting",
+    "forced_backend",
+    "is_capturing",
+]
 
 OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 _NAMES = ("torch", "numba", "cuda")
@@ -61,7 +71,7 @@ class Backends:
 
     def __init__(self, known: Dict[str, Known]) -> None:
         self._known = known
-        self._found: Dict[Tuple[str, torch.device], Availability] = {}
+        self.found: Dict[Tuple[str, torch.device], Availability] = {}
         self.after_fork()
 
     def names(self, device: torch.device) -> List[str]:
@@ -119,16 +129,22 @@ class Backends:
                         found = self._tried(name, device, case)
                     except (NotNow, MemoryError, OUT_OF_MEMORY) as error:
                         return Availability(None, True, _in_words(error))
-                    self._record((name, _indexed(device)), found)
+                    self._record(self.place(name, device), found)
         return found
 
     def _known_already(self, name: str, device: torch.device, case: _Case) -> Optional[Availability]:
-        found = self._found.get((name, _indexed(device)))
+        found = self.found.get(self.place(name, device))
         return found if found is None or found.backend is None or case in found.tried else None
 
     def give_up(self, name: str, device: torch.device, error: Exception) -> None:
         """Leave a backend that failed after its trial."""
-        self._record((name, _indexed(device)), Availability(None, True, _in_words(error)))
+        self._record(self.place(name, device), Availability(None, True, _in_words(error)))
+
+    def place(self, name: str, device: torch.device) -> Tuple[str, torch.device]:
+        """Return where in ``found`` stands what was found of a backend on a device, which "cuda" alone does not say."""
+        if device.type == "cuda" and device.index is None and torch.cuda.is_available():
+            device = torch.device("cuda", torch.cuda.current_device())
+        return name, device
 
     def after_fork(self) -> None:
         """Take a lock that no thread holds."""
@@ -150,7 +166,7 @@ class Backends:
 
         try:
             backend = importlib.import_module(self._known[name].module).BACKEND
-            before = self._found.get((name, _indexed(device)))
+            before = self.found.get(self.place(name, device))
             tried = frozenset() if before is None else before.tried
             operation, settings = case
             operations = [each for each in sorted(backend.offers) if operation in (None, each)]
@@ -168,7 +184,7 @@ class Backends:
         return Availability(None if problem else backend, True, problem or "its trial agreed with torch", tried | cases)
 
     def _record(self, key: Tuple[str, torch.device], found: Availability) -> None:
-        self._found[key] = found
+        self.found[key] = found
         if found.backend is None and (found.installed or forced_backend() == key[0]):
             print(f"legs-loss: {key[0]} is unavailable, torch is used: {found.reason}", file=sys.stderr, flush=True)
 
@@ -199,17 +215,16 @@ def forced_backend() -> Optional[str]:
     return name or None
 
 
+# What LEGS_BACKEND says, raw. Its environment's own memory is asked: os.environ would take three calls at each step.
+_memory = getattr(os.environ, "_data", os.environ)
+_name = os.environ.encodekey("LEGS_BACKEND") if _memory is not os.environ else "LEGS_BACKEND"
+backend_setting: Callable[[], Any] = partial(_memory.get, _name)
+
+
 def is_capturing(device: torch.device) -> bool:
     """Return whether launches on a device are being recorded into a CUDA graph."""
     probe = getattr(torch.cuda, "is_current_stream_capturing", None)
     return device.type == "cuda" and probe is not None and bool(probe())
-
-
-def _indexed(device: torch.device) -> torch.device:
-    """Return a device with its number, which "cuda" alone does not say."""
-    if device.type == "cuda" and device.index is None and torch.cuda.is_available():
-        return torch.device("cuda", torch.cuda.current_device())
-    return device
 
 
 def _why_missing(name: str) -> Optional[str]:

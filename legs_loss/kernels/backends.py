@@ -1,124 +1,184 @@
-"""The loss by the backend that is available for its images; each function returns None where torch has to do it."""
+"""The plan of a loss: what hangs on shapes, types, device and settings alone, worked out once and kept.
+
+A step looks its plan up, and launches. A plan is kept for a backend's losses only: torch has no need of one.
+"""
 
 from __future__ import annotations
 
-from typing import Any, Callable, Optional
+from typing import Any, Dict, NamedTuple, Optional, Tuple
 
 import torch
 from torch import Tensor
 
+from legs_loss.autograd import is_transformed, is_wrapped
 from legs_loss.errors import LegsError
-from legs_loss.images import is_compiling, is_transformed
-from legs_loss.kernels.available import BACKENDS, OUT_OF_MEMORY, forced_backend
-from legs_loss.kernels.contract import Backend, DeviceFault, NotNow
+from legs_loss.images import Layout, read_pair
+from legs_loss.kernels.available import BACKENDS, OUT_OF_MEMORY, backend_setting, forced_backend
+from legs_loss.kernels.contract import DeviceFault, NotNow, Prepared, Terms, node
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
-__all__ = ["fused_l1", "fused_l1_of_target", "fused_loss", "fused_range", "fused_ssim"]
+__all__ = ["Plan", "fused", "fused_range", "plan_of"]
+
+_PLAIN = {Tensor, torch.nn.Parameter}  # what others mean by their values only they know
+_TERMS = {"l1": Terms(1.0), "ssim": Terms(0.0, 1.0)}
+_MOST = 256  # plans; a codebase with more shapes of images begins again
 
 
-def fused_loss(
+class Plan(NamedTuple):
+    """A loss of two images, worked out.
+
+    Attributes:
+        layout: of the images as they were given.
+        operation: "loss", "l1" or "ssim"; None is torch's.
+        share: of D-SSIM in a "loss".
+        spec: of the weights that are made from the target.
+        prepared: the backend's; None where torch computes.
+        makes: whether the backend makes the spec's weights by itself; else torch makes a map.
+        moved: whether the images are not channels first as they are given.
+        converted: whether they are converted to float32.
+        plain: whether the loss is 3DGS's own, which torch computes, unless there is a map.
+        place, found: where in BACKENDS what was found of the backend stands, and that: while it stands the plan holds.
+    """
+
+    layout: Layout
+    operation: Optional[str] = None
+    share: float = 0.0
+    spec: Optional[WeightSpec] = None
+    prepared: Optional[Prepared] = None
+    makes: bool = False
+    moved: bool = False
+    converted: bool = False
+    plain: bool = False
+    place: Any = None
+    found: Any = None
+
+
+_plans: Dict[Any, Plan] = {}
+
+
+def plan_of(
+    operation: Optional[str],
+    share: float,
+    spec: Optional[WeightSpec],
     prediction: Tensor,
     target: Tensor,
-    weights: Weights,
-    lambda_dssim: float,
-    padding: str = "zeros",
-) -> Optional[Tensor]:
-    """Return what :func:`legs_loss.legs_loss` returns, by the backend for these images; None where that is torch.
+    channels_last: Optional[bool] = None,
+) -> Tuple[Plan, Tensor, Tensor]:
+    """Return the plan of a loss, and its images as :func:`~legs_loss.images.read_pair` does, which checks them.
 
-    The arguments of this and the next functions are checked already, channels first, as the contract says.
+    Args:
+        operation: None where torch is to compute, as in a graph that is compiled.
+        share, spec: as in a Plan.
+        prediction, target, channels_last: as for :func:`~legs_loss.legs_loss`.
     """
-    unweighted = weights.map is None and (weights.spec is None or weights.spec.unweighted)
-    if padding != "zeros" or lambda_dssim == 0.0 or (unweighted and not forced_backend()):
+    if (
+        operation is None
+        or type(prediction) not in _PLAIN
+        or type(target) not in _PLAIN
+        or is_transformed()
+        or is_wrapped(prediction)
+        or is_wrapped(target)
+        or target.requires_grad
+    ):
+        layout, prediction, target = read_pair(prediction, target, channels_last)
+        return Plan(layout, spec=spec), prediction, target
+    wanted = prediction.requires_grad and torch.is_grad_enabled()
+    given = (operation, share, spec, channels_last, wanted, backend_setting())
+    one = (prediction.shape, prediction.stride(), prediction.dtype, prediction.device)
+    key = (given, one, target.shape, target.stride(), target.dtype, target.device)
+    plan = _plans.get(key)
+    if plan is None or BACKENDS.found.get(plan.place) is not plan.found:
+        layout, first, second = read_pair(prediction, target, channels_last)
+        plan = _new_plan(Plan(layout, operation, share, spec), first, second, wanted)
+        if plan.prepared is not None:
+            if len(_plans) >= _MOST:
+                _plans.clear()
+            moved = first is not prediction or second is not target
+            _plans[key] = plan = plan._replace(moved=moved)
+        return plan, first, second
+    if plan.moved:
+        return (plan, *read_pair(prediction, target, channels_last)[1:])
+    return plan, prediction, target
+
+
+def _new_plan(plan: Plan, prediction: Tensor, target: Tensor, wanted: bool) -> Plan:
+    """Return a plan with what a backend prepares for images [C, H, W] or [B, C, H, W], if one takes them."""
+    spec, operation, device = plan.spec, str(plan.operation), prediction.device
+    backend = BACKENDS.ready(device, operation, spec)
+    channels, height, width = prediction.shape[-3:]
+    if (
+        backend is None
+        or operation not in backend.offers
+        or channels > backend.most_channels
+        or height * width > backend.most_pixels
+        or not {prediction.dtype, target.dtype} <= backend.dtypes
+    ):
+        return plan
+    makes = spec is not None and not spec.unweighted and backend.makes_weights_of(spec)
+    converted = backend.converts(prediction, target)
+    if converted:
+        prediction, target = prediction.detach().float(), target.float()
+    terms = _TERMS.get(operation) or Terms.of(plan.share)
+    try:
+        prepared = backend.prepare(terms, spec if makes else None, prediction, target, wanted)
+    except Exception as error:
+        _given_up(error, backend.name, device)
+        return plan
+    plain = operation == "loss" and (spec is None or spec.unweighted) and not forced_backend()
+    place = BACKENDS.place(backend.name, device)
+    return plan._replace(
+        prepared=prepared, makes=makes, converted=converted, plain=plain, place=place, found=BACKENDS.found[place]
+    )
+
+
+def fused(plan: Plan, prediction: Tensor, target: Tensor, weights: Weights) -> Optional[Tensor]:
+    """Return the loss that a plan is of, by its backend; None where torch computes it.
+
+    Args:
+        plan, prediction, target: of :func:`plan_of`; the prediction's hidden pixels may be the target's.
+        weights: they may have a map in place of the plan's spec.
+    """
+    map_ = weights.map
+    if plan.prepared is None or (plan.plain and map_ is None):
         return None  # unweighted it is 3DGS's own loss, bit-identical
-    seen = weights.hidden(prediction, target)
-    return _fused("loss", seen, target, weights, lambda backend, *given: backend.loss(*given, lambda_dssim))
-
-
-def fused_l1(prediction: Tensor, target: Tensor, weights: Weights) -> Optional[Tensor]:
-    """Return what :func:`legs_loss.weighted_l1` returns, by the backend for these images; None where that is torch."""
-    return _fused("l1", prediction, target, weights, lambda backend, *given: backend.weighted_l1(*given))
-
-
-def fused_l1_of_target(prediction: Tensor, target: Tensor, spec: WeightSpec) -> Optional[Tensor]:
-    """Return :func:`fused_l1` with the weights of a spec, where a backend makes them in its own pass; else None."""
-
-    def run(backend: Backend, first: Tensor, second: Tensor, resolved: Weights) -> Optional[Tensor]:
-        return None if resolved.spec is None else backend.weighted_l1(first, second, resolved)
-
-    return _fused("l1", prediction, target, Weights(spec), run, with_maps=False)
-
-
-def fused_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros") -> Optional[Tensor]:
-    """Return what :func:`legs_loss.ssim` returns, by the backend for these images; None where that is torch."""
-    if padding != "zeros":
+    if map_ is not None and (type(map_) not in _PLAIN or map_.requires_grad or is_wrapped(map_)):
         return None
-    return _fused("ssim", prediction, target, Weights(), lambda backend, first, second, _: backend.ssim(first, second))
+    if weights.spec is not plan.spec or weights.seen is not None:
+        plan, prediction, target = plan_of(plan.operation, plan.share, weights.spec, prediction, target, False)
+        if plan.prepared is None:
+            return None
+    try:
+        if weights.spec is not None and not plan.makes:
+            map_ = weights.with_map(target).map
+        if plan.converted:
+            prediction, target = prediction.float(), target.float()
+        loss: Tensor = node(prediction, target, map_, weights.range, plan.prepared)
+    except Exception as error:
+        _given_up(error, plan.place[0], prediction.device)
+        return None
+    return loss if weights.share is None else weights.of_what_counts(loss)
 
 
 def fused_range(target: Tensor, spec: WeightSpec) -> Optional[Tensor]:
-    """Return :meth:`~legs_loss.kernels.contract.Backend.response_range` of a target, [B, 2] (one image: [1, 2]).
+    """Return the range of a target, see :class:`~legs_loss.kernels.contract.Prepared`, [B, 2] (one image: [1, 2]).
 
     None where no backend makes the weights of this spec for this image by itself.
     """
-
-    def run(backend: Backend, _: Tensor, second: Tensor, resolved: Weights) -> Optional[Tensor]:
-        return None if resolved.spec is None else backend.response_range(second, spec)
-
     target = target.detach()
-    return _fused("l1", target, target, Weights(spec), run, with_maps=False)
-
-
-Operation = Callable[[Backend, Tensor, Tensor, Weights], Optional[Tensor]]
-
-
-def _fused(
-    operation: str,
-    prediction: Tensor,
-    target: Tensor,
-    weights: Weights,
-    run: Operation,
-    with_maps: bool = True,
-) -> Optional[Tensor]:
-    if is_compiling() or is_transformed() or not _plain_tensors(prediction, target, weights.map, weights.range):
-        return None
-    backend = BACKENDS.ready(prediction.device, operation, weights.spec)
-    if backend is None or operation not in backend.offers:
-        return None
-    channels, height, width = prediction.shape[-3:]
-    if channels > backend.most_channels or height * width > backend.most_pixels:
-        return None
-    if not {prediction.dtype, target.dtype} <= backend.dtypes:
+    plan, _, target = plan_of("l1", 0.0, spec, target, target, False)
+    if not plan.makes or plan.prepared is None:
         return None
     try:
-        loss = run(backend, prediction, target, _resolved(backend, weights, target, with_maps))
-    except NotNow:
+        return plan.prepared.response_range(target.float() if plan.converted else target)
+    except Exception as error:
+        _given_up(error, plan.place[0], target.device)
         return None
-    except (LegsError, MemoryError, OUT_OF_MEMORY, DeviceFault):
-        raise
-    except Exception as error:  # a size or type that its trial did not cover
-        BACKENDS.give_up(backend.name, prediction.device, error)
-        return None
-    return None if loss is None else weights.of_what_counts(loss)
 
 
-def _resolved(backend: Backend, weights: Weights, target: Tensor, with_maps: bool) -> Weights:
-    """Return weights as the backend takes them: without a spec that it does not know."""
-    if weights.spec is None or (not weights.spec.unweighted and backend.makes_weights_of(weights.spec)):
-        return weights
-    return weights.with_map(target) if with_maps else weights._replace(spec=None, range=None)
-
-
-def _plain_tensors(prediction: Tensor, *constants: Optional[Tensor]) -> bool:
-    """Return whether the values are in plain memory, and only the prediction needs a gradient."""
-    for tensor in (prediction, *constants):
-        if tensor is None:
-            continue
-        if type(tensor) not in (Tensor, torch.nn.Parameter) or (tensor.requires_grad and tensor is not prediction):
-            return False
-        if _is_wrapped is not None and _is_wrapped(tensor):
-            return False
-    return prediction is not constants[0] or not prediction.requires_grad
-
-
-_is_wrapped: Any = getattr(getattr(torch._C, "_functorch", None), "is_functorch_wrapped_tensor", None)  # by torch.func
+def _given_up(error: Exception, name: str, device: torch.device) -> None:
+    """Raise what a user or torch must know of; of others, as of a size that no trial covered, leave the backend."""
+    if isinstance(error, (LegsError, MemoryError, OUT_OF_MEMORY, DeviceFault)):
+        raise error
+    if not isinstance(error, NotNow):
+        BACKENDS.give_up(name, device, error)

@@ -9,10 +9,11 @@ import gc
 import operator
 import os
 import sys
+import threading
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from typing import Any, Callable, Iterator, List, Optional, Sequence
+from contextlib import contextmanager
+from queue import SimpleQueue
+from typing import Any, Callable, Iterator, List, Optional, Sequence, Tuple
 
 import numba
 import numpy as np
@@ -161,28 +162,42 @@ claimed: Any = extending.intrinsic(_claimed)
 _MOST: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # a user's, or the processor's cores
 
 
-class _Helpers:
-    """The threads beside the one that calls, begun when they are first needed, and anew in a forked process."""
-
-    def __init__(self) -> None:
-        self.pool: Optional[ThreadPoolExecutor] = None
-
-    def forget(self) -> None:
-        self.pool = None
-
-    def begin(self, count: int, function: Callable[..., Any], *given: Any) -> List[Future[Any]]:
-        """Have up to so many of them call a function."""
-        begun: List[Future[Any]] = []
-        with suppress(RuntimeError):  # the interpreter is shutting down, or no thread can be started
-            while len(begun) < min(count, _MOST - 1):
-                self.pool = self.pool or ThreadPoolExecutor(_MOST - 1, "legs-loss")
-                begun.append(self.pool.submit(function, *given))
-        return begun
+_Task = Tuple[List[Any], Callable[..., Any], Tuple[Any, ...], "SimpleQueue[Optional[BaseException]]"]
+_tasks: SimpleQueue[_Task] = SimpleQueue()
+_helpers: List[threading.Thread] = []  # the threads beside the one that calls, begun when they are first needed
 
 
-_HELPERS = _Helpers()
+def _help(tasks: SimpleQueue[_Task]) -> None:
+    while True:
+        _take(*tasks.get())  # a call, which keeps nothing of the task
+
+
+def _take(
+    seats: List[Any],
+    function: Callable[..., Any],
+    given: Tuple[Any, ...],
+    ended: SimpleQueue[Optional[BaseException]],
+) -> None:
+    try:
+        seats.pop()
+    except IndexError:  # the caller has done it alone
+        return
+    try:
+        function(*given)
+    except BaseException as error:
+        ended.put(error)
+    else:
+        ended.put(None)
+
+
+def _begin_anew() -> None:
+    global _tasks
+    _tasks = SimpleQueue()
+    _helpers.clear()
+
+
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_HELPERS.forget)
+    os.register_at_fork(after_in_child=_begin_anew)  # a forked process has no threads
 
 
 def in_threads(function: Callable[..., Any], tasks: int, *given: Any) -> None:
@@ -192,9 +207,32 @@ def in_threads(function: Callable[..., Any], tasks: int, *given: Any) -> None:
     counter, so one that comes late, or never, leaves its share to the others. (numba's own parallel loops compile each
     function that they call two times more, and one of their three kinds ends the process when two threads use it.)
     """
-    counter = np.zeros(1, np.int64)
-    helpers = _HELPERS.begin(min(torch.get_num_threads(), tasks) - 1, function, counter, tasks, *given)
-    function(counter, tasks, *given)
-    for helper in helpers:
-        if not helper.cancel():
-            helper.result()
+    given = (np.zeros(1, np.int64), tasks, *given)
+    count = min(torch.get_num_threads(), tasks, _MOST) - 1
+    if count <= 0:
+        function(*given)
+        return
+    while len(_helpers) < count:
+        helper = threading.Thread(target=_help, args=(_tasks,), name="legs-loss", daemon=True)
+        try:
+            helper.start()
+        except RuntimeError:  # the interpreter is shutting down, or no thread can be started
+            break
+        _helpers.append(helper)
+    # Queues and lists are used as they are: with futures each step would take twenty calls of Python more.
+    waiting = min(count, len(_helpers))
+    seats: List[Any] = [None] * waiting
+    ended: SimpleQueue[Optional[BaseException]] = SimpleQueue()
+    for _ in range(waiting):
+        _tasks.put((seats, function, given, ended))
+    function(*given)
+    try:
+        while True:  # nobody is waited for who has not begun
+            seats.pop()
+            waiting -= 1
+    except IndexError:
+        pass
+    for _ in range(waiting):
+        error = ended.get()
+        if error is not None:
+            raise error

@@ -1,22 +1,26 @@
-"""The contract of a backend: what it declares, and the operations that it offers. torch is the reference.
+"""The contract of a backend: what it declares, and how it prepares a loss. torch is the reference.
 
 A backend never gets a case that it did not declare: backends.py uses torch for it. So no kernel needs a branch for "any
 other curve", which would silently compute something else.
+
+A loss is one node of autograd's graph. It is a scalar, so its gradient needs nothing of what comes after it but a
+factor: a backend computes both in one pass over the images, and backward only scales.
 """
 
 from __future__ import annotations
 
 from contextlib import nullcontext
 from functools import lru_cache
-from typing import Any, ContextManager, FrozenSet
+from typing import Any, ContextManager, FrozenSet, NamedTuple, Optional, Tuple
 
 import torch
 from torch import Tensor
 
+from legs_loss.errors import LegsError
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
-__all__ = ["Backend", "DeviceFault", "NotNow"]
+__all__ = ["Backend", "DeviceFault", "NotNow", "Prepared", "Terms", "node"]
 
 
 class NotNow(Exception):
@@ -27,18 +31,57 @@ class DeviceFault(RuntimeError):
     """A kernel of somebody else's has failed, and the device computes nothing any more: no backend's failure."""
 
 
-class Backend:
-    """A fast implementation of the loss. Subclasses set the attributes and define the operations in ``offers``.
+class Terms(NamedTuple):
+    """The loss is l1 * (weighted L1) + ssim * SSIM + constant; a term of share 0 is not computed."""
 
-    Images are [C, H, W] or [B, C, H, W] with any strides, of a type in ``dtypes``; no gradient flows to a target or a
-    map. Of weights only spec, range and map are read: what a mask does is done around the operation. An operation
-    returns a float32 scalar, differentiable once in the prediction. It repeats bit for bit. On a GPU nothing waits for
-    the device, and all is launched on the current stream.
+    l1: float
+    ssim: float = 0.0
+    constant: float = 0.0
+
+    @classmethod
+    def of(cls, lambda_dssim: float) -> Terms:
+        """Return (1 - lambda) * L1 + lambda * (1 - SSIM)."""
+        return cls(1.0 - lambda_dssim, -lambda_dssim, lambda_dssim)
+
+
+class Prepared:
+    """A loss of images [C, H, W] or [B, C, H, W] of one shape, strides, types and device: all that hangs on no value.
+
+    The weighted L1 is the mean over pixels of the weight times the mean over channels of |prediction - target|; SSIM
+    has zero padding. Both repeat bit for bit. On a GPU nothing waits for the device, and all is launched on the current
+    stream.
+    """
+
+    def compute(
+        self, prediction: Tensor, target: Tensor, map_: Optional[Tensor], range_: Optional[Tensor]
+    ) -> Tuple[Tensor, Optional[Tensor]]:
+        """Return the loss, a float32 scalar, and its gradient where that is wanted; map and range as in Weights."""
+        raise NotImplementedError
+
+    def scaled(self, gradient: Tensor, step: Tensor) -> Tensor:
+        """Return a gradient, which may be overwritten, times the factor that arrives in backward."""
+        raise NotImplementedError
+
+    def response_range(self, target: Tensor) -> Tensor:
+        """Return the min response of each view, and max - min: float32 [B, 2] on its device.
+
+        It depends on the spec's operator and p only. On the CPU a target with NaN, infinity or values of 0..255 is
+        refused (LegsError); on other devices a NaN makes both numbers NaN, and so each weight.
+        """
+        raise NotImplementedError
+
+
+class Backend:
+    """A fast implementation of the loss. Subclasses set the attributes and define :meth:`prepare`.
+
+    Images have any strides and a type in ``dtypes``; no gradient flows to a target or a map. Of weights only spec,
+    range and map are read: what a mask does is done around the operation.
 
     Attributes:
         name: as in LEGS_BACKEND.
         offers: of "loss", "l1" and "ssim": which of :meth:`loss`, :meth:`weighted_l1` and :meth:`ssim` there are.
         dtypes: of the images.
+        own_dtypes: of images that are computed as they are; others, and pairs of two types, are converted to float32.
         most_channels, most_pixels: how many channels and pixels an image may have.
         operators, norms, curves: of the specs whose weights the backend makes by itself; torch makes a map for others.
     """
@@ -46,6 +89,7 @@ class Backend:
     name: str
     offers: FrozenSet[str] = frozenset()
     dtypes: FrozenSet[torch.dtype] = frozenset({torch.float32, torch.float16, torch.bfloat16})
+    own_dtypes: FrozenSet[torch.dtype] = dtypes
     most_channels: int = 4
     most_pixels: int = 2**31 - 1
     operators: FrozenSet[str] = frozenset()
@@ -61,25 +105,102 @@ class Backend:
         known = spec.operator in self.operators and spec.p in self.norms and spec.curve in self.curves
         return known and _is_known(spec)
 
-    def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
-        """Return the min response of each view, and max - min: float32 [B, 2] on its device.
+    def prepare(
+        self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, target: Tensor, wanted: bool
+    ) -> Prepared:
+        """Return a loss of such images, prepared; its gradient, too, if it is wanted.
 
-        It depends on the spec's operator and p only. On the CPU a target with NaN, infinity or values of 0..255 is
-        refused (LegsError); on other devices a NaN makes both numbers NaN, and so each weight.
+        Args:
+            terms: of the loss.
+            spec: of weights that are made from the target, one of those that are known here.
+            prediction, target: examples, of one type in ``own_dtypes``.
         """
         raise NotImplementedError
 
+    def converts(self, prediction: Tensor, target: Tensor) -> bool:
+        """Return whether images are computed as float32, and are not."""
+        return prediction.dtype != target.dtype or prediction.dtype not in self.own_dtypes
+
+    def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
+        """Return :meth:`Prepared.response_range` of a target."""
+        target = target.detach().float() if self.converts(target, target) else target.detach()
+        return self.prepare(Terms(1.0), spec, target, target, False).response_range(target)
+
     def loss(self, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
-        """Return (1 - lambda) * L_w + lambda * (1 - SSIM), SSIM with zero padding."""
-        raise NotImplementedError
+        """Return (1 - lambda) * L_w + lambda * (1 - SSIM), differentiable once in the prediction."""
+        return self._of(Terms.of(lambda_dssim), prediction, target, weights)
 
     def weighted_l1(self, prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
-        """Return the mean over pixels of the weight times the mean over channels of |prediction - target|."""
-        raise NotImplementedError
+        """Return the weighted L1."""
+        return self._of(Terms(1.0), prediction, target, weights)
 
     def ssim(self, prediction: Tensor, target: Tensor) -> Tensor:
-        """Return the mean SSIM, with zero padding."""
-        raise NotImplementedError
+        """Return the mean SSIM."""
+        return self._of(Terms(0.0, 1.0), prediction, target, Weights())
+
+    def _of(self, terms: Terms, prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
+        if self.converts(prediction, target):
+            prediction, target = prediction.float(), target.float()
+        wanted = prediction.requires_grad and torch.is_grad_enabled()
+        prepared = self.prepare(terms, weights.spec, prediction, target, wanted)
+        return node(prediction, target, weights.map, weights.range, prepared)
+
+
+class _FusedLoss(torch.autograd.Function):
+    """A loss, differentiable once in the prediction.
+
+    The first backward uses the gradient of the forward pass. A second one of a retained graph computes it anew, from
+    tensors that autograd has saved: as everywhere in torch it raises a RuntimeError where one of them was changed in
+    place meanwhile, or where the graph was not retained.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, prediction: Tensor, target: Tensor, map_: Any, range_: Any, prepared: Prepared) -> Tensor:
+        loss, gradient = prepared.compute(prediction, target, map_, range_)
+        if gradient is not None:
+            ctx.prepared, ctx.gradient = prepared, gradient
+            if target.is_inference():  # of such a tensor a copy, whose changes autograd can count
+                target = target.clone()
+            if map_ is not None and map_.is_inference():
+                map_ = map_.clone()
+            if range_ is not None and range_.is_inference():
+                range_ = range_.clone()
+            ctx.save_for_backward(prediction, target, map_, range_)
+        return loss
+
+    @staticmethod
+    def backward(ctx: Any, step: Tensor) -> Tuple[Optional[Tensor], ...]:
+        gradient, ctx.gradient = ctx.gradient, None  # it is passed on, not copied
+        if gradient is None:
+            gradient = ctx.prepared.compute(*ctx.saved_tensors)[1]
+        again = torch.is_grad_enabled()
+        try:
+            scaled = ctx.prepared.scaled(gradient, step.detach() if again else step)
+        except RuntimeError:  # a batch of factors (is_grads_batched, vmap) has no number to read
+            scaled = gradient * step
+        if again:
+            scaled = _Once.apply(scaled, ctx.saved_tensors[0], step)
+        return scaled, None, None, None, None
+
+
+class _Once(torch.autograd.Function):
+    """A gradient in a graph of gradients, which depends on the prediction in a way that no backend differentiates."""
+
+    @staticmethod
+    def forward(ctx: Any, gradient: Tensor, *_: Tensor) -> Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> Any:
+        raise LegsError(
+            "this loss was computed by a backend, which gives no second derivative: set LEGS_BACKEND=torch "
+            "(the gradient was taken with create_graph=True and is differentiated again)"
+        )
+
+
+# (prediction, target, map, range, prepared) -> the loss. Function.apply itself, which looks for torch.func first:
+# no transform is around where a backend is asked.
+node: Any = super(torch.autograd.Function, _FusedLoss).apply
 
 
 @lru_cache(maxsize=64)

@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import sys
 from contextlib import nullcontext
-from typing import Any, ContextManager, FrozenSet, Optional, Sequence, Tuple, Union
+from typing import Any, ContextManager, FrozenSet, Optional, Tuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.kernels.codes import NORMS, STENCILS
-from legs_loss.kernels.compiling import in_threads, said
-from legs_loss.kernels.contract import Backend
-from legs_loss.kernels.differentiable import differentiable
-from legs_loss.kernels.numba_l1 import ROWS, all_strips
-from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles
-from legs_loss.kernels.numba_weights import FORMULAS, Images, WeightSource, images_of, response_range, source_of
+from legs_loss.errors import LegsError
+from legs_loss.images import check_values
+from legs_loss.kernels.codes import CURVES, NORMS, STENCILS
+from legs_loss.kernels.compiling import claimed, compiled, in_threads, part, said
+from legs_loss.kernels.contract import Backend, Prepared, Terms
+from legs_loss.kernels.numba_response import extremes, operator_of
+from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles, error_row
+from legs_loss.kernels.numba_weights import FORMULAS, Images, WeightSource, weights_of_row
 from legs_loss.spec import WeightSpec
-from legs_loss.weights import Weights, weight_map
 
-__all__ = ["BACKEND", "fused_loss"]
+__all__ = ["BACKEND"]
+
+_ROWS = 16  # of a strip of the L1 alone
+_NO_RANGE, _NO_MAP = np.empty((0, 2), np.float32), np.empty(0, np.float32)
 
 
 class _NumbaBackend(Backend):
     name = "numba"
     offers: FrozenSet[str] = frozenset({"loss", "l1", "ssim"})
+    own_dtypes: FrozenSet[torch.dtype] = frozenset({torch.float32})
     operators: FrozenSet[str] = frozenset(STENCILS)
     norms: FrozenSet[float] = frozenset(NORMS)
     curves: FrozenSet[str] = frozenset(FORMULAS)
@@ -34,76 +38,112 @@ class _NumbaBackend(Backend):
         # In somebody's training script: where nobody looks, nothing is said.
         return said("legs-loss", "5 to 15 s") if sys.stderr.isatty() else nullcontext()
 
-    def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
-        return response_range(target, spec)
-
-    def loss(self, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
-        return _differentiable(prediction, target, weights, lambda_dssim)
-
-    def weighted_l1(self, prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
-        return _differentiable(prediction, target, weights, 0.0)
-
-    def ssim(self, prediction: Tensor, target: Tensor) -> Tensor:
-        return 1.0 - _differentiable(prediction, target, Weights(), 1.0)
+    def prepare(
+        self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, target: Tensor, wanted: bool
+    ) -> Prepared:
+        return _Prepared(terms, spec, prediction, wanted)
 
 
 BACKEND: Backend = _NumbaBackend()
 
 
-def fused_loss(
-    prediction: Tensor,
-    target: Tensor,
-    weight: Union[Tensor, WeightSpec, None] = None,
-    lambda_dssim: float = 0.2,
-) -> Tensor:
-    """Return (1 - lambda) * L_w + lambda * (1 - SSIM), as :func:`legs_loss.legs_loss` with zero padding.
+class _Prepared(Prepared):
+    """A loss of images of one shape."""
+
+    def __init__(self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, wanted: bool) -> None:
+        *views, channels, height, width = prediction.shape
+        self.terms, self.spec, self.size = terms, spec, prediction.numel()
+        self.shape, self.sizes = tuple(prediction.shape), (*(views or [1]), channels, height, width)
+        self.wanted = self.size if wanted else 0
+        self.pixels = (height * width, self.size // channels)  # of a map: for all views, or for each
+        self.eps = np.float32(0.0 if spec is None else spec.eps)
+        made = WeightSpec() if spec is None else spec
+        curve, beta = 0 if spec is None else CURVES[spec.curve], np.float32(made.beta)
+        self.source = WeightSource(curve, beta, _NO_RANGE, *operator_of(made), _NO_MAP)
+        self.steps = np.float32(terms.l1 / self.size), np.float32(2.0 * terms.ssim / self.size)  # of halves of slopes
+        down, across = -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
+        self.tiles, self.strips = (self.sizes[0] * down * across, down, across), self.sizes[0] * -(-height // _ROWS)
+
+    def compute(
+        self, prediction: Tensor, target: Tensor, map_: Optional[Tensor], range_: Optional[Tensor]
+    ) -> Tuple[Tensor, Optional[Tensor]]:
+        y = _flat(target)
+        images, source = Images(_flat(prediction), y, *self.sizes), self.source
+        if self.spec is not None:
+            found = self._range(y, target) if range_ is None else range_.numpy().copy()
+            found[:, 1] = 1 / (found[:, 1] + self.eps)
+            source = source._replace(ranges=found)
+        if map_ is not None:
+            if map_.numel() not in self.pixels:
+                raise LegsError(f"weight {list(map_.shape)} does not fit images {list(self.shape)}")
+            source = source._replace(map=_flat(map_))
+        gradient = np.empty(self.wanted, np.float32)
+        if self.terms.ssim == 0.0:
+            sums = np.empty(self.strips)
+            in_threads(all_strips, self.strips, images, source, self.steps[0], gradient, sums)
+            error, similarity = np.add.reduce(sums), 0.0
+        else:
+            tasks, down, across = self.tiles
+            sums = np.zeros((tasks, 2))
+            in_threads(all_tiles, tasks, images, down, across, self.steps, source, gradient, sums)
+            error, similarity = np.add.reduce(sums)
+        loss = float((self.terms.l1 * error + self.terms.ssim * similarity) / self.size + self.terms.constant)
+        made = torch.from_numpy(gradient).reshape(self.shape) if self.wanted else None
+        return prediction.new_tensor(loss), made
+
+    def scaled(self, gradient: Tensor, step: Tensor) -> Tensor:
+        return gradient if step.item() == 1.0 else gradient.mul_(step)
+
+    def response_range(self, target: Tensor) -> Tensor:
+        return torch.from_numpy(self._range(_flat(target), target))
+
+    def _range(self, flat: np.ndarray, target: Tensor) -> np.ndarray:
+        assert self.spec is not None
+        found = extremes(flat.reshape(self.sizes), self.spec)
+        if np.add.reduce(found[:, 2]) != 0.0:  # or NaN; overshoots are fine
+            check_values(target)
+        found[:, 1] -= found[:, 0]
+        return found[:, :2]
+
+
+def _flat(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().float().contiguous().numpy().reshape(-1)
+
+
+@compiled(fastmath=False)
+def all_strips(counter, tasks, images, source, scale, gradient, sums):  # type: ignore[no-untyped-def]
+    """Compute the weighted L1 strip by strip, and its gradient if that has a size.
 
     Args:
-        prediction: on the CPU, [C, H, W] or [B, C, H, W]; what is not float32 is converted.
-        target: the same shape; no gradient flows to it.
-        weight: [1, H, W] or [B, 1, H, W]; a spec computes it from the target; None is 1 everywhere.
-        lambda_dssim: the share of D-SSIM.
-
-    Returns:
-        A scalar, differentiable once in the prediction. It repeats bit for bit, whatever the number of threads.
-
-    Raises:
-        LegsError: a spec, and a target with NaN, infinity or plainly of 0..255.
+        counter, tasks: of `in_threads`; a task is a strip.
+        images: an Images.
+        source: a WeightSource.
+        scale: of the gradient.
+        gradient: float32 [B * C * H * W], or empty.
+        sums: float64 [B * strips]: the weighted absolute error of each strip is written.
     """
-    if isinstance(weight, WeightSpec) and not BACKEND.makes_weights_of(weight):
-        weight = weight_map(target, weight, False)
-    weights = Weights(spec=weight) if isinstance(weight, WeightSpec) else Weights(map=weight)
-    return BACKEND.loss(prediction, target, weights, lambda_dssim)
+    strips, width = tasks // images.views, images.width
+    weights, errors = np.empty(width, np.float32), np.empty(width, np.float32)
+    task = claimed(counter)
+    while task < tasks:
+        view, strip = task // strips, task % strips
+        errors[:] = np.float32(0)
+        for row in range(strip * _ROWS, min((strip + 1) * _ROWS, images.height)):
+            weights_of_row(images, source, view, row, np.int64(0), width, weights)
+            for channel in range(images.channels):
+                at = ((view * images.channels + channel) * images.height + row) * width
+                x, y = images.x[at : at + width], images.y[at : at + width]
+                error_row(x, y, weights, errors)
+                if gradient.size > 0:
+                    _gradient_row(x, y, weights, scale, gradient[at : at + width])
+        total = 0.0
+        for j in range(width):
+            total += errors[j]
+        sums[task] = total
+        task = claimed(counter)
 
 
-def _differentiable(prediction: Tensor, target: Tensor, weights: Weights, share: float) -> Tensor:
-    def compute(wanted: bool, image: Tensor, constants: Sequence[Optional[Tensor]]) -> Tuple[Tensor, Optional[Tensor]]:
-        target, map_, found = constants
-        assert target is not None
-        images = images_of(image, target)
-        source = source_of(Weights(weights.spec, found, map_), target, images)
-        gradient = np.empty(images.x.size if wanted else 0, np.float32)
-        loss = (_l1_alone if share == 0.0 else _l1_and_ssim)(images, source, share, gradient)
-        return image.new_tensor(loss), torch.from_numpy(gradient).reshape(image.shape) if wanted else None
-
-    constants = (target, weights.map, weights.range)
-    return differentiable(prediction.float(), constants, compute, _scaled)
-
-
-def _l1_and_ssim(images: Images, source: WeightSource, share: float, gradient: np.ndarray) -> float:
-    down, across = -(-images.height // TILE_HEIGHT), -(-images.width // TILE_WIDTH)
-    sums, size = np.zeros((images.views * down * across, 2)), images.x.size
-    scales = np.float32((1.0 - share) / size), np.float32(-2.0 * share / size)  # SSIM's, of halves of slopes
-    in_threads(all_tiles, len(sums), images, down, across, scales, source, gradient, sums)
-    absolute_error, similarity = sums.sum(0) / size
-    return float((1.0 - share) * absolute_error + share * (1.0 - similarity))
-
-
-def _l1_alone(images: Images, source: WeightSource, share: float, gradient: np.ndarray) -> float:
-    sums, size = np.empty(images.views * -(-images.height // ROWS)), images.x.size
-    in_threads(all_strips, len(sums), images, source, np.float32(1.0 / size), gradient, sums)
-    return float(sums.sum()) / size
-
-
-def _scaled(gradient: Tensor, factor: Tensor) -> Tensor:
-    return gradient if factor.item() == 1.0 else gradient.mul_(factor)
+@part(fastmath=False)
+def _gradient_row(x, y, weight, scale, out):  # type: ignore[no-untyped-def]
+    for j in range(x.size):
+        out[j] = scale * weight[j] * (np.float32(x[j] > y[j]) - np.float32(x[j] < y[j]))

@@ -9,18 +9,12 @@ from __future__ import annotations
 from typing import Any, Dict, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from legs_loss.errors import LegsError
-from legs_loss.images import check_values, shape_of
 from legs_loss.kernels.codes import CURVES, formulas_in
 from legs_loss.kernels.compiling import inlined, part
-from legs_loss.kernels.numba_response import Operator, Shape, extremes, operator_of, response_row
-from legs_loss.spec import WeightSpec
-from legs_loss.weights import Weights
+from legs_loss.kernels.numba_response import Operator, Shape, response_row
 
-__all__ = ["FORMULAS", "Images", "WeightSource", "images_of", "response_range", "source_of", "weights_of_row"]
+__all__ = ["FORMULAS", "Images", "WeightSource", "weights_of_row"]
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 # No sine, since numba's is slow: C5, as curves of the user's own, is applied by torch, to a map.
@@ -60,45 +54,6 @@ class WeightSource(NamedTuple):
     middle: np.float32
     norm: int
     map: np.ndarray
-
-
-def images_of(prediction: Tensor, target: Tensor) -> Images:
-    """Return images [C, H, W] or [B, C, H, W] as the compiled functions take them."""
-    channels, height, width = prediction.shape[-3:]
-    views = prediction.numel() // (channels * height * width)
-    return Images(_flat(prediction), _flat(target), views, channels, height, width)
-
-
-def source_of(weights: Weights, target: Tensor, images: Images) -> WeightSource:
-    """Return where the weights come from.
-
-    Raises:
-        LegsError: a map that does not fit; a spec, and a target with NaN, infinity or plainly of 0..255.
-    """
-    spec = weights.spec or WeightSpec()
-    found = np.empty((0, 2), np.float32)
-    if weights.spec is not None:
-        found = (response_range(target, spec) if weights.range is None else weights.range).numpy().copy()
-        found[:, 1] = _ONE / (found[:, 1] + np.float32(spec.eps))
-    curve = 0 if weights.spec is None else CURVES[spec.curve]
-    factor = np.empty(0, np.float32) if weights.map is None else _flat(weights.map)
-    pixels = images.height * images.width
-    if weights.map is not None and factor.size not in (pixels, images.views * pixels):
-        raise LegsError(f"weight {shape_of(weights.map)} does not fit images {shape_of(target)}")
-    return WeightSource(curve, np.float32(spec.beta), found, *operator_of(spec), factor)
-
-
-def response_range(target: Tensor, spec: WeightSpec) -> Tensor:
-    """Return of each view of [C, H, W] or [B, C, H, W] the min response, and max - min, [B, 2].
-
-    Raises:
-        LegsError: a target with NaN, infinity or plainly of 0..255.
-    """
-    found = extremes(_flat(target).reshape(-1, *target.shape[-3:]), spec)
-    if np.add.reduce(found[:, 2]) != 0.0:  # or NaN; overshoots are fine
-        check_values(target)
-    found[:, 1] -= found[:, 0]
-    return torch.from_numpy(found[:, :2])
 
 
 @inlined
@@ -144,7 +99,3 @@ def _weigh(out, count, curve, beta, low, scale):  # type: ignore[no-untyped-def]
 def _multiply(out, factor, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         out[j] *= factor[j]
-
-
-def _flat(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().float().contiguous().numpy().reshape(-1)

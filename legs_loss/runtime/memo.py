@@ -17,7 +17,7 @@ import mmap
 import threading
 import weakref
 from collections import OrderedDict
-from typing import Callable, Hashable, Optional, TypeVar, cast
+from typing import Any, Callable, Hashable, Optional, TypeVar
 
 import torch
 from torch import Tensor
@@ -74,7 +74,8 @@ class WeightMemo:
             entry = self._entries.get(key)
             if entry is not None:
                 entry.used = True
-                return cast(Value, entry.value)
+                kept: Value = entry.kept if entry.shape is None else entry.value()  # type: ignore[assignment]
+                return kept
         value = make()
         size = _size(value)
         with self._lock:
@@ -132,28 +133,27 @@ class _Entry:
     memo of such tensors took twice the memory that it counted.
     """
 
-    __slots__ = ("_shape", "_value", "owner", "size", "used")
+    __slots__ = ("dtype", "kept", "owner", "shape", "size", "used")
 
     def __init__(self, value: object, size: int, owner: Optional[weakref.ref[Tensor]]) -> None:
         self.size = size
         self.owner = owner
         self.used = False
-        self._value: object = value
+        self.kept: Any = value
+        self.shape: Optional[torch.Size] = None
         if type(value) is Tensor and value.device.type == "cpu" and value.numel() * value.element_size() >= _LARGE:
-            self._value, self._shape = mmap.mmap(-1, value.numel() * value.element_size()), (value.dtype, value.shape)
-            torch.frombuffer(self._value, dtype=value.dtype).copy_(value.reshape(-1))
+            self.kept = mmap.mmap(-1, value.numel() * value.element_size())
+            self.dtype, self.shape = value.dtype, value.shape
+            torch.frombuffer(self.kept, dtype=value.dtype).copy_(value.reshape(-1))
 
-    @property
-    def value(self) -> object:
-        if not isinstance(self._value, mmap.mmap):
-            return self._value
-        dtype, shape = self._shape
-        return torch.frombuffer(self._value, dtype=dtype).reshape(shape)
+    def value(self) -> Tensor:
+        """Return the map that is kept as bytes."""
+        assert self.shape is not None
+        return torch.frombuffer(self.kept, dtype=self.dtype).reshape(self.shape)
 
 
 def _key(target: Tensor) -> Optional[Hashable]:
-    rule: Callable[[Tensor], Optional[Hashable]] = _content_key if target.device.type == "cpu" else _identity_key
-    return rule(target)
+    return _content_key(target) if target.device.type == "cpu" else _identity_key(target)
 
 
 def _content_key(target: Tensor) -> Hashable:
@@ -167,19 +167,25 @@ def _identity_key(target: Tensor) -> Optional[Hashable]:
         version = target._version
     except RuntimeError:  # an inference tensor counts no writes
         return None
+    base = target._base
     return (
-        id(_storage_owner(target)),
+        id(target if base is None else base),
         target.data_ptr(),
         version,
-        tuple(target.shape),
-        tuple(target.stride()),
+        target.shape,
+        target.stride(),
         target.dtype,
         _current_stream(target.device),
     )
 
 
+_raw_stream: Any = getattr(torch._C, "_cuda_getCurrentRawStream", None)  # some microseconds faster
+
+
 def _current_stream(device: torch.device) -> Optional[int]:
-    return int(torch.cuda.current_stream(device).cuda_stream) if device.type == "cuda" else None
+    if device.type != "cuda":
+        return None
+    return int(_raw_stream(device.index) if _raw_stream else torch.cuda.current_stream(device).cuda_stream)
 
 
 def _storage_owner(target: Tensor) -> Tensor:

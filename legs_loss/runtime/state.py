@@ -1,4 +1,10 @@
-"""The state of this process's run: its settings, the sources of its weights, its counts and its messages."""
+"""The run of this process: its settings, its messages, and the weight of a target.
+
+A weight is found in the memo, in the store, or made from the target itself, in this order. The memo has targets that
+are provably unchanged. The store is used for exactly the image that its map was made from, by the target's fingerprint.
+In all other cases the weight is computed: a backend needs two numbers of the target, the least response and the span;
+torch needs the map.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +14,32 @@ import sys
 import threading
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Deque, List, Optional, Set, Union
+from typing import Any, Deque, Dict, List, Optional, Sequence, Set, Union
 
+import torch
+from torch import Tensor
+
+from legs_loss.autograd import is_transformed
 from legs_loss.config import Config, find_config
 from legs_loss.counting import Counts, counted, note_graph, reset_counts, say_first
 from legs_loss.errors import LegsError
-from legs_loss.runtime.memo import DEFAULT_LIMIT
-from legs_loss.runtime.sources import MASK, NOT_IN_A_GRAPH, WeightSource
+from legs_loss.images import shape_of
+from legs_loss.kernels.available import is_capturing
+from legs_loss.kernels.backends import fused_range
+from legs_loss.runtime.memo import DEFAULT_LIMIT, WeightMemo
+from legs_loss.runtime.stored import Stored, Whole
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.system import say
+from legs_loss.weights import Weights, weight_map
 
 __all__ = [
+    "MASK",
     "Run",
+    "View",
     "active",
     "configure",
-    "counted",
     "counts",
     "current_run",
     "refuse_masks",
@@ -31,21 +47,39 @@ __all__ = [
     "reset_counts",
     "spec_to_compile",
     "thread",
-    "version",
 ]
+
+MASK, WEIGHTS = "mask", "weights"  # the store's names of the user's own maps; it is imported only where there is one
+_NOT_IN_A_GRAPH = (
+    "the store has masks or weights of your own, which are found by the image, and a compiled or captured graph, "
+    "torch.func and forward-mode AD cannot look: leave the loss out of them, or name a store without (LEGS_STORE)"
+)
+
+View = Union[str, int, Sequence[Union[str, int]], None]
 
 
 class Run:
     """A training run.
 
-    Attributes:
+    Args:
         config: its settings.
-        source: where its weights come from.
+        memo_bytes: how much memory the memo may take.
+
+    Attributes:
+        weighted: whether the settings weight anything; the store may do so besides.
+        computes: whether nothing is looked up for images on the CPU. Without a store, a SHA-256 of an image's bytes
+            takes longer than its range.
+        said: whether the first step's line was printed.
     """
 
     def __init__(self, config: Config, memo_bytes: int = DEFAULT_LIMIT) -> None:
         self.config = config
-        self.source: WeightSource = WeightSource(config, memo_bytes, counted, self.say_once)
+        self.weighted: bool = config.active
+        self.computes: bool = config.store is None
+        self.said = False
+        self.memo: WeightMemo = WeightMemo(memo_bytes)
+        self.stored: Stored = Stored(config, self.say_once)
+        self._has_own: Optional[bool] = None
         self._said: Set[str] = set()
         for note in config.notes:
             self.say_once(note, note)
@@ -53,7 +87,102 @@ class Run:
     @property
     def active(self) -> bool:
         """Return whether anything is weighted or masked."""
-        return self.config.active or (not self.config.off and self.source.has_own())
+        return self.weighted or (not self.config.off and self.has_own())
+
+    def has_own(self) -> bool:
+        """Return whether the store has masks or weights of the user's, which hold for every preset."""
+        if self._has_own is None:
+            self._has_own = self.stored.has(MASK) or self.stored.has(WEIGHTS)
+        return self._has_own
+
+    def weights(self, target: Tensor, view: View, mean: bool) -> Weights:
+        """Return the weights of a target [C, H, W] or [B, C, H, W], with the user's own, and count their sources.
+
+        Args:
+            target: the photographs.
+            view: the name of each, as for :func:`~legs_loss.l1_loss`.
+            mean: only the mean is requested: a backend needs no weight map in memory for it.
+
+        Raises:
+            LegsError: another number of names than of images, or a name that is no text or number; as :meth:`own`.
+        """
+        if view is None and target.dim() == 3 and self.weighted and not self.has_own():
+            found = self._weight(target, None, mean)
+            return found if isinstance(found, Weights) else Weights(map=found)
+        images = [target] if target.dim() == 3 else list(target)
+        names = _names(view, target, len(images))
+        weights = Weights() if self.config.spec.unweighted else self._made_weights(images, names, mean)
+        mask = self.own(target, MASK, names)
+        return weights.times(self.own(target, WEIGHTS, names)).masked(mask)
+
+    def own(self, target: Tensor, kind: str, names: Sequence[Optional[str]] = ()) -> Optional[Tensor]:
+        """Return the user's masks or weights of a target, [1, H, W] or [B, 1, H, W]; None where all counts whole.
+
+        Args:
+            target: the photographs.
+            kind: MASK or WEIGHTS.
+            names: of the views, for messages. With them what was found is counted.
+
+        Raises:
+            LegsError: they cannot be looked up in a CUDA graph; or as :meth:`Stored.own`.
+        """
+        if not self.stored.has(kind):
+            return None
+        if is_transformed() or is_capturing(target.device):
+            raise LegsError(_NOT_IN_A_GRAPH)
+        images = [target] if target.dim() == 3 else list(target)
+        maps = [
+            self.memo.recall(image, partial(self.stored.own, image, name, kind), kind)
+            for image, name in zip(images, names or [None] * len(images))
+        ]
+        if kind == MASK and names:
+            counted.masked += sum(isinstance(one, Tensor) for one in maps)
+            counted.unmasked += sum(one is Whole.UNKNOWN for one in maps)
+        if not any(isinstance(one, Tensor) for one in maps):
+            return None
+        ones = torch.ones((1, *target.shape[-2:]), device=target.device)
+        whole = [one if isinstance(one, Tensor) else ones for one in maps]
+        return whole[0] if target.dim() == 3 else torch.stack(whole)
+
+    def _made_weights(self, images: List[Tensor], names: Sequence[Optional[str]], mean: bool) -> Weights:
+        found = [self._weight(image, name, mean) for image, name in zip(images, names)]
+        spec = self.config.spec
+        ranges = [one.range for one in found if isinstance(one, Weights)]
+        if len(ranges) == len(found):
+            return Weights(spec, torch.cat(ranges))  # type: ignore[arg-type]  # each has one
+        maps = [one if isinstance(one, Tensor) else weight_map(image, spec, False) for image, one in zip(images, found)]
+        return Weights(map=torch.stack(maps))
+
+    def _weight(self, image: Tensor, view: Optional[str], mean: bool) -> Union[Tensor, Weights]:
+        """Return an image's weight map [1, H, W], or its spec and the range that a backend makes its weights of."""
+        before = counted.stored + counted.computed
+        if is_transformed() or is_capturing(image.device):
+            # A CUDA graph is replayed with other pixels in the target's memory: their weight is part of the graph.
+            counted.computed += 1
+            return self._computed(image, mean)
+        if mean and self.computes and image.device.type == "cpu":
+            found = fused_range(image, self.config.spec)
+            if found is not None:
+                counted.computed += 1
+                return Weights(self.config.spec, found)
+        weight = self.memo.recall(image, partial(self._made, image, view, mean), mean)
+        counted.remembered += counted.stored + counted.computed == before
+        return weight
+
+    def _made(self, image: Tensor, view: Optional[str], mean: bool) -> Union[Tensor, Weights]:
+        weight = self.stored.weight(image, view)
+        if weight is not None:
+            counted.stored += 1
+            return weight
+        counted.computed += 1
+        return self._computed(image, mean)
+
+    def _computed(self, image: Tensor, mean: bool) -> Union[Tensor, Weights]:
+        spec = self.config.spec
+        if spec.over == "scene":
+            return weight_map(image, spec, False, self.stored.scene_levels(image.shape[-2] * image.shape[-1]))
+        found = fused_range(image, spec) if mean else None
+        return weight_map(image, spec, False) if found is None else Weights(spec, found)
 
     def say_once(self, kind: str, message: str) -> None:
         """Print a line on stderr, once for each kind of message."""
@@ -63,9 +192,9 @@ class Run:
 
     def say_what_is_used(self) -> None:
         """Print, once on rank 0, the settings and the sources of the first step's weights, when they are known."""
-        if "active" in self._said:
+        if self.said:
             return
-        self._said.add("active")
+        self.said = True
         spec = self.config.spec
         if not self.active:
             off = f"LEGS_OFF={os.environ.get('LEGS_OFF', '')}"
@@ -80,7 +209,7 @@ class Run:
             weights = f"maps from {self.config.store}"
         else:
             weights = f"maps from {self.config.store}, but for {counted.computed} image(s), whose weight is computed"
-        if self.source.stored.has(MASK):
+        if self.stored.has(MASK):
             weights += f"; masks from {self.config.store}"
             self.tell_at_end()
         say_first(
@@ -102,61 +231,74 @@ class _Thread(threading.local):
 
 
 thread: _Thread = _Thread()
-version: List[int] = [0]  # how often the settings were replaced; compiled code is recompiled then
-_run: Optional[Run] = None
+generation: int = 0  # how often the settings were replaced; compiled code is recompiled then
+_runs: Dict[int, Run] = {}  # the run of this generation
 _masked: Deque[Run] = deque(maxlen=1)  # the last run with masks
 _lock = threading.RLock()
 
 
 def current_run() -> Run:
     """Return this process's run; its settings are read at the first call."""
-    global _run
-    if _run is None:
-        with _lock:
-            if _run is None:
-                _run = Run(find_config(_main_file()))
-    return _run
+    return _runs.get(generation) or _run_of(generation)
+
+
+def _run_of(number: int) -> Run:
+    with _lock:
+        if number not in _runs:
+            _runs[number] = Run(find_config(_main_file()))
+        return _runs[number]
 
 
 @atexit.register
 def _say_masked() -> None:
     """Print, as the process ends, what the masks of its last run were used for."""
     if _masked:
-        masked, in_l1_alone = _masked[-1].source.stored.masked, counted.masked > 0 and counted.hidden == 0
+        masked, in_l1_alone = _masked[-1].stored.masked, counted.masked > 0 and counted.hidden == 0
         say(f"legs-loss: {masked.summary(counted.unmasked, in_l1_alone)}", sys.stderr)
 
 
-def refuse_masks(version: int) -> None:
-    """Raise a LegsError where a graph is compiled, and the store has masks or weights of the user's."""
-    run = current_run()
-    if not run.config.off and run.source.has_own():
-        raise LegsError(NOT_IN_A_GRAPH)
+def refuse_masks(number: int) -> None:
+    """Raise a LegsError where a graph is compiled, and the store has masks or weights of the user's.
+
+    Args:
+        number: the generation of the settings, for which alone the graph holds.
+    """
+    run = _run_of(number)
+    if not run.config.off and run.has_own():
+        raise LegsError(_NOT_IN_A_GRAPH)
 
 
-def spec_to_compile(version: int) -> Optional[WeightSpec]:
-    """Return the spec of a compiled call, None without a weight."""
-    refuse_masks(version)
-    run = current_run()
+def spec_to_compile(number: int) -> Optional[WeightSpec]:
+    """Return the spec of a compiled call, None without a weight; arguments and errors as :func:`refuse_masks`."""
+    refuse_masks(number)
+    run = _run_of(number)
     run.say_what_is_used()
-    if run.config.active:
-        note_graph(version)
-    return run.config.spec if run.config.active else None
+    if run.weighted:
+        note_graph()
+    return run.config.spec if run.weighted else None
 
 
 # torch.compile calls them while it traces, and takes what they return as a constant: it cannot trace a lock, or a file
 # that is read. What torch.compiler.assume_constant_result would set, without the seconds of importing the compiler.
+_constant: Any
 for _constant in (refuse_masks, spec_to_compile):
-    _constant._dynamo_marked_constant = True  # type: ignore[attr-defined]
+    _constant._dynamo_marked_constant = True
+
+
+def _replace(run: Optional[Run]) -> None:
+    global generation
+    with _lock:
+        generation += 1
+        _runs.clear()
+        if run is not None:
+            _runs[generation] = run
 
 
 def reset() -> None:
     """Reset to the state of a new process: the next call reads the settings again, and all counts are 0."""
-    global _run
-    with _lock:
-        _run = None
-        _masked.clear()
-        version[0] += 1
-        reset_counts()
+    _replace(None)
+    _masked.clear()
+    reset_counts()
 
 
 def configure(
@@ -179,7 +321,6 @@ def configure(
         >>> configure(replace(as_spec("legs"), curve="C5", beta=4.0))
         >>> configure("legs")
     """
-    global _run
     config = find_config(_main_file())
     if spec is not None:
         config = replace(
@@ -190,9 +331,7 @@ def configure(
         )
     if store is not None:
         config = replace(config, store=Path(store))
-    with _lock:
-        _run = Run(config, memo_bytes)
-        version[0] += 1
+    _replace(Run(config, memo_bytes))
 
 
 def active() -> bool:
@@ -207,6 +346,15 @@ def active() -> bool:
 def counts() -> Counts:
     """Return a copy of this process's counts so far."""
     return replace(counted)
+
+
+def _names(view: View, target: Tensor, count: int) -> List[Optional[str]]:
+    if view is None:
+        return [None] * count
+    names: List[Any] = list(view) if isinstance(view, (list, tuple)) else [view]
+    if len(names) != count or not all(isinstance(name, (str, int)) for name in names):
+        raise LegsError(f"view must be one name a view: target {shape_of(target)} holds {count}, got {view!r}")
+    return [str(name) for name in names]
 
 
 def _main_file() -> Path:

@@ -1,23 +1,28 @@
-"""Terms of a training step under the masks of a store; and SSIM, a drop-in for the ``ssim`` of 3DGS."""
+"""Other terms of a training step under the masks of a store: SSIM as 3DGS calls it, and the whole loss as a Module."""
 
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple, Optional, Union
 
 import torch
 from torch import Tensor
 
-from legs_loss.config import is_off
+from legs_loss.autograd import check_order, is_compiling, is_trained
+from legs_loss.config import find_config, is_off
 from legs_loss.counting import counted
-from legs_loss.images import Layout, check_order, is_compiling, is_trained, read_pair
-from legs_loss.kernels.backends import fused_ssim
-from legs_loss.runtime.sources import MASK
-from legs_loss.runtime.state import current_run, refuse_masks, thread, version
+from legs_loss.images import Layout, read_pair
+from legs_loss.kernels.backends import fused, plan_of
+from legs_loss.loss import legs_loss, total_loss, whole_plan
+from legs_loss.runtime import state
+from legs_loss.runtime.state import MASK, Run, current_run, refuse_masks, thread
 from legs_loss.similarity import WINDOW_SIZE, ssim_map
+from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.weights import Weights
 
-__all__ = ["coverage", "masked", "ssim"]
+__all__ = ["LEGSLoss", "coverage", "masked", "ssim"]
 
 
 def masked(prediction: Tensor, target: Tensor) -> Tensor:
@@ -113,7 +118,6 @@ def ssim(
     """
     layout, first, second = read_pair(img1, img2, channels_last)
     mask = layout.map_first(mask, second, "mask")
-    first, second = layout.channels_first(first), layout.channels_first(second)
     swapped = not is_trained(first) and is_trained(second)
     trained, constant = (second, first) if swapped else (first, second)
     step = _step(trained, constant, channels_last=False)
@@ -127,13 +131,101 @@ def ssim(
     weights = Weights().masked(mask)
     trained = weights.hidden(trained, constant)
     if window_size == WINDOW_SIZE and size_average and trained.requires_grad and torch.is_grad_enabled():
-        fused = None if is_off() else fused_ssim(trained, constant, padding)
-        if fused is not None:
-            return _of_what_counts(fused, weights)
+        plan, _, _ = plan_of(
+            "ssim" if padding == "zeros" and not is_off() else None, 0.0, None, trained, constant, False
+        )
+        similarity = fused(plan, trained, constant, Weights())
+        if similarity is not None:
+            return _of_what_counts(similarity, weights)
     first, second = (constant, trained) if swapped else (trained, constant)
     similarity = ssim_map(first, second, padding, False, window_size)
     similarity = similarity.mean() if size_average else similarity.mean(-3).mean(-2).mean(-1)
     return _of_what_counts(similarity, weights, window_size // 2 if padding == "valid" else 0)
+
+
+class LEGSLoss(torch.nn.Module):
+    """:func:`~legs_loss.legs_loss` as a Module: settings at construction, images at each call.
+
+    A spec that is normalised over the scene needs the store that has its levels.
+
+    Args:
+        spec: as for :func:`~legs_loss.legs_loss`, like the others.
+        lambda_dssim: the share of D-SSIM.
+        padding: of SSIM.
+        renormalise: make both terms the mean over what a ``mask`` counts.
+        channels_last: where the channel stands, for shapes that do not show it.
+        store: a folder that ``legs precompute`` wrote: its maps are used for exactly the images that they belong to.
+            With masks in it both terms are the mean over what counts, and an image that is not found is said, or with
+            LEGS_MASKS=require an error (docs/masks.md).
+
+    Shape:
+        prediction, target: [H, W], [C, H, W], [H, W, C] or batches; weight, mask: one value a pixel; output: a scalar.
+
+    Examples:
+        >>> criterion = LEGSLoss("legs-l")
+        >>> target = torch.rand(3, 16, 16)
+        >>> criterion(target, target) < 1e-6
+        tensor(True)
+    """
+
+    def __init__(
+        self,
+        spec: Spec = "legs",
+        lambda_dssim: float = 0.2,
+        padding: str = "zeros",
+        renormalise: bool = False,
+        channels_last: Optional[bool] = None,
+        store: Union[str, Path, None] = None,
+    ) -> None:
+        super().__init__()
+        self.spec: WeightSpec = as_spec(spec)
+        self.lambda_dssim = lambda_dssim
+        self.padding = padding
+        self.renormalise = renormalise
+        self.channels_last = channels_last
+        self._run: Optional[Run] = None
+        if store is not None:
+            config = find_config(None, argv=[])
+            self._run = Run(replace(config, spec=self.spec, preset="LEGSLoss", store=Path(store), source="LEGSLoss()"))
+
+    def forward(
+        self,
+        prediction: Tensor,
+        target: Tensor,
+        weight: Optional[Tensor] = None,
+        mask: Optional[Tensor] = None,
+    ) -> Tensor:
+        """Return the loss; see :func:`~legs_loss.legs_loss`."""
+        if self._run is not None and weight is None:
+            return self._by_store(self._run, prediction, target, mask)
+        return legs_loss(
+            prediction,
+            target,
+            self.spec,
+            weight,
+            mask,
+            self.lambda_dssim,
+            self.padding,
+            self.renormalise,
+            self.channels_last,
+        )
+
+    def _by_store(self, run: Run, prediction: Tensor, target: Tensor, mask: Optional[Tensor]) -> Tensor:
+        check_order(prediction, target)
+        plan, image, photograph = whole_plan(
+            self.spec, prediction, target, self.lambda_dssim, self.padding, self.channels_last
+        )
+        weights = run.weights(photograph, None, True)
+        counted.hidden += weights.share is not None
+        mask = plan.layout.map_first(mask, photograph, "mask")
+        weights = weights.masked(mask, self.renormalise and weights.share is None)
+        run.say_what_is_used()
+        made = "" if weights.map is None and self.spec.unweighted else "by LEGSLoss"
+        return total_loss(plan, image, photograph, weights, self.lambda_dssim, self.padding, made)
+
+    def extra_repr(self) -> str:
+        """Return the settings, for ``print(module)``."""
+        return f"{self.spec}, lambda_dssim={self.lambda_dssim}, padding={self.padding!r}"
 
 
 def _of_what_counts(similarity: Tensor, weights: Weights, border: int = 0) -> Tensor:
@@ -151,18 +243,17 @@ class _Step(NamedTuple):
 
 def _step(prediction: Tensor, target: Tensor, channels_last: Optional[bool] = None) -> Optional[_Step]:
     if is_compiling():
-        refuse_masks(version[0])
+        refuse_masks(state.generation)
         return None
     if thread.unweighted or not (is_trained(prediction) or is_trained(target)):
         return None
     run = current_run()
-    if run.config.off or not run.source.stored.has(MASK):
+    if run.config.off or not run.stored.has(MASK):
         return None
     check_order(prediction, target)
     layout, prediction, target = read_pair(prediction, target, channels_last)
-    prediction, target = layout.channels_first(prediction), layout.channels_first(target)
     with torch.no_grad():
-        mask = run.source.own(target, [None] * (len(target) if target.dim() == 4 else 1), MASK)
+        mask = run.own(target, MASK)
         weights = Weights().masked(mask)
     run.tell_at_end()
     if mask is None:

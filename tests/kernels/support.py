@@ -6,6 +6,10 @@ import pytest
 import torch
 
 from legs_loss import WeightSpec, legs_loss
+from legs_loss.kernels import backends
+from legs_loss.weights import Weights
+
+_NONE = Weights()
 
 
 def images(shape, offset=0.1):
@@ -39,3 +43,21 @@ def used(loss):
             names.add(type(node).__name__)
             nodes += [parent for parent, _ in node.next_functions]
     return "fused" if "_FusedLossBackward" in names else "torch"
+
+
+def by_signature(backend):
+    """Return the loss of a backend with a map, a spec or None for the weight."""
+
+    def loss(prediction, target, weight=None, lambda_dssim=0.2):
+        weights = Weights(spec=weight) if isinstance(weight, WeightSpec) else Weights(map=weight)
+        if weights.spec is not None and not backend.makes_weights_of(weights.spec):
+            weights = weights.with_map(target)
+        return backend.loss(prediction, target, weights, lambda_dssim)
+
+    return loss
+
+
+def fused(operation, prediction, target, weights=_NONE):
+    """Return what a backend that is chosen for these images computes, None where torch has to."""
+    plan, prediction, target = backends.plan_of(operation, 0.0, weights.spec, prediction, target, False)
+    return backends.fused(plan, prediction, target, weights)

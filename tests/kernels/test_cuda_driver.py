@@ -201,7 +201,7 @@ class TestWhoseFiles:
 def on_cpu(modules, cuda, monkeypatch):
     """Make the CUDA backend, behind the stand-in libraries, the untried one for images on the CPU."""
     monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("stand-in", "cpu")})
-    monkeypatch.setattr(BACKENDS, "_found", {})
+    monkeypatch.setattr(BACKENDS, "found", {})
     backend = CudaBackend(lambda device: modules)
     monkeypatch.setattr(available.importlib, "import_module", lambda name: SimpleNamespace(BACKEND=backend))
     monkeypatch.setattr(available, "_why_missing", lambda name: None)
@@ -241,10 +241,10 @@ class TestAvailability:
         on_cpu.test_fail(b"cuLaunchKernel", 700, 1)
         with pytest.raises(DeviceFault):
             legs_loss(*images((3, 20, 30)))
-        assert not BACKENDS._found and capfd.readouterr().err == ""
+        assert not BACKENDS.found and capfd.readouterr().err == ""
 
     def test_each_device_is_tried_by_itself(self, monkeypatch, capfd):
-        monkeypatch.setattr(BACKENDS, "_found", {})
+        monkeypatch.setattr(BACKENDS, "found", {})
         monkeypatch.setattr(available, "_why_missing", lambda name: None)
         problems = {torch.device("cuda", 0): "its card is odd", torch.device("cuda", 1): None}
         monkeypatch.setattr(trial, "difference_from_torch", lambda backend, device, *_: problems[device])

@@ -38,7 +38,7 @@ from legs_loss.spec import PRESETS
 from legs_loss.weights import Weights
 from tests.cuda_emulation import COMPILER, TRIED
 from tests.kernels.on_device import DEVICE, MISSING, new_backend, new_driver
-from tests.kernels.support import compare, images, used
+from tests.kernels.support import by_signature, compare, fused, images, used
 from tests.support import legs_environment
 
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
@@ -60,7 +60,7 @@ def chosen(monkeypatch):
     found = Availability(backend, True, "", TRIED)
     device = torch.empty(0, device=DEVICE).device
     monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", DEVICE.type)})
-    monkeypatch.setattr(BACKENDS, "_found", {("cuda", device): found})
+    monkeypatch.setattr(BACKENDS, "found", {("cuda", device): found})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return found.backend, driver
 
@@ -81,16 +81,6 @@ def poisoned():
     torch.use_deterministic_algorithms(True, warn_only=True)
     yield
     torch.use_deterministic_algorithms(False)
-
-
-def by_signature(backend):
-    """Return the loss as tests of other backends call it: with a map, a spec or None for the weight."""
-
-    def loss(prediction, target, weight=None, lambda_dssim=0.2):
-        weights = Weights(spec=weight) if isinstance(weight, WeightSpec) else Weights(map=weight)
-        return backend.loss(prediction, target, weights, lambda_dssim)
-
-    return loss
 
 
 def compare_l1(backend, prediction, target, weights, **reference):
@@ -361,10 +351,10 @@ class TestSelection:
         if channels_last:  # as the front ends hand them over: views of the same memory
             prediction, target = prediction.movedim(-1, 1), target.movedim(-1, 1)
         weights = Weights(spec=LEGS, range=backends.fused_range(target, LEGS))
-        found = backends.fused_l1(prediction, target, weights)
+        found = fused("l1", prediction, target, weights)
         expected = weighted_l1(prediction, target, weight_map(target, LEGS))
         assert found.item() == pytest.approx(expected.item(), rel=1e-5)
-        found = backends.fused_ssim(prediction, target)
+        found = fused("ssim", prediction, target)
         with torch.no_grad():  # then it is torch's
             expected = ssim(prediction, target)
         assert found.item() == pytest.approx(expected.item(), rel=1e-5)
@@ -405,7 +395,7 @@ class TestSelection:
         assert used(legs_loss(prediction.double(), target.double())) == "torch"
         assert used(legs_loss(prediction, target, padding="reflect")) == "torch"
         assert used(legs_loss(prediction, target.clone().requires_grad_())) == "torch"
-        assert backends.fused_ssim(prediction, target, "valid") is None
+        assert used(ssim(prediction, target, padding="valid")) == "torch"
 
 
 @pytest.mark.slow

@@ -15,13 +15,13 @@ from legs_loss.kernels.cuda.backend import CudaBackend, Layout, Task, chunks_of,
 from legs_loss.kernels.cuda.driver import DriverError
 from legs_loss.kernels.cuda.modules import BinaryCache, Modules
 from legs_loss.kernels.cuda.nvrtc import NotFound
-from legs_loss.runtime import counts, sources, state
+from legs_loss.runtime import counts, state
 from legs_loss.runtime.memo import _OVERHEAD
 from legs_loss.spec import PRESETS
 from legs_loss.weights import Weights
 from tests.cuda_emulation import TRIED
 from tests.kernels.parts import FakeCompiler, FakeDriver
-from tests.kernels.support import images, used
+from tests.kernels.support import fused, images, used
 
 LEGS = PRESETS["legs"]
 
@@ -78,7 +78,7 @@ def on_meta(monkeypatch, parts):
     """The backend for tensors on torch's meta device, which have no values that could be read."""
     known = Availability(CudaBackend(lambda _: parts[2]), True, "", TRIED)
     monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "meta")})
-    monkeypatch.setattr(BACKENDS, "_found", {("cuda", torch.device("meta")): known})
+    monkeypatch.setattr(BACKENDS, "found", {("cuda", torch.device("meta")): known})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return parts[0]
 
@@ -94,12 +94,12 @@ class TestNothingWaits:
         one = torch.empty(40, 50, device="meta")
         with Watched() as watched:
             if kind == "l1":
-                loss = backends.fused_l1(prediction, target, Weights(spec=LEGS))
+                loss = fused("l1", prediction, target, Weights(spec=LEGS))
             elif kind == "ssim":
-                loss = backends.fused_ssim(prediction, target)
+                loss = fused("ssim", prediction, target)
             elif kind == "kept range":
                 found = backends.fused_range(target, LEGS)
-                loss = backends.fused_l1(prediction, target, Weights(spec=LEGS, range=found))
+                loss = fused("l1", prediction, target, Weights(spec=LEGS, range=found))
             else:
                 options = {
                     "map": {"weight": one},
@@ -161,13 +161,13 @@ class TestDropIn:
         assert used(loss) == "fused" and watched.seen > 0 and not watched.waits
         assert on_meta.launches.count("legs_range") == 2
         assert (counts().computed, counts().remembered) == (2, 2)
-        assert state.current_run().source.memo.bytes == 2 * _OVERHEAD
+        assert state.current_run().memo.bytes == 2 * _OVERHEAD
 
     def test_a_capture_makes_the_range_part_of_the_graph(self, on_meta, monkeypatch):
         target = torch.empty(3, 40, 50, device="meta")
         prediction = torch.empty(3, 40, 50, device="meta", requires_grad=True)
         l1_loss(prediction, target)
-        monkeypatch.setattr(sources, "is_capturing", lambda device: True)
+        monkeypatch.setattr(state, "is_capturing", lambda device: True)
         for _ in range(2):
             assert used(l1_loss(prediction, target)) == "fused"
         assert on_meta.launches.count("legs_range") == 3
@@ -180,7 +180,7 @@ class TestCapture:
         backend = CudaBackend(lambda _: Modules(driver, FakeCompiler(), BinaryCache(tmp_path)))
         monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "cpu")})
         known = Availability(backend, True, "", TRIED)
-        monkeypatch.setattr(BACKENDS, "_found", {("cuda", torch.device("cpu")): known})
+        monkeypatch.setattr(BACKENDS, "found", {("cuda", torch.device("cpu")): known})
         prediction, target = images((3, 20, 30))
         driver.captures = True
         assert used(legs_loss(prediction, target)) == "torch" and not driver.launches
@@ -192,11 +192,11 @@ class TestCapture:
         assert used(loss) == "fused" and driver.launches[-1] == "legs_scale"
 
     def test_the_trial_does_not_run_in_a_capture(self, monkeypatch):
-        monkeypatch.setattr(BACKENDS, "_found", {})
+        monkeypatch.setattr(BACKENDS, "found", {})
         monkeypatch.setattr(available, "is_capturing", lambda device: True)
         monkeypatch.setattr(trial, "difference_from_torch", lambda *_: pytest.fail("a trial waits for the device"))
         assert used(legs_loss(*images((3, 20, 30)))) == "torch"
-        assert not BACKENDS._found
+        assert not BACKENDS.found
 
 
 class TestFailures:
@@ -214,7 +214,7 @@ class TestFailures:
 
         module = SimpleNamespace(BACKEND=CudaBackend(broken))
         monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("broken", "cpu")})
-        monkeypatch.setattr(BACKENDS, "_found", {})
+        monkeypatch.setattr(BACKENDS, "found", {})
         monkeypatch.setattr(available.importlib, "import_module", lambda name: module)
         monkeypatch.setattr(available, "_why_missing", lambda name: None)
         for _ in range(2):
@@ -222,7 +222,7 @@ class TestFailures:
         assert capfd.readouterr().err == f"legs-loss: cuda is unavailable, torch is used: {said}\n"
 
     def test_a_torch_without_cuda_is_no_failure(self, monkeypatch, capfd):
-        monkeypatch.setattr(BACKENDS, "_found", {})
+        monkeypatch.setattr(BACKENDS, "found", {})
         monkeypatch.setattr(torch.version, "cuda", None)
         found = BACKENDS.availability("cuda", torch.device("cuda", 0))
         assert found == Availability(None, False, "this torch is built without CUDA")

@@ -23,15 +23,15 @@ from legs_loss.precompute import normalised_map
 from legs_loss.responses import response
 from legs_loss.scenes.images import image_tensor
 from legs_loss.spec import PRESETS
-from tests.kernels.support import compare, images, used
+from tests.kernels.support import by_signature, compare, images, used
 from tests.support import legs_environment
 
 pytest.importorskip("numba")
 
 from legs_loss.kernels import numba_loss
-from legs_loss.kernels.numba_loss import fused_loss
 from legs_loss.kernels.numba_response import extremes, photograph_response, supports_response
 
+fused_loss = by_signature(numba_loss.BACKEND)
 COMPILED = [name for name in OPERATORS if supports_response(WeightSpec(operator=name))]
 
 SHAPES = [(3, 1, 1), (1, 5, 7), (3, 40, 300), (2, 3, 30, 17), (3, 150, 530), (4, 11, 257), (2, 1, 8, 9), (3, 129, 8)]
@@ -214,7 +214,7 @@ class TestResponse:
 @pytest.fixture
 def chosen(monkeypatch):
     """Return a function that sets LEGS_BACKEND; clear the backends' findings before and after."""
-    monkeypatch.setattr(BACKENDS, "_found", {})
+    monkeypatch.setattr(BACKENDS, "found", {})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return lambda name: monkeypatch.setenv("LEGS_BACKEND", name)
 
@@ -338,21 +338,21 @@ class TestSelection:
         def broken(*_):
             raise RuntimeError("no such instruction\nsecond line")
 
-        monkeypatch.setattr("legs_loss.kernels.numba_loss._differentiable", broken)
+        monkeypatch.setattr("legs_loss.kernels.numba_loss._Prepared", broken)
         for _ in range(3):
             assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         said = capfd.readouterr().err
         assert said == "legs-loss: numba is unavailable, torch is used: RuntimeError: no such instruction\n"
 
     def test_a_backend_that_fails_after_its_trial_is_left(self, chosen, monkeypatch, capfd):
-        own = numba_loss._differentiable
+        own = numba_loss._Prepared.compute
 
-        def breaks_at_four_channels(prediction, *rest):
+        def breaks_at_four_channels(self, prediction, *rest):
             if prediction.shape[0] == 4:
                 raise RuntimeError("out of resource: shared memory")
-            return own(prediction, *rest)
+            return own(self, prediction, *rest)
 
-        monkeypatch.setattr(numba_loss, "_differentiable", breaks_at_four_channels)
+        monkeypatch.setattr(numba_loss._Prepared, "compute", breaks_at_four_channels)
         assert used(legs_loss(*images((3, 20, 30)))) == "fused"
         for channels in (4, 4, 3):
             assert used(legs_loss(*images((channels, 20, 30)))) == "torch"
@@ -360,8 +360,13 @@ class TestSelection:
         assert said == "legs-loss: numba is unavailable, torch is used: RuntimeError: out of resource: shared memory\n"
 
     def test_a_backend_that_computes_something_else_is_found_out(self, chosen, monkeypatch, capfd):
-        own = numba_loss._differentiable
-        monkeypatch.setattr(numba_loss, "_differentiable", lambda *args: 1.01 * own(*args))
+        own = numba_loss._Prepared.compute
+
+        def more(*given):
+            loss, gradient = own(*given)
+            return 1.01 * loss, gradient
+
+        monkeypatch.setattr(numba_loss._Prepared, "compute", more)
         assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         assert "its trial of the loss gave" in capfd.readouterr().err
 

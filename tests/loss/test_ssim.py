@@ -154,7 +154,7 @@ class TestDropIn:
         index = 0 if trained == "first" else 1
         images[index].requires_grad_()
         value = ssim(*images)
-        assert "_FusedLossBackward" in {type(node).__name__ for node, _ in value.grad_fn.next_functions}
+        assert type(value.grad_fn).__name__ == "_FusedLossBackward"
         exact = [image.detach().double() for image in images]
         exact[index].requires_grad_()
         expected = formula_of_3dgs(*exact)

@@ -11,7 +11,7 @@ import torch
 import legs_loss
 from tests.runtime.support import pair
 
-MOST, OURS, FILES = 134, 64, 16
+MOST, OURS, FILES = 60, 22, 8
 
 
 @pytest.mark.parametrize("loss", ["l1_loss", "legs_loss"])

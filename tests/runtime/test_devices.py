@@ -30,7 +30,7 @@ class TestBackends:
             torch.testing.assert_close(loss, expected)
             gradients = [torch.autograd.grad(one, prediction)[0] for one in (loss, expected)]
             torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-9)
-        assert state.current_run().source.memo.bytes == 0
+        assert state.current_run().memo.bytes == 0
 
     @pytest.mark.parametrize("options", [{"reduction": "none"}, {"own": plain}])
     def test_what_needs_the_map_gets_it(self, options):

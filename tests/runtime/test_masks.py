@@ -272,7 +272,7 @@ class TestNoSilence:
         stored(scene, masks="masks")
         for refused in (state.spec_to_compile, state.refuse_masks):
             with pytest.raises(LegsError, match="compiled or captured graph"):
-                refused(0)
+                refused(state.generation)
 
     def test_beta_zero_with_masks_is_active(self, scene):
         stored(scene, "3dgs", masks="masks")

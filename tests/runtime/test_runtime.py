@@ -145,7 +145,7 @@ class TestMemo:
         prediction = torch.rand(3, 9, 8, requires_grad=True)
         for target in targets + targets:
             torch.testing.assert_close(l1_loss(prediction, target), weighted(prediction, target))
-        assert state.current_run().source.memo.bytes <= 9 * 8 * 4 + 1024
+        assert state.current_run().memo.bytes <= 9 * 8 * 4 + 1024
 
     @pytest.mark.parametrize("by", ["content", "identity"])
     def test_any_order_of_changing_targets_gets_its_own_weight(self, monkeypatch, by):

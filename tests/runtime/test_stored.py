@@ -12,7 +12,7 @@ from PIL import Image
 from legs_loss import configure, l1_loss
 from legs_loss.kernels.available import is_capturing
 from legs_loss.precompute import precompute
-from legs_loss.runtime import counts, sources, state
+from legs_loss.runtime import counts, state
 from legs_loss.scenes import read_scene
 from legs_loss.store import WeightStore, fingerprint, reading, sampled_fingerprint
 from tests.runtime.support import weighted
@@ -158,13 +158,13 @@ class TestCapture:
         monkeypatch.setenv("LEGS_BACKEND", "torch")
         configure("legs", store=scene / "legs_weights")
         run = state.current_run()
-        monkeypatch.setattr(sources, "is_capturing", lambda device: True)
+        monkeypatch.setattr(state, "is_capturing", lambda device: True)
         prediction, target = torch.rand(3, 9, 8, requires_grad=True), photograph(scene, "a.png")
         for _ in range(2):
             torch.testing.assert_close(l1_loss(prediction, target, view="a"), weighted(prediction, target))
             target.copy_(torch.rand(3, 9, 8))  # as a replay would find it
         assert (counts().computed, counts().stored, counts().remembered) == (2, 0, 0)
-        assert len(run.source.memo) == 0
+        assert len(run.memo) == 0
 
     def test_only_a_cuda_device_is_asked(self, monkeypatch):
         monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)

@@ -123,14 +123,12 @@ class CudaDriver:
         Their one argument is copied at once.
         """
         now = _POINTER()
-        self._call("cuCtxGetCurrent", ctypes.byref(now))
-        if now.value == self._context:  # as a rule; a generator would take some microseconds
-            self._launch_all(task, kernels)
-        else:
+        code = self._library.cuCtxGetCurrent(ctypes.byref(now))
+        if code:
+            self._fail("cuCtxGetCurrent", code)
+        if now.value != self._context:  # seldom; a generator takes some microseconds
             with self._current():
-                self._launch_all(task, kernels)
-
-    def _launch_all(self, task: ctypes.Structure, kernels: Tuple[Tuple[int, int, int], ...]) -> None:
+                return CudaDriver.launch(self, task, *kernels)
         arguments, stream = _One(ctypes.addressof(task)), self._stream(self._index)
         for function, blocks, threads in kernels:
             code = self._launch_kernel(function, blocks, 1, 1, threads, 1, 1, 0, stream, arguments, None)

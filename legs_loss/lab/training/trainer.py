@@ -77,10 +77,9 @@ class TrainingResult:
 
 def step_loss(prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
     """Return the loss of one iteration: of a rendering [3, H, W], its photograph and the weights of its pixels."""
-    from legs_loss.kernels.numba_loss import fused_loss
+    from legs_loss.kernels.numba_loss import BACKEND
 
-    loss = fused_loss(weights.hidden(prediction, target), target, weights.map, lambda_dssim)
-    return weights.of_what_counts(loss)
+    return weights.of_what_counts(BACKEND.loss(weights.hidden(prediction, target), target, weights, lambda_dssim))
 
 
 def compile_step(command: str) -> None:

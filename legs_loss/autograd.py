@@ -1,0 +1,95 @@
+"""How torch runs what is computed now: whether it is compiled, transformed, or recorded for a gradient."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, Callable
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from legs_loss.errors import LegsError
+
+__all__ = ["check_order", "is_compiling", "is_trained", "is_transformed", "is_wrapped"]
+
+
+def _never(*_: object) -> bool:
+    return False
+
+
+# Whether torch.compile is tracing: checks that read values from the device are skipped then.
+is_compiling: Callable[[], bool] = getattr(getattr(torch, "compiler", None), "is_compiling", _never)
+
+_functorch: Any = getattr(torch._C, "_functorch", None)  # of torch.func; torch 1.12 has none
+is_wrapped: Callable[[Tensor], bool] = getattr(_functorch, "is_functorch_wrapped_tensor", _never)  # by torch.func
+_levels: Any = getattr(_functorch, "peek_interpreter_stack", None)
+_modes: Any = getattr(torch._C, "_len_torch_dispatch_stack", None)
+# Of the dispatch modes, those under which a tensor may have no memory; others, as torch's FlopCounterMode, only watch.
+_mode_of: Any = getattr(torch._C, "_get_dispatch_mode", None)
+_MEMORYLESS = [
+    getattr(getattr(torch._C, "_TorchDispatchModeKey", None), key, None) for key in ("FAKE", "PROXY", "FUNCTIONAL")
+]
+
+
+def is_transformed() -> bool:
+    """Return whether torch.func, forward-mode AD or a recording (torch.jit.trace, make_fx) sees what is computed now.
+
+    Then tensors may have no memory to read, and what is computed is valid until the transform ends: torch computes it,
+    and nothing is looked up or kept.
+    """
+    if forward_ad._current_level >= 0 or torch._C._get_tracing_state() is not None:
+        return True
+    if _levels is not None and _levels() is not None:
+        return True
+    return _modes is not None and _modes() > 0 and (None in _MEMORYLESS or any(map(_mode_of, _MEMORYLESS)))
+
+
+def is_trained(image: Tensor) -> bool:
+    """Return whether a derivative in an image is taken, in whatever way: a gradient, torch.func, forward-mode AD.
+
+    The first pass of a re-entrant checkpoint counts, too: it runs without gradients, which its second pass takes.
+    """
+    if image.requires_grad and torch.is_grad_enabled():
+        return True
+    if is_compiling():
+        return False
+    if not is_transformed():
+        return not torch.is_grad_enabled() and _in_a_node()
+    while True:  # each transform wraps the tensor of the one outside it
+        batched = _functorch is not None and _functorch.is_batchedtensor(image)
+        if image.requires_grad and torch.is_grad_enabled():
+            return True
+        if forward_ad._current_level >= 0 and not batched and forward_ad.unpack_dual(image).tangent is not None:
+            return True
+        if _functorch is None or not _functorch.is_functorch_wrapped_tensor(image):
+            return False
+        image = _functorch.get_unwrapped(image)
+
+
+def _in_a_node() -> bool:
+    """Return whether this runs in the forward pass of an autograd.Function that becomes a node of a graph."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        code = frame.f_code
+        if code.co_name == "forward" and code.co_argcount:
+            context = frame.f_locals.get(code.co_varnames[0])
+            # It has none where the graph does not get this node.
+            if isinstance(context, torch.autograd.function.FunctionCtx) and getattr(context, "next_functions", None):
+                return True
+        frame = frame.f_back  # type: ignore[assignment]
+    return False
+
+
+def check_order(prediction: Tensor, target: Tensor) -> None:
+    """Check that a loss whose weights come from its second image is not given the rendering there.
+
+    Raises:
+        LegsError: gradients are taken, and the second image alone requires one.
+    """
+    if not is_trained(prediction) and is_trained(target):
+        raise LegsError(
+            "of the two images the second alone requires a gradient, so it seems to be the rendering, and the weights "
+            "would come from it: turn them round, loss(rendering, photograph). Where a photograph is learned from a "
+            "fixed rendering, call it by legs_loss.unweighted(l1_loss), or give legs_loss a weight="
+        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Optional, Tuple
+from typing import Optional
 
 import torch
 from torch import Tensor
@@ -14,10 +14,10 @@ from legs_loss.images import read_pair
 from legs_loss.kernels.backends import Plan, fused, plan_of
 from legs_loss.levels import NEEDS_LEVELS
 from legs_loss.similarity import WINDOW_SIZE, d_ssim
-from legs_loss.spec import PRESETS, Spec, WeightSpec, as_spec
+from legs_loss.spec import PRESETS, Spec, as_spec
 from legs_loss.weights import Weights
 
-__all__ = ["legs_loss", "mean_error", "total_loss", "weighted_l1", "whole_plan"]
+__all__ = ["legs_loss", "mean_error", "total_loss", "weighted_l1", "whole"]
 
 
 def weighted_l1(
@@ -121,7 +121,8 @@ def legs_loss(
     own = None if weight is not None or spec.beta == 0.0 else spec
     if own is not None and own.over == "scene":
         raise LegsError(NEEDS_LEVELS.format(where="one call does not know", then="and give LEGSLoss that store="))
-    plan, image, photograph = whole_plan(own, prediction, target, lambda_dssim, padding, channels_last)
+    operation = whole(lambda_dssim, padding)
+    plan, image, photograph = plan_of(operation, lambda_dssim, own, prediction, target, channels_last)
     if own is not None and not (prediction.requires_grad and torch.is_grad_enabled()):
         check_order(prediction, target)
     weights, made = Weights(own), "" if own is None else "by legs_loss"
@@ -132,17 +133,9 @@ def legs_loss(
     return total_loss(plan, image, photograph, weights, lambda_dssim, padding, made)
 
 
-def whole_plan(
-    spec: Optional[WeightSpec],
-    prediction: Tensor,
-    target: Tensor,
-    lambda_dssim: float,
-    padding: str,
-    channels_last: Optional[bool],
-) -> Tuple[Plan, Tensor, Tensor]:
-    """Return :func:`~legs_loss.kernels.backends.plan_of` for :func:`total_loss`."""
-    operation = "loss" if padding == "zeros" and lambda_dssim > 0.0 and not is_compiling() else None
-    return plan_of(operation, lambda_dssim, spec, prediction, target, channels_last)
+def whole(lambda_dssim: float, padding: str) -> Optional[str]:
+    """Return the operation of a plan of :func:`total_loss`; None where it is torch's."""
+    return "loss" if padding == "zeros" and lambda_dssim > 0.0 and not is_compiling() else None
 
 
 def total_loss(

@@ -22,16 +22,7 @@ from legs_loss.errors import LegsError
 from legs_loss.kernels.contract import Backend, DeviceFault, NotNow
 from legs_loss.spec import WeightSpec
 
-__all__ = [
-    "BACKENDS",
-    "OUT_OF_MEMORY",
-    "Availability",
-    "Backends",
-    "Known",
-    "backend_setting",
-    "forced_backend",
-    "is_capturing",
-]
+__all__ = ["BACKENDS", "OUT_OF_MEMORY", "Availability", "Backends", "Known", "forced_backend", "is_capturing"]
 
 OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 _NAMES = ("torch", "numba", "cuda")
@@ -72,6 +63,11 @@ class Backends:
     def __init__(self, known: Dict[str, Known]) -> None:
         self._known = known
         self.found: Dict[Tuple[str, torch.device], Availability] = {}
+        # What LEGS_BACKEND says, raw. The environment's own memory is asked: os.environ takes three calls.
+        environment: Any = os.environ
+        memory = getattr(environment, "_data", environment)
+        name = "LEGS_BACKEND" if memory is environment else environment.encodekey("LEGS_BACKEND")
+        self.setting: Callable[[], Any] = partial(memory.get, name)
         self.after_fork()
 
     def names(self, device: torch.device) -> List[str]:
@@ -213,12 +209,6 @@ def forced_backend() -> Optional[str]:
             f"LEGS_BACKEND=cuda, but {_why_missing(name) or 'there is no CUDA device here'}: unset LEGS_BACKEND"
         )
     return name or None
-
-
-# What LEGS_BACKEND says, raw. Its environment's own memory is asked: os.environ would take three calls at each step.
-_memory = getattr(os.environ, "_data", os.environ)
-_name = os.environ.encodekey("LEGS_BACKEND") if _memory is not os.environ else "LEGS_BACKEND"
-backend_setting: Callable[[], Any] = partial(_memory.get, _name)
 
 
 def is_capturing(device: torch.device) -> bool:

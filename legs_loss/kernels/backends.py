@@ -13,7 +13,7 @@ from torch import Tensor
 from legs_loss.autograd import is_transformed, is_wrapped
 from legs_loss.errors import LegsError
 from legs_loss.images import Layout, read_pair
-from legs_loss.kernels.available import BACKENDS, OUT_OF_MEMORY, backend_setting, forced_backend
+from legs_loss.kernels.available import BACKENDS, OUT_OF_MEMORY, forced_backend
 from legs_loss.kernels.contract import DeviceFault, NotNow, Prepared, Terms, node
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
@@ -84,18 +84,18 @@ def plan_of(
         layout, prediction, target = read_pair(prediction, target, channels_last)
         return Plan(layout, spec=spec), prediction, target
     wanted = prediction.requires_grad and torch.is_grad_enabled()
-    given = (operation, share, spec, channels_last, wanted, backend_setting())
+    given = (operation, share, spec, channels_last, wanted, BACKENDS.setting())
     one = (prediction.shape, prediction.stride(), prediction.dtype, prediction.device)
     key = (given, one, target.shape, target.stride(), target.dtype, target.device)
     plan = _plans.get(key)
     if plan is None or BACKENDS.found.get(plan.place) is not plan.found:
         layout, first, second = read_pair(prediction, target, channels_last)
-        plan = _new_plan(Plan(layout, operation, share, spec), first, second, wanted)
+        moved = first is not prediction or second is not target
+        plan = _new_plan(Plan(layout, operation, share, spec, moved=moved), first, second, wanted)
         if plan.prepared is not None:
             if len(_plans) >= _MOST:
                 _plans.clear()
-            moved = first is not prediction or second is not target
-            _plans[key] = plan = plan._replace(moved=moved)
+            _plans[key] = plan
         return plan, first, second
     if plan.moved:
         return (plan, *read_pair(prediction, target, channels_last)[1:])

@@ -11,9 +11,9 @@ import os
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from queue import SimpleQueue
-from typing import Any, Callable, Iterator, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Iterator, List, Optional, Sequence
 
 import numba
 import numpy as np
@@ -160,34 +160,31 @@ def _claimed(typingctx: Any, counter: Any) -> Any:
 claimed: Any = extending.intrinsic(_claimed)
 
 _MOST: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # a user's, or the processor's cores
-
-
-_Task = Tuple[List[Any], Callable[..., Any], Tuple[Any, ...], "SimpleQueue[Optional[BaseException]]"]
-_tasks: SimpleQueue[_Task] = SimpleQueue()
+_tasks: SimpleQueue[Any] = SimpleQueue()
 _helpers: List[threading.Thread] = []  # the threads beside the one that calls, begun when they are first needed
 
 
-def _help(tasks: SimpleQueue[_Task]) -> None:
+def _help(tasks: SimpleQueue[Any]) -> None:
     while True:
         _take(*tasks.get())  # a call, which keeps nothing of the task
 
 
-def _take(
-    seats: List[Any],
-    function: Callable[..., Any],
-    given: Tuple[Any, ...],
-    ended: SimpleQueue[Optional[BaseException]],
-) -> None:
-    try:
-        seats.pop()
-    except IndexError:  # the caller has done it alone
-        return
+def _take(function: Callable[..., Any], given: Sequence[Any], begun: List[None], ended: SimpleQueue[Any]) -> None:
+    begun.append(None)
+    error = None
     try:
         function(*given)
-    except BaseException as error:
-        ended.put(error)
-    else:
-        ended.put(None)
+    except BaseException as raised:
+        error = raised
+    ended.put(error)
+
+
+def _begin(count: int) -> None:
+    with suppress(RuntimeError):  # the interpreter is shutting down, or no thread can be started
+        while len(_helpers) < count:
+            helper = threading.Thread(target=_help, args=(_tasks,), name="legs-loss", daemon=True)
+            helper.start()
+            _helpers.append(helper)
 
 
 def _begin_anew() -> None:
@@ -209,30 +206,15 @@ def in_threads(function: Callable[..., Any], tasks: int, *given: Any) -> None:
     """
     given = (np.zeros(1, np.int64), tasks, *given)
     count = min(torch.get_num_threads(), tasks, _MOST) - 1
-    if count <= 0:
-        function(*given)
-        return
-    while len(_helpers) < count:
-        helper = threading.Thread(target=_help, args=(_tasks,), name="legs-loss", daemon=True)
-        try:
-            helper.start()
-        except RuntimeError:  # the interpreter is shutting down, or no thread can be started
-            break
-        _helpers.append(helper)
+    if count > len(_helpers):
+        _begin(count)
     # Queues and lists are used as they are: with futures each step would take twenty calls of Python more.
-    waiting = min(count, len(_helpers))
-    seats: List[Any] = [None] * waiting
-    ended: SimpleQueue[Optional[BaseException]] = SimpleQueue()
-    for _ in range(waiting):
-        _tasks.put((seats, function, given, ended))
+    begun: List[None] = []
+    ended: SimpleQueue[Any] = SimpleQueue()
+    for _ in range(min(count, len(_helpers))):
+        _tasks.put((function, given, begun, ended))
     function(*given)
-    try:
-        while True:  # nobody is waited for who has not begun
-            seats.pop()
-            waiting -= 1
-    except IndexError:
-        pass
-    for _ in range(waiting):
+    for _ in begun:  # who has not begun finds no task left
         error = ended.get()
         if error is not None:
             raise error

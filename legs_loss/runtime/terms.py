@@ -15,7 +15,7 @@ from legs_loss.config import find_config, is_off
 from legs_loss.counting import counted
 from legs_loss.images import Layout, read_pair
 from legs_loss.kernels.backends import fused, plan_of
-from legs_loss.loss import legs_loss, total_loss, whole_plan
+from legs_loss.loss import legs_loss, total_loss, whole
 from legs_loss.runtime import state
 from legs_loss.runtime.state import MASK, Run, current_run, refuse_masks, thread
 from legs_loss.similarity import WINDOW_SIZE, ssim_map
@@ -131,9 +131,8 @@ def ssim(
     weights = Weights().masked(mask)
     trained = weights.hidden(trained, constant)
     if window_size == WINDOW_SIZE and size_average and trained.requires_grad and torch.is_grad_enabled():
-        plan, _, _ = plan_of(
-            "ssim" if padding == "zeros" and not is_off() else None, 0.0, None, trained, constant, False
-        )
+        operation = None if padding != "zeros" or is_compiling() or is_off() else "ssim"
+        plan, _, _ = plan_of(operation, 0.0, None, trained, constant, False)
         similarity = fused(plan, trained, constant, Weights())
         if similarity is not None:
             return _of_what_counts(similarity, weights)
@@ -211,17 +210,16 @@ class LEGSLoss(torch.nn.Module):
         )
 
     def _by_store(self, run: Run, prediction: Tensor, target: Tensor, mask: Optional[Tensor]) -> Tensor:
-        check_order(prediction, target)
-        plan, image, photograph = whole_plan(
-            self.spec, prediction, target, self.lambda_dssim, self.padding, self.channels_last
-        )
+        share, operation = self.lambda_dssim, whole(self.lambda_dssim, self.padding)
+        plan, image, photograph = plan_of(operation, share, self.spec, prediction, target, self.channels_last)
+        check_order(image, photograph)
         weights = run.weights(photograph, None, True)
         counted.hidden += weights.share is not None
         mask = plan.layout.map_first(mask, photograph, "mask")
         weights = weights.masked(mask, self.renormalise and weights.share is None)
         run.say_what_is_used()
         made = "" if weights.map is None and self.spec.unweighted else "by LEGSLoss"
-        return total_loss(plan, image, photograph, weights, self.lambda_dssim, self.padding, made)
+        return total_loss(plan, image, photograph, weights, share, self.padding, made)
 
     def extra_repr(self) -> str:
         """Return the settings, for ``print(module)``."""

@@ -170,7 +170,6 @@ class _Prepared(Prepared):
 
     def scaled(self, gradient: Tensor, step: Tensor) -> Tensor:
         """Return their product, rounded once, in the images' type."""
-        step = step.to(torch.float32).contiguous()
         scaled = gradient if self._dtype == torch.float32 else torch.empty_like(gradient, dtype=self._dtype)
         task = Task(gradient=gradient.data_ptr(), scaled=scaled.data_ptr(), step=step.data_ptr())
         task.count = gradient.numel()

@@ -12,7 +12,7 @@ from legs_loss.counting import counted, note_graph, said, say_first
 from legs_loss.errors import LegsError
 from legs_loss.images import read_pair
 from legs_loss.kernels.backends import Plan, fused, plan_of
-from legs_loss.levels import NEEDS_LEVELS
+from legs_loss.responses import NEEDS_LEVELS
 from legs_loss.similarity import WINDOW_SIZE, d_ssim
 from legs_loss.spec import PRESETS, Spec, as_spec
 from legs_loss.weights import Weights

@@ -39,7 +39,7 @@ class WeightSpec:
         over: what the response is normalised over: "image", as in the paper, or "scene": the response that counts as 1
             is the median over views of each one's percentile, so that a photograph out of focus gets small weights
             beside sharp ones. ``legs precompute`` knows all views; without its maps a training stops
-            (:mod:`legs_loss.levels`).
+            (:mod:`legs_loss.responses`).
         noise_floor: in [0, 1e6], only over "scene": this multiple of the median response, the view's or the scene's,
             whichever is larger, is subtracted from the response. 3 removes most noise.
         smooth: in [0, 100], the standard deviation in pixels of a Gaussian before the operator.

@@ -20,8 +20,7 @@ from legs_loss.autograd import is_compiling, is_transformed
 from legs_loss.curves import curve
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, read_layout
-from legs_loss.levels import levels_of, over_scene, percentile
-from legs_loss.responses import normalise_response, response
+from legs_loss.responses import levels_of, normalise_response, over_scene, percentile, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
 __all__ = ["Weights", "curved", "weight_from_response", "weight_map", "weight_maps", "weight_over_scene"]
@@ -36,7 +35,7 @@ def weight_map(
         image: the photograph as the training uses it, floats in [0, 1], [H, W], [C, H, W], [H, W, C], or a batch.
         spec: a preset's name or a :class:`~legs_loss.WeightSpec`.
         channels_last: where the channel stands, for a shape that does not show it.
-        scene: for a spec that is normalised over the scene its levels, [2], as :func:`legs_loss.levels.scene_levels`
+        scene: for a spec that is normalised over the scene its levels, [2], as :func:`legs_loss.responses.scene_levels`
             returns them; without them the images of this call are the scene.
 
     Returns:

@@ -80,7 +80,7 @@ FLOORS = [
     {"autograd", "images", "operators", "curves", "upstreams"},
     {"spec", "scenes"},
     {"config", "responses"},
-    {"levels", "similarity"},
+    {"similarity"},
     {"weights"},
     {"kernels"},
     {"store"},

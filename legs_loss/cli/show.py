@@ -103,7 +103,7 @@ def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor], mask: Optio
 
 def _over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor]) -> np.ndarray:
     """Normalise a response [H, W] over its scene, or by itself for a single photograph."""
-    from legs_loss.levels import over_scene
+    from legs_loss.responses import over_scene
 
     return over_scene(strength[None], spec, scene)[0].numpy()
 
@@ -112,8 +112,8 @@ def _levels(views: Sequence[View], spec: WeightSpec) -> Optional[Tensor]:
     """Read all photographs for the levels of the scene, if the spec is normalised over it."""
     from tqdm import tqdm
 
-    from legs_loss.levels import response_levels, scene_levels
     from legs_loss.precompute import response_map
+    from legs_loss.responses import response_levels, scene_levels
     from legs_loss.scenes import load_training_image
 
     if spec.over == "image":

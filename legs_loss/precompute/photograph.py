@@ -9,9 +9,8 @@ import numpy as np
 import torch
 
 from legs_loss.kernels.available import BACKENDS
-from legs_loss.levels import response_levels
 from legs_loss.operators import OPERATORS
-from legs_loss.responses import response
+from legs_loss.responses import response, response_levels
 from legs_loss.scenes import image_tensor
 from legs_loss.scenes.images import row_strips
 from legs_loss.spec import WeightSpec

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from legs_loss.config import Config
 from legs_loss.errors import LegsError
-from legs_loss.levels import NEEDS_LEVELS
+from legs_loss.responses import NEEDS_LEVELS
 from legs_loss.weights import weight_from_response, weight_over_scene
 
 if TYPE_CHECKING:

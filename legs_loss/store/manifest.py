@@ -60,7 +60,7 @@ class Entry:
         low, span: the response that E^ was made from is low + span * E^; None, as the next ones, where the map was not
             made to be normalised over its scene. Of the user's weights, too, whose map is divided by their largest.
         percentile: of the level ``strong``.
-        median, strong: the view's levels (:mod:`legs_loss.levels`); of the user's weights 0 and ``span``.
+        median, strong: the view's levels (:mod:`legs_loss.responses`); of the user's weights 0 and ``span``.
         sample: of the training image (:func:`sampled_fingerprint`), "" from before version 3.
     """
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError
-from legs_loss.levels import scene_levels
+from legs_loss.responses import scene_levels
 from legs_loss.scenes.model import view_names
 from legs_loss.spec import WeightSpec
 from legs_loss.store.fingerprints import fingerprint, sampled_fingerprint
@@ -119,7 +119,7 @@ class WeightStore:
         return entry.key[3:] == _made_with(spec) and (spec.over == "image" or entry.percentile == spec.percentile)
 
     def scene_levels(self, spec: WeightSpec, pixels: int) -> Optional[Tensor]:
-        """Return the levels of the scene (:mod:`legs_loss.levels`) over all views of a number of pixels, [2].
+        """Return the levels of the scene (:mod:`legs_loss.responses`) over all views of a number of pixels, [2].
 
         None where the store holds none for this spec: ``legs precompute`` was run for another preset.
         """

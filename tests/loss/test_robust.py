@@ -17,9 +17,8 @@ from torch.nn.functional import conv2d, pad
 from legs_loss import LegsError, LEGSLoss, WeightSpec, configure, l1_loss, legs_loss, weight_map
 from legs_loss.cli import main
 from legs_loss.kernels.available import BACKENDS
-from legs_loss.levels import levels_of, response_levels
 from legs_loss.precompute import precompute
-from legs_loss.responses import gaussian_blur, response
+from legs_loss.responses import gaussian_blur, levels_of, response, response_levels
 from legs_loss.runtime import state
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
 from legs_loss.spec import PRESETS

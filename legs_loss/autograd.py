@@ -1,4 +1,4 @@
-"""How torch runs what is computed now: whether it is compiled, transformed, or recorded for a gradient."""
+"""Ways of torch to run what is computed now: compiled, transformed, recorded for a gradient."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a patched script calls.
+"""The functions that a patched script calls.
 
 l1.py is ``l1_loss``, terms.py what a store's masks do to other terms, ``ssim`` and ``LEGSLoss``; state.py has the
 settings of the process's run and finds the weight of a target, in memo.py, in stored.py or from the target.

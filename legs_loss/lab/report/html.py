@@ -148,7 +148,7 @@ def _verdict(rows: Sequence[Row], arms: Sequence[str], arm: str) -> str:
     sentence = f"{arm} has {_in_words(found)} {BASELINE} {where}{cost}"
     equal = difference(rows, f"{arm}@{BASELINE}", BASELINE, split) if f"{arm}@{BASELINE}" in arms else None
     if equal is None:
-        return f"{sentence}; at the same number of Gaussians it was not compared (the arm {arm}@{BASELINE})."
+        return f"{sentence}. At the same number of Gaussians it was not compared: add the arm {arm}@{BASELINE}."
     return f"{sentence}; at the same number of Gaussians it has {_in_words(equal)} it."
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import shlex
 import sys
 from pathlib import Path
@@ -160,7 +159,7 @@ def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.plan import plan, write
     from legs_adapters.report import as_diff
     from legs_adapters.settings import SETTINGS_FILE, settings_text
-    from legs_adapters.terms.instead import trained_instead
+    from legs_adapters.terms.instead import offered, trained_instead
     from legs_adapters.undo import unrecorded
 
     if not args.trace and (args.cpu or args.photos):
@@ -177,13 +176,16 @@ def _patch(args: argparse.Namespace) -> int:
     problems, is_decided = found.findings.problems, bool(found.findings.sites or found.findings.patched)
     if not is_decided or (problems and args.strict):
         _show(args, found)
+        instead = list(trained_instead(root, args.exclude, found.findings.program.sources.values()))
         if not problems:
             raise LegsError(
-                f"no photometric L1 term was found in {args.folder}: {_offered(found)}"
+                f"no photometric L1 term was found in {args.folder}: {offered(found.findings)}"
                 + _elsewhere(root, args.exclude, found),
-                *trained_instead(found.findings.program.sources.values()),
+                *instead,
             )
         _quote(problems, "error")
+        for line in instead:
+            say(f"legs-patch: {line}", sys.stderr)
         say("legs-patch: nothing was changed: --site FILE:LINE takes your word, --exclude leaves files out", sys.stderr)
         return 2
     if writes:
@@ -225,19 +227,6 @@ def _show(args: argparse.Namespace, found: Plan, wrote: Sequence[str] = ()) -> N
 
     text = as_json(found, wrote) if args.json else as_table(found)
     say(text, sys.stderr if args.diff and not args.json else None, end="", lines=True)
-
-
-def _offered(found: Plan) -> str:
-    """Say how to name the term: by its line where one that was skipped speaks of images."""
-    from legs_adapters.code.folders import first_of
-    from legs_adapters.lexicon.names import kind_of_words
-
-    skipped = [left for left in found.findings.left if left.rule not in ("", "definition")]
-    named = [left for left in skipped if "image" in map(kind_of_words, re.findall(r"\w+", left.text))]
-    if not named:
-        return "if there is one, name it with --site FILE:LINE"
-    lines = [f"--site {left.path}:{left.line}" for left in named]
-    return f"if a skipped line is the loss, take it with {first_of(lines, 3, ' or ')}"
 
 
 def _elsewhere(root: Path, exclude: Sequence[str], found: Plan) -> str:

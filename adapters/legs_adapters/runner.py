@@ -20,6 +20,7 @@ from legs_adapters.code.folders import SUBMODULE, VENDORED, foreign_folder
 from legs_adapters.code.sources import check_root
 from legs_adapters.plan import plan
 from legs_adapters.rewritten import Loader, install, main_module
+from legs_adapters.terms.instead import offered, trained_instead
 from legs_loss import LegsError
 from legs_loss.config import find_config
 from legs_loss.system import is_first_process, say
@@ -75,15 +76,22 @@ def run_script(
     found = plan(root, in_place=True, ssim=ssim, masks=masks)
     for elsewhere in found.unsearched:
         _say(f"not weighted: {elsewhere.text(root)}")
-    for problem in found.findings.problems:
-        text = f"{problem.path}:{problem.line}: {problem.reason}; if this is the loss: {problem.way}"
-        if not found.after and not found.findings.patched:
-            raise LegsError(text)
+    is_plain = not found.after and not found.findings.patched
+    instead = list(trained_instead(root, (), found.findings.program.sources.values())) if is_plain else []
+    said = [
+        f"{problem.path}:{problem.line}: {problem.reason}; if this is the loss: {problem.way}"
+        for problem in (*found.findings.problems, *found.findings.doubts)
+    ]
+    if is_plain and found.findings.problems:
+        raise LegsError(*said, *instead)
+    for text in said:
         _say(f"not weighted: {text}")
-    if not found.after and not found.findings.patched:
+    if is_plain:
+        none = f"no photometric L1 term was found in {root}: {offered(found.findings, f'legs-patch {root} ')}"
         if not cpu:
-            raise LegsError(f"no photometric L1 term was found in {root}")
-        _say(f"no photometric L1 term was found in {root}: nothing is weighted")
+            raise LegsError(none, *instead)
+        for text in (f"nothing is weighted: {none}", *instead):
+            _say(text)
     sources = {os.path.realpath(str(root / name)): data for name, data in found.after.items()}
     for site in found.findings.sites:
         _say(f"{site.path}:{site.line} {site.form.done} in this run")

@@ -136,12 +136,29 @@ def test_a_body_is_parsed_only_when_it_is_asked_for(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("def f(:\n    pass\n", "does not parse (line 2)"),
-        ("x = 1\n\n\ndef f():\n    return 1 2\n", "does not parse (line 5)"),
+        ("def f(:\n    pass\n", "does not parse (line 1: "),
+        ("x = 1\n\n\ndef f():\n    return 1 2\n", "does not parse (line 5: "),
     ],
 )
 def test_what_does_not_parse_is_said_of_the_file(text: str, reason: str) -> None:
-    assert parse(Source("file.py", text.encode(), text)) == Unreadable("file.py", reason)
+    found = parse(Source("file.py", text.encode(), text))
+    assert isinstance(found, Unreadable)
+    assert found.reason.startswith(reason)
+
+
+def test_what_python_reads_and_libcst_does_not_is_said_so_with_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(text: str) -> None:
+        if text.startswith("async def _()"):
+            raise cst.ParserSyntaxError("no", lines=text.splitlines(True), raw_line=3, raw_column=0)
+        return parse_module(text)
+
+    parse_module = cst.parse_module
+    monkeypatch.setattr(cst, "parse_module", refuse)
+    text = "import a\n\n\ndef f(x):\n    y = x\n    return y\n"
+    found = parse(Source("file.py", text.encode(), text))
+    assert isinstance(found, Module)
+    assert named(found, "f").flow.calls == []
+    assert found.failure == Unreadable("file.py", "does not parse (line 6: Python reads it, and LibCST does not)")
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ import subprocess
 
 import pytest
 from legs_adapters.cli import main
+from legs_adapters.code.sources import read_files
+from legs_adapters.terms.instead import trained_instead
 
 from legs_loss.config import find_config
 from tests.patcher.support import PATCHED, SITE, checkout, files, legs_patch, run_git, snapshot, without_marks
@@ -337,7 +339,7 @@ class TestCommandLine:
             ("old/train.py", "it is not searched: excluded"),
             ("test_train.py", "it is not searched: excluded, not a .py file, a test or a link\n"),
             ("train.sh", "it is not searched"),
-            ("broken.py", "does not parse (line 1)"),
+            ("broken.py", "does not parse (line 1: "),
         ],
     )
     def test_a_site_that_is_not_looked_into_is_said_to_be(self, path, message, tmp_path, run):
@@ -382,14 +384,14 @@ class TestCommandLine:
 @pytest.mark.parametrize(
     ("text", "line", "what"),
     [
-        ("import jax\n", 1, "the loss is written in JAX"),
-        ("import mlx.core as mx\n", 1, "the loss is written in MLX"),
+        ("import jax\n", 1, "JAX is imported"),
+        ("import mlx.core as mx\n", 1, "MLX is imported"),
         ("class BadModel(SplatfactoModel):\n    pass\n", 1, "ns-train splatfacto-legs"),
-        ("loss = LOSSES[cfg.loss](image, gt)\nkind = PhotoLoss.L1\n", 2, "the loss is chosen by a setting"),
-        ("loss_fn = getattr(losses, cfg.kind)\n", 1, "the loss is chosen by a setting"),
-        ("# mse_loss(image, gt)\nloss = F.mse_loss(image, gt_image)\n", 2, "the image loss is squared"),
-        ("delta = image - photo\nloss = (delta**2).mean()\n", 2, "the image loss is squared"),
-        ("loss += self.guidance(images, prompts)['loss_sds']\n", 1, "the gradient is a diffusion model's (SDS)"),
+        ("\nkind = PhotoLoss.L1\n", 2, "seems to be chosen here, by an Enum"),
+        ("loss_fn = getattr(losses, cfg.kind)\n", 1, "seems to be chosen here, by a setting"),
+        ("# mse_loss(image, gt)\nloss = F.mse_loss(image, gt_image)\n", 2, "a squared loss of images"),
+        ("delta = image - photo\nloss = (delta**2).mean()\n", 2, "a squared loss of images"),
+        ("loss += self.guidance(images, prompts)['loss_sds']\n", 1, "a gradient by a diffusion model (SDS)"),
         ("loss = fused_ssim.fused_l1_ssim_loss(img, gt)\n", 1, "take both apart"),
         (
             "class M(S):\n    def get_loss_dict(self, *a):\n        return super().get_loss_dict(*a)\n",
@@ -405,6 +407,40 @@ def test_what_is_not_ours_is_one_line(text, line, what, tmp_path, run):
     (said,) = done.stderr.splitlines()[1:]
     assert said.startswith(f"train.py:{line}: ")
     assert what in said
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "line"),
+    [
+        ("train.py", "@LOSSES.register\ndef f():\n    pass\n\nloss = LOSSES[kind](image, gt)\n", 5),
+        ("train.py", "x = 1\ncriterion = LOSS_REGISTRY.get(opt.kind)\n", 2),
+        ("train.py", "class Trainer:\n    def make(self, cfg):\n        self.criterion = LOSSES[cfg.loss.type]\n", 3),
+        ("train.py", "loss_fn = build_loss(cfg.loss)\n", 1),
+        ("train.py", "loss_fn = eval(f'{kind}_loss')\n", 1),
+        ("train.py", "loss_fn = globals()[args.loss]\n", 1),
+        ("train.py", "criterion = hydra.utils.instantiate(cfg.loss)\n", 1),
+        ("train.py", "losses = importlib.import_module(settings.losses)\n", 1),
+        ("train.py", "import enum\n\n\nclass PhotoLoss(str, enum.Enum):\n    FIRST = 'l1'\n", 4),
+        ("train.py", "if kind is ImageLoss.MAE:\n    pass\n", 1),
+        ("configs/a.yaml", "model: x\nloss: l1\n", 2),
+        ("configs/a.yaml", "loss:\n  weight: 0.2\n  _target_: torch.nn.L1Loss\n", 3),
+        ("configs/a.yml", "model:\n  criterion:\n    - name: L1Loss  # mean\n", 3),
+        ("a.json", '{"a": 1,\n "loss": {"weight": 1, "type": "l1"}}', 2),
+        ("a.toml", '[train.loss]\nkind = "mae"\n', 2),
+    ],
+)
+def test_the_line_that_chooses_a_loss_is_named(path, text, line, tmp_path):
+    root = checkout(tmp_path, {"other.py": "import os\n", path: text})
+    [said] = trained_instead(root, (), read_files(root, ())[0])
+    assert said.startswith(f"{path}:{line}: the loss seems to be chosen here, by ")
+
+
+def test_settings_and_dictionaries_of_losses_choose_none(tmp_path):
+    code = "loss = losses[i]\ntotal = sum(losses[k] for k in losses)\nlosses[name] = 1\nlog(losses[name])\n"
+    settings = "lambda_l1: 0.8\nloss_weight: 1\nname: l1\nssim_loss: true\n"
+    root = checkout(tmp_path, {"train.py": code, "a.yaml": settings, "b.json": '{"l1_loss": 0.8, "type": "l1"}'})
+    os.mkfifo(root / "pipe.yaml")
+    assert list(trained_instead(root, (), read_files(root, ())[0])) == []
 
 
 def test_squares_of_poses_and_definitions_are_not_the_image_loss(tmp_path, run):

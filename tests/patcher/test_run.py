@@ -232,6 +232,29 @@ class TestAsPythonRunsIt:
         assert message in done.stderr
         assert done.stdout == ""
 
+    def test_what_may_be_the_loss_is_offered_where_nothing_is_weighted(self, tmp_path):
+        step = "def train_texture(image, gt_image):\n    l1_loss(image.depth, gt_image.depth).backward()\n"
+        train = "from gaussian_renderer import render\n\n\n" + step
+        settings = "loss:\n  weight: 1.0\n  type: l1\n"
+        root = checkout(tmp_path, {"train.py": train, "configs/fox.yaml": settings})
+        done = legs("run", "train.py", cwd=str(root))
+        assert done.returncode == 2
+        first, *rest = done.stderr.splitlines()
+        assert first.endswith(f": if a skipped line is the loss, take it with legs-patch {root} --site train.py:5")
+        assert [each.split(": ")[0] for each in rest] == ["configs/fox.yaml:3"]
+
+    def test_a_term_that_may_be_the_loss_is_named_beside_one_that_is_weighted(self, tmp_path):
+        other = "from utils.loss_utils import l1_loss\nimport gaussian_renderer\n\n\ndef step(image, gt, opt):\n"
+        other += "    l1_loss(image, gt).backward()\n    print(opt.grad)\n"
+        texts = {**files("runnable_train_script_weighted"), "other.py": other, "run.py": "print(1)\n"}
+        root = checkout(tmp_path, texts)
+        done = legs("run", "run.py", cwd=str(root))
+        assert done.returncode == 0, done.stderr
+        assert (
+            "legs-loss: not weighted: other.py:6: nothing shows that this is the loss: No optimiser was" in done.stderr
+        )
+        assert "; if this is the loss: legs-patch --site other.py:6 takes your word" in done.stderr
+
     def test_a_mistyped_setting_is_one_line_before_the_script_starts(self, tmp_path):
         (tmp_path / "plain.py").write_text("print('never')\n")
         for variable, value, meant in (("LEGS_PRESET", "legz", "legs"), ("LEGS_CURVE", "C33", "C3")):

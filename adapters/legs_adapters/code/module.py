@@ -9,7 +9,7 @@ import libcst as cst
 
 from legs_adapters.code.flow import MUTATORS, Flow
 from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps
-from legs_adapters.code.parsing import STUB, Lines, Part, Place, body_part, outline_part
+from legs_adapters.code.parsing import STUB, Lines, Part, Place, body_part, outline_part, refused
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import arguments, children, dotted
@@ -82,7 +82,8 @@ class Function:
                     self._body = header.body
                     self._inner = self.module.collect(self._body, self)
                 except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
-                    self.module.failure = _failure(self.module.path, error)
+                    before = self.module.lines.place(self._cut.start, self._cut.start).line - 2
+                    self.module.failure = _failure(self.module.path, self.module.text, error, before)
         return self._body
 
     @property
@@ -111,7 +112,7 @@ class Function:
             try:
                 self._flow = Flow(self.body, parameters, self.module.budget.left(self.module.path))
             except RecursionError as error:
-                self.module.failure = _failure(self.module.path, error)
+                self.module.failure = _failure(self.module.path, self.module.text, error)
             if self._flow is None or not self.module.spend(self._flow.steps):
                 self._flow = Flow(cst.Module(body=[]), parameters)
         return self._flow
@@ -263,17 +264,15 @@ def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadabl
     try:
         return Module(source.path, source.text, budget)
     except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
-        first = re.search(r"^[ \t](?=\s*\S)", source.text, re.M)
-        other = re.search("^\t" if first is not None and first.group() == " " else "^ ", source.text, re.M)
-        if first is not None and other is not None and isinstance(error, cst.ParserSyntaxError):
-            line = source.text.count("\n", 0, other.start()) + 1
-            return Unreadable(source.path, f"does not parse, perhaps since it mixes tabs and blanks (line {line})")
-        return _failure(source.path, error)
+        return _failure(source.path, source.text, error)
 
 
-def _failure(path: str, error: Exception) -> Unreadable:
+def _failure(path: str, text: str, error: Exception, lines_before: int = 0) -> Unreadable:
     if isinstance(error, cst.ParserSyntaxError):
-        return Unreadable(path, f"does not parse (line {error.raw_line})")
+        known = refused(text)
+        line = lines_before + error.raw_line if known is None or known.lineno is None else known.lineno
+        why = f"line {line}: Python reads it, and LibCST does not" if known is None else f"line {line}: {known.msg}"
+        return Unreadable(path, f"does not parse ({why})")
     if isinstance(error, RecursionError):
         return Unreadable(path, "is nested too deeply")
     return Unreadable(path, f"cannot be parsed: {type(error).__name__}")

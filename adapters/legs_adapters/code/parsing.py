@@ -20,7 +20,7 @@ from libcst.metadata.span_provider import SpanProvidingCodegenState, byte_length
 from legs_adapters.code.syntax import code
 from legs_loss.system import held_back
 
-__all__ = ["STUB", "Lines", "Part", "Place", "body_part", "outline_part"]
+__all__ = ["STUB", "Lines", "Part", "Place", "body_part", "outline_part", "refused"]
 
 STUB = re.compile("0#x*")  # what stands for a body
 
@@ -92,8 +92,12 @@ class Part:
             )
             with held_back():  # in there LibCST would make a KeyError of Ctrl-C
                 tree._codegen(state)
-            if "".join(state.tokens).encode(tree.encoding) != self.text:
-                raise ValueError("LibCST would write another text")
+            written = "".join(state.tokens).encode(tree.encoding)
+            if written != self.text:
+                pairs = enumerate(zip(written, self.text))
+                at = self.shift + next((i for i, (one, other) in pairs if one != other), len(self.text) - 1)
+                line = self._lines.place(at, at).line
+                raise ValueError(f"LibCST would write line {line} in another way")
             self._spans = cast("Mapping[cst.CSTNode, CodeSpan]", spans._computed)
         span = self._spans[node]
         start, end = self.shift + span.start, self.shift + span.start + span.length
@@ -131,6 +135,19 @@ def body_part(lines: Lines, cut: slice) -> Part:
     newline = _NEWLINE.search(lines.data)
     header = b"async def _():" + (newline.group() if newline is not None else b"\n")
     return Part(lines, header + lines.data[cut], cut.start - len(header))
+
+
+def refused(text: str) -> Optional[SyntaxError]:
+    """Return what this Python says of a text that it does not parse; None where it does, or cannot say."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            ast.parse(text)
+    except SyntaxError as error:
+        return error
+    except (ValueError, RecursionError, MemoryError):
+        pass
+    return None
 
 
 def _cuts(lines: Lines) -> List[Optional[slice]]:

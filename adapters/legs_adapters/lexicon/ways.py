@@ -12,7 +12,7 @@ import libcst as cst
 from legs_adapters.code.calls import sure_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.syntax import call_name, code, constant, root_of, words, words_in
+from legs_adapters.code.syntax import attribute_chain, call_name, code, constant, root_of, words, words_in
 from legs_adapters.lexicon.calls import CallReading, meaning_of_call, meaning_returned
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning
@@ -80,26 +80,21 @@ class Ways(Meanings):
         return bool(GAUSSIANS & words_in(call)) or any(map(SPLATS.search, texts))
 
     def _holds_data(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
-        """Return whether an object is a camera or a dataset's entry, by its name or those of what it is taken from."""
-        while True:
-            if isinstance(node, cst.Subscript):
-                node = node.value
-            elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
-                if DATA & set(words(call_name(node))):
-                    return True
-                node = node.func.value
-            else:
-                break
-        if isinstance(node, cst.Call):
-            given = node.args[:1] if call_name(node) in PICTURE_FUNCTIONS else []
-            return bool(DATA & set(words(call_name(node)))) or any(
-                self._holds_data(function, arg.value, depth) for arg in given
-            )
-        if not isinstance(node, (cst.Name, cst.Attribute)) or depth > _DEPTH or not function.module.spend(1):
+        """Return whether an object is a camera or a dataset's entry, by its name or those of what it is taken from.
+
+        A camera of a view that was warped, or that nobody photographed, is none: ``pseudo_cam``.
+        """
+        chain = list(attribute_chain(node))
+        names = [root_of(part) for part in chain if isinstance(part, (cst.Name, cst.Attribute))]
+        if depth > _DEPTH or not function.module.spend(1) or "warp" in map(kind_of_words, names):
             return False
-        if DATA & set(words(root_of(node))):
-            return self._role_of_holder(function, node) == "target"
-        made = [(where, each.value) for where, each in self.program.lookup(function, node) or ()]
+        root, call = chain[-1], chain[-2] if len(chain) > 1 else None
+        if any(DATA & set(words(name)) for name in names):
+            is_drawn = isinstance(root, cst.Name) and self._is_given_renderings(function, root)
+            return not is_drawn and "render" not in map(role_of_words, names)
+        if isinstance(call, cst.Call) and call.args and call_name(call) in PICTURE_FUNCTIONS:
+            return self._holds_data(function, call.args[0].value, depth + 1)
+        made = [(where, each.value) for where, each in self.program.lookup(function, root) or ()]
         return any(value is not None and self._holds_data(where, value, depth + 1) for where, value in made)
 
     # -- definitions

@@ -94,8 +94,8 @@ class _Finder:
                 continue
             try:
                 self._module(module)
-            except ValueError:
-                program.give_up(module.path, "cannot be written back exactly")
+            except ValueError as error:
+                program.give_up(module.path, f"cannot be written back exactly: {error}")
             except RecursionError:
                 program.give_up(module.path, "is nested too deeply")
         found.without(program.unreadable)

@@ -1,42 +1,82 @@
-"""Say what a checkout trains with where it has no photometric L1: a line for each thing that is not ours to weight."""
+"""Say what may be the loss where no photometric L1 was found: a skipped line, or what the checkout trains with."""
 
 from __future__ import annotations
 
+import contextlib
 import re
-from typing import Iterable, Iterator
+from pathlib import Path
+from typing import Iterable, Iterator, Sequence, Set
 
+from legs_adapters.code.folders import first_of, walk
 from legs_adapters.code.sources import Source
+from legs_adapters.lexicon.names import kind_of_words
+from legs_adapters.terms.findings import Findings
+from legs_loss.system import read_regular
 
-__all__ = ["trained_instead"]
+__all__ = ["offered", "trained_instead"]
 
-_SQUARED = "the image loss is squared, not absolute"
 _OF_PICTURES = re.compile(r"rgb|im(g|age)|colou?r|delta", re.I)
+_SQUARED = "a squared loss of images was found here, which is not weighted"
+_CHOSEN = "the loss seems to be chosen here, by {}: name the line that calls it with --site"
+_LOSS = r"\b\w*(?:loss|criteri)\w*"
+_SETTINGS = r"(cfg|conf\w*|opt|args|settings)"
 _INSTEAD = (
-    (r"^[ \t]*(import|from) jax\b", "the loss is written in JAX, and legs_loss in torch"),
-    (r"^[ \t]*(import|from) mlx\b", "the loss is written in MLX, and legs_loss in torch"),
+    (r"^[ \t]*(import|from) jax\b", "JAX is imported, and legs_loss is written in torch"),
+    (r"^[ \t]*(import|from) mlx\b", "MLX is imported, and legs_loss is written in torch"),
     (
         r"\bsuper\(\)\.get_loss_dict\(|^class \w+\([\w.]*\bSplatfactoModel\b",
-        "the loss is nerfstudio's own: its hook is `ns-train splatfacto-legs`",
+        "the loss seems to be nerfstudio's own: its hook is `ns-train splatfacto-legs`",
     ),
     (
         r"\b\w*(l1\w*ssim|ssim\w*l1)\w*\(",
-        "one function computes L1 and SSIM, perhaps a compiled kernel: take both apart, and weight the L1",
+        "one function seems to compute L1 and SSIM, perhaps a compiled kernel: take both apart, and weight the L1",
     ),
     (r"mse_loss\w*\(|\bMSELoss\(|\bimg2mse\(|\bl2_loss\(|\) ?\*\* ?2\b|delta ?\*\* ?2", _SQUARED),
     (
-        r"\bgetattr\(\w*loss\w*, ?\w|\b\w*Loss\w*\.L1\b|\w*loss\w*\[\w*(cfg|conf|opt|args)\w*\.",
-        "the loss is chosen by a setting: name the line that calls it with --site",
+        rf"(?i:\bgetattr\({_LOSS}, ?\w|{_LOSS}\[[^\]\"':]*\b{_SETTINGS}\b|\bglobals\(\)\[[^\"'\]]*loss"
+        r"|\beval\([^)\n]*loss|\binstantiate\([^)\n]*(loss|criteri)|\bimport_module\([^)\n]*loss"
+        rf"|\b(build|make|get|create)_\w*(loss|criteri)\w*\([^)\n]*\b{_SETTINGS}\b)",
+        _CHOSEN.format("a setting"),
+    ),
+    (
+        rf"(?i:(?<![\w@.]){_LOSS}(\[[^\]\"'\d:]+\]|\.get\([^\"'()][^()]*\))\s*\("
+        r"|\b\w*REGISTRY\w*\.(get|build)\()|= *[A-Z_]*(LOSS|CRITERI)[A-Z_]*\[[\w.]+\] *$",
+        _CHOSEN.format("a name in a registry"),
+    ),
+    (
+        r"\b\w*(Loss|Criterion)\w*\.(L1|MAE|PHOTO\w*)\b|^class \w*(Loss|Criterion)\w*\([^)\n]*Enum\)",
+        _CHOSEN.format("an Enum"),
     ),
     (
         r"loss_sds|\bsds_loss|guidance\w*(\.train_step)?\(",
-        "the gradient is a diffusion model's (SDS), of no photograph",
+        "a gradient by a diffusion model (SDS) seems to be used, of no photograph",
     ),
 )
+# In YAML, JSON or TOML: an L1 as the value of a key of losses, or of a kind, a few lines below such a key.
+_L1_VALUE = r"[\"']?\s*[:=]\s*[\"']?(?:[\w.]+\.)?(?:l1|l1[_-]?loss|mae|photometric\w*)\b"
+_KIND = rf"\b(?:type|name|kind|_target_){_L1_VALUE}"
+_IN_SETTINGS = re.compile(
+    rf"{_LOSS}{_L1_VALUE}|_target_[\"']?\s*[:=]\s*[\"']?[\w.]*L1Loss\b|{_LOSS}[\"']?\s*[:=]\s*{{[^}}\n]*{_KIND}"
+    rf"|{_LOSS}[\"']?\]?\s*[:=]?\s*[\[{{]?[ \t]*\r?\n(?:[^\n]*\n){{0,3}}?[^\n]*{_KIND}",
+    re.I,
+)
+_MOST_SETTINGS, _LARGEST = 500, 1 << 17  # files, and bytes of each
 
 
-def trained_instead(sources: Iterable[Source]) -> Iterator[str]:
-    """Yield ``file:line: what`` for each row of the table that the files speak of, at its first line in code."""
+def offered(findings: Findings, command: str = "") -> str:
+    """Say how to name the term: by the lines that were skipped, those first that speak of images."""
+    skipped = [left for left in findings.left if left.rule not in ("", "definition")]
+    skipped.sort(key=lambda left: "image" not in map(kind_of_words, re.findall(r"\w+", left.text)))
+    lines = dict.fromkeys(f"{command}--site {left.path}:{left.line}" for left in skipped)
+    if not lines:
+        return f"if there is one, name it with {command}--site FILE:LINE"
+    return f"if a skipped line is the loss, take it with {first_of(list(lines), 3, ' or ')}"
+
+
+def trained_instead(root: Path, exclude: Sequence[str], sources: Iterable[Source]) -> Iterator[str]:
+    """Yield ``file:line: what`` for each row of the table that the files speak of, and for an L1 that settings name."""
     files = sorted(sources, key=lambda source: (source.path.count("/"), source.path))
+    said: Set[str] = set()
     for pattern, what in _INSTEAD:
         found = ((source, hit) for source in files for hit in re.finditer(pattern, source.text, re.M))
         for source, hit in found:
@@ -44,5 +84,15 @@ def trained_instead(sources: Iterable[Source]) -> Iterator[str]:
             line = source.text[start:].partition("\n")[0].lstrip()
             of_images = _OF_PICTURES.search(line) and "loss" in (line.replace(hit.group(), "") + source.path).lower()
             if not line.startswith(("#", "def ")) and (of_images or what is not _SQUARED):
-                yield f"{source.path}:{source.text.count(chr(10), 0, hit.start()) + 1}: {what}"
+                place = f"{source.path}:{source.text.count(chr(10), 0, hit.start()) + 1}"
+                if place not in said:
+                    yield f"{place}: {what}"
+                said.add(place)
+                break
+    for path in list(walk(root, exclude, (".yaml", ".yml", ".json", ".toml")))[:_MOST_SETTINGS]:
+        with contextlib.suppress(OSError):  # larger, or no file
+            text = read_regular(root / path, _LARGEST).decode("utf-8", "replace")
+            named = _IN_SETTINGS.search(text)
+            if named is not None:
+                yield f"{path}:{text.count(chr(10), 0, named.end()) + 1}: {_CHOSEN.format('settings')}"
                 break

@@ -80,7 +80,9 @@ class Traced(NamedTuple):
             return "both sides are trained"
         if not self.steps:
             return (
-                "only poses, exposures or embeddings are stepped after it" if self.poses else "nothing is stepped by it"
+                "only poses, exposures or embeddings are stepped after it"
+                if self.poses
+                else "nothing was seen to step by it"
             )
         if not self.is_picture:
             channels = [side for side in self.shape if side > 1]

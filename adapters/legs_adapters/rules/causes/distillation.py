@@ -18,7 +18,7 @@ __all__ = ["Distillation", "is_rendered"]
 
 
 class Distillation(Rule):
-    """The target is a rendering: of another model, of another view, or of the same model at an earlier step.
+    """The target was found to be a rendering: of another model, another view, or an earlier step.
 
     skipped:
         teacher_image = render(camera, teacher, None, None)["render"]

@@ -20,7 +20,7 @@ _OTHER_FRAMEWORK = re.compile(
 
 
 class NotSplats(Rule):
-    """The code around the term is not about Gaussian splatting in torch, or the sides are colours of rays.
+    """No word of Gaussian splatting in torch was found around the term, or names say that its sides are of rays.
 
     skipped:
         loss = l1_loss(image[ray_indexes], gt[ray_indexes])

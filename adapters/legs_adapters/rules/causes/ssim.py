@@ -8,7 +8,7 @@ __all__ = ["UnprovenSsim"]
 
 
 class UnprovenSsim(Rule):
-    """With `--ssim`: it is no call of a known form of 3DGS's SSIM with its defaults, but a library's, or masked.
+    """With `--ssim`: nothing proves that it is 3DGS's SSIM with its defaults: a library's, perhaps, or masked.
 
     skipped:
         loss = l1_loss(image, gt) - ssim(image, gt, window_size=7)

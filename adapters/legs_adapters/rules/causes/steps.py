@@ -1,4 +1,4 @@
-"""Skip a term whose gradients do not train the Gaussians: no optimiser uses them, or one of camera poses."""
+"""Skip a term whose gradients were not found to train Gaussians: no optimiser uses them, or one of other things."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class _ByPurpose(Rule):
 
 
 class PoseStep(_ByPurpose):
-    """By the names of what it is given, the optimiser updates camera poses, or an embedding, and no Gaussians.
+    """By the names of what it is given, the optimiser updates camera poses, or an embedding; no Gaussians were found.
 
     skipped:
         def refine(gaussians, camera):
@@ -35,7 +35,7 @@ class PoseStep(_ByPurpose):
 
 
 class OtherStep(_ByPurpose):
-    """The optimiser has new tensors alone, and no Gaussians were found among them, though a model of some is drawn.
+    """No Gaussians were found in the optimiser, which has new tensors alone, though some are drawn.
 
     skipped:
         def fit(gaussians, camera, num_parts):
@@ -54,7 +54,7 @@ class OtherStep(_ByPurpose):
 
 
 class NoStep(_ByPurpose):
-    """No optimiser was found that uses the gradients: code that only reads them scores the Gaussians.
+    """No optimiser was found that uses the gradients: what only reads them scores the Gaussians.
 
     skipped:
         def sensitivity(gaussians, camera):

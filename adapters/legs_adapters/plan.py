@@ -120,6 +120,8 @@ def plan(
                 edits[name] = rewrite(findings.program, name, sites, unweighted, in_place)
             except RecursionError:
                 _give_up(findings, name, "is nested too deeply")
+            except LegsError:
+                raise
             except ValueError as error:
                 _give_up(findings, name, f"cannot be written back exactly: {error}")
         elsewhere = tuple(unsearched(root, findings.program.budget, exclude))

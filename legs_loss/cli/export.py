@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.cli.shared.checks import check_empty
     from legs_loss.config import STORE_FOLDER
     from legs_loss.errors import LegsError
-    from legs_loss.scenes.own_maps import file_names, write_gray
+    from legs_loss.scenes.user_maps import file_names, write_gray
     from legs_loss.spec import as_spec
     from legs_loss.store import MASK, Entry, WeightStore
 
@@ -48,8 +48,8 @@ def run(args: argparse.Namespace) -> int:
         share = store.final_weight(entry, spec) / np.float32(largest or 1.0)
         write_gray(args.out / "weights_8bit" / names[view], share)
         write_gray(args.out / "weights_16bit" / names[view], share, np.uint16)
-        mask = store.own(entry, MASK)
+        mask = store.beside(entry, MASK)
         if mask is not None:
-            write_gray(args.out / "masks" / names[view], store.own_map(mask))
+            write_gray(args.out / "masks" / names[view], store.user_map(mask))
     say(f"{args.out}: {len(views)} maps; white is a weight of {largest:.6g}")
     return 0

@@ -47,16 +47,16 @@ def run(args: argparse.Namespace) -> int:
     say(f"  views      {len({entry.view for entry in entries})}")
     say(f"  maps       {len(entries)} ({sum(entry.bytes for entry in entries) / 1e6:.3g} MB)")
     say(f"  sizes      {_counted(f'{entry.width}x{entry.height}' for entry in entries)}")
-    made = [entry for entry in entries if not entry.is_own]
+    made = [entry for entry in entries if not entry.is_users]
     say(f"  operators  {_counted(f'{entry.operator} p={entry.p:g} eps={entry.eps:g}' for entry in made)}")
     if any(entry.background for entry in entries):
         say(f"  background {_counted(entry.background or 'none' for entry in entries)}")
     for kind in (MASK, WEIGHTS):
-        own = store.of_kind(kind)
-        if own:
-            say(f"  {kind:<10} {len({entry.view for entry in own})} view(s) of your own")
+        users = store.of_kind(kind)
+        if users:
+            say(f"  {kind:<10} {len({entry.view for entry in users})} view(s) of your own")
     if not damaged:
-        half = {entry.view for entry in store.of_kind(MASK) if store.own_map(entry).mean() < 0.5}
+        half = {entry.view for entry in store.of_kind(MASK) if store.user_map(entry).mean() < 0.5}
         if half:
             say(f"  masked by more than half: {', '.join(sorted(half))}")
         say(f"  unsharp    {', '.join(unsharp_views(store)) or 'none'}")

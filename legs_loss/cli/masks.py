@@ -49,8 +49,8 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.cli.shared.checks import check_empty
     from legs_loss.cli.shared.scene_arguments import read_noted
     from legs_loss.errors import LegsError
-    from legs_loss.precompute.own_maps import OwnMaps, is_below
-    from legs_loss.scenes.own_maps import file_names, find_maps, write_gray
+    from legs_loss.precompute.user_maps import UserMaps, is_below
+    from legs_loss.scenes.user_maps import file_names, find_maps, write_gray
 
     out = args.out or args.scene / "masks"
     check_empty(out)
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     folders = {}
     for kind in args.kinds:
         if kind not in _COMPUTED:
-            views = tuple(view for view in views if not is_below(view.path, args.scene, OwnMaps(kind)))
+            views = tuple(view for view in views if not is_below(view.path, args.scene, UserMaps(kind)))
             folders[kind], strays = find_maps(args.scene, kind, views)
             if strays:
                 say(f"legs: note: {kind}: these match no photograph: {', '.join(map(str, strays[:3]))}", sys.stderr)
@@ -88,7 +88,7 @@ def mask_of(view: View, kinds: List[str], folders: Dict[str, Dict[str, Path]]) -
     import numpy as np
 
     from legs_loss.scenes import load_training_image
-    from legs_loss.scenes.own_maps import averaged, read_mask
+    from legs_loss.scenes.user_maps import averaged, read_mask
 
     photograph = load_training_image(view, 1)
     unit = photograph / np.float32(np.iinfo(photograph.dtype).max)

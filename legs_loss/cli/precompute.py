@@ -96,7 +96,7 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     from legs_loss.cli.shared.checks import check_resolution, check_writable
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import SceneTask, find_scenes, stores_of
-    from legs_loss.precompute.own_maps import OwnMaps
+    from legs_loss.precompute.user_maps import UserMaps
     from legs_loss.scenes import read_scene
 
     workers = args.workers if args.workers is not None else cores() if args.scheduler is None else 1
@@ -133,7 +133,7 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
             args.resolution,
             args.white_background,
             workers,
-            OwnMaps(found(args.masks, scene), found(args.weights, scene), args.weight_scale),
+            UserMaps(found(args.masks, scene), found(args.weights, scene), args.weight_scale),
         ): store
         for scene, store in zip(scenes, stores)
     }
@@ -181,7 +181,7 @@ def _say(store: Path, done: SceneDone) -> int:
         )
     if report.unmasked:
         say(f"legs: note: counted whole, without a mask: {', '.join(report.unmasked)}", sys.stderr)
-    for kind, count in report.own.items():
+    for kind, count in report.user_maps.items():
         say(f"{store}: {count} {kind if kind.endswith('s') else kind + 's'} of your own")
     say(f"{store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")
     if report.made and not (report.store / MANIFEST).is_file():

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.cli.shared.scene_arguments import read_noted
     from legs_loss.cli.shared.sheet import save_sheet
     from legs_loss.errors import LegsError
-    from legs_loss.precompute.own_maps import OwnMaps, is_below
+    from legs_loss.precompute.user_maps import UserMaps, is_below
     from legs_loss.scenes import View
     from legs_loss.spec import as_spec
     from legs_loss.store import MANIFEST
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         shown = _stored(path, spec)
     else:
         views = (View(path.name, path),) if path.is_file() else read_noted(path).views
-        views = tuple(view for view in views if not is_below(view.path, path, OwnMaps(args.masks)))
+        views = tuple(view for view in views if not is_below(view.path, path, UserMaps(args.masks)))
         masks, scene = _masks(path, views, args.masks), _levels(views, spec)
         shown = {view.name: partial(_computed, view, spec, scene, masks.get(view.name)) for view in views}
     names = _choose(list(shown), args.views)
@@ -73,7 +73,7 @@ def _masks(path: Path, views: Sequence[View], named: Optional[str]) -> Dict[str,
     """Return what reads the mask of each view that has one: of a folder, its alpha, or of the scene's store."""
     from legs_loss.config import STORE_FOLDER
     from legs_loss.scenes import image_size
-    from legs_loss.scenes.own_maps import find_maps, read_mask
+    from legs_loss.scenes.user_maps import find_maps, read_mask
     from legs_loss.store import MANIFEST, MASK, WeightStore
 
     if named is not None:
@@ -83,14 +83,14 @@ def _masks(path: Path, views: Sequence[View], named: Optional[str]) -> Dict[str,
     if not (path / STORE_FOLDER / MANIFEST).is_file():
         return {}
     store = WeightStore(path / STORE_FOLDER)
-    return {entry.view: partial(store.own_map, entry) for entry in store.of_kind(MASK)}
+    return {entry.view: partial(store.user_map, entry) for entry in store.of_kind(MASK)}
 
 
 def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor], mask: Optional[Callable[[], np.ndarray]]) -> Shown:
     from legs_loss.cli.shared.sheet import Shown
     from legs_loss.precompute import normalised_map, response_map
     from legs_loss.scenes import load_training_image
-    from legs_loss.scenes.own_maps import averaged
+    from legs_loss.scenes.user_maps import averaged
 
     photograph = load_training_image(view)
     if spec.over == "image":
@@ -137,8 +137,8 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
         view = views.get(entry.view)
         photograph = None if view is None else _photograph(view, entry)
         normalised = store.normalised_response(entry) if spec.over == "image" else over_scene(entry)
-        own = [store.own(entry, kind) for kind in (MASK, WEIGHTS)]
-        mask, weights = (None if one is None else store.own_map(one) for one in own)
+        found = [store.beside(entry, kind) for kind in (MASK, WEIGHTS)]
+        mask, weights = (None if one is None else store.user_map(one) for one in found)
         return Shown(f"{entry.view}\n{entry.width}x{entry.height}", photograph, normalised, mask, weights)
 
     def over_scene(entry: Entry) -> np.ndarray:

@@ -9,7 +9,7 @@ recorded, its map's checksum holds, and size, operator and background are those 
 from __future__ import annotations
 
 from legs_loss.precompute.one_scene import Report, precompute
-from legs_loss.precompute.own_maps import OwnMaps
 from legs_loss.precompute.photograph import normalised_map, response_map
+from legs_loss.precompute.user_maps import UserMaps
 
-__all__ = ["OwnMaps", "Report", "normalised_map", "precompute", "response_map"]
+__all__ = ["Report", "UserMaps", "normalised_map", "precompute", "response_map"]

@@ -11,7 +11,7 @@ from typing import List, NamedTuple, Optional, Sequence
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
-from legs_loss.precompute import OwnMaps, Report, precompute
+from legs_loss.precompute import Report, UserMaps, precompute
 from legs_loss.scenes import read_scene
 from legs_loss.spec import Spec
 from legs_loss.system import read_text
@@ -33,7 +33,7 @@ class SceneTask(NamedTuple):
     resolution: int
     white_background: bool
     workers: int
-    maps: OwnMaps = OwnMaps()
+    maps: UserMaps = UserMaps()
 
 
 class SceneDone(NamedTuple):

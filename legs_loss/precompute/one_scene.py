@@ -13,8 +13,8 @@ from typing import Callable, Dict, List, Optional, Union
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.precompute.one_view import Job, ViewTask, make
-from legs_loss.precompute.own_maps import NO_MAPS, OwnMaps, is_below, stage_own
 from legs_loss.precompute.photograph import compile_response
+from legs_loss.precompute.user_maps import NO_MAPS, UserMaps, is_below, stage_user_maps
 from legs_loss.precompute.workers import in_processes
 from legs_loss.scenes import Scene, image_size, training_size
 from legs_loss.spec import Spec, as_spec
@@ -31,7 +31,7 @@ _COMMIT_SECONDS = 1.0
 class Report:
     """The result of :func:`precompute`, by names of views: maps made, maps kept, views skipped with the reason.
 
-    ``own`` are the numbers of the user's own maps, a kind each; ``unmasked`` has no mask where other views have;
+    ``user_maps`` are the numbers of the user's own maps, a kind each; ``unmasked`` has no mask where other views have;
     ``notes`` are sentences for the user.
     """
 
@@ -39,7 +39,7 @@ class Report:
     made: List[str] = field(default_factory=list)
     kept: List[str] = field(default_factory=list)
     skipped: Dict[str, str] = field(default_factory=dict)
-    own: Dict[str, int] = field(default_factory=dict)
+    user_maps: Dict[str, int] = field(default_factory=dict)
     unmasked: List[str] = field(default_factory=list)
     notes: List[str] = field(default_factory=list)
 
@@ -53,7 +53,7 @@ def precompute(
     workers: int = 1,
     progress: bool = False,
     on_progress: Optional[Callable[[int, int], None]] = None,
-    maps: OwnMaps = NO_MAPS,
+    maps: UserMaps = NO_MAPS,
 ) -> Report:
     """Write the normalised response of every view of a scene to a store, and the user's own masks and weights.
 
@@ -87,10 +87,10 @@ def precompute(
     report = Report(out)
     views = {view.name: view for view in scene.views if not is_below(view.path, scene.root, maps)}
     with StoreWriter(out) as writer:
-        mine = stage_own(scene.root, list(views.values()), resolution, maps, writer.entries(), writer.staging)
+        mine = stage_user_maps(scene.root, list(views.values()), resolution, maps, writer.entries(), writer.staging)
         if mine.added:  # all at once, before any response: what is found in the store is never without its mask
             writer.commit(mine.added, mine.dropped)
-        report.own, report.unmasked = Counter(entry.operator for entry in mine.added), mine.unmasked
+        report.user_maps, report.unmasked = Counter(entry.operator for entry in mine.added), mine.unmasked
         report.notes += [*scene.notes, *mine.notes]
         job = Job(spec, resolution, white_background, out, writer.staging)
         known: Dict[str, List[Entry]] = {}

@@ -132,7 +132,7 @@ class Stored:
             (self.masked.whole if entry is None else self.masked.views).add(found.view)
         if entry is None:
             return Whole.KNOWN
-        return torch.from_numpy(store.own_map(entry)).to(image.device).unsqueeze(0)
+        return torch.from_numpy(store.user_map(entry)).to(image.device).unsqueeze(0)
 
     def scene_levels(self, pixels: int) -> Tensor:
         """Return the levels of all the store's views of a number of pixels, [2].
@@ -182,7 +182,7 @@ class Stored:
 
             try:
                 self._store = WeightStore(self._config.store)
-                self._kinds = {entry.operator for entry in self._store.entries.values() if entry.is_own}
+                self._kinds = {entry.operator for entry in self._store.entries.values() if entry.is_users}
             except LegsError as error:
                 if self._config.require_masks:
                     raise

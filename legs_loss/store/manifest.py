@@ -86,7 +86,7 @@ class Entry:
     sample: str = ""
 
     @property
-    def is_own(self) -> bool:
+    def is_users(self) -> bool:
         """Return whether the map is a mask or weights of the user's."""
         return self.operator in (MASK, WEIGHTS)
 
@@ -135,7 +135,7 @@ def is_map_name(name: str) -> bool:
 def manifest_bytes(entries: Iterable[Entry]) -> bytes:
     """Return the manifest's one spelling for these entries."""
     entries = list(entries)
-    rows, version = [], VERSION if any(entry.is_own for entry in entries) else 1
+    rows, version = [], VERSION if any(entry.is_users for entry in entries) else 1
     for entry in sorted(entries, key=lambda entry: entry.key):
         values = dict(vars(entry), p=entry.p if math.isfinite(entry.p) else "inf")
         for name, (since, absent) in _ADDED.items():

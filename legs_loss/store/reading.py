@@ -91,13 +91,13 @@ class WeightStore:
         return Found(entries[0].view, fits[0] if fits else None, self._own(entries, MASK), self._own(entries, WEIGHTS))
 
     def _own(self, entries: List[Entry], kind: str) -> Optional[Entry]:
-        found = {entry.view: self.own(entry, kind) for entry in entries}
+        found = {entry.view: self.beside(entry, kind) for entry in entries}
         first, *others = found.values()
         if any((other and other.sha256) != (first and first.sha256) for other in others):
             raise LegsError(f"{self.path}: {', '.join(found)} are the same photograph, with different maps ({kind})")
         return first
 
-    def own(self, entry: Entry, kind: str) -> Optional[Entry]:
+    def beside(self, entry: Entry, kind: str) -> Optional[Entry]:
         """Return the entry of the user's own map, a kind of :data:`MASK` or :data:`WEIGHTS`, for an entry's view."""
         return self.entries.get((entry.view, entry.height, entry.width, kind, 1.0, 0.0, 0.0))
 
@@ -105,7 +105,7 @@ class WeightStore:
         """Return the user's own maps of a kind."""
         return [entry for entry in self.entries.values() if entry.operator == kind]
 
-    def own_map(self, entry: Entry) -> np.ndarray:
+    def user_map(self, entry: Entry) -> np.ndarray:
         """Return a mask, in [0, 1], or weights of the user's, float32 [H, W].
 
         Raises:
@@ -156,8 +156,8 @@ class WeightStore:
         else:
             made = weight_from_response(torch.from_numpy(self.normalised_response(entry))[None], spec)
         weight: np.ndarray = made[0].numpy()
-        for own in filter(None, (self.own(entry, kind) for kind in (MASK, WEIGHTS))):
-            weight = weight * self.own_map(own)
+        for users in filter(None, (self.beside(entry, kind) for kind in (MASK, WEIGHTS))):
+            weight = weight * self.user_map(users)
         return weight
 
     def check(self) -> Damage:

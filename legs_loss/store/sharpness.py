@@ -68,7 +68,7 @@ def _alike(store: WeightStore) -> List[Entry]:
     """Return the entries of the response and size that most views have; of several, of those with levels."""
     groups: Dict[object, List[Entry]] = {}
     for entry in store.entries.values():
-        if entry.is_own:
+        if entry.is_users:
             continue
         key = entry.operator, entry.p, entry.smooth, entry.percentile, entry.width * entry.height
         groups.setdefault(key, []).append(entry)

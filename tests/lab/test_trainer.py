@@ -21,7 +21,7 @@ from legs_loss.lab.training.dataset import extent, load_dataset, load_view, spli
 from legs_loss.lab.training.densify import Schedule
 from legs_loss.lab.training.metrics import psnr, score, strongest
 from legs_loss.lab.training.trainer import TrainConfig, default_threshold, train
-from legs_loss.precompute import OwnMaps, precompute
+from legs_loss.precompute import UserMaps, precompute
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.weights import Weights
 from tests.lab.training import SHORT, assert_equal
@@ -98,7 +98,7 @@ def with_masks(scene: Scene, folder: Path, kind: str = "masks") -> Path:
         mask = Image.new("L", (64, 48), 255)
         mask.paste(0, (0, 0, 16, 48))
         mask.save(str(folder / kind / f"{PurePosixPath(view.name).stem}.png"))
-    precompute(scene, folder / "store", maps=OwnMaps(**{kind: str(folder / kind)}))
+    precompute(scene, folder / "store", maps=UserMaps(**{kind: str(folder / kind)}))
     return folder / "store"
 
 

@@ -9,7 +9,7 @@ from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
 from legs_loss import LegsError, LEGSLoss, configure, l1_loss, legs_loss, masked, ssim, weight_map, weighted_l1
-from legs_loss.precompute import OwnMaps, precompute
+from legs_loss.precompute import UserMaps, precompute
 from legs_loss.runtime import counts, state
 from legs_loss.scenes import read_scene
 from tests.runtime.support import plain
@@ -271,7 +271,7 @@ class TestStore:
         mask[:4] = 0
         for name in ("0001", "0002", "0003"):
             save(scene / "masks" / f"{name}.png", mask)
-        precompute(read_scene(scene), maps=OwnMaps(masks="masks"))
+        precompute(read_scene(scene), maps=UserMaps(masks="masks"))
         configure("legs", store=scene / "legs_weights")
         return torch.from_numpy(photograph(WIDTH, HEIGHT)).float().div(255).movedim(-1, 0)
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 import legs_loss
 from legs_loss import LegsError, configure, l1_loss
-from legs_loss.precompute import OwnMaps, precompute
+from legs_loss.precompute import UserMaps, precompute
 from legs_loss.runtime import active, counts, state
 from legs_loss.scenes import read_scene
 from legs_loss.similarity import ssim_map
@@ -34,7 +34,7 @@ def scene(tmp_path):
         Image.fromarray(pixels).save(tmp_path / "scene" / "images" / f"{name}.png")
     for name, mask in masks().items():
         Image.fromarray(mask).save(tmp_path / "scene" / "masks" / f"{name}.png")
-    Image.fromarray(own_weights()).save(tmp_path / "scene" / "weights" / "a.png")
+    Image.fromarray(user_weights()).save(tmp_path / "scene" / "weights" / "a.png")
     return tmp_path / "scene"
 
 
@@ -45,12 +45,12 @@ def masks():
     return {"a": first, "b": second}
 
 
-def own_weights():
+def user_weights():
     return np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH) + 100
 
 
 def stored(scene, preset="legs", **folders):
-    precompute(read_scene(scene), spec=preset, maps=OwnMaps(**folders))
+    precompute(read_scene(scene), spec=preset, maps=UserMaps(**folders))
     configure(preset, store=scene / "legs_weights")
 
 
@@ -121,7 +121,7 @@ class TestLoss:
     def test_own_weights_multiply_the_presets(self, scene, preset):
         stored(scene, preset, weights="weights", scale=2.0)
         prediction, target = rendering(), photograph(scene, "a")
-        own = torch.from_numpy(own_weights()).float() / 255 * 2.0
+        own = torch.from_numpy(user_weights()).float() / 255 * 2.0
         expected = (own * legs_loss.weight_map(target, preset) * (prediction - target).abs()).mean()
         assert l1_loss(prediction, target).item() == pytest.approx(expected.item(), rel=1e-3)
         other = photograph(scene, "b")
@@ -366,7 +366,7 @@ class TestLibraries:
 class TestModule:
     @pytest.mark.parametrize("preset", ["legs", "3dgs"])
     def test_legs_loss_with_a_store_masks_both_terms(self, scene, preset):
-        precompute(read_scene(scene), spec=preset, maps=OwnMaps(masks="masks"))
+        precompute(read_scene(scene), spec=preset, maps=UserMaps(masks="masks"))
         criterion = legs_loss.LEGSLoss(preset, store=scene / "legs_weights")
         for name, mask in masks().items():
             prediction, target = rendering(), photograph(scene, name)

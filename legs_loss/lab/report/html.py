@@ -29,7 +29,7 @@ from legs_loss.lab.experiments.tables import (
 from legs_loss.lab.report.html_pictures import FORMATS as IMAGE_FORMATS
 from legs_loss.lab.report.html_pictures import ViewPictures, draw_row, encode
 from legs_loss.lab.report.html_plots import by_gaussians, by_iterations
-from legs_loss.lab.training.dataset import load_dataset, load_view, open_store, split_views, with_own_maps
+from legs_loss.lab.training.dataset import load_dataset, load_view, open_store, split_views, with_user_maps
 from legs_loss.lab.training.trainer import TrainConfig
 from legs_loss.responses import levels_of
 from legs_loss.scenes import Scene, View
@@ -75,7 +75,7 @@ def write_report(
     levels = _scene_levels(read, base, first)
     folders = {arm: run / parse_arm(arm).folder / f"seed-{first[arm]['seed']}" for arm in names}
     drawn, store = [], open_store(read)
-    for view in (with_own_maps(load_view(read, view, base.resolution), store, needed=False) for view in shown):
+    for view in (with_user_maps(load_view(read, view, base.resolution), store, needed=False) for view in shown):
         drawn.append((view, {arm: draw_row(first[arm], folders[arm], view, levels.get(arm)) for arm in names}))
     for form in IMAGE_FORMATS:
         page = _page(settings, rows, names, [encode(view, each, form) for view, each in drawn], first, run)

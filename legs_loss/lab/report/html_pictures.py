@@ -18,7 +18,7 @@ from legs_loss.lab.ply import read_ply
 from legs_loss.lab.training.dataset import TrainingView, shuffled
 from legs_loss.lab.training.trainer import TrainConfig, draw, point_cloud, step_weights
 from legs_loss.scenes import image_tensor, open_image
-from legs_loss.scenes.own_maps import dimmed
+from legs_loss.scenes.user_maps import dimmed
 from legs_loss.weights import weight_map
 
 __all__ = ["KINDS", "DrawnView", "ViewPictures", "as_bytes", "differing", "draw_row", "encode", "read_picture"]

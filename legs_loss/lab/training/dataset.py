@@ -27,7 +27,7 @@ __all__ = [
     "pinhole_camera",
     "shuffled",
     "split_views",
-    "with_own_maps",
+    "with_user_maps",
 ]
 
 HOLD_OUT = 8  # every 8th view, sorted by name, as usual for 3DGS
@@ -112,14 +112,14 @@ def load_dataset(
     opened = open_store(scene, store)
     if not spec.unweighted:
         train = [replace(view, weight=weight) for view, weight in zip(train, _weights(opened, train, spec))]
-    if opened is None or not any(entry.is_own for entry in opened.entries.values()):
+    if opened is None or not any(entry.is_users for entry in opened.entries.values()):
         return Dataset(train, test)
-    train = [with_own_maps(view, opened, own_weights=True) for view in train]
-    return Dataset(train, [with_own_maps(view, opened) for view in test])
+    train = [with_user_maps(view, opened, user_weights=True) for view in train]
+    return Dataset(train, [with_user_maps(view, opened) for view in test])
 
 
-def with_own_maps(
-    view: TrainingView, store: Optional[WeightStore], own_weights: bool = False, needed: bool = True
+def with_user_maps(
+    view: TrainingView, store: Optional[WeightStore], user_weights: bool = False, needed: bool = True
 ) -> TrainingView:
     """Return a view with the user's mask, and on request its weight times the user's, as a store has them.
 
@@ -135,8 +135,8 @@ def with_own_maps(
             f"{store.path} has masks or weights of your own, and does not know {view.name} of {width}x{height}: give "
             "legs precompute the training's -r and --images"
         )
-    mask, weight = (None if one is None else torch.from_numpy(store.own_map(one))[None] for one in found[2:])
-    if not own_weights or weight is None:
+    mask, weight = (None if one is None else torch.from_numpy(store.user_map(one))[None] for one in found[2:])
+    if not user_weights or weight is None:
         return replace(view, mask=mask)
     return replace(view, mask=mask, weight=weight if view.weight is None else weight * view.weight)
 

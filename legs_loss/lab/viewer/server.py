@@ -21,7 +21,7 @@ from legs_loss.lab.training.dataset import open_store
 from legs_loss.lab.viewer.content import Content
 from legs_loss.lab.viewer.guard import Guard, check_address
 from legs_loss.scenes import View, image_tensor, load_training_image
-from legs_loss.scenes.own_maps import averaged, dimmed
+from legs_loss.scenes.user_maps import averaged, dimmed
 from legs_loss.spec import as_spec
 from legs_loss.store import MASK
 from legs_loss.system import say
@@ -267,7 +267,7 @@ class _Cameras:
         """Return a photograph, darkened where its mask leaves it out, uint8 [H, W, 3]."""
         image, mask = _image(view).expand(3, -1, -1).numpy(), None
         if view.name in self.masks and self.store is not None:
-            mask = averaged(self.store.own_map(self.masks[view.name]), image.shape[:0:-1])
+            mask = averaged(self.store.user_map(self.masks[view.name]), image.shape[:0:-1])
         return (dimmed(image, mask).transpose(1, 2, 0) * 255).round().astype(np.uint8)
 
     def _weight(self, view: View) -> np.ndarray:

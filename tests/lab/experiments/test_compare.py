@@ -32,7 +32,7 @@ from legs_loss.lab.training import trainer
 from legs_loss.lab.training.checkpoint import CHECKPOINT
 from legs_loss.lab.training.side_by_side import train_arm
 from legs_loss.lab.training.trainer import TrainConfig, train
-from legs_loss.precompute import OwnMaps, precompute
+from legs_loss.precompute import UserMaps, precompute
 from legs_loss.scenes import read_scene
 from tests.lab.experiments.support import BASE
 from tests.support import without_times
@@ -82,7 +82,7 @@ def test_masks_of_the_scenes_store_hold_for_every_arm(tiny_scene: Path, tmp_path
         mask = Image.new("L", (64, 48), 255)
         mask.paste(0, (0, 0, 16, 48))
         mask.save(str(tmp_path / "scene/masks" / f"{PurePosixPath(view.name).stem}.png"))
-    precompute(read_scene(tmp_path / "scene"), resolution=2, maps=OwnMaps("masks"))
+    precompute(read_scene(tmp_path / "scene"), resolution=2, maps=UserMaps("masks"))
     comparison = Comparison(tmp_path / "scene", BASE, tmp_path / "out")
     rows = [comparison.train_one(arm, 0) for arm in parse_arms(["3dgs", "legs:scale"])]
     assert [row["metrics"]["masked_views"] for row in rows] == [10, 10]
@@ -98,7 +98,7 @@ def test_weights_of_ones_own_in_the_store_are_refused_before_anything_is_written
     (tmp_path / "scene/importance").mkdir()
     trained = read_scene(tmp_path / "scene").views[1].name
     Image.new("L", (64, 48), 255).save(str(tmp_path / "scene/importance" / f"{PurePosixPath(trained).stem}.png"))
-    precompute(read_scene(tmp_path / "scene"), resolution=2, maps=OwnMaps(weights="importance", scale=3.0))
+    precompute(read_scene(tmp_path / "scene"), resolution=2, maps=UserMaps(weights="importance", scale=3.0))
     with pytest.raises(
         LegsError, match=rf"{trained} has a weight map of mean 3\.000: .* --weights\? Move the store away"
     ):

@@ -11,10 +11,10 @@ import numpy as np
 from legs_loss.errors import LegsError
 from legs_loss.scenes import View, image_size, training_size
 from legs_loss.scenes.folder import SUFFIXES
-from legs_loss.scenes.own_maps import ALPHA, MASK_PATH, averaged, find_maps, own_path, read_map_file, read_mask
+from legs_loss.scenes.user_maps import ALPHA, MASK_PATH, averaged, find_maps, map_path, read_map_file, read_mask
 from legs_loss.store import MASK, WEIGHTS, Entry, stage
 
-__all__ = ["NO_MAPS", "OwnMaps", "is_below", "stage_own"]
+__all__ = ["NO_MAPS", "UserMaps", "is_below", "stage_user_maps"]
 
 _LARGEST = 1e6  # weight
 _OF_THE_SCENE = (None, ALPHA, MASK_PATH)
@@ -22,7 +22,7 @@ _OPTIONS = {MASK: "--masks", WEIGHTS: "--weights"}
 _SUFFIXES = {MASK: SUFFIXES, WEIGHTS: (*SUFFIXES, ".npy")}
 
 
-class OwnMaps(NamedTuple):
+class UserMaps(NamedTuple):
     """The places of the user's own maps: folders, or a file for all views, in the scene or paths; None without.
 
     Attributes:
@@ -37,7 +37,7 @@ class OwnMaps(NamedTuple):
     scale: float = 1.0
 
 
-NO_MAPS: OwnMaps = OwnMaps()
+NO_MAPS: UserMaps = UserMaps()
 
 
 class Staged(NamedTuple):
@@ -49,14 +49,14 @@ class Staged(NamedTuple):
     notes: List[str]
 
 
-def is_below(path: Path, root: Path, maps: OwnMaps) -> bool:
+def is_below(path: Path, root: Path, maps: UserMaps) -> bool:
     """Return whether a file is one of the user's maps or lies in one of their folders, and so is no photograph."""
-    places = [own_path(root, named).resolve() for named in (maps.masks, maps.weights) if named not in _OF_THE_SCENE]
+    places = [map_path(root, named).resolve() for named in (maps.masks, maps.weights) if named not in _OF_THE_SCENE]
     return any(place in (path.resolve(), *path.resolve().parents) for place in places)
 
 
-def stage_own(
-    root: Path, views: Sequence[View], resolution: int, maps: OwnMaps, known: Sequence[Entry], staging: Path
+def stage_user_maps(
+    root: Path, views: Sequence[View], resolution: int, maps: UserMaps, known: Sequence[Entry], staging: Path
 ) -> Staged:
     """Read, check and stage all of the user's maps, at every size that the store has or is to have of a view.
 
@@ -79,7 +79,7 @@ def stage_own(
         result.notes.append(f"transforms.json names masks of {masked} photograph(s): --masks mask_path applies them")
     given = {kind: named for kind, named in ((MASK, maps.masks), (WEIGHTS, maps.weights)) if named is not None}
     for entry in known:
-        if entry.is_own and entry.operator not in given:
+        if entry.is_users and entry.operator not in given:
             raise LegsError(
                 f"the store has maps of {_OPTIONS[entry.operator]}: give that option again, or delete the store"
             )
@@ -92,7 +92,7 @@ def stage_own(
     views = [view for view in views if view.name in sizes]
     trained = {view.name: {training_size(*sizes[view.name], resolution)} for view in views}
     for entry in known:
-        if not entry.is_own and entry.view in trained:
+        if not entry.is_users and entry.view in trained:
             trained[entry.view].add((entry.width, entry.height))
     for kind, named in given.items():
         files, strays = find_maps(root, named, views, _SUFFIXES[kind])

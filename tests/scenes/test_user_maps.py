@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from legs_loss import LegsError, WeightSpec
-from legs_loss.precompute import OwnMaps, precompute
+from legs_loss.precompute import UserMaps, precompute
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
 from legs_loss.store import MASK, WEIGHTS, WeightStore
 
@@ -41,12 +41,12 @@ def third(dtype=np.uint8, white=255):
 
 def mask_of(scene, name="images/a.png", kind=MASK, **settings):
     """Return the map that a run finds by the very image, None if it has none."""
-    precompute(read_scene(scene), maps=OwnMaps(**{"masks": "masks", **settings}))
+    precompute(read_scene(scene), maps=UserMaps(**{"masks": "masks", **settings}))
     store = WeightStore(scene / "legs_weights")
     view = next(view for view in read_scene(scene, "images").views if view.name == name)
     found = store.find_image(image_tensor(load_training_image(view)), SPEC)
     entry = found.mask if kind == MASK else found.weights
-    return None if entry is None else store.own_map(entry)
+    return None if entry is None else store.user_map(entry)
 
 
 def replace_mask(scene, image, name="a.png", **options):
@@ -58,8 +58,8 @@ class TestReading:
     def test_a_mask_is_found_by_its_photograph_and_others_count_whole(self, scene):
         np.testing.assert_array_equal(mask_of(scene), third() / 255)
         assert mask_of(scene, "images/b.png") is None
-        report = precompute(read_scene(scene), maps=OwnMaps("masks"))
-        assert (report.own, report.unmasked, len(report.kept)) == ({MASK: 1}, ["images/b.png", "images/c.png"], 3)
+        report = precompute(read_scene(scene), maps=UserMaps("masks"))
+        assert (report.user_maps, report.unmasked, len(report.kept)) == ({MASK: 1}, ["images/b.png", "images/c.png"], 3)
 
     @pytest.mark.parametrize("name", ["a.png.png", "images/a.png", "a.tif", "a.bmp"])
     def test_the_names_of_colmap_nerfstudio_and_folders(self, scene, name):
@@ -108,8 +108,8 @@ class TestReading:
 
     def test_those_of_no_photograph_are_named_and_left_out(self, scene):
         Image.fromarray(third()).save(scene / "masks/z.png")
-        report = precompute(read_scene(scene), maps=OwnMaps("masks"))
-        assert report.own == {MASK: 1} and len(report.notes) == 1
+        report = precompute(read_scene(scene), maps=UserMaps("masks"))
+        assert report.user_maps == {MASK: 1} and len(report.notes) == 1
         assert "1 file(s) are left out" in report.notes[0] and str(scene / "masks/z.png") in report.notes[0]
 
     def test_one_for_all(self, scene):
@@ -119,8 +119,8 @@ class TestReading:
 
     def test_one_for_all_beside_the_photographs_is_none_of_them(self, scene):
         Image.fromarray(third()).save(scene / "images/all.png")
-        report = precompute(read_scene(scene), maps=OwnMaps("images/all.png"))
-        assert (len(report.made), report.own) == (3, {MASK: 3})
+        report = precompute(read_scene(scene), maps=UserMaps("images/all.png"))
+        assert (len(report.made), report.user_maps) == (3, {MASK: 3})
 
     def test_those_that_transforms_json_names_are_used_or_spoken_of(self, scene):
         pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
@@ -129,8 +129,8 @@ class TestReading:
         (scene / "transforms.json").write_text(json.dumps({"fl_x": 9, "w": 12, "h": 8, "frames": frames}))
         report = precompute(read_scene(scene))
         assert "masks of 1 photograph(s): --masks mask_path applies them" in report.notes[0]
-        report = precompute(read_scene(scene), maps=OwnMaps("mask_path"))
-        assert (report.own, report.unmasked, report.notes) == ({MASK: 1}, ["images/b.png"], [])
+        report = precompute(read_scene(scene), maps=UserMaps("mask_path"))
+        assert (report.user_maps, report.unmasked, report.notes) == ({MASK: 1}, ["images/b.png"], [])
         np.testing.assert_array_equal(mask_of(scene, masks="mask_path"), third() / 255)
 
     def test_gray_counts_in_part(self, scene):
@@ -141,10 +141,10 @@ class TestReading:
         checks = np.zeros((16, 24), np.uint8)  # twice the photograph's size
         checks[:, ::4] = 255
         replace_mask(scene, Image.fromarray(checks))
-        precompute(read_scene(scene), resolution=2, maps=OwnMaps("masks"))
+        precompute(read_scene(scene), resolution=2, maps=UserMaps("masks"))
         (entry,) = WeightStore(scene / "legs_weights").of_kind(MASK)
         assert (entry.width, entry.height) == (6, 4)
-        np.testing.assert_allclose(WeightStore(scene / "legs_weights").own_map(entry), 0.25)
+        np.testing.assert_allclose(WeightStore(scene / "legs_weights").user_map(entry), 0.25)
 
     def test_the_photographs_own_alpha(self, scene):
         image = Image.open(scene / "images/a.png").convert("RGBA")
@@ -160,8 +160,8 @@ class TestReading:
         for path in (scene / "images").iterdir():
             path.rename(scene / path.name)
         (scene / "images").rmdir()
-        report = precompute(read_scene(scene), maps=OwnMaps("masks"))
-        assert sorted(report.made) == ["a.png", "b.png", "c.png"] and report.own == {MASK: 1}
+        report = precompute(read_scene(scene), maps=UserMaps("masks"))
+        assert sorted(report.made) == ["a.png", "b.png", "c.png"] and report.user_maps == {MASK: 1}
 
     def test_weights_are_values_times_the_scale(self, scene):
         (scene / "mine").mkdir()
@@ -189,7 +189,7 @@ class TestRefused:
 
     def refuse(self, scene, message, **settings):
         with pytest.raises(LegsError, match=message) as caught:
-            precompute(read_scene(scene), maps=OwnMaps(**{"masks": "masks", **settings}))
+            precompute(read_scene(scene), maps=UserMaps(**{"masks": "masks", **settings}))
         assert "\n" not in str(caught.value)
         assert not (scene / "legs_weights").exists()
 
@@ -298,7 +298,7 @@ class TestRefused:
         self.refuse(scene, "weight_scale must be above 0", scale=float("nan"))
 
     def test_a_store_with_masks_asks_for_them_again(self, scene):
-        precompute(read_scene(scene), maps=OwnMaps("masks"))
+        precompute(read_scene(scene), maps=UserMaps("masks"))
         before = sorted(path.name for path in (scene / "legs_weights").iterdir())
         with pytest.raises(LegsError, match="has maps of --masks: give that option again"):
             precompute(read_scene(scene), resolution=2)
@@ -308,13 +308,13 @@ class TestRefused:
 class TestAgain:
     def test_masks_are_of_every_size_in_the_store_and_replace_older_ones(self, scene):
         precompute(read_scene(scene), resolution=2)
-        precompute(read_scene(scene), maps=OwnMaps("masks"))
+        precompute(read_scene(scene), maps=UserMaps("masks"))
         assert len(WeightStore(scene / "legs_weights").of_kind(MASK)) == 2
         Image.fromarray(255 - third()).save(scene / "masks/a.png")
         np.testing.assert_array_equal(mask_of(scene), 1 - third() / 255)
         store = WeightStore(scene / "legs_weights")
         half = next(entry for entry in store.of_kind(MASK) if entry.width == 6)
-        np.testing.assert_array_equal(store.own_map(half)[0], [1, 1, 0, 0, 0, 0])
+        np.testing.assert_array_equal(store.user_map(half)[0], [1, 1, 0, 0, 0, 0])
         files = len(list((scene / "legs_weights").glob("*.npy")))
         assert files == len(WeightStore(scene / "legs_weights").entries) == 8
 

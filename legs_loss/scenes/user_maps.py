@@ -21,7 +21,7 @@ __all__ = [
     "dimmed",
     "file_names",
     "find_maps",
-    "own_path",
+    "map_path",
     "read_map_file",
     "read_mask",
     "write_gray",
@@ -34,7 +34,7 @@ _DARK = 0.1  # of white: a mask whose lightest pixel is darker shows something e
 _BOX = 4  # Image.BOX, whose home differs between versions of Pillow
 
 
-def own_path(root: Path, named: str) -> Path:
+def map_path(root: Path, named: str) -> Path:
     """Return the file or folder of maps that was named: in the scene, or a path."""
     return root / named if (root / named).exists() else Path(named)
 
@@ -54,7 +54,7 @@ def find_maps(
     Raises:
         LegsError: there is no such path, or no map; a map fits several photographs; a photograph has two maps.
     """
-    path, missing = own_path(root, named), f"no map of a photograph ({', '.join(suffixes)})"
+    path, missing = map_path(root, named), f"no map of a photograph ({', '.join(suffixes)})"
     strays: List[Path] = []
     if named == ALPHA:
         found = {view.name: view.path for view in views if _has_alpha(view.path)}

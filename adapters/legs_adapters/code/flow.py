@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any, Dict, FrozenSet, List, Optional, Set, Tuple
+from typing import Any, Dict, List, Optional, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.reaching import Definition, Env
+from legs_adapters.code.reaching import Definition, Env, Reaching
 from legs_adapters.code.syntax import (
     call_name,
     children,
@@ -25,6 +25,7 @@ from legs_adapters.code.syntax import (
 
 __all__ = ["MUTATORS", "Flow"]
 
+_NOTHING = Reaching()
 _PART = re.compile(r"[.\[]")
 MUTATORS = {"append", "add", "extend", "insert", "update", "setdefault", "appendleft", "__setitem__"}
 
@@ -47,7 +48,7 @@ class Flow:
         contexts: by a node's id, the loops and the context managers around it (``with torch.no_grad():``), the
             innermost last.
         conditions: by a call's id, the names that must be true where it runs, ``if tracking:``, the innermost last.
-        steps: how many it took: nodes that were visited, definitions that reach them, and copied ones, four a step.
+        steps: how many it took: nodes that were visited, and copied definitions, four a step.
     """
 
     def __init__(
@@ -61,7 +62,8 @@ class Flow:
         self.definitions: Dict[str, List[Definition]] = {}
         self.contexts: Dict[int, Tuple[cst.CSTNode, ...]] = {}
         self.conditions: Dict[int, Tuple[cst.Name | cst.Attribute, ...]] = {}
-        self._reaching: Dict[int, Set[Definition]] = {}
+        self._reaching: Dict[int, Reaching] = {}
+        self._everywhere: Dict[str, Reaching] = {}
         self._visited: Dict[int, Tuple[cst.CSTNode, int]] = {}  # with the number of definitions made before
         self._made: Dict[Tuple[int, str, str], Definition] = {}
         self._holders: Set[str] = set()  # places of which a part is defined: ``x`` and ``x.y`` of ``x.y['z']``
@@ -90,25 +92,35 @@ class Flow:
         """All definitions, place by place."""
         return [definition for definitions in self.definitions.values() for definition in definitions]
 
-    def reaching(self, node: cst.CSTNode) -> FrozenSet[Definition]:
+    def reaching(self, node: cst.CSTNode) -> Reaching:
         """Return the definitions that this use of a place can come from; empty for what is not local."""
-        return frozenset(self._reaching.get(id(node), ()))
+        return self._reaching.get(id(node), _NOTHING)
+
+    def everywhere(self, place: str) -> Reaching:
+        """Return all definitions of a place, joined."""
+        if place not in self._everywhere:
+            self._everywhere[place] = Reaching(self.definitions.get(place, ()))
+        return self._everywhere[place]
 
     def assigned(self, node: cst.CSTNode) -> List[cst.CSTNode]:
         """Return the values of the assignments that reach this use."""
         return [d.value for d in self.reaching(node) if d.kind == "assign" and d.value is not None]
 
+    def reads_in(self, node: cst.CSTNode) -> List[cst.Name]:
+        """Return the names that are read in an expression, keywords and attributes aside."""
+        return [part for part in walk_expressions(node) if isinstance(part, cst.Name) and id(part) in self._visited]
+
     def value_of(self, node: cst.CSTNode) -> Optional[cst.CSTNode]:
         """Return the value of a name, where exactly one assignment reaches it; else None."""
-        found = list(self.reaching(node)) if isinstance(node, cst.Name) else []
-        return found[0].value if len(found) == 1 and found[0].kind == "assign" else None
+        found = self.reaching(node) if isinstance(node, cst.Name) else None
+        return found.value if isinstance(found, Definition) and found.kind == "assign" else None
 
     def unchanged(self, *nodes: cst.CSTNode) -> bool:
         """Return whether the names in expressions are not reassigned anywhere in the body."""
         for part in (part for node in nodes for part in walk_expressions(node)):
             if isinstance(part, cst.Name) and self.reaching(part):
                 everywhere = {d for d in self.definitions.get(part.value, []) if d.kind != "store"}
-                if not everywhere <= self.reaching(part):
+                if not everywhere.issubset(self.reaching(part)):
                     return False
         return True
 
@@ -134,11 +146,11 @@ class Flow:
         if place in self._holders:  # a top level may bind thousands of names, and few of them have parts
             for other in [other for other in env if other.startswith((place + ".", place + "["))]:
                 del env[other]
-        env[place] = frozenset([definition])
+        env[place] = definition
 
     def _add(self, env: Env, definition: Definition) -> None:
         definition = self._first(definition)
-        env[definition.place] = env.get(definition.place, frozenset()) | {definition}
+        env[definition.place] = definition.join(env.get(definition.place))
 
     def _first(self, made: Definition) -> Definition:
         """Return the definition that a statement was recorded as when it was met first; a loop is walked twice."""
@@ -351,8 +363,7 @@ class Flow:
     def _visit_Name(self, node: cst.CSTNode, env: Env) -> None:
         place = path_of(node)
         if place is not None and place in env:
-            self.steps += len(env[place]) - 1
-            self._reaching.setdefault(id(node), set()).update(env[place])
+            self._reaching[id(node)] = env[place].join(self._reaching.get(id(node)))
 
     def _visit_Attribute(self, node: cst.Attribute, env: Env) -> None:
         self._visit_Name(node, env)

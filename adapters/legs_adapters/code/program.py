@@ -12,7 +12,7 @@ import libcst as cst
 from legs_adapters.code.checkout import Checkout, imported_name
 from legs_adapters.code.limits import Budget
 from legs_adapters.code.module import CALLED, Class, Function, Module
-from legs_adapters.code.reaching import Definition
+from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import arguments, call_name, dotted, path_of
 
@@ -54,7 +54,7 @@ class Program(Checkout):
         self._returning_self = frozenset(returning_self)
         self._wrapping = tuple("." + name for name in wrapping)
         # by expression and depth; each may be asked from many places, and asks for many others
-        self._resolved: Dict[Function, Dict[Tuple[int, int], Tuple[cst.CSTNode, List[Reference]]]] = {}
+        self._resolved: Dict[Function, Dict[Tuple[int, int], Tuple[object, List[Reference]]]] = {}
 
     def resolve(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[Reference]:
         """Return what an expression may refer to; empty where it is unknown."""
@@ -68,10 +68,10 @@ class Program(Checkout):
 
     def _resolve(self, function: Function, node: cst.CSTNode, depth: int) -> Iterable[Reference]:
         if isinstance(node, cst.Name):
-            definitions = self.lookup(function, node)
-            if definitions is None:
-                return self._member_of_module(function.module, node.value, depth)
-            return [ref for where, made in definitions for ref in self.of_definition(where, made, depth)]
+            found = self.lookup(function, node)
+            return (
+                self._member_of_module(function.module, node.value, depth) if found is None else self._of(*found, depth)
+            )
         if isinstance(node, cst.Attribute):
             return self._attribute(function, node, depth)
         if isinstance(node, cst.Call):
@@ -85,16 +85,26 @@ class Program(Checkout):
             return self.resolve(function, node.body, depth) + self.resolve(function, node.orelse, depth)
         return [Reference("lambda", node)] if isinstance(node, cst.Lambda) else []
 
-    def lookup(self, function: Function, node: cst.CSTNode) -> Optional[List[Tuple[Function, Definition]]]:
-        """Return the definitions that a place may come from, each with its function; None if unknown."""
+    def lookup(self, function: Function, node: cst.CSTNode) -> Optional[Tuple[Function, Reaching]]:
+        """Return the definitions that a place may come from, and their function; None if unknown."""
         local = function.flow.reaching(node)
         if local:
-            return [(function, definition) for definition in sorted(local, key=lambda made: made.order)]
+            return function, local
         place, scope = path_of(node), function.parent or function
         while place is not None and place not in scope.flow.definitions and scope.parent is not None:
             scope = scope.parent
-        found = scope.flow.definitions.get(place) if place is not None else None
-        return None if found is None else [(scope, definition) for definition in found]
+        found = scope.flow.everywhere(place) if place is not None else None
+        return (scope, found) if found else None
+
+    def _of(self, where: Function, reaching: Reaching, depth: int) -> List[Reference]:
+        """Return what definitions may bind their place to; of each join it is found once."""
+        known = self._resolved.setdefault(where, {})
+        for join in reaching.joins(lambda part: (id(part), depth) in known):
+            found = [self._of(where, part, depth) for part in join.parts if where.module.spend(1)]
+            known[id(join), depth] = join, list(dict.fromkeys(ref for some in found for ref in some))
+        if isinstance(reaching, Definition):
+            return self.of_definition(where, reaching, depth)
+        return known[id(reaching), depth][1]
 
     def of_definition(self, where: Function, definition: Definition, depth: int = 0) -> List[Reference]:
         """Return what a definition may bind its place to."""
@@ -152,10 +162,12 @@ class Program(Checkout):
     # -- modules
 
     def _member_of_module(self, module: Module, name: str, depth: int) -> List[Reference]:
-        definitions = module.top.flow.definitions.get(name) if depth <= _MAX_DEPTH else ()
+        if depth > _MAX_DEPTH:
+            return []
+        definitions = module.top.flow.everywhere(name)
         if definitions:
-            return [ref for definition in definitions for ref in self.of_definition(module.top, definition, depth)]
-        for node in module.top.flow.imports if definitions is None else ():
+            return self._of(module.top, definitions, depth)
+        for node in module.top.flow.imports:
             if isinstance(node, cst.ImportFrom) and isinstance(node.names, cst.ImportStar):
                 other = self.imported_from(module, node)
                 found = self._member_of_module(other, name, depth + 1) if other not in (None, module) else []
@@ -184,8 +196,7 @@ class Program(Checkout):
     def _attribute(self, function: Function, node: cst.Attribute, depth: int) -> List[Reference]:
         name = node.attr.value
         if function.flow.reaching(node):
-            stored = self.lookup(function, node) or ()
-            references = [ref for where, definition in stored for ref in self.of_definition(where, definition, depth)]
+            references = self._of(function, function.flow.reaching(node), depth)
             if references:
                 return references
         if isinstance(node.value, cst.Name) and node.value.value in ("self", "cls"):

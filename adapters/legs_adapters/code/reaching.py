@@ -7,16 +7,65 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Dict, FrozenSet, Optional
+from typing import Callable, Dict, Iterator, List, Optional, Sequence, Set
 
 import libcst as cst
 
-__all__ = ["Definition", "Env"]
+__all__ = ["Definition", "Env", "Reaching"]
+
+
+class Reaching:
+    """The definitions that reach a point: one, or a join of those that reach the points before it.
+
+    Joins refer to one another, as the phi nodes of SSA do: what is asked of each of them once takes as long as there
+    are joins, while n branches have n * n definitions.
+
+    Args:
+        parts: what was joined; empty where nothing reaches the point.
+    """
+
+    def __init__(self, parts: Sequence[Reaching] = ()) -> None:
+        self.parts = parts
+
+    def __bool__(self) -> bool:
+        return bool(self.parts)
+
+    def __iter__(self) -> Iterator[Definition]:
+        """Yield every definition once, in source order."""
+        return iter(sorted(self.new(set()), key=lambda made: made.order))
+
+    def new(self, met: Set[Reaching]) -> Iterator[Definition]:
+        """Yield the definitions that were not met before, in any order, and add what is met now."""
+        work: List[Reaching] = [self]
+        while work:
+            part = work.pop()
+            if part not in met:
+                met.add(part)
+                work += part.parts
+                if isinstance(part, Definition):
+                    yield part
+
+    def join(self, other: Optional[Reaching]) -> Reaching:
+        """Return both; itself or the other where that was made of both."""
+        if other is None or other is self or other in self.parts:
+            return self
+        return other if self in other.parts else Reaching((other, self))
+
+    def joins(self, is_done: Callable[[Reaching], bool]) -> Iterator[Reaching]:
+        """Yield the joins in it and itself, each after those in it; the caller does each before it takes the next."""
+        work = [self] if self.parts else []
+        while work:
+            inner = [part for part in work[-1].parts if part.parts and not is_done(part)]
+            work += inner
+            if not inner:
+                join = work.pop()
+                if not is_done(join):
+                    yield join
 
 
 @dataclass(eq=False)
-class Definition:
-    """One definition of a place.
+class Definition(Reaching):
+    """One definition of a place, which reaches a point alone.
 
     Attributes:
         place: ``x``, ``self.x`` or ``losses['im']``.
@@ -37,9 +86,13 @@ class Definition:
     index: Optional[int] = None
     key: object = None
     order: int = 0
+    parts = ()
+
+    def __bool__(self) -> bool:
+        return True
 
 
-class Env(Dict[str, FrozenSet[Definition]]):
+class Env(Dict[str, Reaching]):
     """The definitions of each place that reach one point; it is not alive after a return."""
 
     alive: bool = True
@@ -52,8 +105,7 @@ class Env(Dict[str, FrozenSet[Definition]]):
             joined = dict(alive[0])
             for end in alive[1:]:
                 for place, definitions in end.items():
-                    known = joined.get(place)
-                    if known is not definitions:
-                        joined[place] = definitions if known is None else known | definitions
+                    if joined.get(place) is not definitions:
+                        joined[place] = definitions.join(joined.get(place))
             self.clear()
             self.update(joined)

@@ -7,6 +7,7 @@ from typing import Dict, List, Optional
 import libcst as cst
 
 from legs_adapters.code.module import Function
+from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import constant
 
 __all__ = ["default_key", "formatted_key", "returned"]
@@ -66,5 +67,5 @@ def default_key(function: Function, node: cst.Subscript) -> object:
     index = node.slice[0].slice
     if len(node.slice) != 1 or not isinstance(index, cst.Index) or not isinstance(index.value, cst.Name):
         return None
-    found = list(function.flow.reaching(index.value))
-    return constant(found[0].value) if len(found) == 1 and found[0].kind == "parameter" else None
+    found = function.flow.reaching(index.value)
+    return constant(found.value) if isinstance(found, Definition) and found.kind == "parameter" else None

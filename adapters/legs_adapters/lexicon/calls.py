@@ -68,7 +68,7 @@ class CallReading:
         if not isinstance(node, cst.Name):
             return False
         found = self.program.lookup(self.function, node)
-        return node.value in MODULES or (bool(found) and all(isinstance(d.value, cst.Import) for _, d in found or ()))
+        return node.value in MODULES or (found is not None and all(isinstance(d.value, cst.Import) for d in found[1]))
 
 
 def meaning_of_call(call: CallReading, by_arguments: bool = True) -> Meaning:

@@ -7,17 +7,18 @@ and the field's words in the names along it. A name with "depth" or "feature" ou
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional, Tuple
+import heapq
+from typing import Any, Callable, Dict, FrozenSet, List, Optional, Set, Tuple, Union
 
 import libcst as cst
 
 from legs_adapters.code.calls import callees, sure_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.reaching import Definition
+from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.returned import default_key, formatted_key
 from legs_adapters.code.syntax import arguments, call_name, constant, dotted, key_of, root_of, same, words
-from legs_adapters.lexicon.calls import CallReading, MeaningOf, meaning_of_call
+from legs_adapters.lexicon.calls import CallReading, meaning_of_call
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import BACKGROUND, DATA, KIND_OF, LOSS, RENDER, RENDERERS
@@ -25,10 +26,24 @@ from legs_adapters.tensors.backward import Training
 
 __all__ = ["Meanings"]
 
-_DEPTH = 40
-_NONE = _DEPTH + 2
+_DEPTH = 200  # questions in one another; deeper ones are answered afterwards, and those that asked are asked again
+_TURNS = 8  # that one is answered in, in a loop
 
-_Question = Tuple[str, int]  # of an expression, or of the definitions that reach it; its id
+_Subject = Union[cst.CSTNode, Reaching]  # what is asked about: an expression, or the definitions that reach it
+
+
+class _Question:
+    """A question that is not settled yet, its answer so far, and those who were given that."""
+
+    def __init__(self, order: int, function: Function, subject: _Subject, ask: Callable[[Function, Any], Any]) -> None:
+        self.order = order
+        self.function = function
+        self.subject = subject
+        self.ask = ask
+        self.answer: Any = frozenset() if isinstance(subject, Reaching) else UNKNOWN
+        self.readers: Set[_Question] = set()
+        self.turns = 0
+        self.is_waiting = False
 
 
 class Meanings:
@@ -42,10 +57,11 @@ class Meanings:
         self.program = program
         self.training = training
         self.rows: Dict[Tuple[int, int], bool] = {}  # see `is_rows`
-        self._known: Dict[_Question, Meaning] = {}
-        self._here: Dict[_Question, Tuple[Meaning, int]] = {}
-        self._open: Dict[_Question, int] = {}  # in their order, from 0
-        self._needs = _NONE  # the first open question on which the answers since depend
+        self._known: Dict[Tuple[str, int], Any] = {}
+        self._asked: Dict[Tuple[str, int], _Question] = {}  # since the outermost question
+        self._waiting: List[Tuple[int, _Question]] = []  # to be answered, or again: those that were asked last first
+        self._reader: Optional[_Question] = None
+        self._depth = 0
 
     def meaning(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Return the meaning of an expression."""
@@ -59,35 +75,70 @@ class Meanings:
 
     def _flow(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Join the meanings of the definitions that reach this use."""
-        return self._answer(function, node, self._defined)
+        found = self.program.lookup(function, node)
+        return self._joined(self._answer(*found, self._ways) if found is not None else frozenset())
 
-    def _answer(self, function: Function, node: cst.CSTNode, answer: MeaningOf) -> Meaning:
-        """Answer a question once; unknown where the answer depends on itself or the file is over its budget."""
-        question, here = (answer.__name__, id(node)), len(self._open)
-        if question in self._known:
-            return self._known[question]
-        if question in self._here:
-            self._needs = min(self._needs, self._here[question][1])
-            return self._here[question][0]
-        is_over = here > _DEPTH or not function.module.spend(2)
-        if question in self._open or is_over:
-            self._needs = 0 if is_over else min(self._needs, self._open[question])
-            return UNKNOWN
-        before, self._needs = self._needs, _NONE
-        self._open[question] = here
+    def _joined(self, ways: FrozenSet[Meaning]) -> Meaning:
+        """Return the meaning of what can come by several ways."""
+        if any(meaning.role == "target" and meaning.kind in ("image", None) for meaning in ways):
+            # or what a setting puts into the photograph's place
+            ways = frozenset(meaning for meaning in ways if meaning.kind not in ("warp", "feature"))
+        return mix(ways)
+
+    def _answer(self, function: Function, subject: _Subject, ask: Callable[[Function, Any], Any]) -> Any:
+        """Answer a question once, a fixed point where it depends on itself; unknown where a file is over its budget.
+
+        Everything that was asked on the way is settled, and remembered, when the outermost question is.
+        """
+        key = ask.__name__, id(subject)
+        if key in self._known:
+            return self._known[key]
+        question = self._asked.get(key)
+        if question is None:
+            question = self._asked[key] = _Question(len(self._asked), function, subject, ask)
+            if self._reader is None:
+                self._settle(question)
+                return question.answer
+            if self._depth < _DEPTH:
+                self._turn(question)
+            else:
+                self._wait(question)
+        assert self._reader is not None
+        question.readers.add(self._reader)
+        return question.answer
+
+    def _settle(self, question: _Question) -> None:
+        self._wait(question)
         try:
-            meaning = answer(function, node)
+            while self._waiting:
+                self._turn(heapq.heappop(self._waiting)[1])
+            self._known.update((key, asked.answer) for key, asked in self._asked.items())
         finally:
-            del self._open[question]
-            needs, self._needs = self._needs, min(before, self._needs) if self._needs < here else before
-        # An answer from inside a cycle is incomplete: it is remembered for the outermost question alone.
-        if needs < here:
-            self._here[question] = meaning, needs
-        else:
-            self._known[question] = meaning
-        if not here:
-            self._here.clear()
-        return meaning
+            self._asked.clear()
+            self._waiting.clear()
+
+    def _wait(self, question: _Question) -> None:
+        if not question.is_waiting:
+            question.is_waiting = True
+            heapq.heappush(self._waiting, (-question.order, question))
+
+    def _turn(self, question: _Question) -> None:
+        """Answer a question; where the answer is another than before, whoever was given that one has a turn."""
+        question.is_waiting = False
+        question.turns += 1
+        if question.turns > _TURNS or not question.function.module.spend(2):
+            return
+        reader, self._reader = self._reader, question
+        self._depth += 1
+        try:
+            answer = question.ask(question.function, question.subject)
+        finally:
+            self._reader = reader
+            self._depth -= 1
+        if answer != question.answer:
+            question.answer = answer
+            for each in question.readers:
+                self._wait(each)
 
     # -- expressions
 
@@ -159,15 +210,11 @@ class Meanings:
 
     # -- definitions
 
-    def _defined(self, function: Function, node: cst.CSTNode) -> Meaning:
-        definitions = self.program.lookup(function, node) or ()
-        if not function.module.spend(2 * len(definitions)):
-            return UNKNOWN
-        ways = [self._definition(where, definition) for where, definition in definitions]
-        if any(meaning.role == "target" and meaning.kind in ("image", None) for meaning in ways):
-            # or what a setting puts into the photograph's place
-            ways = [meaning for meaning in ways if meaning.kind not in ("warp", "feature")]
-        return mix(ways)
+    def _ways(self, function: Function, reaching: Reaching) -> FrozenSet[Meaning]:
+        """Return the meanings of definitions, each once."""
+        if isinstance(reaching, Definition):
+            return frozenset([self._definition(function, reaching)])
+        return frozenset().union(*(self._answer(function, part, self._ways) for part in reaching.parts))
 
     def _definition(self, function: Function, definition: Definition) -> Meaning:
         value = definition.value

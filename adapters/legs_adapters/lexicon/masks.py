@@ -8,6 +8,7 @@ import libcst as cst
 
 from legs_adapters.code.calls import callees
 from legs_adapters.code.module import Function
+from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.syntax import arguments, call_name, constant, key_of, walk_expressions, words
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.words import PICKING
@@ -36,19 +37,27 @@ def makes_mask(call: cst.Call) -> bool:
     return bool(set(words(call_name(call))) & PICKING) or call_name(call) == "quantile"
 
 
-def is_rows(meanings: Meanings, function: Function, node: Optional[cst.CSTNode], depth: int = 0) -> bool:
-    """Return whether an expression is a list of pixels, ``image.reshape(-1, 3)``, without neighbours."""
-    if node is None or depth > _DEPTH or not function.module.spend(1):
+def is_rows(meanings: Meanings, function: Function, node: Optional[cst.CSTNode | Reaching], depth: int = 0) -> bool:
+    """Return whether an expression, or what reaches it, is a list of pixels, ``image.reshape(-1, 3)``."""
+    if node is None or depth > _DEPTH:
         return False
     known = meanings.rows
+    if isinstance(node, Reaching) and not isinstance(node, Definition):
+        for join in node.joins(lambda part: (id(part), depth) in known):
+            known[id(join), depth] = any(is_rows(meanings, function, part, depth) for part in join.parts)
     if (id(node), depth) not in known:
-        known[id(node), depth] = _is_rows(meanings, function, node, depth)
+        known[id(node), depth] = function.module.spend(1) and _is_rows(meanings, function, node, depth)
     return known[id(node), depth]
 
 
-def _is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: int) -> bool:
+def _is_rows(meanings: Meanings, function: Function, node: cst.CSTNode | Reaching, depth: int) -> bool:
     parts: List[Optional[cst.CSTNode]] = []
-    if isinstance(node, cst.BinaryOperation):
+    if isinstance(node, Definition):
+        if node.kind == "mutate" and isinstance(node.value, cst.Call):
+            parts = [*arguments(node.value)[0]]  # crops = [], then crops.append(crop.flatten())
+        elif node.kind == "assign":
+            parts = [node.value]
+    elif isinstance(node, cst.BinaryOperation):
         parts = [node.left, node.right]
     elif isinstance(node, cst.Subscript):
         if depth and not isinstance(key_of(node), str) and any(is_mask(meanings, function, e) for e in node.slice):
@@ -57,11 +66,7 @@ def _is_rows(meanings: Meanings, function: Function, node: cst.CSTNode, depth: i
             return True
         parts = [node.value]
     elif isinstance(node, cst.Name):
-        for made in function.flow.reaching(node):
-            if made.kind == "mutate" and isinstance(made.value, cst.Call):
-                parts += arguments(made.value)[0]  # crops = [], then crops.append(crop.flatten())
-            elif made.kind == "assign":
-                parts.append(made.value)
+        return is_rows(meanings, function, function.flow.reaching(node), depth)
     elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
         if _flattens(node):
             return True

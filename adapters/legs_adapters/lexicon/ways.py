@@ -5,19 +5,21 @@ No name of a variable counts. What is not followed for certain is not known.
 
 from __future__ import annotations
 
-from typing import List
+from typing import AbstractSet, Dict, FrozenSet, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.calls import sure_calls
 from legs_adapters.code.module import Function
-from legs_adapters.code.reaching import Definition
+from legs_adapters.code.program import Program
+from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.syntax import attribute_chain, call_name, code, constant, root_of, words, words_in
 from legs_adapters.lexicon.calls import CallReading, meaning_of_call, meaning_returned
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import BACKGROUND, DATA, GAUSSIANS, RENDERERS, SPLATS
+from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.operations import PICTURE_FUNCTIONS, VIEWS
 
 __all__ = ["PHOTOGRAPH", "RENDERING", "Ways"]
@@ -29,6 +31,10 @@ _DEPTH = 4
 
 class Ways(Meanings):
     """Answer for the expressions of one program as `Meanings` does, without the names of variables."""
+
+    def __init__(self, program: Program, training: Training) -> None:
+        super().__init__(program, training)
+        self._holding: Dict[Tuple[int, int], bool] = {}  # by the id of an expression or a join, and the depth
 
     def _name(self, function: Function, node: cst.Name, flow: Meaning) -> Meaning:
         return flow
@@ -70,7 +76,7 @@ class Ways(Meanings):
         if owner is None or not isinstance(node, cst.Attribute) or not isinstance(node.value, cst.Name):
             return UNKNOWN
         stores = owner.stores(node.attr.value) if node.value.value == "self" else []
-        return _agreed([self._definition(method, definition) for method, definition in stores])
+        return _agreed({self._definition(method, definition) for method, definition in stores})
 
     def _draws_splats(self, function: Function, call: cst.Call) -> bool:
         """Return whether a renderer is known to draw Gaussians: by what it is given, or where and how it is defined."""
@@ -79,14 +85,25 @@ class Ways(Meanings):
         texts += [run.module.path + run.text for reference in found for run in self.program.run_by(reference)]
         return bool(GAUSSIANS & words_in(call)) or any(map(SPLATS.search, texts))
 
-    def _holds_data(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
+    def _holds_data(self, function: Function, node: cst.CSTNode | Reaching, depth: int = 0) -> bool:
         """Return whether an object is a camera or a dataset's entry, by its name or those of what it is taken from.
 
         A camera of a view that was warped, or that nobody photographed, is none: ``pseudo_cam``.
         """
+        known = self._holding
+        for join in node.joins(lambda part: (id(part), depth) in known) if isinstance(node, Reaching) else ():
+            known[id(join), depth] = any(self._holds_data(function, part, depth) for part in join.parts)
+        if (id(node), depth) not in known:
+            known[id(node), depth] = function.module.spend(1) and self._holds(function, node, depth)
+        return known[id(node), depth]
+
+    def _holds(self, function: Function, node: cst.CSTNode | Reaching, depth: int) -> bool:
+        if isinstance(node, Reaching):
+            value = node.value if isinstance(node, Definition) else None
+            return value is not None and self._holds_data(function, value, depth + 1)
         chain = list(attribute_chain(node))
         names = [root_of(part) for part in chain if isinstance(part, (cst.Name, cst.Attribute))]
-        if depth > _DEPTH or not function.module.spend(1) or "warp" in map(kind_of_words, names):
+        if depth > _DEPTH or "warp" in map(kind_of_words, names):
             return False
         root, call = chain[-1], chain[-2] if len(chain) > 1 else None
         if any(DATA & set(words(name)) for name in names):
@@ -94,28 +111,28 @@ class Ways(Meanings):
             return not is_drawn and "render" not in map(role_of_words, names)
         if isinstance(call, cst.Call) and call.args and call_name(call) in PICTURE_FUNCTIONS:
             return self._holds_data(function, call.args[0].value, depth + 1)
-        made = [(where, each.value) for where, each in self.program.lookup(function, root) or ()]
-        return any(value is not None and self._holds_data(where, value, depth + 1) for where, value in made)
+        found = self.program.lookup(function, root)
+        return found is not None and self._holds_data(*found, depth)
 
     # -- definitions
 
-    def _defined(self, function: Function, node: cst.CSTNode) -> Meaning:
-        definitions = self.program.lookup(function, node) or ()
-        if not function.module.spend(2 * len(definitions)):
-            return UNKNOWN
-        found = [(definition.kind, self._definition(where, definition)) for where, definition in definitions]
-        return _agreed([meaning for kind, meaning in found if kind != "store" or meaning != UNKNOWN])
+    def _ways(self, function: Function, reaching: Reaching) -> FrozenSet[Meaning]:
+        ways = super()._ways(function, reaching)
+        return ways - {UNKNOWN} if isinstance(reaching, Definition) and reaching.kind == "store" else ways
+
+    def _joined(self, ways: FrozenSet[Meaning]) -> Meaning:
+        return _agreed(ways)
 
     def _parameter(self, function: Function, definition: Definition) -> Meaning:
         if definition.place not in function.parameters:
             return UNKNOWN
         calls = self.training.sites.get(function) or list(sure_calls(self.program, function))
         given = [(caller, function.given(call, definition.place)) for caller, call in calls[:12]]
-        return _agreed([UNKNOWN if value is None else self.meaning(caller, value) for caller, value in given])
+        return _agreed({UNKNOWN if value is None else self.meaning(caller, value) for caller, value in given})
 
 
-def _agreed(ways: List[Meaning]) -> Meaning:
-    return ways[0] if len(set(ways)) == 1 else UNKNOWN
+def _agreed(ways: AbstractSet[Meaning]) -> Meaning:
+    return next(iter(ways)) if len(ways) == 1 else UNKNOWN
 
 
 def _keeps_colours(element: cst.SubscriptElement) -> bool:

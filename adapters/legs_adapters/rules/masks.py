@@ -7,13 +7,16 @@ What else compares the two there may be a mean over all pixels, masked ones too:
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import re
-from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple, Union
+from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple, Union
 
 import libcst as cst
 
 from legs_adapters.code.module import Function, blocks_of
-from legs_adapters.code.reaching import Definition
+from legs_adapters.code.parsing import Place
+from legs_adapters.code.reaching import Reaching
 from legs_adapters.code.syntax import (
     arguments,
     call_name,
@@ -35,12 +38,14 @@ from legs_adapters.terms.writing import PACKAGE
 __all__ = ["with_masks"]
 
 _MASKED, _COVERAGE = f"{PACKAGE}.masked", f"{PACKAGE}.coverage"
+_Given = Tuple[cst.Call, List[Set[Optional[str]]]]  # a call, and what its arguments read
+
 _MOST = 100  # expressions that a rendering is followed through
 
 
 def with_masks(found: Findings, analysis: Analysis) -> Findings:
     """Return findings with the lines that mask the renderings of their terms, and with those to be written by hand."""
-    finder = _Finder(analysis)
+    finder = _Finder(analysis, found.sites)
     for site in found.sites:
         form = site.form
         sides = (form.second, form.first) if site.swapped else (form.first, form.second)
@@ -53,7 +58,7 @@ def with_masks(found: Findings, analysis: Analysis) -> Findings:
     for entry in found.patched:
         finder.look_at_patched(entry)
     lines, problems = finder.settled()
-    left = [entry for line in lines for entry in finder.diluted(line, found.sites)]
+    left = [entry for line in lines for entry in finder.diluted(line)]
     return found.with_more(sites=[line.site for line in lines], problems=problems, left=left)
 
 
@@ -86,6 +91,11 @@ class _Line(NamedTuple):
     start: int
     end: int
 
+    @property
+    def place(self) -> Tuple[Function, Optional[str]]:
+        """The function and the place of the rendering."""
+        return self.pair.function, path_of(self.pair.prediction)
+
     def covers(self, function: Function, node: cst.CSTNode) -> bool:
         """Return whether a read is of its rendering, and comes after it."""
         is_same = function is self.pair.function and path_of(node) == path_of(self.pair.prediction)
@@ -98,13 +108,36 @@ class _Line(NamedTuple):
         return Site.at(function, form, f"{form.line}, before line {function.place(self.before).line}")
 
 
+class _Spans:
+    """Places in a file, in their order."""
+
+    def __init__(self, places: Sequence[Place]) -> None:
+        self.places = sorted(places)
+        self._starts = [place.start for place in self.places]
+        self._ends = list(itertools.accumulate((place.end for place in self.places), max))
+
+    def before(self, at: int) -> int:
+        """Return the index of the last that begins at a byte or before it; -1 without."""
+        return bisect.bisect_right(self._starts, at) - 1
+
+    def meets(self, place: Place) -> bool:
+        """Return whether one of them and a place have bytes in common."""
+        index = bisect.bisect_left(self._starts, place.end)
+        return index > 0 and self._ends[index - 1] > place.start
+
+
 class _Finder:
-    def __init__(self, analysis: Analysis) -> None:
+    def __init__(self, analysis: Analysis, sites: Sequence[Site]) -> None:
         self.analysis = analysis
-        self.lines: List[_Line] = []
+        self.lines: Dict[Tuple[Function, Optional[str]], List[_Line]] = {}  # by the rendering's function and place
         self.unnamed: List[_Pair] = []
         self.problems: List[Problem] = []
         self._reads: Dict[Function, Dict[Optional[str], List[cst.CSTNode]]] = {}
+        self._given: Dict[Function, Dict[Optional[str], List[_Given]]] = {}
+        self._blocks: Dict[int, _Spans] = {}
+        self._edited: Dict[Function, List[Place]] = {}
+        for site in sites:
+            self._edited.setdefault(site.scope, []).append(site.scope.place(site.form.node))
 
     def look_at_patched(self, entry: Left) -> None:
         """Take in the terms of a line that were weighted before."""
@@ -125,25 +158,25 @@ class _Finder:
         if not isinstance(pair.prediction, cst.Name):
             self.unnamed.append(pair)
             return
-        line = _line(pair)
+        line = self._line(pair)
         if isinstance(line, str):
             self.problems.append(pair.problem(pair.function, pair.node, line))
-        elif not any(one.start == line.start and one.covers(pair.function, pair.prediction) for one in self.lines):
-            self.lines.append(line)
+        else:
+            known = self.lines.setdefault(line.place, [])
+            covered = any(one.start == line.start and one.covers(pair.function, pair.prediction) for one in known)
+            known += [] if covered else [line]
 
-    def diluted(self, line: _Line, sites: Sequence[Site]) -> Iterator[Left]:
+    def diluted(self, line: _Line) -> Iterator[Left]:
         """Yield the calls that get both images of a line after it, and are no terms of ours."""
         function, resolve = line.pair.function, self.analysis.program.resolve
         pair = {path_of(line.pair.prediction), path_of(line.pair.target)}
-        edited = [function.place(site.form.node) for site in sites if site.scope is function]
-        for call in function.flow.calls:
-            place, given = function.place(call), arguments(call)[0]
-            images = [{path_of(part) for part in _places(each)} & pair for each in given]
-            if set().union(*images) != pair or not self.analysis.training.includes(call):
+        edited = _Spans(self._edited.get(function, ()))
+        for call, images in self._calls(function, path_of(line.pair.prediction)):
+            place = function.place(call)
+            if not pair <= set().union(*images) or any(pair <= both for both in images) or edited.meets(place):
                 continue
             own = any(str(r.target).startswith(f"{PACKAGE}.") for r in resolve(function, call.func))
-            inside = any(at.start < place.end and place.start < at.end for at in edited)
-            if own or inside or any(both == pair for both in images) or not line.start <= place.start < line.end:
+            if own or not line.start <= place.start < line.end:
                 continue
             term, share = one_line(call), f"{_COVERAGE}({one_line(line.pair.prediction)}, {one_line(line.pair.target)})"
             is_similarity = STRUCTURAL.search(term) and not re.search("(?i)loss", call_name(call))
@@ -152,32 +185,36 @@ class _Finder:
 
     def settled(self) -> Tuple[List[_Line], List[Problem]]:
         """Return the lines that mask every term, and the problems; where one is not written, others may leak."""
-        for line in self.lines:
-            leak = self._leak(line.pair)
-            if leak is not None:
-                self.lines.remove(line)
-                why = f"{one_line(leak[1])} reaches the loss here, past the mask"
-                self.problems.append(line.pair.problem(*leak, why))
-                return self.settled()
+        kept = [line for lines in self.lines.values() for line in lines]
+        left = None
+        while left != len(kept):
+            left = len(kept)
+            for line in list(kept):
+                leak = self._leak(line.pair)
+                if leak is not None:
+                    kept.remove(line)
+                    self.lines[line.place].remove(line)
+                    why = f"{one_line(leak[1])} reaches the loss here, past the mask"
+                    self.problems.append(line.pair.problem(*leak, why))
         for pair in self.unnamed:  # image * alpha is masked where image is
             if self._leak(pair) is not None:
                 self.problems.append(pair.problem(pair.function, pair.node, "the rendering has no name"))
-        return self.lines, list(dict.fromkeys(self.problems))
+        return kept, list(dict.fromkeys(self.problems))
 
     def _leak(self, pair: _Pair) -> Optional[Decider]:
         """Return a read that takes what a rendering is made of into the loss, and comes after no line."""
         work: List[Tuple[Function, cst.CSTNode]] = [(pair.function, pair.prediction)]
         found: List[Tuple[Function, cst.CSTNode]]
-        carriers: List[Decider] = []
+        carriers: Dict[Tuple[Function, Optional[str]], None] = {}
+        made_of: Set[int] = set()
+        met: Set[Reaching] = set()
         for where, node in work:  # which grows
             for part in _places(node):
                 meaning = self.analysis.meanings.meaning(where, part)
                 if part is not pair.prediction and not (meaning.kind == "image" and meaning.role in ("render", "both")):
                     continue
-                carriers.append((where, part))
-                reaching = where.flow.reaching(part) if len(work) < _MOST else ()
-                where.module.spend(len(reaching))
-                for made in reaching:
+                carriers[where, path_of(part)] = None
+                for made in where.flow.reaching(part).new(met) if len(work) < _MOST else ():
                     if made.kind == "parameter":
                         calls = self.analysis.training.sites.get(where, ())
                         given = [(caller, where.given(call, made.place)) for caller, call in calls]
@@ -185,17 +222,19 @@ class _Finder:
                     else:
                         value = made.node if made.kind == "augment" else made.value
                         found = [(where, value)] if value is not None and made.kind != "import" else []
-                    work += [entry for entry in found if entry not in work]
-        spans = [(where, where.place(node)) for where, node in work[1:]]
-        for function, carrier in carriers:
-            for read in self._others(function, carrier):
-                at = function.place(read).start
-                inside = any(where is function and span.start <= at < span.end for where, span in spans)
-                if not inside and not any(line.covers(function, read) for line in self.lines):
+                    for source, value in found:
+                        if id(value) not in made_of and value is not pair.prediction:
+                            work.append((source, value))
+                            made_of.update(map(id, walk_expressions(value)))
+        pair.function.module.spend(len(met) + len(made_of))
+        for function, place in carriers:
+            lines = self.lines.get((function, place), ())
+            for read in self._others(function, place):
+                if id(read) not in made_of and not any(line.covers(function, read) for line in lines):
                     return function, read
         return None
 
-    def _others(self, function: Function, carrier: cst.CSTNode) -> Iterator[cst.CSTNode]:
+    def _others(self, function: Function, place: Optional[str]) -> Iterator[cst.CSTNode]:
         """Yield the reads of the same value, or of the whole of it, that a backward pass reaches."""
         training = self.analysis.training
         if function not in self._reads:
@@ -203,59 +242,82 @@ class _Finder:
             for read in _places(function.body):
                 if training.includes(read) or not training.touches(function):
                     self._reads[function].setdefault(path_of(read), []).append(read)
-        for read in self._reads[function].get(path_of(carrier), ()):
+        for read in self._reads[function].get(place, ()):
             if function.module.spend(1):
                 yield read
 
+    def _calls(self, function: Function, place: Optional[str]) -> List[_Given]:
+        """Return the trained calls that are given a place, each with the places in its arguments."""
+        if function not in self._given:
+            self._given[function] = {}
+            for call in filter(self.analysis.training.includes, function.flow.calls):
+                given = [{path_of(part) for part in _places(each)} for each in arguments(call)[0]]
+                for path in set().union(*given) if function.module.spend(1 + sum(map(len, given))) else ():
+                    self._given[function].setdefault(path, []).append((call, given))
+        return self._given[function].get(place, [])
 
-def _line(pair: _Pair) -> Union[_Line, str]:
-    """Return the line, in the outermost block in which both images are defined before the term; or why not."""
-    function, reaching = pair.function, pair.function.flow.reaching
-    parts = [part for side in (pair.prediction, pair.target) for part in walk_expressions(side)]
-    if not reaching(pair.prediction) or any(isinstance(part, cst.Call) for part in parts):
-        return "the images have no names here"
-    header = list(every_parameter(function.node.params)) if isinstance(function.node, cst.FunctionDef) else []
-    made = [[d for d in reaching(part) if d.node not in header] for part in parts]
-    starts = [function.place(d.node).start for definitions in made for d in definitions]
-    names = [(part, ds) for part, ds in zip(parts, made) if isinstance(part, cst.Name)]
-    unbound = [ds for name, ds in names if ds and len(ds) == len(reaching(name))]
-    for block, index in _blocks_around(function, pair.node):
-        places = [function.place(statement) for statement in block]
-        here = any(places[index].start <= start for start in starts)
-        earlier = [i for i in range(index) if any(places[i].start <= start for start in starts)]
-        after = index - 1 if here or not earlier else earlier[-1]
-        unbound = [ds for ds in unbound if not any(_binds(function, each, ds) for each in block[: after + 1])]
-        if not here and not unbound:
-            before = block[after + 1]
-            return _Line(pair, block[after] if after >= 0 else None, before, places[after + 1].start, places[-1].end)
-    return "no line before the term surely comes after both images"
+    def _line(self, pair: _Pair) -> Union[_Line, str]:
+        """Return the line, in the outermost block in which both images are defined before the term; or why not."""
+        function, reaching = pair.function, pair.function.flow.reaching
+        parts = [part for side in (pair.prediction, pair.target) for part in walk_expressions(side)]
+        if not reaching(pair.prediction) or any(isinstance(part, cst.Call) for part in parts):
+            return "the images have no names here"
+        header = list(every_parameter(function.node.params)) if isinstance(function.node, cst.FunctionDef) else []
+        made = [[d.node for d in reaching(part)] for part in parts]
+        starts = [[function.place(node).start for node in nodes if node not in header] for nodes in made]
+        last = max((start for some in starts for start in some), default=-1)
+        function.module.spend(sum(map(len, starts)))
+        names = [(nodes, some) for part, nodes, some in zip(parts, made, starts) if isinstance(part, cst.Name)]
+        unbound = [some for nodes, some in names if some and len(some) == len(nodes)]
+        for block, spans, index in self._blocks_around(function, pair.node):
+            here, earlier = spans.places[index].start <= last, spans.before(last)
+            after = index - 1 if here or earlier < 0 else earlier
+            end = spans.places[after].end if after >= 0 else -1
+            unbound = [some for some in unbound if not self._bind(function, block, [at for at in some if at < end])]
+            if not here and not unbound:
+                last_one, before = block[after] if after >= 0 else None, block[after + 1]
+                return _Line(pair, last_one, before, spans.places[after + 1].start, spans.places[-1].end)
+        return "no line before the term surely comes after both images"
 
+    def _bind(self, function: Function, block: Sequence[cst.CSTNode], starts: Sequence[int]) -> bool:
+        """Return whether the statements of a block surely make one of the definitions that begin there."""
+        spans = self._spans(function, block)
+        inside: Dict[int, List[int]] = {}
+        for at in starts:
+            index = spans.before(at)
+            if index >= 0 and at < spans.places[index].end:
+                inside.setdefault(index, []).append(at)
+        return any(self._binds(function, block[index], some) for index, some in inside.items())
 
-def _binds(function: Function, node: cst.CSTNode, made: Sequence[Definition]) -> bool:
-    """Return whether a statement makes one of these definitions, in each of its branches."""
-    if isinstance(node, (cst.If, cst.Else, cst.With)):
-        inside = any(_binds(function, statement, made) for statement in node.body.body)
-        other = node.orelse if isinstance(node, cst.If) else node
-        return inside and other is not None and (other is node or _binds(function, other, made))
-    span = function.place(node)
-    is_line = isinstance(node, cst.SimpleStatementLine)
-    return is_line and any(span.start <= function.place(d.node).start < span.end for d in made)
+    def _binds(self, function: Function, node: cst.CSTNode, starts: Sequence[int]) -> bool:
+        """Return whether a statement makes one of the definitions that begin in it, in each of its branches."""
+        if isinstance(node, (cst.If, cst.Else, cst.With)):
+            other = node.orelse if isinstance(node, cst.If) else node
+            inside = other is not None and self._bind(function, node.body.body, starts)
+            return inside and other is not None and (other is node or self._binds(function, other, starts))
+        return isinstance(node, cst.SimpleStatementLine)
 
+    def _blocks_around(
+        self, function: Function, node: cst.CSTNode
+    ) -> Iterator[Tuple[Sequence[cst.CSTNode], _Spans, int]]:
+        """Yield the blocks around a node, the outermost first, each with the index of the statement around it."""
+        start = function.place(node).start
+        blocks: List[Sequence[cst.CSTNode]] = [function.body.body]
+        while blocks:
+            found = []
+            for block in blocks:
+                spans = self._spans(function, block)
+                index = spans.before(start)
+                is_small = isinstance(block[index], cst.BaseSmallStatement)  # on the line of its if
+                if index >= 0 and start < spans.places[index].end and not is_small:
+                    found.append((block, spans, index))
+            yield from found
+            blocks = [inner for block, _, index in found for inner in blocks_of(block[index])]
 
-def _blocks_around(function: Function, node: cst.CSTNode) -> Iterator[Tuple[Sequence[cst.CSTNode], int]]:
-    """Yield the blocks around a node, the outermost first, each with the index of the statement around it."""
-    start = function.place(node).start
-    blocks: List[Sequence[cst.CSTNode]] = [function.body.body]
-    while blocks:
-        found = [
-            (block, i)
-            for block in blocks
-            for i, statement in enumerate(block)
-            if not isinstance(statement, cst.BaseSmallStatement)  # on the line of its if
-            and function.place(statement).start <= start < function.place(statement).end
-        ]
-        yield from found
-        blocks = [inner for block, i in found for inner in blocks_of(block[i])]
+    def _spans(self, function: Function, block: Sequence[cst.CSTNode]) -> _Spans:
+        if id(block) not in self._blocks:
+            self._blocks[id(block)] = _Spans([function.place(statement) for statement in block])
+        return self._blocks[id(block)]
 
 
 def _places(node: cst.CSTNode) -> Iterator[cst.CSTNode]:

@@ -37,6 +37,7 @@ _Step = Tuple[Function, cst.Call, Set[str]]  # with the words of whose method ru
 _Value = Tuple[Function, cst.CSTNode]
 _STEPS = re.compile(r"step\w*\s*\(")
 _CALLED = re.compile(r"(\w+)\s*\(")
+_Round = Tuple[Function, Tuple[int, ...], int]
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 
 
@@ -47,20 +48,27 @@ class Purposes:
         self.program = program
         self.training = training
         self._may_step: Optional[Set[str]] = None
-        self._known: Dict[Tuple[Function, Tuple[int, ...], int], Optional[Evidence]] = {}
+        self._known: Dict[_Round, Optional[Evidence]] = {}
+        self._moving: Dict[_Round, bool] = {}
 
     def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Evidence]:
         """Return the evidence that the backward pass of an expression trains no Gaussians; None where it may."""
         score = self.training.scores(node)
         if score is not None:
             return Evidence("no-step", "scoring", [score])
-        known = function, tuple(map(id, function.flow.loops_around(node))), depth
+        known = _round(function, node, depth)
         if known not in self._known:
             self._known[known] = self._purpose(function, node, depth)
         return self._known[known]
 
     def moves_gaussians(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
         """Return whether an optimiser that steps after the backward pass of an expression is known to have them."""
+        known = _round(function, node, depth)
+        if known not in self._moving:
+            self._moving[known] = self._moves(function, node, depth)
+        return self._moving[known]
+
+    def _moves(self, function: Function, node: cst.CSTNode, depth: int) -> bool:
         if not any(map(is_backward, function.flow.calls)):
             sites = self.training.sites.get(function, []) if depth < _DEPTH else []
             return any(self.moves_gaussians(caller, call, depth + 1) for caller, call in sites)
@@ -210,12 +218,19 @@ class Purposes:
         return any(self._draws_a_model(each, depth + 1) for each in inner)
 
 
+def _round(function: Function, node: cst.CSTNode, depth: int) -> _Round:
+    """Return what the terms of a round of a loop share: the step after them is the same."""
+    return function, tuple(map(id, function.flow.loops_around(node))), depth
+
+
 def _definitions(program: Program, function: Function, node: cst.CSTNode) -> List[Tuple[Function, Definition]]:
     """Return the definitions of a name, or of what the methods of its class assign to ``self.name``."""
     found, owner = program.lookup(function, node), program.owner_of(function)
-    if not found and owner is not None and isinstance(node, cst.Attribute) and dotted(node.value) == "self":
-        found = owner.stores(node.attr.value)
-    return found or []
+    if found is not None:
+        return [(found[0], made) for made in found[1]]
+    if owner is not None and isinstance(node, cst.Attribute) and dotted(node.value) == "self":
+        return owner.stores(node.attr.value)
+    return []
 
 
 def _is_own_tensor(value: Optional[cst.CSTNode]) -> bool:

@@ -129,7 +129,7 @@ def source_of(
     for part in parts:
         if says is not None and isinstance(part, (cst.Name, cst.SimpleString)) and says(part.value):
             return function, part
-    definitions = [d for part in parts for d in sorted(function.flow.reaching(part), key=lambda d: d.order)]
+    definitions = [made for part in parts for made in function.flow.reaching(part)]
     for made in definitions if depth < _DEPTH else ():
         if made.value is not None:
             found = source_of(function, made.value, says, depth + 1) if says else (function, made.value)

@@ -27,9 +27,15 @@ class Splats:
         self.training = training
         self.forms = forms
         self._known: Dict[Tuple[str, re.Pattern[str]], bool] = {}
+        self._about: Dict[Function, bool] = {}
 
     def is_about(self, function: Function) -> bool:
         """Return whether the file, one that trains through it, or a neighbour mentions Gaussian splatting."""
+        if function not in self._about:  # each of its terms asks
+            self._about[function] = self._is_about(function)
+        return self._about[function]
+
+    def _is_about(self, function: Function) -> bool:
         module, above = function.module, [function]
         for current in above:  # which grows
             speaks = self._speaks(current.module.path, DRAWS_SPLATS) or self._takes_splats(current.module)

@@ -8,6 +8,7 @@ import libcst as cst
 
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
+from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import one_line, words, words_in
 from legs_adapters.lexicon.meaning import UNKNOWN, swapped
 from legs_adapters.lexicon.words import MESH, PERCEPTUAL, TRACKING, WARPED
@@ -71,7 +72,11 @@ class Verdicts:
         if others_read and not loss:
             return Left.at(function, place, Evidence("untrained", "untrained", term.here))
         if others_read:
-            alone = len(loss) == 1 and loss[0] not in others_read and len(function.flow.reaching(loss[0])) == 1
+            alone = (
+                len(loss) == 1
+                and loss[0] not in others_read
+                and isinstance(function.flow.reaching(loss[0]), Definition)
+            )
             if not alone or not function.flow.unchanged(form.first, form.second):
                 reason = f"{one_line(form.node)} has other uses than the loss"
                 return _ByHand(reason, "weight a second error map, for the loss, and leave this one to its other uses")

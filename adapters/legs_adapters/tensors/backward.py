@@ -10,7 +10,7 @@ import libcst as cst
 from legs_adapters.code.calls import given_to, handed
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program, Reference
-from legs_adapters.code.reaching import Definition
+from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.syntax import arguments, call_name, children, constant, key_of, walk_expressions
 from legs_adapters.tensors.operations import APPLIES, BACKWARD, ENDS_GRADIENT, HOOKS, LOSSES, SIZES, depends
 from legs_adapters.tensors.steps import is_backward
@@ -43,8 +43,9 @@ class Training:
         self._scoring: Optional[Tuple[Function, cst.Call]] = None  # the call from which the slice begins now
         self._touched: Set[Function] = set()
         self._met: Set[Tuple[Function, int]] = set()  # what ``sites`` has
+        self._begun: Set[Reaching] = set()
         self._done: Set[Tuple[int, object]] = set()
-        self._work: List[Tuple[Function, cst.CSTNode, object]] = []
+        self._work: List[Tuple[Function, cst.CSTNode | Reaching, object]] = []
         scoring: List[Tuple[Function, cst.Call]] = []
         for module in program.matching(TRAINS):
             for function in module.scopes(TRAINS.search):
@@ -64,8 +65,7 @@ class Training:
         while self._work:
             function, node, key = self._work.pop()
             if function.module.spend(1):
-                self._touched.add(function)
-                self._visit(function, node, key)
+                self._reach(function, node, key) if isinstance(node, Reaching) else self._visit(function, node, key)
 
     def scores(self, node: cst.CSTNode) -> Optional[Tuple[Function, cst.Call]]:
         """Return the call of ``torch.autograd.grad`` that alone takes the gradient of this expression, to be read."""
@@ -88,12 +88,12 @@ class Training:
             self.roots.append(function)
         for value in values:
             self._push(function, value)
-            for definition in function.flow.reaching(value):  # def step(loss): loss.backward()
+            for definition in function.flow.reaching(value).new(self._begun):  # def step(loss): loss.backward()
                 if definition.kind == "parameter" and definition.place in function.parameters:
                     for caller, given in given_to(self.program, function, definition.place):
                         self._push(caller, given)
 
-    def _push(self, function: Function, node: Optional[cst.CSTNode], key: object = _ANY) -> None:
+    def _push(self, function: Function, node: Optional[cst.CSTNode | Reaching], key: object = _ANY) -> None:
         mark = (id(node), key if isinstance(key, (str, int)) else _ANY)
         if node is not None and mark not in self._done:
             self._done.add(mark)
@@ -101,6 +101,7 @@ class Training:
 
     def _visit(self, function: Function, node: cst.CSTNode, key: object) -> None:
         """Mark what ``node`` (or, with a key, ``node[key]``) gets its value from."""
+        self._touched.add(function)
         entries = _entries(node, key)
         for entry in entries:
             self._push(function, entry)
@@ -160,21 +161,26 @@ class Training:
             self.sites.setdefault(callee, []).append((caller, call))
 
     def _place(self, function: Function, node: cst.CSTNode, key: object) -> None:
-        definitions = self.program.lookup(function, node)
-        if not definitions and isinstance(node, cst.Subscript):
+        found = self.program.lookup(function, node)
+        if found is not None:
+            self._push(*found, key)
+        elif isinstance(node, cst.Subscript):
             inner = key_of(node)
             self._push(function, node.value, _ANY if inner is None else inner)
-        elif not definitions and isinstance(node, cst.Attribute):
+        elif isinstance(node, cst.Attribute):
             owner = self.program.owner_of(function)
             if not isinstance(node.value, cst.Name) or node.value.value != "self":
                 self._push(function, node.value, "." + node.attr.value)
             elif owner is not None:
-                matters = [one.stores(node.attr.value, self._matters) for one in self.program.lineage(owner)]
-                definitions = [entry for stores in matters for entry in stores]
-        for where, definition in definitions or ():
-            self._definition(where, definition, key)
+                for one in self.program.lineage(owner):
+                    for where, made in one.stores(node.attr.value, self._matters):
+                        self._push(where, made, key)
 
-    def _definition(self, function: Function, definition: Definition, key: object) -> None:
+    def _reach(self, function: Function, definition: Reaching, key: object) -> None:
+        if not isinstance(definition, Definition):
+            for part in definition.parts:
+                self._push(function, part, key)
+            return
         value, kind = definition.value, definition.kind
         if kind == "store":
             if definition.key in (None, key) or key is _ANY:

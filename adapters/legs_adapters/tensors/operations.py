@@ -10,6 +10,7 @@ from typing import List, Set
 import libcst as cst
 
 from legs_adapters.code.module import Function
+from legs_adapters.code.reaching import Reaching
 from legs_adapters.code.syntax import children, word_set
 
 # The same values: on another device, of another type or copied; where they are in range; in another order or shape.
@@ -67,16 +68,14 @@ PICTURE_FUNCTIONS = PICTURE_METHODS | _MAKES | _FILTERS | _RESAMPLES | _PASSES_O
 
 def depends(function: Function, node: cst.CSTNode, names: Set[str]) -> bool:
     """Return whether an expression of a function depends on the value of one of these names, not only on its size."""
-    seen: Set[int] = set()
+    met: Set[Reaching] = set()
     work: List[cst.CSTNode] = [node]
     while work:
         part = work.pop()
         if isinstance(part, cst.Name):
             if part.value in names:
                 return True
-            new = [d for d in function.flow.reaching(part) if id(d) not in seen]
-            seen.update(id(definition) for definition in new)
-            work.extend(definition.value for definition in new if definition.value is not None)
+            work.extend(made.value for made in function.flow.reaching(part).new(met) if made.value is not None)
         elif not (isinstance(part, cst.Attribute) and part.attr.value in SIZES):
             work.extend(children(part))
     return False

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import List, Optional, Tuple
+import functools
+from typing import Dict, Iterable, List, Optional, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
+from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.syntax import attribute_chain, call_name, walk_expressions
 from legs_adapters.lexicon.masks import makes_mask
 from legs_adapters.tensors.backward import Training
@@ -17,53 +19,86 @@ from legs_adapters.terms.form import Form
 __all__ = ["is_measured", "reads_of"]
 
 
+class _Uses:
+    """The uses of a function's expressions, by their ids, found in one walk over it; and the values of its names."""
+
+    def __init__(self, function: Function) -> None:
+        function.module.spend(function.flow.steps)
+        unused: List[cst.CSTNode] = []
+        masks: List[cst.CSTNode] = []
+        changed: List[cst.CSTNode] = []  # compared, squared, or scaled: a weight moves the threshold
+        compared: List[cst.CSTNode] = []
+        numbers: List[cst.CSTNode] = []
+        for part in walk_expressions(function.body):
+            if isinstance(part, cst.Comparison):
+                compared.append(part.left)
+            elif isinstance(part, cst.BinaryOperation) and isinstance(part.operator, cst.Power):
+                changed.append(part.left)
+            elif isinstance(part, cst.Attribute) and part.attr.value in SIZES:
+                unused.append(part.value)
+            elif isinstance(part, cst.Call) and call_name(part) in EXTREMES and not part.args:
+                changed += attribute_chain(part.func)
+            elif isinstance(part, cst.Call) and call_name(part) in TRANSFORMS:
+                changed += walk_expressions(part)
+            elif isinstance(part, cst.AugAssign):
+                unused += attribute_chain(part.target)
+            elif isinstance(part, cst.Call) and call_name(part) in LEAVES:
+                numbers += attribute_chain(part)
+            elif isinstance(part, cst.Call) and makes_mask(part):
+                masks += [node for each in (part.func, *(a.value for a in part.args)) for node in attribute_chain(each)]
+        self.unused, self.masks = set(map(id, unused + numbers)), set(map(id, masks))
+        self.changed, self.numbers = set(map(id, changed + compared)), set(map(id, compared + numbers))
+        self._reads: Dict[str, Dict[Reaching, List[cst.Name]]] = {}  # by the name, and what reaches them
+        for read in function.flow.reads:
+            self._reads.setdefault(read.value, {}).setdefault(function.flow.reaching(read), []).append(read)
+        self.made: Dict[int, Definition] = {}  # by the id of a value, or of what a value is the mean of over an axis
+        for made in function.flow.every_definition:
+            if made.kind == "assign":
+                for value in (made.value, *_averaged(made.value)):
+                    self.made.setdefault(id(value), made)
+
+    def reads_of(self, made: Definition) -> List[cst.Name]:
+        """Return the reads that a definition reaches."""
+        reads = self._reads.get(made.place, {})
+        has: Dict[Reaching, bool] = {made: True}
+        for reaching in reads:
+            for join in reaching.joins(has.__contains__):
+                has[join] = any(has.get(part) for part in join.parts)
+        return [read for reaching, some in reads.items() if has.get(reaching) for read in some]
+
+
+@functools.lru_cache(maxsize=1)
+def _uses(function: Function) -> _Uses:
+    """Return the uses in a function, cached: its terms are asked about one after the other."""
+    return _Uses(function)
+
+
 def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[cst.Name], List[cst.Name]]:
     """Return the reads of a named error map, logging and sizes aside; none where the map has no name of its own.
 
     Returns:
         The reads that are the loss, and the others: a mask or a threshold is made of them.
     """
-    named = [d for d in function.flow.every_definition if d.kind == "assign"]
-    made = [d for d in named if d.value is form.node or _averages(d.value, form.node)]
-    if not form.is_map or not made or "." in made[0].place:
+    made = _uses(function).made.get(id(form.node)) if form.is_map else None
+    if made is None or "." in made.place:
         return [], []
-    unused: List[cst.CSTNode] = []
-    masks: List[cst.CSTNode] = []
-    compared: List[cst.CSTNode] = []  # or squared, or scaled: a weight moves the threshold
-    for part in walk_expressions(function.body):
-        is_square = isinstance(part, cst.BinaryOperation) and isinstance(part.operator, cst.Power)
-        if is_square or isinstance(part, cst.Comparison):
-            compared.append(part.left)  # type: ignore[attr-defined]
-        elif isinstance(part, cst.Attribute) and part.attr.value in SIZES:
-            unused.append(part.value)
-        elif isinstance(part, cst.Call) and call_name(part) in EXTREMES and not part.args:
-            compared += attribute_chain(part.func)
-        elif isinstance(part, cst.Call) and call_name(part) in TRANSFORMS:
-            compared += walk_expressions(part)
-        elif isinstance(part, cst.AugAssign):
-            unused += attribute_chain(part.target)
-        elif isinstance(part, cst.Call) and call_name(part) in LEAVES:
-            unused += attribute_chain(part)
-        elif isinstance(part, cst.Call) and makes_mask(part):
-            masks += [node for each in (part.func, *(arg.value for arg in part.args)) for node in attribute_chain(each)]
-    reads = [read for read in function.flow.reads if made[0] in function.flow.reaching(read)]
-    reads = [read for read in reads if read not in unused and not no_grad_around(function, read)]
-    loss = [read for read in reads if training.includes(read) and read not in masks]
-    averaged = made[0].value is not form.node
-    is_changed = any(read in compared or (averaged and read in masks) for read in reads)
+    uses, every = _uses(function), _uses(function).reads_of(made)
+    function.module.spend(len(every))
+    reads = [read for read in every if id(read) not in uses.unused and not no_grad_around(function, read)]
+    loss = [read for read in reads if training.includes(read) and id(read) not in uses.masks]
+    averaged = made.value is not form.node
+    is_changed = any(id(read) in uses.changed or (averaged and id(read) in uses.masks) for read in reads)
     others = [] if averaged else [read for read in reads if read not in loss]
     return loss, reads if is_changed else others
 
 
-def _averages(value: Optional[cst.CSTNode], node: cst.CSTNode) -> bool:
-    """Return whether a value is the mean of an error map over an axis."""
+def _averaged(value: Optional[cst.CSTNode]) -> Iterable[cst.CSTNode]:
+    """Return what a value is the mean of over an axis."""
     if not isinstance(value, cst.Call) or call_name(value) != "mean":
-        return False
-    return any(part is node for part in (*attribute_chain(value.func), *(arg.value for arg in value.args)))
+        return ()
+    return (*attribute_chain(value.func), *(arg.value for arg in value.args))
 
 
 def is_measured(function: Function, form: Form) -> bool:
     """Return whether a term is only a number: ``error.mean().item()``, or compared, ``abs(height - wanted) > 0.1``."""
-    numbers = [part for call in function.flow.calls if call_name(call) in LEAVES for part in attribute_chain(call)]
-    compared = [part.left for part in walk_expressions(function.body) if isinstance(part, cst.Comparison)]
-    return any(part is form.node for part in (*numbers, *compared))
+    return id(form.node) in _uses(function).numbers

@@ -68,8 +68,8 @@ class L1Functions:
         """Return whether an expression may be an L1 function, a variable or by its words: resolving it costs more."""
         if self._prospects.may_have(dotted(node) or code(node)):
             return True
-        definitions = self.program.lookup(function, list(attribute_chain(node))[-1]) or ()
-        values = [made.value for _, made in definitions if made.kind in ("assign", "element", "with")]
+        found = self.program.lookup(function, list(attribute_chain(node))[-1])
+        values = [made.value for made in (found[1] if found else ()) if made.kind in ("assign", "element", "with")]
         return any(value is not None and self._prospects.may_hold(code(value)) for value in values)
 
     def shape(self, function: Function) -> Optional[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from typing import List, NamedTuple, Sequence
 
@@ -89,9 +90,8 @@ def same_root(form: Form) -> bool:
 def is_of_numbers(function: Function, side: cst.CSTNode) -> bool:
     """Return whether a side is a tensor of numbers alone: ``torch.eye(3)``, ``torch.tensor([0.0, 1.0])[:, None]``."""
     value = function.flow.value_of(side) or side
-    parts = set(walk_expressions(value))
-    read = {part.value for part in function.flow.reads if part in parts and isinstance(part, cst.Name)}
-    makes = any(isinstance(part, cst.Call) and call_name(part) in ("eye", "tensor") for part in parts)
+    read = {part.value for part in function.flow.reads_in(value)}
+    makes = any(isinstance(part, cst.Call) and call_name(part) in ("eye", "tensor") for part in walk_expressions(value))
     return is_no_picture(value) or (makes and read <= MODULES | {"None", "device"})
 
 
@@ -102,8 +102,15 @@ def of_rays(form: Form) -> bool:
 
 def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
     """Return whether an SSIM is computed of the same two expressions: they are images then, whatever their names."""
-    calls = [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
-    return any(all(_is_given(function, call, side) for side in (first, second)) for call in calls)
+    calls = _similarities(function)
+    goes_on = function.module.spend(len(calls))
+    return goes_on and any(all(_is_given(function, call, side) for side in (first, second)) for call in calls)
+
+
+@functools.lru_cache(maxsize=1)
+def _similarities(function: Function) -> List[cst.Call]:
+    """Return the calls of a similarity in a function, cached: each of its terms asks."""
+    return [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
 
 
 def _is_given(function: Function, call: cst.Call, picture: cst.CSTNode) -> bool:

@@ -30,7 +30,7 @@ class Definition(Rule):
         if shape(function) is None:
             return []
         calls = analysis.training.sites.get(function) or list(sure_calls(analysis.program, function))
-        known = {id(form.call) for caller, _ in calls for form in analysis.forms.in_function(caller)}
+        known = {id(form.call) for caller in dict(calls) for form in analysis.forms.in_function(caller)}
         own = function in analysis.callbacks.assigned or all(
             id(call) in known or shape(caller) is not None for caller, call in calls
         )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from typing import AbstractSet, List
+import functools
+from typing import TYPE_CHECKING, AbstractSet, List
 
+from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import root_of, words
 from legs_adapters.lexicon.words import (
     EVALUATING,
@@ -19,6 +21,9 @@ from legs_adapters.lexicon.words import (
 )
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
+
+if TYPE_CHECKING:
+    from legs_adapters.rules.analysis import Analysis
 
 __all__ = ["NAMES", "EvaluationName", "OtherName", "Tracking"]
 
@@ -83,18 +88,17 @@ class OtherName(Rule):
 
     def evidence(self, term: Term) -> List[Decider]:
         """Return the first name that has one of the words, unless both sides are proven."""
-        if term.pair.is_proven and self._is_outweighed(term):
-            return []
         module = term.function.module
         names = [(name, decider) for name, decider in term.names_around if not SPLATS.search(name)]
-        names += [] if "gaussian" in module.text.lower() else [(module.path.rpartition("/")[2], header(term.function))]
-        return [decider for name, decider in names if self.words & set(words(name))][:1]
+        names += [] if _speaks_of_gaussians(module.text) else [(module.path.rpartition("/")[2], header(term.function))]
+        found = [decider for name, decider in names if self.words & set(words(name))][:1]
+        return [] if found and term.pair.is_proven and self._is_outweighed(term) else found
 
     def _is_outweighed(self, term: Term) -> bool:
         """Return whether it is the plain L1: no threshold may be taken of it, nor features beside it."""
-        others = [form for form in term.analysis.forms.in_function(term.function) if form is not term.form]
-        beside = [Term(term.analysis, term.function, form) for form in others] if self.id == "perceptual" else []
-        return (self.id != "robust" or not term.form.is_map) and all(other.pair.is_proven for other in beside)
+        if self.id == "robust":
+            return not term.form.is_map
+        return self.id != "perceptual" or _are_proven(term.analysis, term.function)
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether the name may mean something else: it is reported where no other term was found."""
@@ -125,6 +129,17 @@ NAMES = (
         "huber",
     ),
 )
+
+
+@functools.lru_cache(maxsize=1)
+def _are_proven(analysis: Analysis, function: Function) -> bool:
+    """Return whether both sides of each term of a function are proven."""
+    return all(Term(analysis, function, form).pair.is_proven for form in analysis.forms.in_function(function))
+
+
+@functools.lru_cache(maxsize=8)
+def _speaks_of_gaussians(text: str) -> bool:
+    return "gaussian" in text.lower()
 
 
 def _is_of_tracking(name: str) -> bool:

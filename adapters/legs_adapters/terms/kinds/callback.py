@@ -76,7 +76,7 @@ class Callbacks:
 
     def _add(self, function: Function) -> None:
         shape, calls = self._forms.functions.shape, self._training.sites[function]
-        known = {id(form.call) for caller, _ in calls for form in self._forms.in_function(caller)}
+        known = {id(form.call) for caller in dict(calls) for form in self._forms.in_function(caller)}
         by_name = [site for site in calls if id(site[1]) not in known and len(site[1].args) == 2]
         by_name = [(caller, call) for caller, call in by_name if shape(caller) is None]
         for holder in self._program.mentioning(function.name) if by_name else ():

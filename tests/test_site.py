@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
@@ -21,6 +22,10 @@ from tests.support import ROOT, legs_environment
 def test_the_reference_has_every_public_name():
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     shown = {line.split(".")[-1] for line in text.splitlines() if line.startswith("::: ")}
+    for line in text.splitlines():  # each stands where the page says
+        if line.startswith("::: "):
+            module, _, name = line[4:].rpartition(".")
+            assert name in vars(importlib.import_module(module)), line
     data = {"OPERATORS", "PRESETS", "METRICS", "__version__"}
     assert set(legs_loss.__all__) - data <= shown
 

@@ -146,6 +146,8 @@ def compare(original, written, prediction, target, names):
                 expected = _outcome(before, names, values, wanted)
             except Exception:  # other shapes
                 continue
+            if not all(value is None or value.isfinite().all() for value in expected):  # the mean of no pixel
+                continue
             try:
                 for one, other in zip(expected, _outcome(after, names, values, wanted)):
                     torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)

@@ -7,14 +7,14 @@ and the field's words in the names along it. A name with "depth" or "feature" ou
 
 from __future__ import annotations
 
-import heapq
-from typing import Any, Callable, Dict, FrozenSet, List, Optional, Set, Tuple, Union
+from typing import Dict, FrozenSet, List, Optional, Tuple
 
 import libcst as cst
 
 from legs_adapters.code.calls import callees, sure_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
+from legs_adapters.code.questions import Questions
 from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.returned import default_key, formatted_key
 from legs_adapters.code.syntax import arguments, call_name, constant, dotted, key_of, root_of, same, words
@@ -25,25 +25,6 @@ from legs_adapters.lexicon.words import BACKGROUND, DATA, KIND_OF, LOSS, RENDER,
 from legs_adapters.tensors.backward import Training
 
 __all__ = ["Meanings"]
-
-_DEPTH = 200  # questions in one another; deeper ones are answered afterwards, and those that asked are asked again
-_TURNS = 8  # that one is answered in, in a loop
-
-_Subject = Union[cst.CSTNode, Reaching]  # what is asked about: an expression, or the definitions that reach it
-
-
-class _Question:
-    """A question that is not settled yet, its answer so far, and those who were given that."""
-
-    def __init__(self, order: int, function: Function, subject: _Subject, ask: Callable[[Function, Any], Any]) -> None:
-        self.order = order
-        self.function = function
-        self.subject = subject
-        self.ask = ask
-        self.answer: Any = frozenset() if isinstance(subject, Reaching) else UNKNOWN
-        self.readers: Set[_Question] = set()
-        self.turns = 0
-        self.is_waiting = False
 
 
 class Meanings:
@@ -57,15 +38,11 @@ class Meanings:
         self.program = program
         self.training = training
         self.rows: Dict[Tuple[int, int], bool] = {}  # see `is_rows`
-        self._known: Dict[Tuple[str, int], Any] = {}
-        self._asked: Dict[Tuple[str, int], _Question] = {}  # since the outermost question
-        self._waiting: List[Tuple[int, _Question]] = []  # to be answered, or again: those that were asked last first
-        self._reader: Optional[_Question] = None
-        self._depth = 0
+        self._questions = Questions()
 
     def meaning(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Return the meaning of an expression."""
-        return self._answer(function, node, self._of)
+        return self._questions.answer(function, node, self._of, UNKNOWN)
 
     def origin(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Return the meaning from a name's definitions, without the name itself."""
@@ -76,7 +53,10 @@ class Meanings:
     def _flow(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Join the meanings of the definitions that reach this use."""
         found = self.program.lookup(function, node)
-        return self._joined(self._answer(*found, self._ways) if found is not None else frozenset())
+        return self._joined(self._reached(*found) if found is not None else frozenset())
+
+    def _reached(self, function: Function, reaching: Reaching) -> FrozenSet[Meaning]:
+        return self._questions.answer(function, reaching, self._ways, frozenset())
 
     def _joined(self, ways: FrozenSet[Meaning]) -> Meaning:
         """Return the meaning of what can come by several ways."""
@@ -84,61 +64,6 @@ class Meanings:
             # or what a setting puts into the photograph's place
             ways = frozenset(meaning for meaning in ways if meaning.kind not in ("warp", "feature"))
         return mix(ways)
-
-    def _answer(self, function: Function, subject: _Subject, ask: Callable[[Function, Any], Any]) -> Any:
-        """Answer a question once, a fixed point where it depends on itself; unknown where a file is over its budget.
-
-        Everything that was asked on the way is settled, and remembered, when the outermost question is.
-        """
-        key = ask.__name__, id(subject)
-        if key in self._known:
-            return self._known[key]
-        question = self._asked.get(key)
-        if question is None:
-            question = self._asked[key] = _Question(len(self._asked), function, subject, ask)
-            if self._reader is None:
-                self._settle(question)
-                return question.answer
-            if self._depth < _DEPTH:
-                self._turn(question)
-            else:
-                self._wait(question)
-        assert self._reader is not None
-        question.readers.add(self._reader)
-        return question.answer
-
-    def _settle(self, question: _Question) -> None:
-        self._wait(question)
-        try:
-            while self._waiting:
-                self._turn(heapq.heappop(self._waiting)[1])
-            self._known.update((key, asked.answer) for key, asked in self._asked.items())
-        finally:
-            self._asked.clear()
-            self._waiting.clear()
-
-    def _wait(self, question: _Question) -> None:
-        if not question.is_waiting:
-            question.is_waiting = True
-            heapq.heappush(self._waiting, (-question.order, question))
-
-    def _turn(self, question: _Question) -> None:
-        """Answer a question; where the answer is another than before, whoever was given that one has a turn."""
-        question.is_waiting = False
-        question.turns += 1
-        if question.turns > _TURNS or not question.function.module.spend(2):
-            return
-        reader, self._reader = self._reader, question
-        self._depth += 1
-        try:
-            answer = question.ask(question.function, question.subject)
-        finally:
-            self._reader = reader
-            self._depth -= 1
-        if answer != question.answer:
-            question.answer = answer
-            for each in question.readers:
-                self._wait(each)
 
     # -- expressions
 
@@ -214,7 +139,7 @@ class Meanings:
         """Return the meanings of definitions, each once."""
         if isinstance(reaching, Definition):
             return frozenset([self._definition(function, reaching)])
-        return frozenset().union(*(self._answer(function, part, self._ways) for part in reaching.parts))
+        return frozenset().union(*(self._reached(function, part) for part in reaching.parts))
 
     def _definition(self, function: Function, definition: Definition) -> Meaning:
         value = definition.value

@@ -185,13 +185,13 @@ def _unknown_variables(environ: Mapping[str, str]) -> Tuple[str, ...]:
 def _find_file(start: Path) -> Tuple[Optional[Path], str]:
     """Return the legs.toml of a script or folder, and a note if one was found and not read."""
     home, is_above = Path(os.path.expanduser("~")), False
-    for folder in [start, *start.parents] if start.is_dir() else start.parents:
+    for folder in [start, *start.parents] if os.path.isdir(str(start)) else start.parents:
         path = folder / CONFIG_FILE
-        if path.is_file() and (not is_above or (folder / _JOURNAL).is_file()):
+        if os.path.isfile(str(path)) and (not is_above or os.path.isfile(str(folder / _JOURNAL))):
             if _owner(path) not in (_owner(start), _user()):
                 return None, f"{path} belongs to another user: it is not read"
             return path, ""
-        is_above = is_above or (folder / ".git").exists()
+        is_above = is_above or os.path.exists(str(folder / ".git"))
         if folder == home:
             break
     return None, ""

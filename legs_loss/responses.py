@@ -30,17 +30,8 @@ from legs_loss.images import read_layout
 from legs_loss.operators import OPERATORS, Operator, Stencil, check_operator
 from legs_loss.spec import WeightSpec
 
-__all__ = [
-    "NEEDS_LEVELS",
-    "gaussian_blur",
-    "levels_of",
-    "normalise_response",
-    "over_scene",
-    "percentile",
-    "response",
-    "response_levels",
-    "scene_levels",
-]
+__all__ = ["NEEDS_LEVELS", "gaussian_blur", "levels_of", "normalise_response", "over_scene", "percentile", "response",
+           "response_levels", "scene_levels"]  # fmt: skip
 
 
 NEEDS_LEVELS = (

@@ -82,9 +82,8 @@ class Backends:
         Raises:
             LegsError: LEGS_BACKEND is none of these.
         """
-        forced, names = forced_backend(), self.names(device)
-        name = forced or (names[0] if names else "torch")
-        return name if name in names and self.availability(name, device, operation).backend is not None else "torch"
+        name = self._wanted(device)
+        return "torch" if name is None or self.availability(name, device, operation).backend is None else name
 
     def ready(
         self, device: torch.device, operation: Optional[str] = None, spec: Optional[WeightSpec] = None
@@ -96,12 +95,15 @@ class Backends:
             operation: as for :meth:`availability`.
             spec: of the weights that it is to make.
         """
-        names = [name for name, known in self._known.items() if known.device == device.type]
-        case = operation, None if spec is None else (spec.operator, spec.p, spec.curve)
-        if is_capturing(device) and any(self._known_already(name, device, case) is None for name in names):
+        name, case = self._wanted(device), (operation, None if spec is None else (spec.operator, spec.p, spec.curve))
+        if name is None or (is_capturing(device) and self._known_already(name, device, case) is None):
             return None  # a trial waits for the device, which would break a capture
-        name = forced_backend() or (names[0] if names else "torch")
-        return self._answer(name, device, case).backend if name in names else None
+        return self._answer(name, device, case).backend
+
+    def _wanted(self, device: torch.device) -> Optional[str]:
+        names = self.names(device)
+        name = forced_backend() or (names[0] if names else None)
+        return name if name in names else None
 
     def availability(self, name: str, device: torch.device, operation: Optional[str] = None) -> Availability:
         """Return whether a backend is available on a device for an operation ("loss", "l1", "ssim"; None: all it has).
@@ -205,9 +207,8 @@ def forced_backend() -> Optional[str]:
     if name and name not in _NAMES:
         raise LegsError(f"LEGS_BACKEND must be one of {', '.join(_NAMES)}, got {name!r}")
     if name == "cuda" and not torch.cuda.is_available():
-        raise LegsError(
-            f"LEGS_BACKEND=cuda, but {_why_missing(name) or 'there is no CUDA device here'}: unset LEGS_BACKEND"
-        )
+        missing = _why_missing(name) or "there is no CUDA device here"
+        raise LegsError(f"LEGS_BACKEND=cuda, but {missing}: unset LEGS_BACKEND")
     return name or None
 
 

@@ -85,12 +85,6 @@ class WeightMemo:
                 self.bytes += size
         return value
 
-    def clear(self) -> None:
-        """Forget everything."""
-        with self._lock:
-            self._entries.clear()
-            self.bytes = 0
-
     def _owner(self, target: Tensor, key: Hashable) -> Optional[weakref.ref[Tensor]]:
         return None if target.device.type == "cpu" else self._owner_of_memory(target, key)
 

@@ -34,20 +34,8 @@ from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.system import say
 from legs_loss.weights import Weights, weight_map
 
-__all__ = [
-    "MASK",
-    "Run",
-    "View",
-    "active",
-    "configure",
-    "counts",
-    "current_run",
-    "refuse_masks",
-    "reset",
-    "reset_counts",
-    "spec_to_compile",
-    "thread",
-]
+__all__ = ["MASK", "Run", "active", "configure", "counts", "current_run", "refuse_masks", "reset", "spec_to_compile",
+           "thread"]  # fmt: skip
 
 MASK, WEIGHTS = "mask", "weights"  # the store's names of the user's own maps; it is imported only where there is one
 _NOT_IN_A_GRAPH = (
@@ -194,13 +182,11 @@ class Run:
         """Print, once on rank 0, the settings and the sources of the first step's weights, when they are known."""
         if self.said:
             return
-        self.said = True
-        spec = self.config.spec
+        self.said, spec = True, self.config.spec
         if not self.active:
             off = f"LEGS_OFF={os.environ.get('LEGS_OFF', '')}"
             beta = f"preset {self.config.preset}, beta {spec.beta:g}; settings from {self.config.source}"
-            say_first(f"L1 plain: {off if self.config.off else beta}")
-            return
+            return say_first(f"L1 plain: {off if self.config.off else beta}")
         if spec.unweighted:
             weights = f"own maps from {self.config.store}"
         elif counted.stored == 0:
@@ -302,9 +288,7 @@ def reset() -> None:
 
 
 def configure(
-    spec: Optional[Spec] = None,
-    store: Union[str, Path, None] = None,
-    memo_bytes: int = DEFAULT_LIMIT,
+    spec: Optional[Spec] = None, store: Union[str, Path, None] = None, memo_bytes: int = DEFAULT_LIMIT
 ) -> None:
     """Set what ``l1_loss`` uses in this process, in place of legs.toml; LEGS_OFF still turns it off.
 
@@ -323,12 +307,8 @@ def configure(
     """
     config = find_config(_main_file())
     if spec is not None:
-        config = replace(
-            config,
-            spec=as_spec(spec),
-            preset=spec if isinstance(spec, str) else "own spec",
-            source="configure()",
-        )
+        preset = spec if isinstance(spec, str) else "own spec"
+        config = replace(config, spec=as_spec(spec), preset=preset, source="configure()")
     if store is not None:
         config = replace(config, store=Path(store))
     _replace(Run(config, memo_bytes))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, Optional, Union
+from typing import Optional, Tuple, Union
 
 import torch
 from torch import Tensor
@@ -53,7 +53,8 @@ def masked(prediction: Tensor, target: Tensor) -> Tensor:
     if step is None:
         return prediction
     counted.hidden += 1
-    return step.layout.restored(step.weights.hidden(step.prediction, step.target)).reshape(prediction.shape)
+    layout, image, photograph, weights = step
+    return layout.restored(weights.hidden(image, photograph)).reshape(prediction.shape)
 
 
 def coverage(prediction: Tensor, target: Tensor) -> Union[Tensor, float]:
@@ -71,7 +72,7 @@ def coverage(prediction: Tensor, target: Tensor) -> Union[Tensor, float]:
         1.0
     """
     step = _step(prediction, target)
-    return 1.0 if step is None or step.weights.share is None else step.weights.share
+    return 1.0 if step is None or step[-1].share is None else step[-1].share
 
 
 def ssim(
@@ -121,9 +122,9 @@ def ssim(
     swapped = not is_trained(first) and is_trained(second)
     trained, constant = (second, first) if swapped else (first, second)
     step = _step(trained, constant, channels_last=False)
-    if step is not None and step.weights.seen is not None:
+    if step is not None and step[-1].seen is not None:
         counted.hidden += 1
-        mask = step.weights.seen if mask is None else mask * step.weights.seen
+        mask = step[-1].seen if mask is None else mask * step[-1].seen
     if mask is not None and trained.dim() == 4 and not size_average:
         masks = mask.expand(len(trained), *mask.shape[-3:])
         one_by_one = functools.partial(ssim, window_size=window_size, padding=padding, channels_last=False)
@@ -188,26 +189,13 @@ class LEGSLoss(torch.nn.Module):
             self._run = Run(replace(config, spec=self.spec, preset="LEGSLoss", store=Path(store), source="LEGSLoss()"))
 
     def forward(
-        self,
-        prediction: Tensor,
-        target: Tensor,
-        weight: Optional[Tensor] = None,
-        mask: Optional[Tensor] = None,
+        self, prediction: Tensor, target: Tensor, weight: Optional[Tensor] = None, mask: Optional[Tensor] = None
     ) -> Tensor:
         """Return the loss; see :func:`~legs_loss.legs_loss`."""
         if self._run is not None and weight is None:
             return self._by_store(self._run, prediction, target, mask)
-        return legs_loss(
-            prediction,
-            target,
-            self.spec,
-            weight,
-            mask,
-            self.lambda_dssim,
-            self.padding,
-            self.renormalise,
-            self.channels_last,
-        )
+        settings = (self.lambda_dssim, self.padding, self.renormalise, self.channels_last)
+        return legs_loss(prediction, target, self.spec, weight, mask, *settings)
 
     def _by_store(self, run: Run, prediction: Tensor, target: Tensor, mask: Optional[Tensor]) -> Tensor:
         share, operation = self.lambda_dssim, whole(self.lambda_dssim, self.padding)
@@ -230,16 +218,10 @@ def _of_what_counts(similarity: Tensor, weights: Weights, border: int = 0) -> Te
     return similarity if weights.share is None else 1.0 - weights.of_what_counts(1.0 - similarity, border)
 
 
-class _Step(NamedTuple):
-    """The images of a step whose target has a mask in the store, [C, H, W] or [B, C, H, W], and what counts of them."""
-
-    layout: Layout
-    prediction: Tensor
-    target: Tensor
-    weights: Weights
-
-
-def _step(prediction: Tensor, target: Tensor, channels_last: Optional[bool] = None) -> Optional[_Step]:
+def _step(
+    prediction: Tensor, target: Tensor, channels_last: Optional[bool] = None
+) -> Optional[Tuple[Layout, Tensor, Tensor, Weights]]:
+    """Return of a step whose target has a mask in the store the layout, the images as [B, C, H, W], and what counts."""
     if is_compiling():
         refuse_masks(state.generation)
         return None
@@ -254,6 +236,4 @@ def _step(prediction: Tensor, target: Tensor, channels_last: Optional[bool] = No
         mask = run.own(target, MASK)
         weights = Weights().masked(mask)
     run.tell_at_end()
-    if mask is None:
-        return None
-    return _Step(layout, prediction, target, weights)
+    return None if mask is None else (layout, prediction, target, weights)

@@ -97,9 +97,11 @@ def test_the_first_gradient_is_of_the_values_that_the_loss_is_of(backend, given,
     assert torch.equal(torch.autograd.grad(loss, given["prediction"])[0], expected)
 
 
-def test_a_target_of_inference_mode(backend, given):
+@pytest.mark.parametrize("grey", [False, True])
+def test_a_target_of_inference_mode(backend, given, grey):
     with torch.inference_mode():
         target = given["target"] * 1.0
+        target = target[:1].expand(3, -1, -1) if grey else target  # whose copy has other strides
     weights = Weights(spec=LEGS)
     loss = backend.loss(given["prediction"], target, weights, 0.2)
     (gradient,) = torch.autograd.grad(loss, given["prediction"], retain_graph=True)

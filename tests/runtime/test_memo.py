@@ -179,10 +179,3 @@ raise SystemExit(not 0.9 < took / memo.bytes < 1.5)
         assert memo.recall(target, lambda: map_, False) is map_
         assert memo.recall(target, lambda: torch.zeros(1), True) is range_
         assert memo.bytes == 8 + 64 + 2 * _OVERHEAD
-
-    def test_clear(self):
-        memo, make, target = WeightMemo(), Maker(), torch.rand(3, 4, 4)
-        memo.recall(target, make)
-        memo.clear()
-        memo.recall(target, make)
-        assert make.made == 2

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from typing import Any, Callable, Dict, FrozenSet, List, Optional, Tuple
+from typing import Any, Callable, Dict, FrozenSet, Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -154,9 +154,25 @@ class _Prepared(Prepared):
         task.prediction, task.target = x.data_ptr(), y.data_ptr()
         if y.stride() != self._strides_of_target:  # autograd's copy of a tensor of inference mode
             task.of_target = _layout_of(_batch(y))
-        # What is held must live until the last launch; the allocator keeps the order of one stream.
-        held = [self._add_map(task, map_)] if map_ is not None else []
-        held += self._add_range(task, y, range_) if self._ranging else []
+        made = None  # it must live until the last launch, as the map; the allocator keeps the order of one stream
+        if map_ is not None:
+            if map_.numel() not in self._pixels:
+                raise ValueError(f"weights {list(map_.shape)} do not fit images {list(self._shape)}")
+            map_ = map_.detach().to(torch.float32).contiguous()
+            task.map, task.map_view = map_.data_ptr(), map_.numel() > self._pixels[0]
+        if self._ranging and (range_ is None or self._ssim):
+            # One piece of memory: the range, sums of blocks, and for the streaming pass the responses.
+            start = 2 * self._views + 3 * self._ranged
+            made = y.new_empty(start + (self._pixels[1] if self._ssim else 0), dtype=torch.float32)
+            task.range = task.result = base = made.data_ptr()
+            task.partial, task.response = base + 8 * self._views, base + 4 * start if self._ssim else None
+            count, task.count = task.count, self._ranged
+            self._launch(task, *self._ranging)
+            task.count = count
+        if self._ranging and range_ is not None:
+            if range_.shape != (self._views, 2):
+                raise ValueError(f"a range {list(range_.shape)} does not fit images {list(self._shape)}")
+            task.range = range_.data_ptr()
         gradient = None
         if self._strides is not None:
             gradient = torch.empty_strided(self._shape, self._strides, dtype=torch.float32, device=x.device)
@@ -165,7 +181,7 @@ class _Prepared(Prepared):
         loss = x.new_empty((), dtype=torch.float32)
         task.partial, task.result = partial.data_ptr(), loss.data_ptr()
         self._launch(task, *self._kernels)
-        del held
+        del made
         return loss, gradient
 
     def scaled(self, gradient: Tensor, step: Tensor) -> Tensor:
@@ -184,33 +200,6 @@ class _Prepared(Prepared):
         task.count = self._ranged
         self._launch(task, *self._ranging)
         return result
-
-    def _add_range(self, task: Task, y: Tensor, given: Optional[Tensor]) -> List[Tensor]:
-        """Set the range of a task's weights, for the streaming pass the responses, too; return their memory."""
-        held = []
-        if given is None or self._ssim:  # one piece of memory: the range, sums of blocks, responses
-            start = 2 * self._views + 3 * self._ranged
-            made = y.new_empty(start + (self._pixels[1] if self._ssim else 0), dtype=torch.float32)
-            base = made.data_ptr()
-            task.range, task.result, task.partial = base, base, base + 8 * self._views
-            task.response = base + 4 * start if self._ssim else None
-            count, task.count = task.count, self._ranged
-            self._launch(task, *self._ranging)
-            task.count = count
-            held.append(made)
-        if given is not None:
-            if given.shape != (self._views, 2):
-                raise ValueError(f"a range {list(given.shape)} does not fit images {list(self._shape)}")
-            task.range = given.data_ptr()
-        return held
-
-    def _add_map(self, task: Task, map_: Tensor) -> Tensor:
-        """Set the map of a task's weights; return its memory."""
-        if map_.numel() not in self._pixels:
-            raise ValueError(f"weights {list(map_.shape)} do not fit images {list(self._shape)}")
-        plane = map_.detach().to(torch.float32).contiguous()
-        task.map, task.map_view = plane.data_ptr(), plane.numel() > self._pixels[0]
-        return plane
 
 
 def variant_of(dtype: torch.dtype, spec: Optional[WeightSpec]) -> Variant:

@@ -89,7 +89,7 @@ def check_order(prediction: Tensor, target: Tensor) -> None:
     """
     if not is_trained(prediction) and is_trained(target):
         raise LegsError(
-            "of the two images the second alone requires a gradient, so it seems to be the rendering, and the weights "
+            "of the two images only the second requires a gradient, so it seems to be the rendering, and the weights "
             "would come from it: turn them round, loss(rendering, photograph). Where a photograph is learned from a "
             "fixed rendering, call it by legs_loss.unweighted(l1_loss), or give legs_loss a weight="
         )

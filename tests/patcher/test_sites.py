@@ -10,7 +10,7 @@ from legs_adapters.plan import plan
 from legs_adapters.terms.functions import L1Functions
 
 from legs_loss import LegsError
-from tests.patcher.support import NAMES, checkout, expected, files, legs_patch, options
+from tests.patcher.support import NAMES, SITE, checkout, expected, files, legs_patch, options
 
 MASKS = re.compile(r"\s*\w+ = legs_loss\.masked\(")
 
@@ -100,6 +100,22 @@ def test_a_site_chosen_by_hand_is_the_only_one(tmp_path):
     line = lines.index("        Ll1 = l1_loss(rendered, target_image)") + 1
     found = plan(root, by_hand=[("train.py", line)])
     assert [(site.path, site.line) for site in found.findings.sites] == [("train.py", line)]
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_of_several_terms_on_a_line_that_is_chosen_by_hand_the_photometric_one_is_weighted(place, tmp_path):
+    others = ["l1_loss(render_pkg['depth'], viewpoint_cam.depth)", "l1_loss(render_pkg['alpha'], viewpoint_cam.mask)"]
+    texts = files("inria")
+    for proven, ours in ((True, "l1_loss(image, gt_image)"), (False, "l1_loss(image, opt.other)")):
+        terms = " + ".join([*others[:place], ours, *others[place:]])
+        after = " + ".join([*others[:place], f"legs_loss.{ours}", *others[place:]])
+        root = checkout(
+            tmp_path / str(proven), {**texts, "train.py": texts["train.py"].replace(SITE, f"        Ll1 = {terms}\n")}
+        )
+        line = (root / "train.py").read_text().splitlines().index(f"        Ll1 = {terms}") + 1
+        found = plan(root, by_hand=[("train.py", line)])
+        assert changed_lines(found, "train.py")[line - 1] == f"        Ll1 = {after}"
+        assert [site.line for site in found.findings.sites] == [line]
 
 
 def test_a_vendored_network_that_is_not_about_splats_is_left(tmp_path):

@@ -17,8 +17,10 @@ from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import arguments, call_name
 from legs_adapters.lexicon.words import NO_L1, SPEAKS_OF_L1
 from legs_adapters.rules.analysis import Analysis
+from legs_adapters.rules.causes.kinds import KINDS
 from legs_adapters.rules.masks import with_masks
-from legs_adapters.rules.order import RULES
+from legs_adapters.rules.order import RULES, first
+from legs_adapters.rules.rule import Term
 from legs_adapters.rules.ssim import with_ssims
 from legs_adapters.rules.traced import with_trace
 from legs_adapters.rules.verdict import Verdicts
@@ -150,11 +152,12 @@ class _Finder:
                 yield place, verdict
 
     def _of_forms(self, function: Function) -> Iterator[_Entry]:
+        meant = self._meant(function) if self.by_hand else []
         for form in self.analysis.forms.in_function(function):
             if not function.module.spend(_RULES):
                 return
             place = function.place(form.node)
-            chosen = self._is_chosen(function, place)
+            chosen = form in meant
             verdict = self.verdicts.decide(function, form, place, chosen)
             if isinstance(verdict, Left):
                 doubt = self.verdicts.doubt(function, form, place, verdict)
@@ -163,6 +166,16 @@ class _Finder:
                 verdict = Left.at(function, place, "not chosen")
             if not (isinstance(verdict, Left) and self._is_noise(form)):
                 yield place, verdict
+
+    def _meant(self, function: Function) -> List[Form]:
+        """Return the terms on named lines: of several those that no rule skips, or that are not of another kind."""
+        named = [
+            f for f in self.analysis.forms.in_function(function) if self._is_chosen(function, function.place(f.node))
+        ]
+        why = [first(Term(self.analysis, function, form)) for form in named] if len(named) > 1 else []
+        clear = [form for form, evidence in zip(named, why) if evidence is None]
+        kinds = {rule.id for rule in KINDS}
+        return clear or [f for f, evidence in zip(named, why) if evidence and evidence.rule not in kinds] or named
 
     def _is_noise(self, form: Form) -> bool:
         """Return whether a skipped term is an absolute difference that is no loss: of angles, of sizes."""

@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from legs_loss.images import read_layout
+from legs_loss.images import is_compiling, read_layout
 from legs_loss.operators import OPERATORS, Operator, Stencil, check_operator
 from legs_loss.spec import WeightSpec
 
@@ -38,6 +38,8 @@ NEEDS_LEVELS = (
     "weights that are normalised over the scene need the levels of all its views, which {where}: run legs precompute "
     "SCENE --preset legs-robust, with the training's -r, {then}; or take a preset for single images, such as legs"
 )
+
+_CACHED = 1 << 17  # values of an image that are worked on at once
 
 
 def response(
@@ -79,7 +81,7 @@ def response(
         # Operators do not respond to a constant: without it, the response of a flat image is exactly 0.
         flat = gaussian_blur(flat - flat[..., :1, :1], smooth)
     single = flat.dim() == 3
-    strength = _norm(_components(flat.unsqueeze(0) if single else flat, OPERATORS[operator]), p)
+    strength = _strength(flat.unsqueeze(0) if single else flat, OPERATORS[operator], p)
     strength = strength[0] if single else strength
     return layout.restored(strength)
 
@@ -101,7 +103,7 @@ def normalise_response(response: Tensor, eps: float = 1e-8) -> Tensor:
     over = tuple(range(max(0, response.dim() - 3), response.dim()))
     low = response.amin(over, keepdim=True)
     high = response.amax(over, keepdim=True)
-    return (response - low) / (high - low + eps)
+    return (response - low).div_(high - low + eps)
 
 
 def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
@@ -197,14 +199,18 @@ def percentile(values: Tensor, share: float) -> Tensor:
     return torch.where(flat.sum(-1).isnan(), flat.sum(-1), found)
 
 
-def _components(image: Tensor, operator: Operator) -> List[Tensor]:
-    """Correlate an image [B, C, H, W] with each stencil of an operator.
+def _strength(image: Tensor, operator: Operator, p: float) -> Tensor:
+    """Return the norm of an image [B, C, H, W] correlated with each stencil of an operator, [B, 1, H, W].
 
     Torch's convolution is not used, since its order of summation varies: here every pixel is computed by the same
-    operations, and a constant image gives exactly 0.
+    operations, and a constant image gives exactly 0. On a CPU they are done on some rows at a time, which stay in its
+    cache from one operation to the next.
     """
-    padded = _with_border(image, operator.reach)
-    return [_correlated(padded, stencil) for stencil in operator.stencils]
+    padded, height = _with_border(image, operator.reach), image.shape[-2]
+    at_once = image.device.type != "cpu" or is_compiling()
+    rows = height if at_once else max(1, _CACHED * height // image.numel())
+    bands = (padded[..., top : min(top + rows, height) + 2 * operator.reach, :] for top in range(0, height, rows))
+    return torch.cat([_norm([_correlated(band, stencil) for stencil in operator.stencils], p) for band in bands], -2)
 
 
 def _correlated(padded: Tensor, stencil: Stencil) -> Tensor:
@@ -270,15 +276,13 @@ def _sum(values: Sequence[Tensor]) -> Tensor:
 
 def _with_border(image: Tensor, reach: int) -> Tensor:
     """Reflect an image [B, C, H, W] at its sides; a side of one pixel continues itself."""
+    if min(image.shape[-2:]) > reach:
+        return F.pad(image, (reach,) * 4, mode="reflect")
     for axis in (-1, -2):
         size = image.shape[axis]
-        if size > reach:
-            sides = (reach, reach, 0, 0) if axis == -1 else (0, 0, reach, reach)
-            image = F.pad(image, sides, mode="reflect")
-        else:
-            period = max(2 * size - 2, 1)
-            index = torch.arange(-reach, size + reach, device=image.device) % period
-            image = image.index_select(axis, torch.minimum(index, period - index) % size)
+        period = max(2 * size - 2, 1)
+        index = torch.arange(-reach, size + reach, device=image.device) % period
+        image = image.index_select(axis, torch.minimum(index, period - index) % size)
     return image
 
 

@@ -127,7 +127,7 @@ def weight_from_response(normalised: Tensor, spec: Spec = "legs") -> Tensor:
 
 def curved(normalised: Tensor, spec: WeightSpec) -> Tensor:
     """Return the weight map of a response that is normalised and clamped already, by the spec."""
-    weight = 1.0 + spec.beta * curve(spec.curve)(normalised)
+    weight = (spec.beta * curve(spec.curve)(normalised)).add_(1.0)
     if spec.normalise == "mean":
         weight = weight / weight.mean(_pixels(weight), keepdim=True)
     return weight

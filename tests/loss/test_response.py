@@ -125,6 +125,16 @@ class TestAgainstScipy:
         ]
         np.testing.assert_allclose(planar(image, operator.name)[0], np.sqrt((np.stack(parts) ** 2).sum(0)), atol=1e-11)
 
+    @pytest.mark.parametrize("operator", [name for name, record in OPERATORS.items() if record.reach > 0])
+    def test_the_rows_of_a_large_image_that_are_worked_on_at_once_leave_no_seam(self, operator):
+        image = torch.rand(3, 701, 301, generator=torch.Generator().manual_seed(0)).double()
+        squares = sum(
+            ndimage.correlate(channel, np.array(stencil, float), mode=ndimage_mode) ** 2
+            for channel in image.numpy()
+            for stencil in OPERATORS[operator].stencils
+        )
+        np.testing.assert_allclose(response(image, operator)[0].numpy(), np.sqrt(squares), atol=1e-12)
+
 
 class TestSymmetries:
     @settings(max_examples=40, deadline=None)

@@ -26,7 +26,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from legs_loss.images import is_compiling, read_layout
+from legs_loss.autograd import is_compiling
+from legs_loss.images import read_layout
 from legs_loss.operators import OPERATORS, Operator, Stencil, check_operator
 from legs_loss.spec import WeightSpec
 

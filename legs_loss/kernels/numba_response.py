@@ -151,13 +151,10 @@ def response_row(image, shape, operator, view, row, left, right, out):  # type: 
             _join_inner(
                 above[first - 1 :], here[first - 1 :], below[first - 1 :], last - first, operator, out[first - left :]
             )
-        if left == 0:
-            east = _folded(1, width)
-            out[0] = _joined(out[0], above, here, below, east, 0, east, operator)
-        if right == width and width > 1:
-            west = width - 2
-            at = width - 1 - left
-            out[at] = _joined(out[at], above, here, below, west, width - 1, west, operator)
+        for j in range(0, width, max(1, width - 1)):  # the first and the last, whose neighbours are one
+            if left <= j < right:
+                beside, at = _folded(j + 1, width), j - left
+                out[at] = _joined(out[at], above, here, below, beside, j, beside, operator)
     if operator.norm == 2:
         for j in range(right - left):
             out[j] = np.sqrt(out[j])

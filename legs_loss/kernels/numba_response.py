@@ -13,7 +13,15 @@ from legs_loss.kernels.codes import EIGHT, GRADIENT, NORMS, STENCILS
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined, part
 from legs_loss.spec import WeightSpec
 
-__all__ = ["Operator", "Shape", "extremes", "operator_of", "photograph_response", "response_row", "supports_response"]
+__all__ = [
+    "OperatorCode",
+    "Shape",
+    "extremes",
+    "operator_of",
+    "photograph_response",
+    "response_row",
+    "supports_response",
+]
 
 _ROWS = 32  # of a task
 _ZERO, _ONE, _FOUR, _EIGHT = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(8.0)
@@ -28,7 +36,7 @@ class Shape(NamedTuple):
     width: int
 
 
-class Operator(NamedTuple):
+class OperatorCode(NamedTuple):
     """The operator of a response and its norm.
 
     stencil, side, middle: as in STENCILS of codes.py: a kind, the weights of a gradient's outer rows and of its middle.
@@ -46,10 +54,10 @@ def supports_response(spec: WeightSpec) -> bool:
     return spec.operator in STENCILS and spec.p in NORMS
 
 
-def operator_of(spec: WeightSpec) -> Operator:
+def operator_of(spec: WeightSpec) -> OperatorCode:
     """Return a spec's operator and norm as the functions here take them."""
     stencil, side, middle = STENCILS[spec.operator]
-    return Operator(stencil, np.float32(side), np.float32(middle), NORMS[spec.p])
+    return OperatorCode(stencil, np.float32(side), np.float32(middle), NORMS[spec.p])
 
 
 def photograph_response(image: np.ndarray, spec: WeightSpec) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from legs_loss.kernels.codes import CURVES, formulas_in
 from legs_loss.kernels.compiling import inlined, part
-from legs_loss.kernels.numba_response import Operator, Shape, response_row
+from legs_loss.kernels.numba_response import OperatorCode, Shape, response_row
 
 __all__ = ["FORMULAS", "Images", "WeightSource", "weights_of_row"]
 
@@ -42,7 +42,7 @@ class WeightSource(NamedTuple):
     curve: of the weight that is made from the target; 0 makes none.
     beta: of that weight.
     ranges: float32 [views, 2]: the min response, and the reciprocal of max - min + eps.
-    stencil, side, middle, norm: an Operator's; a parallel loop takes no group in a group.
+    stencil, side, middle, norm: an OperatorCode's; a parallel loop takes no group in a group.
     map: float32 [height * width] for all views, or [views * height * width], or empty.
     """
 
@@ -81,7 +81,7 @@ def weights_of_row(images, source, view, row, left, right, out):  # type: ignore
             out[j] = _ONE
     else:
         shape = Shape(images.views, images.channels, height, width)
-        operator = Operator(source.stencil, source.side, source.middle, source.norm)
+        operator = OperatorCode(source.stencil, source.side, source.middle, source.norm)
         response_row(images.y, shape, operator, view, row, left, right, out)
         _weigh(out, count, source.curve, source.beta, source.ranges[view, 0], source.ranges[view, 1])
     if source.map.size > 0:

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from legs_loss.system.locks import FileLock as FileLock
     from legs_loss.system.locks import HeldError as HeldError
     from legs_loss.system.locks import is_held as is_held
-    from legs_loss.system.memory import keep_freed_memory as keep_freed_memory
-    from legs_loss.system.processors import cores as cores
+    from legs_loss.system.machine import cores as cores
+    from legs_loss.system.machine import keep_freed_memory as keep_freed_memory
     from legs_loss.system.terminal import is_first_process as is_first_process
     from legs_loss.system.terminal import never_fail_to_print as never_fail_to_print
     from legs_loss.system.terminal import printable as printable
@@ -35,9 +35,8 @@ _NAMES = {
     "ctrl_c": ["held_back", "noted"],
     "files": ["open_regular", "read_regular", "read_text", "write_whole"],
     "locks": ["FileLock", "HeldError", "is_held"],
-    "memory": ["keep_freed_memory"],
+    "machine": ["cores", "keep_freed_memory"],
     "entry_points": ["plugins"],
-    "processors": ["cores"],
     "terminal": ["is_first_process", "never_fail_to_print", "printable", "progress", "say", "say_error"],
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}

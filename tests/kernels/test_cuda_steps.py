@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from legs_loss import LegsError, configure, l1_loss, legs_loss, ssim
 from legs_loss.kernels import available, backends, trial
 from legs_loss.kernels.available import BACKENDS, Availability, Known
-from legs_loss.kernels.cuda.backend import CudaBackend, Layout, Task, chunks_of, strip_of
+from legs_loss.kernels.cuda.backend import CudaBackend, Strides, Task, chunks_of, strip_of
 from legs_loss.kernels.cuda.driver import DriverError
 from legs_loss.kernels.cuda.modules import BinaryCache, Modules
 from legs_loss.kernels.cuda.nvrtc import NotFound
@@ -41,7 +41,7 @@ class TestLaunch:
         assert chunks_of(torch.empty(1, 3, 1080, 1920, device="meta")) == 8 * 135  # tiles of 256 columns, 8 rows
 
     def test_strides_beyond_31_bits_between_views_are_fine(self):
-        task, layout = Task(), Layout(2**40, 2**33, 3840, 1)
+        task, layout = Task(), Strides(2**40, 2**33, 3840, 1)
         task.of_target = layout
         assert (task.of_target.view, task.of_target.channel) == (2**40, 2**33)
 

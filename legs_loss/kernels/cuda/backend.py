@@ -25,7 +25,7 @@ __all__ = [
     "THREADS",
     "VALUES",
     "CudaBackend",
-    "Layout",
+    "Strides",
     "Task",
     "chunks_of",
     "strip_of",
@@ -40,7 +40,7 @@ _BLOCKS_AT_A_TIME = 2  # of a multiprocessor: 128 registers a thread
 _MOST = 2**31 - 1
 
 
-class Layout(ctypes.Structure):
+class Strides(ctypes.Structure):
     """The strides of images [B, C, H, W], in values."""
 
     _fields_ = [
@@ -57,7 +57,7 @@ class Task(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("prediction", "target", "gradient", "scaled", "step", "partial")),
         *((name, ctypes.c_void_p) for name in ("result", "map", "range", "response")),
-        *((name, Layout) for name in ("of_prediction", "of_target", "of_gradient")),
+        *((name, Strides) for name in ("of_prediction", "of_target", "of_gradient")),
         ("count", ctypes.c_longlong),
         *((name, ctypes.c_int) for name in ("views", "channels", "height", "width", "strip", "curve", "chunks")),
         ("map_view", ctypes.c_int),
@@ -122,9 +122,9 @@ class _Prepared(Prepared):
         self._task = task = _task_of(x, spec)
         views, _, height, width = x.shape
         self._views, self._pixels = views, (height * width, views * height * width)  # a map's: for all views, for each
-        task.of_prediction = _layout_of(x.contiguous() if self._copies[0] else x)
+        task.of_prediction = _strides_of(x.contiguous() if self._copies[0] else x)
         y = y.contiguous() if self._copies[1] else y
-        task.of_target, self._strides_of_target = _layout_of(y), y.stride()[-len(self._shape) :]
+        task.of_target, self._strides_of_target = _strides_of(y), y.stride()[-len(self._shape) :]
         task.chunks = chunks_of(x)
         self._ranged = task.count = task.chunks * task.views
         self._ranging: Tuple[_Launch, ...] = ()
@@ -141,7 +141,7 @@ class _Prepared(Prepared):
         if wanted:  # dense, where x may be windows that overlap
             dense = torch.empty_like(x, dtype=torch.float32)
             dense = dense if _is_addressable(dense) else dense.contiguous()
-            task.of_gradient, self._strides = _layout_of(dense), dense.stride()[-len(self._shape) :]
+            task.of_gradient, self._strides = _strides_of(dense), dense.stride()[-len(self._shape) :]
             blocks = max(1, min(-(-x.numel() // (4 * THREADS)), 16 * modules.driver.multiprocessors))
             self._scale = launch("scale", plain, blocks)
 
@@ -153,7 +153,7 @@ class _Prepared(Prepared):
         task = Task.from_buffer_copy(self._task)
         task.prediction, task.target = x.data_ptr(), y.data_ptr()
         if y.stride() != self._strides_of_target:  # autograd's copy of a tensor of inference mode
-            task.of_target = _layout_of(_batch(y))
+            task.of_target = _strides_of(_batch(y))
         made = None  # it must live until the last launch, as the map; the allocator keeps the order of one stream
         if map_ is not None:
             if map_.numel() not in self._pixels:
@@ -245,8 +245,8 @@ def _task_of(images: Tensor, spec: Optional[WeightSpec]) -> Task:
     return task
 
 
-def _layout_of(images: Tensor) -> Layout:
-    return Layout(*images.stride())
+def _strides_of(images: Tensor) -> Strides:
+    return Strides(*images.stride())
 
 
 def _is_addressable(images: Tensor) -> bool:

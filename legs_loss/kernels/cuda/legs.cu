@@ -74,7 +74,7 @@ DEVICE unsigned as_bits(float value) { return __float_as_uint(value); }
 #define K1 0.0001f
 #define K2 0.0009f
 
-struct Layout {  // strides in values
+struct Strides {  // strides in values
     long long view, channel;
     int row, column;
 };
@@ -91,7 +91,7 @@ struct Task {
     const float* map;      // [views or 1, height, width]
     const float* range;    // [views, 2]: the least response, the greatest less the least
     float* response;       // [views, height, width]: written by the range pass, read by the streaming pass
-    Layout of_prediction, of_target, of_gradient;
+    Strides of_prediction, of_target, of_gradient;
     long long count;       // values (scale); blocks whose sums are to be added (finish)
     int views, channels, height, width;
     int strip;    // rows of a block of the streaming pass
@@ -128,7 +128,7 @@ DEVICE float reciprocal(float x) {  // to the last bit or its neighbour
     const float y = rough_reciprocal(x);
     return fmaf(y, fmaf(-x, y, 1.f), y);
 }
-DEVICE const Value* plane_of(const void* images, const Layout& of, long long view, long long channel) {
+DEVICE const Value* plane_of(const void* images, const Strides& of, long long view, long long channel) {
     return (const Value*)images + view * of.view + channel * of.channel;
 }
 
@@ -523,7 +523,7 @@ DEVICE void stream(const Task& k) {
     // The rows that go in; from the step of `needed` on SSIM is computed.
     const int start = first - (WANTED ? 2 * REACH : 2 * ROWS), end = last + (WANTED ? 2 * REACH : REACH);
     const int needed = first + (WANTED ? 0 : REACH);
-    auto plane = [&](const void* images, const Layout& of, int size) {
+    auto plane = [&](const void* images, const Strides& of, int size) {
         return (const char*)images + whole((view * of.view + channel * of.channel) * size);
     };
     const Value* xs = (const Value*)plane(k.prediction, k.of_prediction, sizeof(Value));

@@ -13,7 +13,7 @@ from legs_loss.kernels.compiling import in_threads
 from legs_loss.kernels.compiling import said as said
 from legs_loss.lab.conventions import SH_C0, View
 from legs_loss.lab.rasterizer import projection, projection_backward, sorting, strips
-from legs_loss.lab.rasterizer.groups import Camera, Footprint, Parameters, Splats, room
+from legs_loss.lab.rasterizer.groups import Footprint, GaussianCamera, Parameters, ProjectedGaussians, room
 
 Clip = Callable[..., None]
 
@@ -42,7 +42,7 @@ class Drawing(NamedTuple):
     """
 
     parameters: Parameters
-    camera: Camera
+    camera: GaussianCamera
     splats: np.ndarray
     radii: np.ndarray
     clamped: np.ndarray
@@ -104,14 +104,14 @@ def draw(
         sh=np.zeros((count, 1, 3), np.float32) if tensors.sh is None else _array(tensors.sh),
         covariances=None if tensors.covariances is None else _array(tensors.covariances),
     )
-    camera = Camera(
+    camera = GaussianCamera(
         degree=0 if tensors.sh is None else degree,
         intrinsics=np.array([view.fx, view.fy, view.cx, view.cy, *view.limits]),
         pose=view.world_to_camera,
         position=view.position,
         size=np.array([view.width, view.height], np.int64),
     )
-    found = room(Splats, count, 9)
+    found = room(ProjectedGaussians, count, 9)
     blocks = -(-count // projection.BLOCK)
     in_threads(projection.project, blocks, parameters, camera, footprint, found)
     splats, depths, radii, clamped, boxes, slots = found

@@ -8,7 +8,7 @@ import numpy as np
 
 from legs_loss.lab.conventions import DILATION, SQUARE
 
-__all__ = ["Camera", "Footprint", "Parameters", "Splats", "room"]
+__all__ = ["Footprint", "GaussianCamera", "Parameters", "ProjectedGaussians", "room"]
 
 
 class Parameters(NamedTuple):
@@ -22,7 +22,7 @@ class Parameters(NamedTuple):
     covariances: Optional[np.ndarray]  # [N, 6]: xx, xy, xz, yy, yz, zz
 
 
-class Camera(NamedTuple):
+class GaussianCamera(NamedTuple):
     """The camera that looks at them; float64."""
 
     degree: int  # of the harmonics, as far as they are used
@@ -39,7 +39,7 @@ class Footprint(NamedTuple):
     square: float = SQUARE  # standard deviations
 
 
-class Splats(NamedTuple):
+class ProjectedGaussians(NamedTuple):
     """The projections of N Gaussians."""
 
     rows: np.ndarray  # [N, 9], float64: see projection.py

@@ -197,7 +197,7 @@ def project_backward(counter, blocks, parameters, camera, splats, clamped, first
     Args:
         counter, blocks: of `in_threads`; a block is BLOCK Gaussians.
         parameters, gradients: `Parameters`, with None in the same places.
-        camera: `Camera`.
+        camera: `GaussianCamera`.
         splats: [N, 9], as projected.
         clamped: [N, 3].
         firsts: [N + 1, 2], from the sorting.

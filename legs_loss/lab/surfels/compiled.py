@@ -13,7 +13,7 @@ from legs_loss.kernels.compiling import in_threads
 from legs_loss.lab.rasterizer import sorting
 from legs_loss.lab.rasterizer.groups import room
 from legs_loss.lab.surfels import projection, projection_backward, strips
-from legs_loss.lab.surfels.groups import Camera, Discs, Pictures, Splats, Work
+from legs_loss.lab.surfels.groups import DiscCamera, Discs, Pictures, ProjectedDiscs, Work
 from legs_loss.lab.surfels.model import CHANNELS, Surfels, SurfelView
 
 # Means, scales, quaternions, homographies, opacities, harmonics and colours; of those not given, an empty one.
@@ -33,7 +33,7 @@ class _Render(torch.autograd.Function):
         tensors = tuple(torch.empty(shape) if tensor is None else tensor for tensor, shape in zip(given, EMPTY))
         discs = Discs(*(_array(tensor) for tensor in tensors))
         width, height, count = view.width, view.height, len(discs.means)
-        camera = Camera(
+        camera = DiscCamera(
             degree=view.sh_degree,
             pose=_array(view.world_to_camera.double()),
             pixels=_array(view.pixels),
@@ -41,7 +41,7 @@ class _Render(torch.autograd.Function):
             width=width,
             height=height,
         )
-        found = room(Splats, count, projection.SPLAT, projection.EXTENT)
+        found = room(ProjectedDiscs, count, projection.SPLAT, projection.EXTENT)
         in_threads(projection.project, -(-count // projection.BLOCK), discs, camera, found)
 
         across, down = -(-width // projection.WIDE), -(-height // projection.TALL)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Camera", "Discs", "Pictures", "Splats", "Work"]
+__all__ = ["DiscCamera", "Discs", "Pictures", "ProjectedDiscs", "Work"]
 
 
 class Discs(NamedTuple):
@@ -21,7 +21,7 @@ class Discs(NamedTuple):
     colours: np.ndarray  # [N, 3], in place of sh
 
 
-class Camera(NamedTuple):
+class DiscCamera(NamedTuple):
     """The camera that looks at them; float64."""
 
     degree: int  # of the harmonics
@@ -32,7 +32,7 @@ class Camera(NamedTuple):
     height: int
 
 
-class Splats(NamedTuple):
+class ProjectedDiscs(NamedTuple):
     """The projections of N discs; the fields of a row are in projection.py."""
 
     rows: np.ndarray  # [N, SPLAT], float64

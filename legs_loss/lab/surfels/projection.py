@@ -97,7 +97,7 @@ def _project_block(begin, end, discs, camera, found):
 
 @compiled(fastmath=CAREFUL)
 def project(counter, blocks, discs, camera, found):
-    """Fill the `Splats` that `Discs` become to a `Camera` (groups.py): `in_threads`."""
+    """Fill the `ProjectedDiscs` that `Discs` become to a `DiscCamera` (groups.py): `in_threads`."""
     count, block = len(discs.means), claimed(counter)
     while block < blocks:
         begin = block * BLOCK

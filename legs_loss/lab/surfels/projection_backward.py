@@ -148,7 +148,7 @@ def project_backward(counter, blocks, discs, camera, splats, clamped, firsts, su
     Args:
         counter, blocks: of `in_threads`; a block is BLOCK discs.
         discs, gradients: `Discs`.
-        camera: `Camera`.
+        camera: `DiscCamera`.
         splats: [N, SPLAT], as projected.
         clamped: [N, 3].
         firsts: [N + 1, 2], from the sorting.

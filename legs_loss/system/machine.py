@@ -1,12 +1,20 @@
-"""The C library's heap."""
+"""The machine: the processor's cores, and the C library's heap."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 
-__all__ = ["keep_freed_memory"]
+__all__ = ["cores", "keep_freed_memory"]
 
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # glibc's malloc.h
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def keep_freed_memory() -> None:

@@ -60,7 +60,7 @@ class TestTheTrial:
     @pytest.fixture(autouse=True)
     def anew(self, monkeypatch):
         pytest.importorskip("numba")
-        monkeypatch.setattr(BACKENDS, "_found", {})
+        monkeypatch.setattr(BACKENDS, "found", {})
         monkeypatch.setenv("LEGS_BACKEND", "numba")
 
     @pytest.mark.parametrize(
@@ -72,11 +72,8 @@ class TestTheTrial:
         ],
     )
     def test_it_is_of_what_is_in_use(self, monkeypatch, capfd, table, name, other, spec):
-        from legs_loss.kernels import numba_response, numba_weights
-
-        place = numba_weights if table == "CURVES" else numba_response
-        wrong = {**getattr(place, table), name: getattr(place, table)[other]}
-        monkeypatch.setattr(place, table, wrong)
+        numbers = getattr(codes, table)
+        monkeypatch.setitem(numbers, name, numbers[other])
         assert used(legs_loss(*images((3, 20, 30)))) == "fused"  # whose own is right
         assert used(legs_loss(*images((3, 20, 30)), spec)) == "torch"
         assert "numba is unavailable, torch is used: its trial of the" in capfd.readouterr().err

@@ -201,7 +201,7 @@ def _project_block(first, end, parameters, camera, footprint, found):
 
 @compiled()
 def project(counter, blocks, parameters, camera, footprint, found):
-    """Fill the `ProjectedGaussians` that `Parameters` become to a `GaussianCamera`, with a `Footprint` (groups.py): `in_threads`."""
+    """Fill the `ProjectedGaussians` of `Parameters`, a `GaussianCamera` and a `Footprint` (groups.py): `in_threads`."""
     count, block = len(parameters.means), claimed(counter)
     while block < blocks:
         first = block * BLOCK

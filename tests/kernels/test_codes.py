@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import shutil
@@ -60,6 +61,7 @@ class TestTheTrial:
     @pytest.fixture(autouse=True)
     def anew(self, monkeypatch):
         pytest.importorskip("numba")
+        importlib.import_module("legs_loss.kernels.numba_loss")  # its code is made of the tables as they are
         monkeypatch.setattr(BACKENDS, "found", {})
         monkeypatch.setenv("LEGS_BACKEND", "numba")
 

@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from legs_loss.cli.shared.checks import check_empty
-    from legs_loss.cli.shared.scene_arguments import read_noted
+    from legs_loss.cli.shared.scene_arguments import read_noted, say_skipped
     from legs_loss.errors import LegsError
     from legs_loss.precompute.user_maps import UserMaps, is_below
     from legs_loss.scenes.user_maps import file_names, find_maps, write_gray
@@ -64,22 +64,22 @@ def run(args: argparse.Namespace) -> int:
                 say(f"legs: note: {kind}: these match no photograph: {', '.join(map(str, strays[:3]))}", sys.stderr)
     names = file_names(view.name for view in views)
     mostly: List[str] = []
-    skipped = 0
+    skipped: Dict[str, str] = {}
     for view in tqdm(views, "masks", unit="view"):
         try:
             mask = mask_of(view, args.kinds, folders)
             if not mask.any():
                 raise LegsError("nothing of it would count")
         except LegsError as error:
-            say(f"legs: skipped {view.name}: {error}", sys.stderr)
-            skipped += 1
+            skipped[view.name] = str(error)
             continue
         if mask.mean() < 0.5:
             mostly.append(view.name)
         write_gray(out / names[view.name], mask)
+    say_skipped(skipped)
     if mostly:
         say(f"legs: note: masked by more than half: {', '.join(mostly)}", sys.stderr)
-    say(f"{out}: {len(views) - skipped} masks, {skipped} skipped")
+    say(f"{out}: {len(views) - len(skipped)} masks, {len(skipped)} skipped")
     return 1 if skipped else 0
 
 

@@ -158,12 +158,12 @@ def _refuse_photographs_of_a_scene(folder: Path) -> None:
 
 def _say(store: Path, done: SceneDone) -> int:
     """Print the result of a scene; return 1 if any of it failed."""
+    from legs_loss.cli.shared.scene_arguments import say_skipped
     from legs_loss.store import MANIFEST, WeightStore
     from legs_loss.store.sharpness import unsharp_views
 
     report = done.report
-    for view, reason in report.skipped.items():
-        say(f"legs: skipped {view}: {reason}", sys.stderr)
+    say_skipped(report.skipped)
     for note in report.notes:
         say(f"legs: note: {note}", sys.stderr)
     if done.alike:

@@ -6,14 +6,22 @@ import argparse
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Iterable, Optional, Union
+from typing import TYPE_CHECKING, Any, Iterable, Mapping, Optional, Union
 
 from legs_loss.system import cores, say
 
 if TYPE_CHECKING:
     from legs_loss.scenes import Scene
 
-__all__ = ["add_images", "add_resolution", "add_scene_arguments", "default_resolution", "read_noted", "say_notes"]
+__all__ = [
+    "add_images",
+    "add_resolution",
+    "add_scene_arguments",
+    "default_resolution",
+    "read_noted",
+    "say_notes",
+    "say_skipped",
+]
 
 AFFORDABLE = 70_000  # pixels a photograph
 
@@ -27,6 +35,14 @@ def add_resolution(parser: Any, without: str = "at most 1600 wide", **more: Any)
     """Declare 3DGS's -r, and say what is done without it."""
     what = f"as in 3DGS; default: {without}"
     parser.add_argument("-r", "--resolution", type=int, metavar="1|2|4|8|WIDTH", help=what, **more)
+
+
+def say_skipped(skipped: Mapping[str, str], most: int = 20) -> None:
+    """Print the first of the views that were skipped, each with the reason, and how many more there are."""
+    for view, reason in list(skipped.items())[:most]:
+        say(f"legs: skipped {view}: {reason}", sys.stderr)
+    if len(skipped) > most:
+        say(f"legs: skipped {len(skipped) - most:,} more", sys.stderr)
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:

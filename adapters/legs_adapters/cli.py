@@ -39,8 +39,17 @@ EXIT_CODES = (
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
+
+    def parsed() -> argparse.Namespace:
+        never_fail_to_print()
+        parser = Parser(prog="legs-patch", description=__doc__)
+        add_arguments(parser)
+        parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
+        parser.offer_completion()
+        return parser.parse_args(argv, args)
+
     args = argparse.Namespace(folder="", undo=False)
-    return exit_code("legs-patch", lambda: _run(_parser().parse_args(argv, args)), lambda: _so_far(args))
+    return exit_code("legs-patch", lambda: _run(parsed()), lambda: _so_far(args))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -51,15 +60,6 @@ def run(args: argparse.Namespace) -> int:
 def check_libcst() -> None:
     """Raise a LegsError that says how to install LibCST where it is missing."""
     require("legs-patch", "patch", "libcst")
-
-
-def _parser() -> Parser:
-    never_fail_to_print()
-    parser = Parser(prog="legs-patch", description=__doc__)
-    add_arguments(parser)
-    parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
-    parser.offer_completion()
-    return parser
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -140,8 +140,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", metavar="FOLDER", help="the checkout")
     _declare(parser.add_mutually_exclusive_group(), _MODES)
     text = "run this command in FOLDER for a few steps, and let what it compares decide which term is weighted"
-    _declare(parser, {"--trace COMMAND": text})
-    _declare(parser, {"--undo": "undo the patch, byte for byte; with --diff: show what would change"})
+    undo = "undo the patch, byte for byte; with --diff: show what would change"
+    _declare(parser, {"--trace COMMAND": text, "--undo": undo})
     for title, options in _GROUPS.items():
         _declare(parser.add_argument_group(title), options)
 
@@ -196,29 +196,22 @@ def _patch(args: argparse.Namespace) -> int:
     bare = unrecorded(root) if found.findings.patched else []
     for name, why in bare:
         say(f"legs-patch: {name} is weighted, and --undo leaves it so: {why}", sys.stderr)
-    if args.diff and not args.json:
-        say(as_diff(found.changes()), end="", lines=True)
-    elif args.check and not args.json:
-        say("would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change")
-    elif wrote and not args.json:
-        how = "" if bare else f"; undo it with: legs-patch --undo {shlex.quote(args.folder)}"
-        say(f"\nwrote {', '.join(wrote)}{how}", lines=True)
-    elif not args.json:
-        say("\nnothing to do: it is patched", lines=True)
+    how = "" if bare else f"; undo it with: legs-patch --undo {shlex.quote(args.folder)}"
+    text = f"\nwrote {', '.join(wrote)}{how}" if wrote else "\nnothing to do: it is patched"
+    if args.check:
+        text = "would change: " + ", ".join(sorted(found.after)) if found.after else "nothing would change"
+    if not args.json:
+        say(as_diff(found.changes()) if args.diff else text, end="" if args.diff else "\n", lines=True)
     _quote(problems, "error")
     return 1 if problems or (args.check and found.after) else 0
 
 
 def _trace(args: argparse.Namespace, root: Path) -> Trace:
-    from legs_adapters.trace.running import ScriptFailed, trace
+    from legs_adapters.trace.running import trace
 
     if args.steps < 1:
         raise LegsError(f"--steps must be at least 1, got {args.steps}")
-    try:
-        return trace(root, args.trace, args.steps, args.cpu, args.photos)
-    except ScriptFailed as error:
-        say(f"legs-patch: error: {error}", sys.stderr)
-        sys.exit(error.code)
+    return trace(root, args.trace, args.steps, args.cpu, args.photos)
 
 
 def _show(args: argparse.Namespace, found: Plan, wrote: Sequence[str] = ()) -> None:
@@ -262,13 +255,11 @@ def _undo(args: argparse.Namespace) -> int:
     removed = [name for name, (_, after) in changes.items() if after is None]
     restored = [name for name in changes if name not in removed]
     is_weighted = any(name != SETTINGS_FILE for name, _ in kept)
+    done = [f"restored {name}\n" for name in restored] + [f"removed {name}\n" for name in removed]
     if args.json:
         say(json.dumps({"restored": restored, "removed": removed, "kept": kept}, indent=2), lines=True)
-    elif args.diff:
-        say(as_diff(changes), end="", lines=True)
     else:
-        for line in [f"restored {name}" for name in restored] + [f"removed {name}" for name in removed]:
-            say(line)
+        say(as_diff(changes) if args.diff else "".join(done), end="", lines=True)
     for name, reason in kept if not args.json else ():
         say(f"kept {name}: {reason}", stream=sys.stderr if args.diff else sys.stdout)
     if is_weighted and not args.diff:

@@ -25,7 +25,7 @@ from legs_loss import LegsError
 from legs_loss.config import find_config
 from legs_loss.system import is_first_process, say
 
-__all__ = ["checkout_of", "execute", "run_script"]
+__all__ = ["checkout_of", "execute", "run_exit_functions", "run_script"]
 
 
 def checkout_of(script: Path) -> Path:
@@ -152,6 +152,13 @@ def _as_python_names(script: str) -> str:
     return os.path.join(os.getcwd(), script) if os.name == "posix" else os.path.abspath(script)
 
 
+def run_exit_functions() -> None:
+    """Do what Python does at its end, which a signal and `os._exit` leave out."""
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+
+
 def _interrupted() -> int:
     """End as Python does on Ctrl-C: by the signal, so that a shell's loop ends too; before 3.8 with exit code 1.
 
@@ -161,9 +168,7 @@ def _interrupted() -> int:
         return 1
     if os.name == "posix":
         threading._shutdown()  # type: ignore[attr-defined]
-        atexit._run_exitfuncs()
-        sys.stdout.flush()
-        sys.stderr.flush()
+        run_exit_functions()
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGINT)
     return 130

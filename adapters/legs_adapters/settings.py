@@ -49,7 +49,7 @@ def settings_text(root: Path, given: Mapping[str, Any]) -> str:
     if "store" in given:
         full = Path(os.path.abspath(os.path.expanduser(given["store"])))
         store = (full.relative_to(root) if root in (full, *full.parents) else full).as_posix()
-        if not _is_unicode(store):
+        if store != store.encode("utf-8", "ignore").decode():
             raise LegsError(f"--store {given['store']}: its name is not in UTF-8, as legs.toml is: rename the folder")
     values = {"preset": name, "beta": spec.beta, "curve": spec.curve, "operator": spec.operator, "store": store}
     lines = [
@@ -62,7 +62,3 @@ def settings_text(root: Path, given: Mapping[str, Any]) -> str:
 def _toml(value: Any) -> str:
     """Return a value as TOML: JSON, but characters as they are, since JSON's surrogate pairs are none of TOML."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _is_unicode(text: str) -> bool:
-    return text == text.encode("utf-8", "ignore").decode()

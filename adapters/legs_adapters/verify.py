@@ -172,7 +172,7 @@ def verify(
 
 def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
     losses = {name: list(run.losses) for name, run in runs.items()}
-    unpatched, patched, off = losses["unpatched"], losses["patched"], losses["LEGS_OFF"]
+    unpatched, patched, off = (losses[name] for name in ("unpatched", "patched", "LEGS_OFF"))
     claims = {
         "all three trained": all(run.code == 0 and run.losses for run in runs.values()),
         "as many steps each": len(unpatched) == len(patched) == len(off),
@@ -188,14 +188,10 @@ def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
 
 
 def _of_terms(terms: Sequence[Traced]) -> Dict[str, bool]:
-    """Return a claim for each L1 that was seen: that of a photograph is weighted, and no other.
-
-    Where no picture is of a file that is known, nothing is said of pictures.
-    """
+    """Return a claim for each L1 but those of pictures of no known file: that of a photograph is weighted, no other."""
     claims: Dict[str, bool] = {}
-    is_known = any(term.is_photometric for term in terms)
     for term in terms:
-        if term.is_l1 and (is_known or not term.is_unknown):
+        if term.is_l1 and (term.is_rival or not term.is_unknown):
             where = " from ".join(f"{path}:{line}" for path, line, *_ in term.frames[:2])
             claim = f"{where} is {'' if term.is_photometric else 'not '}weighted: {term.text('')}"
             claims[claim] = (term.kind == "weighted") == term.is_photometric

@@ -64,7 +64,8 @@ class Teacher:
             soft = image
             for _ in range(3):
                 soft = F.avg_pool2d(F.pad(soft, (1, 1, 1, 1), mode="replicate"), 3, 1)
-            return (0.5 * image + 0.5 * soft)[0]
+            floaters = 0.05 * torch.sin(1.3 * torch.arange(image.shape[-1]))
+            return (0.5 * image + 0.5 * soft + floaters)[0]
 
 
 teacher = Teacher()

@@ -64,14 +64,12 @@ class _Join:
             if traced.kind == "weighted" and not traced.is_photometric and (self.is_known or not traced.is_unknown):
                 self._quote(traced, "it is weighted", "write what stood there before: legs-patch --undo has it", 0)
         ran = self.settled.union(candidate.key for _, stack in self.stacks for candidate in stack)
-        lists: Dict[str, Any] = {}
+        kept: Dict[str, Any] = {}
+        for name in ("sites", "left", "problems", "doubts"):
+            kept[name] = [entry for entry in getattr(self.found, name) if not self._is_decided(entry)]
+        found = self.found._replace(**kept, trace=self.trace, ran=frozenset((path, line) for path, line, _ in ran))
         kinds = {"sites": Site, "left": Left, "problems": Problem}
-        for name, kind in kinds.items():
-            fresh = [entry for entry in self.entries if isinstance(entry, kind)]
-            lists[name] = [entry for entry in getattr(self.found, name) if not self._is_decided(entry)] + fresh
-            lists[name].sort(key=lambda entry: (entry.path, entry.line))
-        lists["doubts"] = [entry for entry in self.found.doubts if not self._is_decided(entry)]
-        return self.found._replace(**lists, trace=self.trace, ran=frozenset((path, line) for path, line, _ in ran))
+        return found.with_more(**{name: [e for e in self.entries if isinstance(e, kinds[name])] for name in kinds})
 
     def _is_decided(self, entry: Any) -> bool:
         if isinstance(entry, Site) and not entry.form.weighs:
@@ -83,19 +81,18 @@ class _Join:
     def _candidates(self, traced: Traced) -> Iterator[_Candidate]:
         """Yield the forms on a stack whose arguments are the pair, innermost first."""
         for depth, (path, line, name, _) in enumerate(traced.frames):
-            module = self.analysis.program.module(path)
             inner = traced.frames[depth - 1] if depth else None
-            for function in self._functions(module, line, name) if module is not None else ():
+            for function in self._functions(path, line, name):
                 form = self._form(function, line, inner)
                 if form is not None and (inner is None or self._leads_to(form, inner)):
                     target = traced.target if inner is None else self._target_of(traced, inner)
                     yield _Candidate(function, form, depth, target)
 
-    @staticmethod
-    def _functions(module: Any, line: int, name: str) -> List[Function]:
+    def _functions(self, path: str, line: int, name: str) -> List[Function]:
         """Return the function of a frame, in a list; of a comprehension the one that it stands in."""
-        if name == "<module>":
-            return [module.top]
+        module = self.analysis.program.module(path)
+        if module is None or name == "<module>":
+            return [module.top] if module is not None else []
         scopes = [scope for scope in module.scopes(lambda _: True) if scope is not module.top]
         before = [scope for scope in scopes if scope.place(scope.node).line <= line]
         named = [scope for scope in before if scope.name == name or name.startswith("<")]
@@ -113,7 +110,8 @@ class _Join:
 
     def _leads_to(self, form: Form, inner: Any) -> bool:
         """Return whether a form's own call led to a frame, and not a call in its arguments, as `render(camera)`."""
-        within = {call_name(call) for side in (form.first, form.second) for call in _calls(side)}
+        calls = [call for side in (form.first, form.second) for call in m.findall(side, m.Call())]
+        within = {call_name(cst.ensure_type(call, cst.Call)) for call in calls}
         if inner[2] in ("forward", "__call__"):
             return not within or self._is_pair(inner)
         return inner[2] not in within or inner[2] == call_name(form.call)
@@ -124,9 +122,7 @@ class _Join:
         return len(parameters) > 1 and set(parameters[:2]) == set(frame[3]) and "" not in frame[3]
 
     def _parameters(self, frame: Any) -> List[str]:
-        module = self.analysis.program.module(frame[0])
-        functions = self._functions(module, frame[1], frame[2]) if module is not None else []
-        return functions[0].parameters if functions else []
+        return next((function.parameters for function in self._functions(*frame[:3])), [])
 
     def _target_of(self, traced: Traced, frame: Any) -> int:
         """Return which argument of a call is the target: the position of its name among the callee's parameters."""
@@ -156,10 +152,11 @@ class _Join:
 
     def _quote(self, traced: Traced, why: str, advice: str, depth: int, name: str = "") -> None:
         """Report a line of a term's stack as one that cannot be decided."""
-        path, line, *_ = traced.frames[depth]
-        module = self.analysis.program.module(path)
-        text = module.lines.text(line) if module is not None else ""
-        self.entries.append(Problem(path, line, text, f"{traced.text(name)}; {why}", advice))
+        self.entries.append(Problem(*self._line(traced.frames[depth]), f"{traced.text(name)}; {why}", advice))
+
+    def _line(self, frame: Any) -> Line:
+        module = self.analysis.program.module(frame[0])
+        return Line(frame[0], frame[1], module.lines.text(frame[1]) if module is not None else "")
 
     def _is_definition(self, candidate: _Candidate) -> bool:
         """Return whether a form is the body of the codebase's own L1 function, whose calls are the terms."""
@@ -213,8 +210,7 @@ class _Join:
         path, line, name, _ = traced.frames[depth]
         if any((path, line) in [frame[:2] for frame in loss.frames] for loss in losses):
             return None
-        module = self.analysis.program.module(path)
-        for caller in self._functions(module, line, name) if module is not None else ():
+        for caller in self._functions(path, line, name):
             for call in caller.flow.calls:
                 if _on(caller, call, line) and call_name(call) == candidate.function.name:
                     reason = traced.text(self._name(traced, []))
@@ -225,9 +221,8 @@ class _Join:
         function, form = candidate.function, candidate.form
         place, uses = function.place(form.node), tuple(self._others(candidate) or ())
         text = traced.text(self._name(traced, [candidate]))
-        read = next(
-            (s for s in self.found.sites if (s.path, s.line, s.column) == candidate.key and s.form.weighs), None
-        )
+        sites = [site for site in self.found.sites if site.form.weighs]
+        read = next((site for site in sites if (site.path, site.line, site.column) == candidate.key), None)
         verdict: Any = read or self.verdicts.decide(function, form, place, True)
         if isinstance(verdict, Site):
             if candidate.target >= 0:
@@ -247,45 +242,37 @@ class _Join:
         if any(c.key in self.settled for c in stack):
             return
         if not own:
-            self._without_form(traced)
-            return
+            return self._without_form(traced)
         candidate = own[0]
         place, text = candidate.function.place(candidate.form.node), traced.text(self._name(traced, [candidate]))
         read = [entry for entry in self.found.sites if (entry.path, entry.line) == candidate.key[:2]]
-        if traced.is_unknown and (read or not self._is_left(candidate)):
+        is_left = any((entry.path, entry.line) == candidate.key[:2] for entry in self.found.left)
+        if traced.is_unknown and (read or not is_left):
             if read and not self.is_known:
                 return  # its pictures come from elsewhere: reading decides
-            verdicts, function = self.verdicts, candidate.function
-            term = Term(self.analysis, function, candidate.form)
-            self.entries.append(verdicts.problem(term, place, text))
+            term = Term(self.analysis, candidate.function, candidate.form)
+            self.entries.append(self.verdicts.problem(term, place, text))
         else:
-            self.entries.append(
-                Left.at(candidate.function, place, Evidence("", text + self._differs(candidate, False), ()))
-            )
+            why = Evidence("", text + self._differs(candidate, False), ())
+            self.entries.append(Left.at(candidate.function, place, why))
         self._settle(own)
 
     def _without_form(self, traced: Traced) -> None:
         """Report a photograph's loss that is no L1: squared, or compiled."""
-        path, line, *_ = traced.frames[0]
-        module = self.analysis.program.module(path)
-        if traced.kind in ("l1", "signed") or traced.why_other or module is None:
-            return
-        here = Line(path, line, module.lines.text(line))
-        self.entries.append(Left(*here, traced.text(self._name(traced, [])), (here,)))
-        self.settled.add((path, line, 0))
-
-    def _is_left(self, candidate: _Candidate) -> bool:
-        return any((entry.path, entry.line) == candidate.key[:2] for entry in self.found.left)
+        here = self._line(traced.frames[0])
+        if traced.kind not in ("l1", "signed") and not traced.why_other and here.path in self.analysis.program.sources:
+            self.entries.append(Left(*here, traced.text(self._name(traced, [])), (here,)))
+            self.settled.add((here.path, here.line, 0))
 
     def _differs(self, candidate: _Candidate, is_loss: bool) -> str:
         """Return in words that reading said otherwise."""
-        place = candidate.key[:2]
-        sites, left = ([(e.path, e.line) for e in entries] for entries in (self.found.sites, self.found.left))
-        said = "weighted" if not is_loss and place in sites else "skipped" if is_loss and place in left else ""
-        return f"; by reading it would be {said}" if said else ""
+        read: Any = self.found.left if is_loss else self.found.sites
+        said = "skipped" if is_loss else "weighted"
+        differs = any((entry.path, entry.line) == candidate.key[:2] for entry in read)
+        return f"; by reading it would be {said}" if differs else ""
 
     def _settle(self, stack: List[_Candidate]) -> None:
-        self.settled |= {candidate.key for candidate in stack}
+        self.settled.update(candidate.key for candidate in stack)
 
     @staticmethod
     def _name(traced: Traced, stack: List[_Candidate]) -> str:
@@ -300,7 +287,3 @@ class _Join:
 def _on(function: Function, node: cst.CSTNode, line: int) -> bool:
     place = function.place(node)
     return place.line <= line <= place.last_line
-
-
-def _calls(node: cst.CSTNode) -> List[cst.Call]:
-    return [cst.ensure_type(call, cst.Call) for call in m.findall(node, m.Call())]

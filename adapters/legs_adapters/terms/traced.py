@@ -46,12 +46,11 @@ class Traced(NamedTuple):
     def read(cls, terms: Sequence[Dict[str, Any]]) -> List[Traced]:
         """Return those terms of a watched process's report after which something was stepped."""
         found = []
-        for term in terms:
+        for term in (term for term in terms if term["steps"] or term["poses"]):
             frames = tuple((path, line, name, tuple(names)) for path, line, name, names in term["frames"])
-            shares = term["shares"] or [0.0]
-            rest = {name: term[name] for name in cls._fields if name not in ("frames", "share")}
-            found.append(cls(frames=frames, share=sum(shares) / len(shares), **rest))
-        return [term for term in found if term.steps or term.poses]
+            rest = {name: value for name, value in term.items() if name not in ("frames", "shares")}
+            found.append(cls(frames=frames, share=sum(term["shares"]) / max(1, len(term["shares"])), **rest))
+        return found
 
     @property
     def is_l1(self) -> bool:
@@ -79,11 +78,7 @@ class Traced(NamedTuple):
         if self.target < 0:
             return "both sides are trained"
         if not self.steps:
-            return (
-                "only poses, exposures or embeddings are stepped after it"
-                if self.poses
-                else "nothing was seen to step by it"
-            )
+            return "only poses, exposures or embeddings are stepped after it"
         if not self.is_picture:
             channels = [side for side in self.shape if side > 1]
             what = "1 channel" if len(channels) < 3 else "not of 3 or 4 channels"
@@ -109,10 +104,7 @@ class Traced(NamedTuple):
             assert self.match is not None
             parts.append(f"{target or 'the other side'} is {self.match['path']}")
         if not self.is_l1:
-            what = {
-                "robust": "a Huber, Charbonnier or other bent loss",
-                "signed": "a signed difference",
-            }
+            what = {"robust": "a Huber, Charbonnier or other bent loss", "signed": "a signed difference"}
             parts.append(f"{what.get(self.kind, f'a {self.kind} loss')}, no L1")
         elif not why and self.gaussians:
             parts.append(f"{self.gaussians:,} Gaussians are stepped after it")
@@ -122,8 +114,7 @@ class Traced(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """The terms that a traced run saw, its count of steps, and its functions of TorchScript by file and name."""
+    """The terms that a traced run saw, and its functions of TorchScript by file and name."""
 
     terms: List[Traced]
-    steps: int
     scripted: FrozenSet[Tuple[str, str]]

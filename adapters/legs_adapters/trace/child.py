@@ -7,7 +7,6 @@ What is recorded: every difference under a loss, the loss of every backward pass
 
 from __future__ import annotations
 
-import atexit
 import importlib
 import json
 import multiprocessing.spawn
@@ -33,12 +32,12 @@ def _main(given: str, script: str, *arguments: str) -> int:
     import numpy as np
     import torch
 
-    from legs_adapters.runner import execute
+    from legs_adapters.runner import execute, run_exit_functions
 
     spec = json.loads(given)
     threading.Thread(target=_end_with_parent, args=(spec,), daemon=True).start()
     _watched(spec)
-    if "losses" in spec:  # runs are compared
+    if "losses" in spec["limits"]:  # runs are compared
         random.seed(0)
         np.random.seed(0)
         torch.manual_seed(0)
@@ -46,9 +45,7 @@ def _main(given: str, script: str, *arguments: str) -> int:
         return exit_code("legs", lambda: execute(script, arguments, {}, Path(spec["root"]) if spec["cpu"] else None))
     finally:
         if _over:  # whatever threads of the script are left
-            atexit._run_exitfuncs()
-            sys.stdout.flush()
-            sys.stderr.flush()
+            run_exit_functions()
             os._exit(0)
 
 
@@ -87,11 +84,11 @@ def _watched(spec: Dict[str, Any]) -> None:
         sys.exit(0)  # (without the 0, a process of multiprocessing fails before Python 3.8)
 
     def write() -> None:
-        if is_first_process() and (watch.steps or not os.path.exists(spec["report"])):
+        if is_first_process() and (watch.seen["steps"] or not os.path.exists(spec["report"])):
             Path(spec["report"]).write_text(json.dumps({"is_over": bool(_over), **watch.report()}))
 
     photographs = Photographs(spec["folders"], spec["photos"])
-    watch = Watch(spec["root"], photographs, spec.get("steps"), spec.get("losses"), ended)
+    watch = Watch(spec["root"], photographs, spec["limits"], ended)
     watch.install()
     Finalize(None, write, exitpriority=0)  # a process that multiprocessing starts has no atexit
     start: Any = multiprocessing.spawn

@@ -54,11 +54,8 @@ class Photographs:
         roots = [photos] if photos else list(folders)
         self.root: str = os.path.commonpath([os.path.realpath(root) for root in roots]) if roots else ""
         files = list(dict.fromkeys(path for root in roots for path in _image_files(root)))[:MAX_FILES]
-        listed: Dict[str, Set[Tuple[str, str]]] = {}  # by folder: what the model in it lists
-        for path in files if not photos else ():
-            for folder in _folders(path, roots):
-                if folder not in listed:
-                    listed[folder] = _listed(folder)
+        above = {folder for path in files for folder in _folders(path, roots)} if not photos else set()
+        listed = {folder: _listed(folder) for folder in above}  # what the model in it lists
         every = set().union(*listed.values())
         self._tiers: List[List[str]] = [[], []]
         for path in files:
@@ -75,10 +72,10 @@ class Photographs:
     def match(self, picture: Optional[Picture]) -> Optional[Match]:
         """Return the file that a picture's thumbnail is most like: a photograph first; None without files."""
         best: Optional[Match] = None
-        for tier, files in enumerate(self._tiers):
-            found = self._best(tier, picture) if files and picture is not None else None
-            if found is not None and (best is None or found[1] > best.correlation):
-                best = Match(os.path.relpath(files[found[0]], self.root), found[1], not tier)
+        for tier in (0, 1):
+            found = self._best(tier, picture) if picture is not None else None
+            if found is not None and (best is None or found.correlation > best.correlation):
+                best = found
             if best is not None and best.correlation >= SURE:
                 break
         if best is None or picture is None or best.correlation < SURE:
@@ -109,7 +106,7 @@ class Photographs:
             self._fine[path, scale] = _thumbnails([path], scale * SIDE)[1]
         return self._fine[path, scale]
 
-    def _best(self, tier: int, picture: Picture) -> Optional[Tuple[int, float]]:
+    def _best(self, tier: int, picture: Picture) -> Optional[Match]:
         import numpy as np
 
         if self._known[tier] is None:
@@ -125,7 +122,7 @@ class Photographs:
         others = _standardised(stack[:, :, kept])
         scores = np.maximum(others @ one.ravel(), others @ one[::-1].ravel())  # RGB, BGR
         at = int(np.argmax(scores))
-        return int(files[at]), float(scores[at])
+        return Match(os.path.relpath(self._tiers[tier][files[at]], self.root), float(scores[at]), not tier)
 
 
 def _colours(thumb: Any) -> float:
@@ -252,8 +249,7 @@ def _image_files(root: str) -> List[str]:
     for folder, folders, names in os.walk(root):
         folders[:] = sorted(name for name in folders if not name.startswith(".") and name != "legs_weights")
         found += [os.path.join(folder, name) for name in sorted(names) if name.lower().endswith(_SUFFIXES)]
-        if len(found) > MAX_FILES:
-            break
+        folders[:] = folders if len(found) <= MAX_FILES else []
     return found
 
 
@@ -294,11 +290,11 @@ def _thumbnails(files: Sequence[str], side: int = SIDE) -> Tuple[Any, Any]:
             with Image.open(path) as image:
                 image.draft("RGB", (16 * SIDE, 16 * SIDE))  # of a JPEG: decoded smaller
                 pictures = [image.convert("RGB")]
-                if image.mode in ("RGBA", "LA", "PA"):
+                for ground in ("black", "white") if image.mode in ("RGBA", "LA", "PA") else ():
                     pixels = image.convert("RGBA")
-                    for colour in ((0, 0, 0, 255), (255, 255, 255, 255)):
-                        ground = Image.new("RGBA", pixels.size, colour)
-                        pictures.append(Image.alpha_composite(ground, pixels).convert("RGB"))
+                    pictures.append(
+                        Image.alpha_composite(Image.new("RGBA", pixels.size, ground), pixels).convert("RGB")
+                    )
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             continue
         for picture in pictures:

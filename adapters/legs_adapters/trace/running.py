@@ -11,27 +11,19 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
-from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
+from typing import Any, Dict, Iterator, Optional, Sequence, Tuple
 
 from legs_adapters.terms.traced import Trace, Traced
 from legs_adapters.trace.command import SCENE, filled, folders, parts
 from legs_loss import LegsError
 from legs_loss.system import FileLock, say
 
-__all__ = ["ScriptFailed", "folder_for_runs", "run_watched", "trace"]
+__all__ = ["folder_for_runs", "run_watched", "trace"]
 
 _SETTINGS = {  # no bytecode is written into the checkout; torch.compile and TorchScript cannot be watched
     "PYTHONDONTWRITEBYTECODE": "1", "TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0",
 }  # fmt: skip
 _NOTHING: Dict[str, Any] = {"terms": [], "steps": 0, "backward_passes": 0, "unseen": [], "scripted": []}
-
-
-class ScriptFailed(LegsError):
-    """The traced script failed; its traceback is on stderr already. ``code`` is its exit code."""
-
-    def __init__(self, message: str, code: int) -> None:
-        super().__init__(message)
-        self.code = code
 
 
 def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optional[str] = None) -> Trace:
@@ -45,7 +37,7 @@ def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optio
         photos: the folder of the photographs; default: those that the scenes' models list.
 
     Raises:
-        ScriptFailed: the script did.
+        SystemExit: the script failed, with its exit code; its traceback is on stderr already.
         LegsError: the command names no script; or nothing was trained.
     """
     launcher, script, arguments = parts(root, command)
@@ -64,21 +56,20 @@ def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optio
         code, seen = run_watched(root, work, [script, *arguments], cpu, photos, {"steps": steps}, launcher, stdout=2)
     if code and not seen.get("is_over"):  # (a rank that waits for one that has ended fails)
         message = f"{script} ended with exit code {code}; nothing was changed. By reading: legs-patch {root}"
-        raise ScriptFailed(message, code if code > 0 else 128 - code)
+        say(f"legs-patch: error: {message}", sys.stderr)
+        sys.exit(code if code > 0 else 128 - code)
     if seen.get("failure"):
         say(f"legs-patch: warning: a difference could not be watched ({seen['failure']})", sys.stderr)
     names = ", ".join(seen["unseen"])
     unseen = [f"a trace cannot look into fused kernels, as these under the loss: {names}"] if names else []
     terms = Traced.read(seen["terms"])
     if not terms:
-        passes = f"{seen['backward_passes']} backward passes" if seen["backward_passes"] else "no backward pass"
-        raise LegsError(
-            f"{script} ended before an optimiser moved what it renders ({passes} seen): by reading: legs-patch {root}",
-            *unseen,
-        )
+        passes = f"{seen['backward_passes'] or 'no'} backward passes seen"
+        message = f"{script} ended before an optimiser moved what it renders ({passes}): by reading: legs-patch {root}"
+        raise LegsError(message, *unseen)
     for line in unseen if not any(term.is_photometric for term in terms) else ():
         say(f"legs-patch: warning: {line}", sys.stderr)
-    return Trace(terms, seen["steps"], frozenset(map(tuple, seen["scripted"])))
+    return Trace(terms, frozenset(map(tuple, seen["scripted"])))
 
 
 def run_watched(
@@ -112,9 +103,9 @@ def run_watched(
     environment.update(_SETTINGS, **(settings or {}), **({"CUDA_VISIBLE_DEVICES": ""} if cpu else {}))
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     report, seconds = Path(tempfile.mkdtemp(dir=str(work))) / "report.json", streams.pop("timeout", None)
-    spec = {"report": str(report), "root": str(root), "cpu": cpu, "folders": folders(root, words[1:]), **limits}
-    spec.update(photos=photos and os.path.abspath(photos), work=str(work))
-    command: List[str] = [*(launcher or [sys.executable]), "-m", "legs_adapters.trace.child", json.dumps(spec), *words]
+    spec: Dict[str, Any] = {"report": str(report), "root": str(root), "work": str(work), "cpu": cpu, "limits": limits}
+    spec.update(folders=folders(root, words[1:]), photos=photos and os.path.abspath(photos))
+    command = [*(launcher or [sys.executable]), "-m", "legs_adapters.trace.child", json.dumps(spec), *words]
     streams.update(cwd=str(root), env=environment, stdin=subprocess.DEVNULL, start_new_session=True)
     with FileLock(f"{report}.lock"):
         child = subprocess.Popen(command, **streams)

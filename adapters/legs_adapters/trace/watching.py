@@ -7,6 +7,7 @@ graph does. Nothing of a backward pass is kept after it but numbers, and weak re
 from __future__ import annotations
 
 import functools
+import math
 import os
 import sys
 import time
@@ -35,6 +36,7 @@ _OWNERS: Sequence[Tuple[Any, Sequence[str], str]] = (  # where torch has each; a
     (legs_loss, ("l1_loss",), "weighted"),
     (legs_loss.runtime, ("l1_loss",), "weighted"),
 )
+_SIDES = ("input", "other", "prediction", "target")  # their names, given by name
 
 Frame = Tuple[str, int, str, Tuple[str, ...]]
 
@@ -48,7 +50,7 @@ def _harmless(own: Any) -> Any:
         try:
             return own(self, *args)
         except Exception as error:
-            self.failure = self.failure or f"{type(error).__name__}: {error}"
+            self.seen["failure"] = self.seen["failure"] or f"{type(error).__name__}: {error}"
             return None
         finally:
             self._inside = False
@@ -97,31 +99,19 @@ class Watch:
     Args:
         root: the checkout, whose frames are kept.
         photographs: the image files that targets are compared with.
-        steps, losses: after how many steps, and before how many further backward passes of a scalar `ended` is called.
+        limits: after how many "steps", and before how many further "losses" (backward passes of a scalar) to end.
         ended: ends the script.
     """
 
-    def __init__(
-        self,
-        root: str,
-        photographs: Photographs,
-        steps: Optional[int],
-        losses: Optional[int],
-        ended: Callable[[], None],
-    ) -> None:
+    def __init__(self, root: str, photographs: Photographs, limits: Dict[str, Any], ended: Callable[[], None]) -> None:
         self.root: str = os.path.join(os.path.realpath(root), "")
         self.photographs: Photographs = photographs
-        self.most_steps, self.most_losses = steps, losses
-        self.ended = ended
-        self.steps: int = 0
-        self.pose_steps: int = 0
-        self.backward_passes: int = 0
-        self.losses: List[str] = []
+        self.limits, self.ended = limits, ended
+        self.seen: Dict[str, Any] = {"steps": 0, "poses": 0, "backward_passes": 0, "failure": "", "losses": []}
         self.times: List[float] = []
         self.terms: Dict[Any, Dict[str, Any]] = {}
         self.unseen: Set[str] = set()
         self.scripted: Set[Tuple[str, str]] = set()  # files and names of functions of TorchScript: nothing is edited
-        self.failure = ""
         self._waiting: Dict[Any, Set[int]] = {}  # terms whose step is awaited, with the ids of the leaves under each
         self._samples: Dict[int, _Sample] = {}
         self._files: Dict[str, Optional[str]] = {}
@@ -130,9 +120,9 @@ class Watch:
 
     def report(self) -> Dict[str, Any]:
         """Return what was seen so far, as JSON has it."""
-        found = {name: getattr(self, name) for name in ("steps", "backward_passes", "failure", "losses")}
-        found.update(terms=list(self.terms.values()), unseen=sorted(self.unseen), scripted=sorted(self.scripted))
-        return {**found, "seconds": [b - a for a, b in zip(self.times, self.times[1:])], **vars(counts())}
+        found = {"terms": list(self.terms.values()), "unseen": sorted(self.unseen), "scripted": sorted(self.scripted)}
+        seconds = [b - a for a, b in zip(self.times, self.times[1:])]
+        return {**self.seen, **found, "seconds": seconds, **vars(counts())}
 
     def install(self) -> None:
         """Wrap torch's differences, its backward passes and its optimisers, for good."""
@@ -178,12 +168,10 @@ class Watch:
                 made = own(*args, **kwargs)
             finally:
                 self._inside = False
-            if getattr(made, "requires_grad", False) and made.grad_fn is not None:
-                names = ("input", "other", "prediction", "target")
-                sides = [*args, *(kwargs[name] for name in names if name in kwargs)][:2]
-                if len(sides) == 2 and all(isinstance(side, torch.Tensor) for side in sides):
-                    is_plain = kind == "weighted" and counts().weighted == weighted
-                    self._record("plain" if is_plain else kind, sides[::-1] if is_reversed else sides, made)
+            sides = [*args, *(kwargs[name] for name in _SIDES if name in kwargs)][:2]
+            if getattr(made, "grad_fn", None) is not None and all(isinstance(side, torch.Tensor) for side in sides):
+                is_plain = kind == "weighted" and counts().weighted == weighted
+                self._record("plain" if is_plain else kind, sides[::-1] if is_reversed else sides, made)
             return made
 
         return watched
@@ -198,8 +186,8 @@ class Watch:
             made = call(*args, **kwargs)
             if not self._inside and getattr(made, "grad_fn", None) is not None:
                 pictures = [arg for arg in args if isinstance(arg, torch.Tensor) and arg.dim() > 2]
-                pairs = [(a, b) for a, b in zip(pictures, pictures[1:]) if a.shape == b.shape]
-                for pair in pairs[:1]:
+                pair = next(((a, b) for a, b in zip(pictures, pictures[1:]) if a.shape == b.shape), None)
+                if pair is not None:
                     self._record(f"compiled: {cls.__name__}", pair, made)
             return made
 
@@ -210,28 +198,26 @@ class Watch:
         moving = [side.requires_grad for side in sides]
         largest = max(sides, key=lambda side: side.numel())
         node = made.grad_fn
-        if largest.dim() < 2 or largest.numel() < 64 or not any(moving) or KEY in node.metadata:
+        if len(sides) < 2 or largest.dim() < 2 or largest.numel() < 64 or not any(moving) or KEY in node.metadata:
             return  # (of nested functions the inner one is kept)
         frames = self._frames(sides)
         if frames:
             target = -1 if all(moving) else moving.index(False)
-            still = sides[target] if target >= 0 else sides[1].detach()
-            record = _Record(kind, frames, target, still, made.detach(), [])
-            node.metadata[KEY] = record
+            still = sides[1].detach() if target < 0 else sides[target]  # (detached it has no base)
+            node.metadata[KEY] = record = _Record(kind, frames, target, still, made.detach(), [])
             node.register_hook(functools.partial(_share, record.shares, record.values))
 
     def _frames(self, sides: Sequence[Any]) -> Tuple[Frame, ...]:
         """Return the frames of the checkout, innermost first, each with its names of the two sides."""
         found: List[Frame] = []
-        frame = sys._getframe(4)
+        frame: Any = sys._getframe(4)
         while frame is not None:
-            path = self._inside_root(frame.f_code.co_filename)
-            name = frame.f_globals.get("__name__", "")
-            if path is None and not found and name.startswith(_OWN) and name != legs_loss.runtime.__name__:
-                return ()  # a shim's, or one of another loss (the run time's `unweighted` calls the script's)
+            path, module = self._inside_root(frame.f_code.co_filename), frame.f_globals.get("__name__", "")
             if path is not None:
                 found.append((path, frame.f_lineno, frame.f_code.co_name, _names(frame, sides)))
-            frame = frame.f_back  # type: ignore[assignment]
+            elif not found and module.startswith(_OWN) and module != legs_loss.runtime.__name__:
+                return ()  # a shim's, or one of another loss (the run time's `unweighted` calls the script's)
+            frame = frame.f_back
         return tuple(found)
 
     def _inside_root(self, name: str) -> Optional[str]:
@@ -251,9 +237,9 @@ class Watch:
             self._settle()  # what was stepped without an optimiser of torch's
             roots = list(tensors) if isinstance(tensors, (tuple, list)) else [tensors]
             if is_step and len(roots) == 1 and roots[0].numel() == 1:
-                if self.most_losses is not None and len(self.losses) >= self.most_losses:
+                if len(self.seen["losses"]) >= self.limits.get("losses", math.inf):
                     self.ended()
-                self.losses.append(float(roots[0].detach()).hex())
+                self.seen["losses"].append(float(roots[0].detach()).hex())
                 self.times.append(time.perf_counter())
             seen = self._seen(roots) or []
             made = own(tensors, *args, **kwargs)
@@ -304,7 +290,7 @@ class Watch:
 
     @_harmless
     def _sum_up(self, roots: Sequence[Any], seen: Sequence[Tuple[_Record, Any, List[Any]]]) -> None:
-        self.backward_passes += 1
+        self.seen["backward_passes"] += 1
         loss = sum(float(root.detach().sum()) for root in roots)
         for record, key, leaves in seen:
             if not record.shares:
@@ -336,7 +322,8 @@ class Watch:
 
         What has not changed waits on: for another optimiser, or until enough gradients are accumulated.
         """
-        if self._changes() and self.most_steps is not None and self.steps + self.pose_steps // 20 >= self.most_steps:
+        steps = self.seen["steps"] + self.seen["poses"] // 20 if self._changes() else 0
+        if steps >= self.limits.get("steps", math.inf):
             self.ended()
 
     @_harmless
@@ -350,22 +337,18 @@ class Watch:
                 stepped.append(self._stepped(self.terms[key], [self._samples[at].leaf() for at in leaves]))
                 del self._waiting[key]
         awaited = set().union(*self._waiting.values()) - changed
-        self._samples = {
-            at: sample for at, sample in self._samples.items() if at in awaited and sample.leaf() is not None
-        }
-        self.steps += any(stepped)
-        self.pose_steps += bool(stepped) and not any(stepped)
+        self._samples = {at: each for at, each in self._samples.items() if at in awaited and each.leaf() is not None}
+        self.seen["steps"] += any(stepped)
+        self.seen["poses"] += bool(stepped) and not any(stepped)
         return bool(stepped)
 
     def _stepped(self, term: Dict[str, Any], leaves: Sequence[Any]) -> bool:
         """Record what was stepped after a term; return whether it is more than poses, exposures and embeddings."""
         firsts = [leaf.shape[0] for leaf in leaves if leaf.dim() > 1]
-        common = max(set(firsts), key=firsts.count) if firsts else 0
+        common = max(firsts, key=firsts.count, default=0)
         is_model = not all(self._is_of_views(leaf, firsts) for leaf in leaves)
-        term["steps"] += is_model
-        term["poses"] += not is_model
-        if firsts.count(common) > 2:
-            term["gaussians"] = common
+        term["steps" if is_model else "poses"] += 1
+        term["gaussians"] = common if firsts.count(common) > 2 else term["gaussians"]
         term["parameters"] = sorted({*term["parameters"], *(self._names.get(id(leaf), "") for leaf in leaves)} - {""})
         term["stepped"] = sorted({*map(tuple, term["stepped"]), *(tuple(leaf.shape) for leaf in leaves)})[:32]
         return is_model
@@ -384,9 +367,5 @@ def _share(shares: List[Any], values: Any, _: Any, gradients: Sequence[Any]) -> 
 
 def _names(frame: Any, sides: Sequence[Any]) -> Tuple[str, ...]:
     """Return the first two parameters of a frame where they are the two sides, in order; else its names of each."""
-    found = ["", ""]
-    for name, value in frame.f_locals.items():
-        for at, side in enumerate(sides):
-            if value is side and not found[at]:
-                found[at] = name
-    return tuple(found)
+    known = frame.f_locals
+    return tuple(next((name for name in known if known[name] is side), "") for side in sides)

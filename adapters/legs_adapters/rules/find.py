@@ -37,7 +37,7 @@ __all__ = ["find"]
 
 _Entry = Tuple[Place, Union[Site, Left, Problem]]
 
-_RULES = 100  # steps of what all rules ask about a term
+_RULES = 100  # steps at most of what all rules ask about a term
 _TEXT = 50  # letters of a text that are searched in a step
 _MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|\bunweighted\(")
 _TO_READ = re.compile(f"{_MAY_HAVE_L1.pattern}|{TRAINS.pattern}|{'|'.join(sorted(HOOKS))}")
@@ -154,7 +154,7 @@ class _Finder:
     def _of_forms(self, function: Function) -> Iterator[_Entry]:
         meant = self._meant(function) if self.by_hand else []
         for form in self.analysis.forms.in_function(function):
-            if not function.module.spend(_RULES):
+            if not function.module.spend(min(_RULES, function.flow.steps)):
                 return
             place = function.place(form.node)
             chosen = form in meant

@@ -215,7 +215,7 @@ class Watch:
             path, module = self._inside_root(frame.f_code.co_filename), frame.f_globals.get("__name__", "")
             if path is not None:
                 found.append((path, frame.f_lineno, frame.f_code.co_name, _names(frame, sides)))
-            elif not found and module.startswith(_OWN) and module != legs_loss.runtime.__name__:
+            elif not found and module.startswith(_OWN) and not module.startswith(legs_loss.runtime.__name__):
                 return ()  # a shim's, or one of another loss (the run time's `unweighted` calls the script's)
             frame = frame.f_back
         return tuple(found)

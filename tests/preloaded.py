@@ -59,7 +59,7 @@ def _ask(job, timeout):
             env=dict(os.environ, OMP_NUM_THREADS="1", PYTHONPATH=PATH),
             bufsize=0,
         )
-        atexit.register(_server.kill)
+        atexit.register(_end)
     _server.stdin.write(json.dumps(job).encode() + b"\n")
     process = int(_server.stdout.readline())
     if not select.select([_server.stdout], [], [], timeout)[0]:
@@ -67,6 +67,12 @@ def _ask(job, timeout):
         _server.stdout.readline()
         raise subprocess.TimeoutExpired(job["arguments"], timeout)
     return int(_server.stdout.readline())
+
+
+def _end():
+    """End the server, and wait for it: then its processes' time counts to this one's."""
+    _server.kill()
+    _server.wait()
 
 
 def _serve():

@@ -13,8 +13,9 @@ import importlib.util
 import os
 import sys
 import threading
+from contextlib import nullcontext
 from functools import partial
-from typing import Any, Callable, Dict, FrozenSet, List, NamedTuple, Optional, Tuple
+from typing import Any, Callable, ContextManager, Dict, FrozenSet, List, NamedTuple, Optional, Tuple
 
 import torch
 
@@ -169,8 +170,9 @@ class Backends:
             operation, settings = case
             operations = [each for each in sorted(backend.offers) if operation in (None, each)]
             spec = None if settings is None else WeightSpec(*settings)
-            # The first call may be in an evaluation, and the trial needs gradients.
-            with torch.inference_mode(False), backend.preparing():
+            # The first call may be in an evaluation, and the trial needs gradients; or in a checkpoint, which counts by
+            # hooks what is saved, and would count what the trial saves.
+            with torch.inference_mode(False), _own_hooks(), backend.preparing():
                 problem = difference_from_torch(backend, device, operations, spec)
         except (NotNow, MemoryError, OUT_OF_MEMORY, DeviceFault):
             raise
@@ -227,6 +229,14 @@ def _why_missing(name: str) -> Optional[str]:
     if sys.version_info < (3, 8):
         return "the last numba for Python 3.7 takes minutes to compile the weights"
     return None
+
+
+def _own_hooks() -> ContextManager[Any]:
+    """Return what keeps hooks of tensors that autograd saves, of whoever is around, from those of a block."""
+    allowed = getattr(torch._C._autograd, "_saved_tensors_hooks_is_enabled", None)
+    if allowed is not None and not allowed():
+        return nullcontext()
+    return torch.autograd.graph.saved_tensors_hooks(lambda saved: saved, lambda saved: saved)
 
 
 def _in_words(error: Exception) -> str:

@@ -14,7 +14,7 @@ from legs_loss.autograd import is_transformed, is_wrapped
 from legs_loss.errors import LegsError
 from legs_loss.images import Layout, read_pair
 from legs_loss.kernels.available import BACKENDS, OUT_OF_MEMORY, forced_backend
-from legs_loss.kernels.contract import DeviceFault, NotNow, Prepared, Terms, node
+from legs_loss.kernels.contract import DeviceFault, Failed, NotNow, Prepared, Terms, node
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
@@ -83,7 +83,7 @@ def plan_of(
     ):
         layout, prediction, target = read_pair(prediction, target, channels_last)
         return Plan(layout, spec=spec), prediction, target
-    wanted = prediction.requires_grad and torch.is_grad_enabled()
+    wanted, share = prediction.requires_grad and torch.is_grad_enabled(), float(share)  # a tensor's hash is its place
     given = (operation, share, spec, channels_last, wanted, BACKENDS.setting())
     one = (prediction.shape, prediction.stride(), prediction.dtype, prediction.device)
     key = (given, one, target.shape, target.stride(), target.dtype, target.device)
@@ -148,14 +148,14 @@ def fused(plan: Plan, prediction: Tensor, target: Tensor, weights: Weights) -> O
         plan, prediction, target = plan_of(plan.operation, plan.share, weights.spec, prediction, target, False)
         if plan.prepared is None:
             return None
+    if weights.spec is not None and not plan.makes:
+        map_ = weights.with_map(target).map
+    if plan.converted:
+        prediction, target = prediction.float(), target.float()
     try:
-        if weights.spec is not None and not plan.makes:
-            map_ = weights.with_map(target).map
-        if plan.converted:
-            prediction, target = prediction.float(), target.float()
         loss: Tensor = node(prediction, target, map_, weights.range, plan.prepared)
-    except Exception as error:
-        _given_up(error, plan.place[0], prediction.device)
+    except Failed as failed:
+        _given_up(failed.__cause__, plan.place[0], prediction.device)
         return None
     return loss if weights.share is None else weights.of_what_counts(loss)
 
@@ -176,9 +176,9 @@ def fused_range(target: Tensor, spec: WeightSpec) -> Optional[Tensor]:
         return None
 
 
-def _given_up(error: Exception, name: str, device: torch.device) -> None:
+def _given_up(error: Optional[BaseException], name: str, device: torch.device) -> None:
     """Raise what a user or torch must know of; of others, as of a size that no trial covered, leave the backend."""
     if isinstance(error, (LegsError, MemoryError, OUT_OF_MEMORY, DeviceFault)):
-        raise error
-    if not isinstance(error, NotNow):
+        raise error from None  # what a node made of it says nothing more
+    if isinstance(error, Exception) and not isinstance(error, NotNow):
         BACKENDS.give_up(name, device, error)

@@ -102,7 +102,9 @@ def _stamp(folder: Path) -> str:
     here = Path(__file__).parent
     paths = sorted({*folder.parent.glob("*/*.py"), *here.glob("*.py")})
     texts = [text for text in (path.read_bytes() for path in paths) if b"numba" in text or b"compiling" in text]
-    tables = [(here.parent / name).read_bytes() for name in ("curves.py", "operators.py", "similarity.py")]
+    tables = [
+        (here.parent / name).read_bytes() for name in ("curves.py", "operators.py", "similarity.py", "kernels/codes.py")
+    ]
     return _digest(b"\0".join([numba.__version__.encode(), *texts, *tables]))
 
 

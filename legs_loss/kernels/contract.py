@@ -20,11 +20,16 @@ from legs_loss.errors import LegsError
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
-__all__ = ["Backend", "DeviceFault", "NotNow", "Prepared", "Terms", "node"]
+__all__ = ["Backend", "DeviceFault", "Failed", "NotNow", "Prepared", "Terms", "node"]
 
 
 class NotNow(Exception):
     """An operation cannot be done now, for want of memory or since a capture is under way: torch computes it once."""
+
+
+class Failed(Exception):
+    """A node's computation failed, as the cause says. What else is raised in a node, as by a hook of tensors that are
+    saved (torch stops a checkpoint's second pass so), is not the backend's."""
 
 
 class DeviceFault(RuntimeError):
@@ -143,7 +148,11 @@ class Backend:
             prediction, target = prediction.float(), target.float()
         wanted = prediction.requires_grad and torch.is_grad_enabled()
         prepared = self.prepare(terms, weights.spec, prediction, target, wanted)
-        return node(prediction, target, weights.map, weights.range, prepared)
+        try:
+            loss: Tensor = node(prediction, target, weights.map, weights.range, prepared)
+        except Failed as failed:
+            raise (failed.__cause__ or failed) from None
+        return loss
 
 
 class _FusedLoss(torch.autograd.Function):
@@ -156,10 +165,15 @@ class _FusedLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, map_: Any, range_: Any, prepared: Prepared) -> Tensor:
-        loss, gradient = prepared.compute(prediction, target, map_, range_)
+        try:
+            loss, gradient = prepared.compute(prediction, target, map_, range_)
+        except Exception as error:
+            raise Failed from error
         if gradient is not None:
             ctx.prepared, ctx.gradient = prepared, gradient
-            if target.is_inference():  # of such a tensor a copy, whose changes autograd can count
+            if prediction.is_inference():  # of such a tensor a copy, whose changes autograd can count
+                prediction = prediction.clone()
+            if target.is_inference():
                 target = target.clone()
             if map_ is not None and map_.is_inference():
                 map_ = map_.clone()

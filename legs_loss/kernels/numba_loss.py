@@ -103,7 +103,7 @@ class _Prepared(Prepared):
         if np.add.reduce(found[:, 2]) != 0.0:  # or NaN; overshoots are fine
             check_values(target)
         found[:, 1] -= found[:, 0]
-        return found[:, :2]
+        return found[:, :2].copy()  # of a batch it has gaps, and numba would compile all for such memory once more
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

@@ -122,8 +122,8 @@ class _Prepared(Prepared):
         self._task = task = _task_of(x, spec)
         views, _, height, width = x.shape
         self._views, self._pixels = views, (height * width, views * height * width)  # a map's: for all views, for each
-        task.of_prediction = _strides_of(x.contiguous() if self._copies[0] else x)
-        y = y.contiguous() if self._copies[1] else y
+        x, y = x.contiguous() if self._copies[0] else x, y.contiguous() if self._copies[1] else y
+        task.of_prediction, self._strides_of_prediction = _strides_of(x), x.stride()[-len(self._shape) :]
         task.of_target, self._strides_of_target = _strides_of(y), y.stride()[-len(self._shape) :]
         task.chunks = chunks_of(x)
         self._ranged = task.count = task.chunks * task.views
@@ -152,7 +152,10 @@ class _Prepared(Prepared):
         y = target.contiguous() if self._copies[1] else target
         task = Task.from_buffer_copy(self._task)
         task.prediction, task.target = x.data_ptr(), y.data_ptr()
-        if y.stride() != self._strides_of_target:  # autograd's copy of a tensor of inference mode
+        # A copy of a tensor of inference mode; or what a hook of saved tensors, as of torch's save_on_cpu, gives back.
+        if x.stride() != self._strides_of_prediction:
+            task.of_prediction = _strides_of(_batch(x))
+        if y.stride() != self._strides_of_target:
             task.of_target = _strides_of(_batch(y))
         made = None  # it must live until the last launch, as the map; the allocator keeps the order of one stream
         if map_ is not None:

@@ -237,7 +237,8 @@ def _elsewhere(root: Path, exclude: Sequence[str], found: Plan) -> str:
 def _verify(args: argparse.Namespace, script: str, given: Sequence[str]) -> int:
     from legs_adapters.verify import verify
 
-    verdict = verify(args.folder, script, args.arguments, args.iterations, given, args.photos if args.cpu else None)
+    photos, by_hand = args.photos if args.cpu else None, bool(args.site)
+    verdict = verify(args.folder, script, args.arguments, args.iterations, given, photos, by_hand)
     if args.json:
         say(json.dumps({"holds": verdict.claims, "runs": {name: run._asdict() for name, run in verdict.runs.items()}}))
     else:

@@ -100,7 +100,7 @@ def check_verifiable(
         script: the training script in it; None: the file of its one weighted term, or its train.py.
         arguments: as for :func:`verify`.
         command: one that was traced: its script is the one by default, and its arguments, the folders among them by
-            their whole paths, those that are returned.
+            their whole paths but those of the checkout, which its copies have, those that are returned.
 
     Raises:
         LegsError: it is ambiguous or not there, imports what is not installed, or its arguments name what is unknown.
@@ -109,7 +109,9 @@ def check_verifiable(
     given: List[str] = []
     if command is not None:
         _, traced, given = parts(root, command)
-        given = [str((root / word).resolve()) if (root / word).is_dir() else word for word in given]
+        folders = {word: (root / word).resolve() for word in given if (root / word).is_dir()}
+        outside = {word: str(path) for word, path in folders.items() if root not in (path, *path.parents)}
+        given = [outside.get(word, word) for word in given]
         script = script or traced
     script = _script(root) if script is None else script
     if not (root / script).is_file():
@@ -126,6 +128,7 @@ def verify(
     iterations: int,
     given: Sequence[str] = (),
     photos: Optional[str] = None,
+    by_hand: bool = False,
 ) -> Verdict:
     """Train a patched checkout and its unpatched self on the CPU, and compare.
 
@@ -137,6 +140,7 @@ def verify(
         iterations: how many steps are compared; the script is ended then.
         given: arguments that stand before those.
         photos: the folder of the photographs, of which the weighted terms are; default: those of the scene's model.
+        by_hand: which terms are weighted was chosen by the user: nothing is claimed of that.
 
     Raises:
         LegsError: the folder is not patched any more.
@@ -167,7 +171,8 @@ def verify(
             runs[name] = _run(copy, words, iterations, photos, settings, work)
             if not runs["unpatched"].losses:
                 return Verdict(runs, {"the unpatched script trained": False})
-    return Verdict(runs, _claims(runs))
+    claims = _claims(runs)
+    return Verdict(runs, claims if by_hand else {**claims, **_of_terms(Traced.read(runs["patched"].terms))})
 
 
 def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
@@ -184,7 +189,7 @@ def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
     if "beta 0" in runs:
         equal = _are_close(unpatched, losses["beta 0"])
         claims["with beta 0 every loss is the unpatched one, up to the rounding of the SSIM"] = equal
-    return {**claims, **_of_terms(Traced.read(runs["patched"].terms))}
+    return claims
 
 
 def _of_terms(terms: Sequence[Traced]) -> Dict[str, bool]:

@@ -153,7 +153,7 @@ def _stage(root: Path, path: str, data: bytes) -> str:
 def _keep_owner(file: int, before: os.stat_result) -> int:
     """Give an open file owner and group of another one, or the group alone; return the mode that it may have then."""
     for owner in (before.st_uid, -1):  # only root gives a file away, and only to one's own groups, on POSIX
-        with contextlib.suppress(PermissionError, AttributeError):
+        with contextlib.suppress(OSError, AttributeError):  # EINVAL: no owner or group of a user namespace
             os.fchown(file, owner, before.st_gid)
             break
     made, mode = os.fstat(file), stat.S_IMODE(before.st_mode)

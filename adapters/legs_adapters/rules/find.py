@@ -168,14 +168,16 @@ class _Finder:
                 yield place, verdict
 
     def _meant(self, function: Function) -> List[Form]:
-        """Return the terms on named lines: of several those that no rule skips, or that are not of another kind."""
-        named = [
-            f for f in self.analysis.forms.in_function(function) if self._is_chosen(function, function.place(f.node))
-        ]
-        why = [first(Term(self.analysis, function, form)) for form in named] if len(named) > 1 else []
-        clear = [form for form, evidence in zip(named, why) if evidence is None]
-        kinds = {rule.id for rule in KINDS}
-        return clear or [f for f, evidence in zip(named, why) if evidence and evidence.rule not in kinds] or named
+        """Return the terms on named lines: of several on one those that no rule skips, or not as of another kind."""
+        kinds, meant = {rule.id for rule in KINDS}, []
+        places = [(f, function.place(f.node)) for f in self.analysis.forms.in_function(function)]
+        for line in (line for path, line in self.by_hand if path == function.module.path):
+            named = [form for form, place in places if place.line <= line <= place.last_line]
+            why = [first(Term(self.analysis, function, form)) for form in named] if len(named) > 1 else []
+            clear = [form for form, evidence in zip(named, why) if evidence is None]
+            known = [form for form, evidence in zip(named, why) if evidence and evidence.rule not in kinds]
+            meant += clear or known or named
+        return meant
 
     def _is_noise(self, form: Form) -> bool:
         """Return whether a skipped term is an absolute difference that is no loss: of angles, of sizes."""

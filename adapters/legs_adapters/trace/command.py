@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shlex
 import socket
+import sys
 from pathlib import Path
 from typing import List, Optional, Sequence, Tuple
 
@@ -36,7 +38,11 @@ def parts(root: Path, command: str) -> Tuple[List[str], str, List[str]]:
     if not (root / words[at]).is_file():
         raise LegsError(f"--trace: there is no {words[at]} in {root}")
     before = words[: at - 1 if words[at - 1 : at] == ["-m"] else at]
-    is_python = all(os.path.basename(word).startswith("python") or word == "-u" for word in before)
+    variables = list(itertools.takewhile(lambda word: "=" in word, before))  # a shell's `CUDA_VISIBLE_DEVICES=0 python`
+    program = before[len(variables) :]
+    is_python = all(os.path.basename(word).startswith("python") or word == "-u" for word in program)
+    if variables:
+        return ["env", *variables, *([sys.executable] if is_python else program)], words[at], words[at + 1 :]
     return [] if is_python else before, words[at], words[at + 1 :]
 
 

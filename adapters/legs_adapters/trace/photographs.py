@@ -84,7 +84,9 @@ class Photographs:
         detail = self._detail(path, picture)
         if detail < DETAIL:
             return best._replace(correlation=min(best.correlation, SURE * max(detail, 0.0)))
-        is_grey = _colours(picture[0]) + 1e-4 < _GREY * max(map(_colours, self._fine_of(path, 1)))
+        kept = picture[1]
+        most = max(_colours(thumb[:, kept]) for thumb in self._fine_of(path, 1))
+        is_grey = _colours(picture[0][:, kept]) + 1e-4 < _GREY * most
         return best._replace(detail=detail, is_photograph=best.is_photograph and not is_grey)
 
     def _detail(self, path: str, picture: Picture) -> float:

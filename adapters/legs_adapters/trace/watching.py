@@ -253,27 +253,30 @@ class Watch:
         """Return the records under the roots, the key of the term of each, and the leaves that it leads to."""
         graph = Graph.under(getattr(root, "grad_fn", None) for root in roots)
         self.unseen |= graph.foreign()
-        found = []
+        found, known = [], []
         for at, record in graph.records().items():
             record.shares.clear()
             kind = graph.made_of(at) if record.kind == "difference" else record.kind
             if record.kind == "l1" and graph.made_of(at) not in ("signed", "l1"):
                 kind = "robust"
             if kind == "l1" or (record.target >= 0 and (kind != "signed" or as_planes(record.still) is not None)):
-                found.append((record, self._term(record, kind), graph.leaves(at)))
-        self._rivals([(record, self.terms[key]) for record, key, _ in found if record.target >= 0])
+                key, match, picture = self._term(record, kind)
+                found.append((record, key, graph.leaves(at)))
+                if key[-1] is not None and not self.terms[key]["is_rival"]:
+                    known.append((match, picture, self.terms[key]))
+        self._rivals(known)
         return found
 
-    def _rivals(self, found: List[Tuple[_Record, Dict[str, Any]]]) -> None:
+    @staticmethod
+    def _rivals(known: List[Tuple[Any, Any, Dict[str, Any]]]) -> None:
         """Mark what is less like a file than another picture under the same loss, and no part or exposure of that."""
-        known = [(as_planes(record.still), term) for record, term in found if term["is_known"] and not term["is_rival"]]
-        known.sort(key=lambda each: -each[1]["match"]["detail"])
-        for at, (picture, term) in enumerate(known):
-            best = next((b for b, other in known[:at] if other["match"]["path"] == term["match"]["path"]), None)
-            term["is_rival"] = best is not None and is_another(picture, best)
+        known.sort(key=lambda each: -each[0].detail)
+        for at, (match, picture, term) in enumerate(known):
+            best = next((b for other, b, _ in known[:at] if other.path == match.path), None)
+            term["is_rival"] |= best is not None and is_another(picture, best)
 
     def _term(self, record: _Record, kind: str) -> Any:
-        """Return the key of a term; those with the same frames, kind and target are one."""
+        """Return a term's key, its picture's match, that picture; those of the same frames, kind, target are one."""
         picture = thumbnail(record.still) if record.target >= 0 else None
         match = self.photographs.match(picture)
         whole = uncut(record.still) if match is not None and match.correlation < SURE else None
@@ -286,7 +289,7 @@ class Watch:
             "is_rival": False,
             "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
         })  # fmt: skip
-        return key
+        return key, match, as_planes(record.still) if whole is None else whole
 
     @_harmless
     def _sum_up(self, roots: Sequence[Any], seen: Sequence[Tuple[_Record, Any, List[Any]]]) -> None:

@@ -388,6 +388,12 @@ class TestCommandLine:
         ("import mlx.core as mx\n", 1, "MLX is imported"),
         ("class BadModel(SplatfactoModel):\n    pass\n", 1, "ns-train splatfacto-legs"),
         ("\nkind = PhotoLoss.L1\n", 2, "seems to be chosen here, by an Enum"),
+        ("\nkinds = {'l1': F.l1_loss, 'l2': None}\n", 2, "seems to be chosen here, by an entry of a table"),
+        (
+            "chosen = functools.partial(F.l1_loss, reduction='mean')\n",
+            1,
+            "seems to be chosen here, by an entry of a table",
+        ),
         ("loss_fn = getattr(losses, cfg.kind)\n", 1, "seems to be chosen here, by a setting"),
         ("# mse_loss(image, gt)\nloss = F.mse_loss(image, gt_image)\n", 2, "a squared loss of images"),
         ("delta = image - photo\nloss = (delta**2).mean()\n", 2, "a squared loss of images"),

@@ -17,11 +17,22 @@ from legs_adapters.code.program import Program
 from legs_adapters.code.questions import Questions
 from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.returned import default_key, formatted_key
-from legs_adapters.code.syntax import arguments, call_name, constant, dotted, key_of, root_of, same, words
+from legs_adapters.code.syntax import (
+    arguments,
+    call_name,
+    code,
+    constant,
+    dotted,
+    key_of,
+    root_of,
+    same,
+    walk_expressions,
+    words,
+)
 from legs_adapters.lexicon.calls import CallReading, meaning_of_call
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
-from legs_adapters.lexicon.words import BACKGROUND, DATA, KIND_OF, LOSS, RENDER, RENDERERS
+from legs_adapters.lexicon.words import BACKGROUND, COLORS, DATA, KIND_OF, LOSS, RENDER, RENDERERS
 from legs_adapters.tensors.backward import Training
 
 __all__ = ["Meanings"]
@@ -87,7 +98,7 @@ class Meanings:
         shown = "image_" if flow.kind == "image" else ""
         kind, role = kind_of_words(shown + node.value), role_of_words(node.value)
         role = role or flow.role
-        if kind == "image" and flow.kind == "feature":
+        if flow.kind == "feature" and kind == "image" and COLORS & set(words(node.value)):
             return Meaning("image", role)  # `rgb = outputs["features"]`: colours, there
         if kind == "mask" and flow.kind in ("flow", "depth"):
             return Meaning("mask", role)  # motion_masks, alpha = depth_sil[1]: to be laid over a rendering
@@ -96,9 +107,23 @@ class Meanings:
     def _subscript(self, function: Function, node: cst.Subscript) -> Meaning:
         key = key_of(node) or formatted_key(node) or default_key(function, node)
         last = node.slice[-1].slice
-        if len(node.slice) > 1 and isinstance(last, cst.Index) and constant(last.value) == 3:
-            return Meaning("depth", self.meaning(function, node.value).role)  # of RGB+D, render[0, ..., 3]
-        return self._member(function, node, key) if isinstance(key, str) else self.meaning(function, node.value)
+        is_fourth = len(node.slice) > 1 and isinstance(last, cst.Index) and constant(last.value) == 3
+        cuts = [cut for cut in (each.slice for each in node.slice) if isinstance(cut, cst.Slice) and code(cut) != ":"]
+        is_behind = len(cuts) == 1 and constant(cuts[0].lower) == 3  # no block of a matrix, no border: 3:-3
+        if is_fourth or (is_behind and (cuts[0].upper is None or constant(cuts[0].upper, 0) > 3)):
+            return Meaning("depth", self.meaning(function, node.value).role)  # of RGB+D: render[0, ..., 3], render[3:]
+        keys = [key] if isinstance(key, str) else self._keys(function, last)
+        return mix(self._member(function, node, each) for each in keys) if keys else self.meaning(function, node.value)
+
+    def _keys(self, function: Function, index: cst.CSTNode) -> List[str]:
+        """Return the kinds of pictures that an index takes: in a loop over a literal, or by its function's calls."""
+        found: List[cst.CSTNode] = []
+        for made in function.flow.reaching(index.value) if isinstance(index, cst.Index) else ():
+            calls = self.training.sites.get(function, ()) if made.kind == "parameter" else ()
+            found += [given for given in (function.given(call, made.place) for _, call in calls) if given is not None]
+            found += walk_expressions(made.value) if made.kind == "element" and made.value is not None else ()
+        keys = [constant(each) for each in found if isinstance(each, cst.SimpleString)]
+        return [key for key in keys if isinstance(key, str) and kind_of_words(key) is not None]
 
     def _member(self, function: Function, node: cst.Attribute | cst.Subscript, name: str) -> Meaning:
         """Return the meaning of an attribute or an entry: of its words, what is assigned to it, and who holds it."""
@@ -162,6 +187,11 @@ class Meanings:
     def _element(self, function: Function, value: cst.CSTNode, index: int) -> Meaning:
         """Return the meaning of an element of what is unpacked."""
         if not isinstance(value, cst.Call):
+            held = function.flow.value_of(value) or value
+            literal = held.elements if isinstance(held, (cst.Tuple, cst.List)) else ()
+            rows = [each.value.elements for each in literal if isinstance(each.value, (cst.Tuple, cst.List))]
+            if rows and all(len(row) > index for row in rows):  # for key, gt in (("render", image), ("depth", depth))
+                return mix(self.meaning(function, row[index].value) for row in rows)
             return Meaning(None, self.meaning(function, value).role)
         given = arguments(value)[0]
         if call_name(value) == "zip" and index < len(given):

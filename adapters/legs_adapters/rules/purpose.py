@@ -182,9 +182,18 @@ class Purposes:
                 passed = given_to(self.program, where, definition.place)
                 for caller, value in ((caller, value) for caller, value in passed if value is not None):
                     found += self._given(caller, value, depth + 1) or [(caller, value)]
-            if isinstance(made, cst.Call) and _OPTIMISER.search(call_name(made)) and made.args:
-                positional, keywords, _ = arguments(made)
-                found.append((where, keywords.get("params") or positional[0]))
+            calls = [(where, made)]
+            if definition.kind == "element" and made is not None:  # for each in optimizers.values()
+                held = [each for part in attribute_chain(made) for each in _definitions(self.program, where, part)]
+                calls = [(holder, entry) for holder, each in held for entry in _entries(each.value)]
+            for maker in callees(self.program, where, made) if isinstance(made, cst.Call) else ():
+                for each in (each for each in maker.flow.returns if isinstance(each, cst.Call)):
+                    of = _optimised(each)
+                    passed_on = maker.given(made, of.value) if isinstance(of, cst.Name) else None  # type: ignore[arg-type]
+                    found += [(where, passed_on)] if passed_on is not None else []
+            all_given = [(maker, _optimised(each)) for maker, each in calls]
+            known = [(maker, of) for maker, of in all_given if of is not None]
+            found += known if len(known) == len(all_given) else []
         return found
 
     def _is_beside(self, step: _Step) -> bool:
@@ -192,8 +201,8 @@ class Purposes:
         assert isinstance(step[1].func, cst.Attribute)
         leaves = [leaf for given in self._given(step[0], step[1].func.value) for leaf in self._leaves(*given)]
         made = [_definitions(self.program, *leaf) for leaf in leaves]
-        values = [definition.value for definitions in made for _, definition in definitions]
-        return bool(leaves) and all(made) and all(map(_is_own_tensor, values))
+        values = [(where, definition.value) for definitions in made for where, definition in definitions]
+        return bool(leaves) and all(made) and all(_is_own_tensor(*value) for value in values)
 
     def _leaves(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[_Value]:
         """Return the parameters in ``[{"params": [a, b]}, c]``, or in a name of such a list."""
@@ -233,9 +242,25 @@ def _definitions(program: Program, function: Function, node: cst.CSTNode) -> Lis
     return []
 
 
-def _is_own_tensor(value: Optional[cst.CSTNode]) -> bool:
+def _optimised(made: Optional[cst.CSTNode]) -> Optional[cst.CSTNode]:
+    """Return what an optimiser is made with; None for what makes none."""
+    if not isinstance(made, cst.Call) or not _OPTIMISER.search(call_name(made)):
+        return None
+    positional, keywords, _ = arguments(made)
+    return keywords.get("params") or next(iter(positional), None)
+
+
+def _entries(value: Optional[cst.CSTNode]) -> List[Optional[cst.CSTNode]]:
+    """Return the values in a dict or a list, or what a comprehension makes one of; else the value itself."""
+    if isinstance(value, (cst.Dict, cst.List, cst.Tuple)):
+        return [element.value for element in value.elements]
+    return [value.elt if isinstance(value, cst.ListComp) else value.value if isinstance(value, cst.DictComp) else value]
+
+
+def _is_own_tensor(function: Function, value: Optional[cst.CSTNode]) -> bool:
     """Return whether a value is a new tensor whose values and sizes are none of Gaussians."""
     made = [part for part in attribute_chain(value) if isinstance(part, cst.Call)] if value is not None else []
     if not made or call_name(made[-1]) not in NEW_TENSORS:
         return False
-    return not words_in(*(arg.value for arg in made[-1].args)) & TENSORS
+    sizes = [part for arg in made[-1].args for part in walk_expressions(arg.value)]
+    return not words_in(*sizes, *(each for part in sizes for each in function.flow.assigned(part))) & TENSORS

@@ -11,7 +11,16 @@ from legs_adapters.code.calls import given_to, handed
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.reaching import Definition, Reaching
-from legs_adapters.code.syntax import arguments, call_name, children, constant, key_of, walk_expressions
+from legs_adapters.code.syntax import (
+    arguments,
+    attribute_chain,
+    call_name,
+    children,
+    constant,
+    key_of,
+    path_of,
+    walk_expressions,
+)
 from legs_adapters.tensors.operations import APPLIES, BACKWARD, ENDS_GRADIENT, HOOKS, LOSSES, SIZES, depends
 from legs_adapters.tensors.steps import is_backward
 
@@ -205,10 +214,30 @@ def _is_applied(function: Function, call: cst.Call) -> bool:
     """Return whether a function steps by a gradient that it takes: ``p.grad = g``, ``p -= rate * g``."""
     made = [(each, each.value) for each in function.flow.every_definition if each.value is not None]
     names = {each.place for each, value in made if call in walk_expressions(value)}
-    is_less = [isinstance(getattr(each.node, "operator", None), cst.SubtractAssign) for each, _ in made]
-    given = [value for (each, value), less in zip(made, is_less) if less or each.place.endswith(".grad")]
-    given += [arg.value for each in function.flow.calls if call_name(each) in APPLIES for arg in each.args]
+    given = [value for each, value in made if _is_less(each) or each.place.endswith(".grad")]
+    given += [arg.value for each in function.flow.calls if _is_downhill(each) for arg in each.args]
+    given = [value for value in given if not any(_loses_sign(part) for part in attribute_chain(value))]
     return any(call in walk_expressions(value) or depends(function, value, names) for value in given)
+
+
+def _is_less(made: Definition) -> bool:
+    """Return whether a place becomes less: ``p -= rate * g``, ``p = (p - rate * g).detach()``."""
+    parts = (
+        [part for part in attribute_chain(made.value) if isinstance(part, cst.BinaryOperation)] if made.value else []
+    )
+    less = any(isinstance(part.operator, cst.Subtract) and path_of(part.left) == made.place for part in parts)
+    return less or isinstance(getattr(made.node, "operator", None), cst.SubtractAssign)
+
+
+def _loses_sign(node: cst.CSTNode) -> bool:
+    """Return whether it is a size, ``gradient.abs()``: nothing steps by one."""
+    return isinstance(node, cst.Call) and call_name(node) in ("abs", "norm", "square")
+
+
+def _is_downhill(call: cst.Call) -> bool:
+    """Return whether a call may step by its arguments: ``p.add_(g, alpha=-rate)``, no sum: ``scores.add_(g.abs())``."""
+    is_sum = call_name(call) == "add_" and not any(isinstance(part, cst.Minus) for part in walk_expressions(call))
+    return call_name(call) in APPLIES and not is_sum
 
 
 def _trained_by(call: cst.Call) -> List[cst.BaseExpression]:

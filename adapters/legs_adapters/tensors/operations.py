@@ -62,7 +62,7 @@ _FILTERS = word_set("abs conv2d einsum gather masked_select relu sigmoid")
 _RESAMPLES = word_set("avg_pool2d center_crop crop gaussian_blur grid_sample interpolate max_pool2d pad resize")
 _PASSES_ON = word_set("DataLoader checkpoint enumerate iter list next no_grad reversed tqdm tuple zip")
 VIEWS = word_set("T data mT")  # attributes that are the same values
-PICTURE_METHODS = KEEPS_AXES | _AXES | _PICKS | _COMPUTES  # of an image, they return an image
+PICTURE_METHODS = KEEPS_AXES | _AXES | _PICKS | _COMPUTES | {"abs"}  # of an image, they return an image
 PICTURE_FUNCTIONS = PICTURE_METHODS | _MAKES | _FILTERS | _RESAMPLES | _PASSES_ON
 
 

@@ -48,6 +48,11 @@ _INSTEAD = (
         _CHOSEN.format("an Enum"),
     ),
     (
+        r"(?:[\"'\w\])] *: *|\bdict\([^)\n]*= *|= *(?:functools\.)?(?:partial|member|staticmethod)\(|\bmap\()"
+        r"(?:functools\.)?(?:partial\()?(?:[\w.]+\.)?(?:l1_loss\b(?!\()|L1Loss\()|= *[\"']l1_loss[\"'] *$",
+        _CHOSEN.format("an entry of a table"),
+    ),
+    (
         r"loss_sds|\bsds_loss|guidance\w*(\.train_step)?\(",
         "a gradient by a diffusion model (SDS) seems to be used, of no photograph",
     ),

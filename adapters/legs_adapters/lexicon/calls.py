@@ -73,7 +73,7 @@ class CallReading:
 
 def meaning_of_call(call: CallReading, by_arguments: bool = True) -> Meaning:
     """Return what a call depicts, from its name and what the function returns; on request from its arguments, too."""
-    readings = (*_SURE, *((_changed, _of_images, meaning_returned, _of_owner) if by_arguments else (meaning_returned,)))
+    readings = (*_SURE, *((_of_images, meaning_returned, _of_owner) if by_arguments else (meaning_returned,)))
     return next((known for known in (reading(call) for reading in readings) if known is not None), UNKNOWN)
 
 
@@ -107,7 +107,7 @@ def _statistic(call: CallReading) -> Optional[Meaning]:
 
 
 def _filtered(call: CallReading) -> Optional[Meaning]:
-    filters = call.name in ("conv2d", "diff", "filter2d", "spatial_gradient") and "stride" not in call.keywords
+    filters = call.name in ("conv2d", "filter2d", "spatial_gradient") and "stride" not in call.keywords
     return Meaning("gradient", call.ask(call.values[0]).role) if filters and call.values else None
 
 
@@ -135,12 +135,6 @@ def _named(call: CallReading) -> Optional[Meaning]:
     if kind not in (None, "image", "mask", "parameter"):
         return Meaning(kind, role)
     return Meaning(kind, role) if kind == "image" and role == "target" else None
-
-
-def _changed(call: CallReading) -> Optional[Meaning]:
-    """A function that returns a change in its argument, ``x - blur(x)``."""
-    known = meaning_returned(call)
-    return known if known is not None and known.kind == "gradient" else None
 
 
 def _of_images(call: CallReading) -> Optional[Meaning]:

@@ -64,7 +64,7 @@ class Run:
         self.config = config
         self.weighted: bool = config.active
         self.computes: bool = config.store is None
-        self.said = False
+        self.said: bool = False
         self.memo: WeightMemo = WeightMemo(memo_bytes)
         self.stored: Stored = Stored(config, self.say_once)
         self._has_own: Optional[bool] = None

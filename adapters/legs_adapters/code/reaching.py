@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Callable, Dict, Iterator, List, Optional, Sequence, Set
+from typing import Callable, ClassVar, Dict, Iterator, List, Optional, Sequence, Set
 
 import libcst as cst
 
@@ -25,7 +25,7 @@ class Reaching:
     """
 
     def __init__(self, parts: Sequence[Reaching] = ()) -> None:
-        self.parts = parts
+        self.parts: Sequence[Reaching] = parts
 
     def __bool__(self) -> bool:
         return bool(self.parts)
@@ -86,7 +86,7 @@ class Definition(Reaching):
     index: Optional[int] = None
     key: object = None
     order: int = 0
-    parts = ()
+    parts: ClassVar[Sequence[Reaching]] = ()  # type: ignore[misc]
 
     def __bool__(self) -> bool:
         return True

@@ -106,7 +106,8 @@ class Watch:
     def __init__(self, root: str, photographs: Photographs, limits: Dict[str, Any], ended: Callable[[], None]) -> None:
         self.root: str = os.path.join(os.path.realpath(root), "")
         self.photographs: Photographs = photographs
-        self.limits, self.ended = limits, ended
+        self.limits: Dict[str, Any] = limits
+        self.ended: Callable[[], None] = ended
         self.seen: Dict[str, Any] = {"steps": 0, "poses": 0, "backward_passes": 0, "failure": "", "losses": []}
         self.times: List[float] = []
         self.terms: Dict[Any, Dict[str, Any]] = {}

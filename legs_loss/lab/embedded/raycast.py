@@ -66,6 +66,13 @@ class Quad:
     It is seen and lit from both sides.
     """
 
+    corner: np.ndarray
+    across: np.ndarray
+    down: np.ndarray
+    texture: np.ndarray
+    round: bool
+    casts_shadow: bool
+
     def __init__(
         self,
         corner: Vector,
@@ -114,8 +121,11 @@ class Quad:
 class _Curved:
     """The shading of spheres and tubes: Lambert without shadows, a contact shade below, a soft highlight."""
 
-    texture: np.ndarray
-    gloss: float
+    def __init__(self, radius: float, texture: np.ndarray, gloss: float, casts_shadow: bool) -> None:
+        self.radius: float = radius
+        self.texture: np.ndarray = texture
+        self.gloss: float = gloss
+        self.casts_shadow: bool = casts_shadow
 
     def normal(self, hits: Hits, point: np.ndarray) -> np.ndarray:
         """Return the normals [N, 3] at the hit points."""
@@ -142,7 +152,7 @@ class Sphere(_Curved):
 
     def __init__(self, centre: Vector, radius: float, texture: np.ndarray, gloss: float = 0.0) -> None:
         self.centre: np.ndarray = np.asarray(centre, float)
-        self.radius, self.texture, self.gloss, self.casts_shadow = radius, texture, gloss, True
+        super().__init__(radius, texture, gloss, True)
 
     def hull(self) -> np.ndarray:
         """Return points whose convex hull holds the surface."""
@@ -175,7 +185,7 @@ class Tube(_Curved):
     def __init__(self, start: Vector, end: Vector, radius: float, texture: np.ndarray, gloss: float = 0.0) -> None:
         self.start: np.ndarray = np.asarray(start, float)
         # The shadow of a thin wire under a wide lamp is too faint to see.
-        self.radius, self.texture, self.gloss, self.casts_shadow = radius, texture, gloss, radius > 0.02
+        super().__init__(radius, texture, gloss, radius > 0.02)
         axis = np.asarray(end, float) - self.start
         self.length: float = float(np.linalg.norm(axis))
         axis = axis / self.length

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined
@@ -75,7 +77,17 @@ def _strips(counter, strips, across, ranges, ends, splats, draws, entries, value
         strip = claimed(counter)
 
 
-def contribute(across, ranges, ends, splats, draws, entries, values, image, g_image):
+def contribute(
+    across: int,
+    ranges: np.ndarray,
+    ends: np.ndarray,
+    splats: Any,
+    draws: np.ndarray,
+    entries: np.ndarray,
+    values: np.ndarray,
+    image: np.ndarray,
+    g_image: np.ndarray,
+) -> np.ndarray:
     """Return sums [N, FIELDS], over the pixels that each Gaussian is blended into.
 
     COUNT: how many; WEIGHT: of transmittance times alpha; VALUE: of ``values`` [H, W] there; DISTANCE: from its centre,

@@ -17,6 +17,7 @@ from legs_adapters.cli import main as legs_patch
 
 import legs_loss
 from legs_loss.cli import main as legs
+from legs_loss.runtime import state as state_of_run
 from legs_loss.scenes import View, image_tensor, load_training_image
 from legs_loss.store import WeightStore
 from tests.hostile.forked import forked
@@ -36,6 +37,7 @@ def become(user, umask):
     os.setgid(user)
     os.setuid(user)
     os.umask(umask)
+    torch.set_num_threads(1)  # OpenMP's threads are not in a fork, and torch would wait for them
 
 
 def by(user, main, *arguments, umask=0o022):
@@ -180,6 +182,7 @@ def step(store, photo):
     """Return a function that takes a step on a view with a store and says the loss."""
 
     def command(_):
+        state_of_run.reset()  # the fork's run is its own, with a first step that is said
         legs_loss.configure(store=store)
         target = image_tensor(load_training_image(View(photo.name, photo)))
         for _ in range(2):

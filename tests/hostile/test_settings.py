@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 
 import pytest
 
 from legs_loss.config import find_config
 from legs_loss.errors import LegsError
+from tests.hostile.forked import forked
 from tests.support import colmap_scene, legs
 
 FILES = {
@@ -145,30 +147,12 @@ def as_nobody(arguments):
     import legs_loss.lab.commands.train
     import legs_loss.precompute
 
-    words, written = os.pipe()
-    child = os.fork()
-    if child == 0:
-        import signal
-        import sys
-        import traceback
-
+    def command():
         signal.alarm(120)
-        os.dup2(written, 1)
-        os.dup2(written, 2)
-        sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
-        code = 99
-        try:
-            os.setgid(65534)
-            os.setuid(65534)
-            os.environ.update(HOME="/nonexistent", LEGS_TEST="1")
-            code = legs_loss.cli.main(arguments)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
-    os.close(written)
-    with os.fdopen(words, errors="replace") as file:
-        said = file.read()
-    return os.waitpid(child, 0)[1] >> 8, said
+        os.setgid(65534)
+        os.setuid(65534)
+        os.environ.update(HOME="/nonexistent", LEGS_TEST="1")
+        return legs_loss.cli.main(arguments)
+
+    status, said = forked(command)
+    return status >> 8, said

@@ -183,8 +183,7 @@ class TestWaysToTrain:
         before = "torchrun --nproc_per_node 2 --master_port 29547 " if name == "torchrun" else ""
         report, line, done = traced(tmp_path, train, before=before, steps=4)
         assert weighted(report) == [line], done.stderr
-        # gloo may abort one process of a group when the other has ended, which the script's own parent says.
-        assert "Traceback" not in done.stderr or "SIGABRT" in done.stderr
+        assert "Traceback" not in done.stderr
 
     def test_a_fused_loss_is_said(self, tmp_path):
         report, line, done = traced(tmp_path, UNSEEN)

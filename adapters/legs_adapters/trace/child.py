@@ -65,7 +65,8 @@ class _Spawned:
         self.spec = spec
 
     def __reduce__(self) -> Any:
-        return importlib.import_module("legs_adapters.trace.child")._watched, (self.spec,)  # (here it is __main__'s)
+        here = importlib.import_module("legs_adapters.trace.child")  # (this one is __main__)
+        return here._watched, (dict(self.spec, spawned=True),)
 
 
 def _watched(spec: Dict[str, Any]) -> None:
@@ -79,6 +80,8 @@ def _watched(spec: Dict[str, Any]) -> None:
     def ended() -> None:
         _over.append(True)
         write()  # before Python 3.9 a spawned process forgets what it was to call at its end
+        if spec.get("spawned") and os.name == "posix" and is_first_process():
+            os.killpg(0, signal.SIGKILL)  # a rank that waits for one that has ended aborts, and the script would say so
         if len(_over) > 1:  # the script went on
             os._exit(0)
         sys.exit(0)  # (without the 0, a process of multiprocessing fails before Python 3.8)

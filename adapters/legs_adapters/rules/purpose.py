@@ -191,9 +191,8 @@ class Purposes:
                     of = _optimised(each)
                     passed_on = maker.given(made, of.value) if isinstance(of, cst.Name) else None  # type: ignore[arg-type]
                     found += [(where, passed_on)] if passed_on is not None else []
-            all_given = [(maker, _optimised(each)) for maker, each in calls]
-            known = [(maker, of) for maker, of in all_given if of is not None]
-            found += known if len(known) == len(all_given) else []
+            known = [(by, of) for by, of in ((by, _optimised(each)) for by, each in calls) if of is not None]
+            found += known if len(known) == len(calls) else []
         return found
 
     def _is_beside(self, step: _Step) -> bool:

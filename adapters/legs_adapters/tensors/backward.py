@@ -222,9 +222,7 @@ def _is_applied(function: Function, call: cst.Call) -> bool:
 
 def _is_less(made: Definition) -> bool:
     """Return whether a place becomes less: ``p -= rate * g``, ``p = (p - rate * g).detach()``."""
-    parts = (
-        [part for part in attribute_chain(made.value) if isinstance(part, cst.BinaryOperation)] if made.value else []
-    )
+    parts = [part for part in attribute_chain(made.value or made.node) if isinstance(part, cst.BinaryOperation)]
     less = any(isinstance(part.operator, cst.Subtract) and path_of(part.left) == made.place for part in parts)
     return less or isinstance(getattr(made.node, "operator", None), cst.SubtractAssign)
 

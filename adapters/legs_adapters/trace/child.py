@@ -65,8 +65,8 @@ class _Spawned:
         self.spec = spec
 
     def __reduce__(self) -> Any:
-        here = importlib.import_module("legs_adapters.trace.child")  # (this one is __main__)
-        return here._watched, (dict(self.spec, spawned=True),)
+        # (This module is __main__ here, and not there.)
+        return importlib.import_module("legs_adapters.trace.child")._watched, (dict(self.spec, spawned=True),)
 
 
 def _watched(spec: Dict[str, Any]) -> None:

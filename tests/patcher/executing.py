@@ -82,7 +82,7 @@ class _Leaves(ast.NodeTransformer):
         return self.function(node) or (self.generic_visit(node) if node.attr in OF_TENSORS else self.leaf(node))
 
     def visit_Subscript(self, node):
-        is_key = isinstance(node.slice, ast.Constant) and isinstance(node.slice.value, str)
+        is_key = isinstance(getattr(node.slice, "value", None), str) or ast.unparse(node.slice) == "key"  # of a dict
         return self.leaf(node) if is_key else self.generic_visit(node)
 
     def visit_Lambda(self, node):

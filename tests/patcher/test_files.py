@@ -279,10 +279,9 @@ class TestWhereItLooks:
         texts = {**files("inria"), "other.py": "from utils.loss_utils import l1_loss\nx = 1\n" + step}
         compile(texts["other.py"], "other.py", "exec")
         found = plan(checkout(tmp_path, texts)).findings
-        assert [(one.path, one.reason) for one in found.unreadable] in (
-            [],
-            [("other.py", "cannot be written back exactly: LibCST would write line 7 in another way")],
-        )
+        said = "other.py cannot be written back exactly: LibCST would write line {} in another way"
+        known = [[], [said.format(7)], [said.format(8)]]  # some of its parsers read both lines, or the first
+        assert [f"{one.path} {one.reason}" for one in found.unreadable] in known
 
     def test_a_notebook_that_trains_is_named(self, tmp_path):
         root = checkout(tmp_path, {**files("inria"), "a.ipynb": "loss.backward()", "b.ipynb": "plot()"})

@@ -82,7 +82,7 @@ class Ways(Meanings):
         """Return whether a renderer is known to draw Gaussians: by what it is given, or where and how it is defined."""
         found = self.program.resolve(function, call.func)
         texts = [code(call), *(str(reference.target) for reference in found if isinstance(reference.target, str))]
-        texts += [run.module.path + run.text for reference in found for run in self.program.run_by(reference)]
+        texts += [run.module.path + code(run.body) for reference in found for run in self.program.run_by(reference)]
         return bool(GAUSSIANS & words_in(call)) or any(map(SPLATS.search, texts))
 
     def _holds_data(self, function: Function, node: cst.CSTNode | Reaching, depth: int = 0) -> bool:

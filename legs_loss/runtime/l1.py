@@ -18,6 +18,7 @@ from legs_loss.images import read_pair
 from legs_loss.kernels.backends import fused, plan_of
 from legs_loss.loss import mean_error
 from legs_loss.runtime import state
+from legs_loss.runtime.own import check_own
 from legs_loss.runtime.state import View, current_run, spec_to_compile, thread
 from legs_loss.weights import Weights
 
@@ -53,7 +54,8 @@ def l1_loss(
         reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.
         own: the codebase's own L1 of (prediction, target), where it is more than a mean: its mask or reduction is then
             applied to the weighted difference. It is called with the target and a prediction whose difference from it
-            is scaled by the weight; without a weight, with the prediction itself.
+            is scaled by the weight; without a weight, with the prediction itself. Twice the difference must make it
+            twice as large, which is asked of it once: a squared, smooth, robust or clamped one is refused.
 
     Returns:
         A scalar, or the result of ``reduction`` or ``own``. With beta 0 or LEGS_OFF it is
@@ -61,8 +63,8 @@ def l1_loss(
 
     Raises:
         LegsError: shapes that do not fit (both are named), that may be read either way, or that contradict
-            ``channels_last``; the target alone requires a gradient: the two are swapped; on the CPU a target
-            with NaN or infinity; a setting in legs.toml or LEGS_* that is out of range.
+            ``channels_last``; the target alone requires a gradient: the two are swapped; ``own`` is no L1; on the
+            CPU a target with NaN or infinity; a setting in legs.toml or LEGS_* that is out of range.
 
     Examples:
         >>> target = torch.rand(3, 8, 8)
@@ -151,6 +153,7 @@ def _by_torch(
         return layout.restored(torch.abs(error))
     # |F + W * (U - F) - F| = W * |U - F|: any L1 of the difference becomes the weighted one, and masks that the
     # codebase makes from the target stay as they are.
+    check_own(own, layout.restored(target))
     return own(layout.restored(target + error), layout.restored(target))
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import threading
+from functools import partial
 
 import pytest
 import torch
 import torch.nn.functional as F
+from torch.utils.checkpoint import checkpoint
 
 from legs_loss import LegsError, configure, l1_loss, unweighted, weight_map
 from legs_loss.runtime import active, counts
@@ -33,6 +36,46 @@ def valid(network_output, gt):
     error = torch.abs(network_output - gt)
     error = torch.where(gt != 0, error, torch.zeros_like(error))
     return error, error.mean()
+
+
+def charbonnier(a, b, epsilon=1e-3):
+    return torch.sqrt((a - b) ** 2 + epsilon**2).mean()
+
+
+def truncated(a, b):
+    error = torch.abs(a - b)
+    return error[error < 0.1].mean()
+
+
+L1 = {
+    "torch's": F.l1_loss,
+    "a module, summed": torch.nn.L1Loss(reduction="sum"),
+    "scaled": lambda a, b: 0.8 * F.l1_loss(a, b),
+    "of pixels of the photograph": lambda a, b: torch.abs(a - b)[b > 0].mean(),
+    "of no pixel": lambda a, b: torch.abs(a - b)[b > 2].mean(),
+    "with its mask": lambda a, b: (torch.abs(a - b), b > 0),
+    "in a dictionary": lambda a, b: {"l1": F.l1_loss(a, b)},
+    "of gradients": lambda a, b: F.l1_loss(a, b) + F.l1_loss(a[..., 1:] - a[..., :-1], b[..., 1:] - b[..., :-1]),
+    "of samples": lambda a, b: (torch.abs(a - b) * (torch.rand(a.shape) > 0.5)).mean(),
+    "Charbonnier's": charbonnier,
+}
+NO_L1 = {
+    "squared": F.mse_loss,
+    "squared by a module": torch.nn.MSELoss(),
+    "squared by parts": partial(F.mse_loss, reduction="sum"),
+    "squared in a lambda": lambda a, b: ((a - b) ** 2 * (b > 0)).sum(),
+    "smooth": F.smooth_l1_loss,
+    "Huber's": torch.nn.HuberLoss(delta=0.1),
+    "smoother than usual": partial(charbonnier, epsilon=0.05),
+    "truncated": truncated,
+    "clamped": lambda a, b: F.l1_loss(a.clamp(0, 1), b),
+}
+WAYS = {
+    "grad": lambda f, image: torch.func.grad(f)(image.detach()),
+    "vmap": lambda f, image: torch.func.vmap(torch.func.grad(f))(image.detach()),
+    "jvp": lambda f, image: torch.func.jvp(f, (image.detach(),), (torch.ones_like(image),)),
+    "checkpoint": lambda f, image: checkpoint(f, image, use_reentrant=True),
+}
 
 
 class TestUnreduced:
@@ -93,6 +136,74 @@ class TestOwn:
         for settings in ({"mask": torch.ones(4, 4)}, {"reduction": "none"}):
             with pytest.raises(LegsError, match="own= replaces"):
                 l1_loss(*pair(3, 4, 4), own=F.l1_loss, **settings)
+
+    @pytest.mark.parametrize("name", NO_L1)
+    def test_what_is_no_l1_is_refused(self, name):
+        prediction, target = pair(3, 7, 6)
+        for _ in range(2):  # in every step
+            with pytest.raises(LegsError, match=r"own= is no L1: 256 times the difference gives .* times the loss"):
+                l1_loss(prediction, target, own=NO_L1[name])
+        with torch.no_grad():  # nothing is weighted
+            assert torch.equal(l1_loss(prediction, target, own=NO_L1[name]), NO_L1[name](prediction, target))
+
+    def test_how_much_it_grows_is_said(self):
+        with pytest.raises(LegsError, match="gives 65,536 times the loss"):  # 256 squared
+            l1_loss(*pair(3, 7, 6), own=F.mse_loss)
+
+    @pytest.mark.parametrize("name", L1)
+    @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
+    def test_what_is_an_l1_is_not(self, name, dtype):
+        prediction, target = pair(3, 7, 6)
+        l1_loss(prediction.to(dtype), target.to(dtype), own=L1[name])
+
+    def test_one_that_is_chosen_later_is_asked_again(self):
+        prediction, target = pair(3, 7, 6)
+
+        def step(criterion):
+            return l1_loss(prediction, target, own=lambda a, b: criterion(a, b))
+
+        for criterion in (F.l1_loss, torch.nn.L1Loss(), lambda a, b: (a - b).abs().sum()):
+            assert step(criterion) > criterion(prediction, target)
+        for criterion in (F.mse_loss, torch.nn.MSELoss(), partial(F.mse_loss, reduction="sum")):
+            with pytest.raises(LegsError, match="no L1"):
+                step(criterion)
+
+    def test_it_is_asked_once_though_made_anew_in_each_step_and_draws_no_number(self):
+        calls = []
+        prediction, target = pair(3, 7, 6)
+
+        def step(scale):
+            def drawn(a, b):
+                calls.append(scale)
+                return ((a - b).abs() * (torch.rand(a.shape) > 0.5)).mean() * scale
+
+            return l1_loss(prediction, target, own=lambda a, b: drawn(a, b))
+
+        torch.manual_seed(7)
+        found = [step(scale) for scale in (0.8, 0.7, 0.6)]
+        assert calls == [0.8, 0.8, 0.8, 0.7, 0.6]
+        torch.manual_seed(7)
+        assert [step(scale) for scale in (0.8, 0.7, 0.6)] == found
+
+    @pytest.mark.skipif(not hasattr(torch, "func"), reason="this torch has no torch.func")
+    @pytest.mark.parametrize("way", WAYS)
+    def test_transforms_and_checkpoints_ask_it_too(self, way):
+        prediction, target = pair(2, 3, 7, 6)
+        WAYS[way](lambda p: l1_loss(p, target[0] if p.dim() == 3 else target, own=F.l1_loss), prediction)
+        with pytest.raises(LegsError, match="no L1"):
+            WAYS[way](lambda p: l1_loss(p, target[0] if p.dim() == 3 else target, own=F.mse_loss), prediction)
+
+    @pytest.mark.skipif(not hasattr(torch, "compile") or sys.platform == "win32", reason="no torch.compile")
+    def test_a_compiled_graph_asks_it_too(self):
+        prediction, target = pair(3, 7, 6)
+        for own, expected in ((F.l1_loss, l1_loss(prediction, target, own=F.l1_loss)), (F.mse_loss, None)):
+            loss = torch.compile(lambda p, t, own=own: l1_loss(p, t, own=own), backend="aot_eager", fullgraph=True)
+            if expected is not None:
+                torch.testing.assert_close(loss(prediction, target), expected)
+                loss(*pair(3, 7, 8)), loss(*pair(3, 6, 9))  # other sizes, symbolic then
+            else:
+                with pytest.raises(RuntimeError, match="own= is no L1"):
+                    loss(prediction, target)
 
 
 # The codebase's own line, and the line that the patch puts there.

@@ -1,0 +1,90 @@
+"""The check that a codebase's own function is an L1, whose difference a weight may change."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any, Callable, Hashable, Set, Tuple
+
+import torch
+from torch import Tensor
+
+from legs_loss.autograd import is_compiling
+from legs_loss.errors import LegsError
+from legs_loss.kernels.available import is_capturing
+
+__all__ = ["check_own"]
+
+_SMALL, _TIMES = 1 / 64, 256  # differences, exact in every type of float; a weight makes the one of the other
+_CLOSE = 0.02  # Charbonnier's root with its usual 1e-3 grows as an L1 within this
+_MOST = 256
+_known: Set[Hashable] = set()
+
+
+def check_own(own: Callable[..., Any], target: Tensor) -> None:
+    """Check once that a function of two images is an L1 of their difference: it grows as the difference does.
+
+    It is asked of two images of one value each. One that makes nothing of these is asked again in the next step.
+
+    Args:
+        own: the function of (prediction, target).
+        target: an image of the shape, type and device of what it is called with.
+
+    Raises:
+        LegsError: it is a squared, smooth, robust or clamped loss. (In a graph of torch.compile: a RuntimeError.)
+    """
+    key = None if is_compiling() else _key(own)
+    if key in _known or is_capturing(target.device) or torch.jit.is_tracing():
+        return
+    if key is None:
+        small, grown = _growth(own, target)
+        torch._assert_async(
+            _is_l1(small, grown).any(), "own= is no L1: a weight on the difference would not be one on the loss"
+        )
+        return
+    devices = [target.device] if target.device.type == "cuda" else []
+
+    def drawing_alike(*images: Tensor) -> Any:
+        with torch.random.fork_rng(devices):
+            return own(*images)
+
+    try:
+        with torch.no_grad():
+            small, grown = _growth(drawing_alike, target)
+            is_l1, known = _is_l1(small, grown).tolist(), (small > 0).tolist()
+    except RuntimeError:  # tensors without values; what it raises itself comes from the loss, too
+        return
+    if not any(is_l1):
+        raise LegsError(
+            f"own= is no L1: {_TIMES} times the difference gives {float(grown[0]):,.0f} times the loss, so a weight on "
+            "the difference would not be one on the loss. Where a setting chooses it, choose the L1; else leave this "
+            "line to the codebase's own loss, or set LEGS_OFF=1"
+        )
+    if any(known):
+        if len(_known) >= _MOST:
+            _known.clear()
+        _known.add(key)
+
+
+def _growth(own: Callable[..., Any], target: Tensor) -> Tuple[Tensor, Tensor]:
+    """Return the sum of each tensor that it makes of a small difference, and how many times it grows."""
+    grey, sums = torch.full(target.shape, 0.5, dtype=target.dtype, device=target.device), []
+    for difference in (_SMALL, _SMALL * _TIMES):
+        found = own(grey + difference, grey)
+        each = found if isinstance(found, (tuple, list)) else [found]
+        sums.append(torch.stack([one.double().abs().sum() for one in each if isinstance(one, Tensor)]))
+    return sums[0], sums[1] / sums[0]
+
+
+def _is_l1(small: Tensor, grown: Tensor) -> Tensor:
+    """Return for each tensor of a result whether it may be of an L1."""
+    return ~(small > 0) | ((grown / _TIMES - 1).abs() < _CLOSE)
+
+
+def _key(own: Any, depth: int = 0) -> Hashable:
+    """Return what stays the same where a lambda is made anew in every step: its code, and the functions in it."""
+    own = getattr(own, "func", own)  # of functools.partial
+    code, cells = getattr(own, "__code__", None), getattr(own, "__closure__", None) or ()
+    if code is None:
+        return id(own) if isinstance(own, type(len)) else weakref.ref(own)
+    inner = [cell.cell_contents for cell in cells] if depth < 4 else []
+    return (code, *(_key(each, depth + 1) for each in inner if callable(each)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import bisect
 import re
-from typing import Dict, Iterator, List, NamedTuple, Optional, Set, Tuple
+from typing import Callable, Dict, Iterator, List, NamedTuple, Optional, Set, Tuple
 
 from legs_adapters.code.folders import first_of
 from legs_adapters.code.limits import STRING, Budget
@@ -26,11 +26,20 @@ _WRITTEN = frozenset(("l1_loss", "masked", "ssim", "unweighted"))  # the functio
 _UTF8 = ("utf-8", "surrogateescape")
 
 
-class _Words:
-    """A text as words and signs, without comments and those of `_FREE`; ``weighted``: which are the package's name."""
+class _TooLongError(Exception):
+    """The search takes more steps than a file may."""
 
-    def __init__(self, text: str) -> None:
-        self.text = text
+
+class _Words:
+    """A text as words and signs, without comments and those of `_FREE`; ``weighted``: which are the package's name.
+
+    ``spend`` is told the steps of each search in it.
+    """
+
+    def __init__(self, text: str, spend: Callable[[int], None] = lambda steps: None) -> None:
+        self.text, self.spend = text, spend
+        self.newline = "\r\n" if "\r\n" in text else "\n"
+        self._breaks = [found.start() for found in re.finditer("\n", text)]
         self.words: List[str] = []
         self.starts: List[int] = []
         self.ends: List[int] = []
@@ -54,12 +63,14 @@ class _Words:
             if found.lastgroup != "comment":
                 depth += (word in ("(", "[", "{")) - (word in (")", "]", "}"))
                 last = found.end()
+        self.spend((last - start) // 4)
         return last
 
     def line(self, at: int) -> str:
         """Return the line of a character, with its number."""
-        start, end = self.text.rfind("\n", 0, at) + 1, self.text.find("\n", at)
-        return f"line {self.text.count(chr(10), 0, at) + 1}: {self.text[start : max(start, end) or None].strip()[:200]}"
+        number = bisect.bisect_left(self._breaks, at)
+        start = self._breaks[number - 1] + 1 if number else 0
+        return f"line {number + 1}: {self.text[start : start + 400].partition(chr(10))[0].strip()[:200]}"
 
 
 class _Part(NamedTuple):
@@ -90,10 +101,21 @@ def restored(name: str, layer: Layer, data: bytes, budget: Budget) -> Tuple[byte
     Returns:
         The file's bytes; and "", or why they are those of now: what is weighted still, and the lines from before.
     """
-    if budget.spend(name, (2 * len(layer.original) + len(data)) // 8 + len(layer.edits)):
+
+    def spend(steps: int) -> None:
+        if budget.spend(name, steps):
+            raise _TooLongError
+
+    try:
+        return _restored(layer, data, spend)
+    except _TooLongError:
         return data, "it was edited since, and looking for the patched lines takes too long: restore it from git"
-    texts = layer.original, apply_edits(layer.original, layer.edits), data
-    original, patched, now = (_Words(text.decode(*_UTF8)) for text in texts)
+
+
+def _restored(layer: Layer, data: bytes, spend: Callable[[int], None]) -> Tuple[bytes, str]:
+    spend((2 * len(layer.original) + len(data)) // 8 + len(layer.edits))
+    three = layer.original, apply_edits(layer.original, layer.edits), data
+    original, patched, now = (_Words(text.decode(*_UTF8), spend) for text in three)
     every = list(_parts(layer, original, patched))
     parts = {part.anchor: part for part in every if part.anchor >= 0}
     places: List[Tuple[int, int, str]] = []
@@ -102,18 +124,20 @@ def restored(name: str, layer: Layer, data: bytes, budget: Budget) -> Tuple[byte
         for part in parts.values():
             ahead, size = min(around, part.first) + part.anchor - part.first, part.last - part.first + 2 * around
             key = patched.words[part.anchor - ahead : part.anchor - ahead + size]
-            if budget.spend(name, len(patched.weighted) + len(now.weighted)):
-                break
+            spend((len(patched.weighted) + len(now.weighted)) * (1 + size // 64))
             same = [parts.get(at) for at in patched.weighted if patched.words[at - ahead : at - ahead + size] == key]
             if len({each and each.before for each in same}) == 1:  # else others, which are alike here, were different
                 for at in now.weighted:
                     if at >= ahead and at not in covered and now.words[at - ahead : at - ahead + size] == key:
                         places += _places(part, patched, now, at, covered)
     left = [at for at in now.weighted if at not in covered]
-    text = now.text
-    for start, end, before in sorted(places, reverse=True):
-        text = text[:start] + before + text[end:]
-    result = text.encode(*_UTF8)
+    at = 0
+    texts: List[str] = []
+    for start, end, before in sorted(places):
+        if start >= at:  # else within another one
+            texts += [now.text[at:start], before]
+            at = end
+    result = "".join([*texts, now.text[at:]]).encode(*_UTF8)
     is_python = not why_not_compiled(result) or why_not_compiled(data)
     if len(every) == len(parts) and len(left) <= len(original.weighted) and is_python:
         return result, ""
@@ -164,6 +188,7 @@ def _places(
     before = part.before.replace("\r\n", "\n")
     if not before.strip():  # a line of its own, or before or behind a semicolon
         line, behind = now.text.rfind("\n", 0, start) + 1, now.text.find("\n", end) + 1 or len(now.text)
+        now.spend((behind - line) // 64)
         head, tail = now.text[line:start], now.text[end:behind]
         if not head.strip() and not tail.strip():
             start, end = line, behind
@@ -171,7 +196,7 @@ def _places(
             end += len(tail) - len(tail.lstrip()[1:].lstrip(" \t"))
         elif head.rstrip().endswith(";"):
             start = line + len(head.rstrip()) - 1
-    yield start, end, before.replace("\n", "\r\n") if "\r\n" in now.text else before
+    yield start, end, before.replace("\n", now.newline)
 
 
 def _tree(text: str) -> Optional[str]:

@@ -304,6 +304,37 @@ def test_the_steps_grow_with_the_code(what, options, tmp_path, monkeypatch):
             assert twice <= 2.5 * once, (shape, once, twice)
 
 
+MIB = 1 << 20
+# Texts that nobody has to parse, each of a size that is read: a search from each of their words or quotes to the end
+# takes from a minute to hours.
+TEXTS = {
+    "quotes.py": "\\'''" + "x" * 30 + "\n",
+    "quotes_in_a_line.py": '\\"x',
+    "a_word.py": "lossmask",
+    "open_brackets.py": "loss[",
+    "calls_in_a_line.py": "eval(",
+    "weighted.py": "legs_loss.ssim;",
+    "a.yaml": "loss: {",
+    ".gitmodules": "\n",
+}
+
+
+@pytest.mark.parametrize("command", ["--check", "--undo"])
+def test_long_texts_are_searched_once(command, tmp_path):
+    texts = {}
+    for name, text in TEXTS.items():
+        head, size = (
+            ("x = l1_loss(image, gt)\n", MIB) if name.endswith(".py") else ("", MIB if "git" in name else 1 << 17)
+        )
+        texts[name] = (head + text * (size // len(text)))[:size]
+    root = checkout(tmp_path, texts)
+    done = subprocess.run(
+        [sys.executable, "-m", "legs_adapters.cli", command, str(root)],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=legs_environment(), timeout=100,
+    )  # fmt: skip
+    assert (done.returncode, b"Traceback" in done.stdout) == (2, False), done.stdout
+
+
 def test_deeper_than_the_stack(tmp_path, monkeypatch):
     """Code within the limits that the walk still cannot follow costs only its own file."""
     from legs_adapters import plan as module

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+import base64
+import json
 import re
 import subprocess
 import sys
+import zlib
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -19,7 +22,7 @@ from legs_adapters.terms.text import Edit
 from legs_adapters.undo import undo
 
 from legs_loss import LegsError
-from tests.patcher.support import NAMES, PATCHED, SITE, checkout, files, options, snapshot
+from tests.patcher.support import NAMES, PATCHED, SITE, checkout, files, legs_patch, options, snapshot
 
 TEXTS = st.text(st.sampled_from("ab \n\r\t[]{}\"'\\#é\u2028\U0001f600\0"), max_size=60)
 
@@ -166,6 +169,37 @@ def test_another_checkout_s_journal_is_named(first, tmp_path, capsys):
     assert snapshot(root) == whole
     assert main(["--undo", str(patched)]) == 0
     assert snapshot(root) == before
+
+
+CALL = "legs_loss.l1_loss({})"
+# Of n edits or calls: the original, the edits, the file now. Each once took the square of n steps.
+LABORIOUS = {
+    "equal words": lambda n: ("x\n", [(0, 1, "legs_loss")], CALL[:-3] * n),
+    "calls in one another": lambda n: ("x\n", [(0, 1, "legs_loss")], "legs_loss(" * n + ")" * n),
+    "edits in a row": lambda n: ("x" * n, [(i, i + 1, "legs_loss.a ") for i in range(n)], "legs_loss.ssim()\n" * n),
+    "edits that do not end": lambda n: (
+        "x\n" * n, [(2 * i, 2 * i + 1, CALL[:-3]) for i in range(n)], CALL.format("") * n
+    ),
+    "one long call": lambda n: ("x\n", [(0, 1, CALL.format("a " * 3 * n))], f"{CALL.format('')}\n" * n),
+    "equal calls": lambda n: (
+        "x\n" * n, [(2 * i, 2 * i + 1, CALL.format("a")) for i in range(n)], f"#\n{CALL.format('a')}\n" * n
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", LABORIOUS, ids=lambda what: what.replace(" ", "_"))
+def test_a_journal_of_much_work_is_given_up(what, tmp_path):
+    """A stranger's: its file stays, with the reason, after some seconds."""
+    original, edits, now = LABORIOUS[what](45_000)
+    packed = base64.b64encode(zlib.compress(original.encode())).decode()
+    layer = {"after": digest(b""), "edits": edits, "original": packed}
+    texts = {"train.py": now, JOURNAL: json.dumps({"version": 1, "created": {}, "files": {"train.py": [layer]}})}
+    done = legs_patch("--undo", "--force", checkout(tmp_path, texts), timeout=100)
+    if what == "equal words":
+        assert (done.returncode, done.stdout) == (0, "restored train.py\n")
+    else:
+        assert done.returncode == 1 and "looking for the patched lines takes too long" in done.stdout
+        assert (tmp_path / "train.py").read_text() == now
 
 
 class TestWhatStaysWeighted:

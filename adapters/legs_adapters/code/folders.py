@@ -7,7 +7,7 @@ import os
 import re
 import unicodedata
 from pathlib import Path, PurePosixPath
-from typing import Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 from legs_loss import LegsError
 from legs_loss.system import read_regular
@@ -83,7 +83,7 @@ def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
     folders = [folder.as_posix() for folder in reversed(PurePosixPath(path).parents)][1:]
     for folder, inner in zip(folders, [*folders[1:], ""]):
         why = "a link" if os.path.islink(str(root / folder)) else _why_foreign(root, folder, submodules)
-        submodules += _submodules(root, folder)
+        submodules |= _submodules(root, folder)
         if why == VENDORED and inner:
             return Skipped(inner, _why_foreign(root, inner, submodules) or why)
         if why is not None:
@@ -95,10 +95,10 @@ def folders_of(
     root: Path, exclude: Sequence[str], ends: Tuple[str, ...] = (".py",)
 ) -> Iterator[Tuple[List[str], List[Skipped]]]:
     """Yield, a folder at a time, the Python files in it, and the folders in it that are not entered."""
-    submodules: List[str] = []
+    submodules: Set[str] = set()
     for here, folders, names in os.walk(str(root), followlinks=False):
         relative = Path(here).relative_to(root)
-        submodules += _submodules(root, relative.as_posix()) if ".gitmodules" in names else []
+        submodules |= _submodules(root, relative.as_posix()) if ".gitmodules" in names else set()
         paths = {(relative / name).as_posix(): name for name in sorted([*folders, *names])}
         own = [path for path in paths if not _excluded(path, exclude) and not os.path.islink(str(root / path))]
         why = {path: _why_foreign(root, path, submodules) for path in own if paths[path] in folders}
@@ -108,7 +108,7 @@ def folders_of(
         yield regular, [Skipped(path, reason) for path, reason in why.items() if reason is not None]
 
 
-def _why_foreign(root: Path, path: str, submodules: Sequence[str]) -> Optional[str]:
+def _why_foreign(root: Path, path: str, submodules: Set[str]) -> Optional[str]:
     """Return why a folder is skipped; None for the checkout's own code."""
     name = ".git" if _is_dot_git(os.path.basename(path)) else os.path.basename(path)
     if path in submodules or name in _FOREIGN:
@@ -138,14 +138,14 @@ def _excluded(path: str, patterns: Sequence[str]) -> bool:
     return any(fnmatch.fnmatch(name, pattern.rstrip("/")) for pattern in patterns for name in names)
 
 
-def _submodules(root: Path, folder: str) -> List[str]:
+def _submodules(root: Path, folder: str) -> Set[str]:
     """Return the submodules that a folder's ``.gitmodules`` names."""
     try:
         text = read_regular(root / folder / ".gitmodules", _LARGEST).decode("utf-8", "replace")
     except OSError:
-        return []
-    found = re.findall(r"^\s*path\s*=\s*(.+)$", text, re.M)
-    return [(PurePosixPath(folder) / match.strip()).as_posix() for match in found]
+        return set()
+    found = (line.partition("=") for line in text.splitlines())
+    return {(PurePosixPath(folder) / path.strip()).as_posix() for key, _, path in found if key.strip() == "path"}
 
 
 def check_name(path: str) -> None:

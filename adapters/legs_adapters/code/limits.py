@@ -24,7 +24,11 @@ MAX_LAMBDAS = 660  # in a file: LibCST's parser takes memory quadratic in lambda
 _TOKEN_STEPS = 20
 _WHY_OVER = f"its analysis takes more than {MAX_FILE_STEPS} steps"
 _PIECE = re.compile(r"\w+|[^\w\s]|\n")
-STRING = r"""\'\'\'(?:[^\\]|\\.)*?\'\'\'|\"\"\"(?:[^\\]|\\.)*?\"\"\"|'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*\""""
+# One that does not end goes to the end of the file or line: looking for an end from each quote would be quadratic.
+STRING = "|".join(
+    [rf"{quotes}(?:[^\\]|\\.?)*?(?:{quotes}|\Z)" for quotes in ("'''", '"""')]
+    + [rf"{quote}(?:[^{quote}\\\n]|\\.?)*{quote}?" for quote in "'\""]
+)
 _TOKEN = re.compile(
     rf"(?P<string>{STRING})|\#[^\n]*|\\\r?\n|(?P<end>[\r\n;]+)|(?P<open>[(\[{{])|(?P<close>[)\]}}])|(?P<comma>,)"
     r"|\b(?P<word>if|else|and|or|not|in|is|await|for|yield)\b|(?P<signs>[-+*/%@&|^~<>=!.]+)",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from pathlib import Path
-from typing import Iterable, Iterator, Sequence, Set
+from typing import Iterable, Iterator, Pattern, Sequence, Set
 
 from legs_adapters.code.folders import first_of, walk
 from legs_adapters.code.sources import Source
@@ -60,12 +60,18 @@ _INSTEAD = (
 # In YAML, JSON or TOML: an L1 as the value of a key of losses, or of a kind, a few lines below such a key.
 _L1_VALUE = r"[\"']?\s*[:=]\s*[\"']?(?:[\w.]+\.)?(?:l1|l1[_-]?loss|mae|photometric\w*)\b"
 _KIND = rf"\b(?:type|name|kind|_target_){_L1_VALUE}"
-_IN_SETTINGS = re.compile(
-    rf"{_LOSS}{_L1_VALUE}|_target_[\"']?\s*[:=]\s*[\"']?[\w.]*L1Loss\b|{_LOSS}[\"']?\s*[:=]\s*{{[^}}\n]*{_KIND}"
-    rf"|{_LOSS}[\"']?\]?\s*[:=]?\s*[\[{{]?[ \t]*\r?\n(?:[^\n]*\n){{0,3}}?[^\n]*{_KIND}",
-    re.I,
+_IN_SETTINGS = (
+    rf"(?i){_LOSS}{_L1_VALUE}|_target_[\"']?\s*[:=]\s*[\"']?[\w.]*L1Loss\b|{_LOSS}[\"']?\s*[:=]\s*{{[^}}\n]*{_KIND}"
+    rf"|{_LOSS}[\"']?\]?\s*[:=]?\s*[\[{{]?[ \t]*\r?\n(?:[^\n]*\n){{0,3}}?[^\n]*{_KIND}"
 )
 _MOST_SETTINGS, _LARGEST = 500, 1 << 17  # files, and bytes of each
+_MOST_SIGNS = 200  # of what a pattern repeats: a stranger's file has lines of a megabyte
+
+
+def _bounded(pattern: str) -> Pattern[str]:
+    """Compile a pattern whose time grows with the text, not with its square."""
+    most = {"*": f"{{0,{_MOST_SIGNS}}}", "+": f"{{1,{_MOST_SIGNS}}}"}
+    return re.compile(re.sub(r"(?<!\\)[*+]", lambda sign: most[sign.group()], pattern), re.M)
 
 
 def offered(findings: Findings, command: str = "") -> str:
@@ -83,10 +89,10 @@ def trained_instead(root: Path, exclude: Sequence[str], sources: Iterable[Source
     files = sorted(sources, key=lambda source: (source.path.count("/"), source.path))
     said: Set[str] = set()
     for pattern, what in _INSTEAD:
-        found = ((source, hit) for source in files for hit in re.finditer(pattern, source.text, re.M))
+        found = ((source, hit) for source in files for hit in _bounded(pattern).finditer(source.text))
         for source, hit in found:
-            start = source.text.rfind("\n", 0, hit.start()) + 1
-            line = source.text[start:].partition("\n")[0].lstrip()
+            before = source.text[max(0, hit.start() - _MOST_SIGNS) : hit.start()].rpartition("\n")[2]
+            line = (before + source.text[hit.start() : hit.end() + _MOST_SIGNS].partition("\n")[0]).lstrip()
             of_images = _OF_PICTURES.search(line) and "loss" in (line.replace(hit.group(), "") + source.path).lower()
             if not line.startswith(("#", "def ")) and (of_images or what is not _SQUARED):
                 place = f"{source.path}:{source.text.count(chr(10), 0, hit.start()) + 1}"
@@ -97,7 +103,7 @@ def trained_instead(root: Path, exclude: Sequence[str], sources: Iterable[Source
     for path in list(walk(root, exclude, (".yaml", ".yml", ".json", ".toml")))[:_MOST_SETTINGS]:
         with contextlib.suppress(OSError):  # larger, or no file
             text = read_regular(root / path, _LARGEST).decode("utf-8", "replace")
-            named = _IN_SETTINGS.search(text)
+            named = _bounded(_IN_SETTINGS).search(text)
             if named is not None:
                 yield f"{path}:{text.count(chr(10), 0, named.end()) + 1}: {_CHOSEN.format('settings')}"
                 break

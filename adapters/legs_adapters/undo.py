@@ -63,7 +63,7 @@ def unrecorded(root: Path) -> List[Tuple[str, str]]:
         lines = weighted_lines(source.text) if isinstance(source, Source) and PACKAGE in source.text else []
         if lines:
             where = _recorded_in(root / name)
-            what = f"no journal has what was there; restore it from git or by hand: {first_of(lines, 20, '; ')}"
+            what = f"no journal names it; restore it from git or by hand: {first_of(lines, 20, '; ')}"
             found.append((name, what if where is None else f"the journal is in {where}: legs-patch --undo {where}"))
     return found
 
@@ -85,7 +85,8 @@ def _undone(root: Path, journal: Journal, force: bool) -> _Undone:
     for name, layers in journal.files.items():
         data = current = read_file(root, name)
         if data is None:
-            kept.append((name, f"the file is gone: put it back, or delete {JOURNAL} if it is gone for good"))
+            why = f"put it back, undo, and move it again; only if it is gone for good delete {JOURNAL}"
+            kept.append((name, f"the file is gone: {why}"))
             continue
         for layer in reversed(layers):
             if digest(data) == layer.after:

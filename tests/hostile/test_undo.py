@@ -165,7 +165,7 @@ def test_another_checkout_s_journal_is_named(first, tmp_path, capsys):
     said = capsys.readouterr().err
     assert f"{other}: nothing to undo" in said
     assert f"the journal is in {patched}: legs-patch --undo {patched}" in said
-    assert "no journal has" not in said
+    assert "no journal names it" not in said
     assert snapshot(root) == whole
     assert main(["--undo", str(patched)]) == 0
     assert snapshot(root) == before
@@ -250,6 +250,23 @@ class TestWhatStaysWeighted:
         (root / "train.py").write_text(now.replace("(image + 1) * 2", "image + (1 * 2)"))
         assert [name for name, _ in undo(root, force=True)[1]] == ["train.py"]
 
+    def test_a_file_that_was_moved_keeps_its_journal(self, tmp_path, capsys):
+        root = checkout(tmp_path, files("inria"))
+        before = snapshot(root)
+        assert main([str(root)]) == 0
+        (root / "train.py").rename(root / "train_mine.py")
+        patched = snapshot(root)
+        for force in ([], ["--force"]):
+            capsys.readouterr()
+            assert main(["--undo", *force, str(root)]) == 1
+            said = capsys.readouterr().out
+            assert "kept train.py: the file is gone: put it back, undo, and move it again" in said
+            assert "kept train_mine.py: no journal names it" in said
+            assert snapshot(root) == patched
+        (root / "train_mine.py").rename(root / "train.py")
+        assert main(["--undo", str(root)]) == 0
+        assert snapshot(root) == before
+
     def test_a_patch_whose_journal_is_gone_is_named(self, tmp_path, capsys):
         root = checkout(tmp_path, files("inria"))
         assert main([str(root)]) == 0
@@ -258,7 +275,7 @@ class TestWhatStaysWeighted:
         capsys.readouterr()
         assert main(["--undo", str(root)]) == 2
         said = capsys.readouterr().err
-        assert "no journal has what was there; restore it from git or by hand: line " in said
+        assert "no journal names it; restore it from git or by hand: line " in said
         assert ": Ll1 = legs_loss.l1_loss(image, gt_image)" in said
         assert main([str(root)]) == 0
         said = capsys.readouterr()

@@ -174,9 +174,9 @@ def _patch(args: argparse.Namespace) -> int:
     for elsewhere in found.unsearched:
         say(f"legs-patch: warning: {elsewhere.text(args.folder)}", sys.stderr)
     problems, is_decided = found.findings.problems, bool(found.findings.sites or found.findings.patched)
+    instead = list(trained_instead(root, args.exclude, found.findings))
     if not is_decided or (problems and args.strict):
         _show(args, found)
-        instead = list(trained_instead(root, args.exclude, found.findings.program.sources.values()))
         if not problems:
             raise LegsError(
                 f"no photometric L1 term was found in {args.folder}: {offered(found.findings)}"
@@ -191,6 +191,8 @@ def _patch(args: argparse.Namespace) -> int:
     if writes:
         found = found._replace(settings=text)
     _quote(found.findings.doubts, "warning: a possible loss was not weighted")
+    for line in instead:
+        say(f"legs-patch: warning: {line}", sys.stderr)
     wrote = [] if args.diff or args.check else write(found, args.force)
     _show(args, found, wrote)
     bare = unrecorded(root) if found.findings.patched else []

@@ -77,14 +77,14 @@ def run_script(
     for elsewhere in found.unsearched:
         _say(f"not weighted: {elsewhere.text(root)}")
     is_plain = not found.after and not found.findings.patched
-    instead = list(trained_instead(root, (), found.findings.program.sources.values())) if is_plain else []
+    instead = list(trained_instead(root, (), found.findings))
     said = [
         f"{problem.path}:{problem.line}: {problem.reason}; if this is the loss: {problem.way}"
         for problem in (*found.findings.problems, *found.findings.doubts)
     ]
     if is_plain and found.findings.problems:
         raise LegsError(*said, *instead)
-    for text in said:
+    for text in said if is_plain else (*said, *instead):
         _say(f"not weighted: {text}")
     if is_plain:
         none = f"no photometric L1 term was found in {root}: {offered(found.findings, f'legs-patch {root} ')}"

@@ -9,7 +9,7 @@ import subprocess
 
 import pytest
 from legs_adapters.cli import main
-from legs_adapters.code.sources import read_files
+from legs_adapters.plan import plan
 from legs_adapters.terms.instead import trained_instead
 
 from legs_loss.config import find_config
@@ -437,8 +437,42 @@ def test_what_is_not_ours_is_one_line(text, line, what, tmp_path, run):
 )
 def test_the_line_that_chooses_a_loss_is_named(path, text, line, tmp_path):
     root = checkout(tmp_path, {"other.py": "import os\n", path: text})
-    [said] = trained_instead(root, (), read_files(root, ())[0])
+    [said] = trained_instead(root, (), plan(root).findings)
     assert said.startswith(f"{path}:{line}: the loss seems to be chosen here, by ")
+
+
+CHOSEN = """
+from gaussian_renderer import render
+
+
+def training(gaussians, cams, cfg):
+    loss_fn = build_loss(cfg.loss)
+    for cam in cams:
+        loss_fn(render(cam, gaussians)["render"], cam.original_image).backward()
+        gaussians.optimizer.step()
+"""
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        (CHOSEN, "warning: finetune.py:6: the loss seems to be chosen here, by a setting"),
+        (
+            CHOSEN.replace("build_loss(cfg.loss)", "LossKind[cfg.loss].value"),
+            "warning: finetune.py:6: the loss seems to be chosen here, by a setting",
+        ),
+        (CHOSEN.replace(".backward()", ""), ""),  # nothing is trained
+        (CHOSEN.replace("gaussian_renderer", "vae").replace("gaussians", "model"), ""),
+    ],
+)
+def test_a_script_that_chooses_its_loss_is_named_beside_one_that_is_weighted(other, said, tmp_path, run):
+    root = checkout(tmp_path, {**files("runnable_train_script_weighted"), "tools/finetune.py": other})
+    for arguments in (("--check",), ("--check", "--json"), ()):
+        done = run(*arguments, root)
+        assert [line.replace("tools/", "") for line in done.stderr.splitlines() if "chosen" in line] == [
+            f"legs-patch: {said}: name the line that calls it with --site" for said in [said] if said
+        ], done.stderr
+    assert "chosen" not in run("--check", "--site", "train.py:60", root).stderr
 
 
 def test_settings_and_dictionaries_of_losses_choose_none(tmp_path):
@@ -446,7 +480,7 @@ def test_settings_and_dictionaries_of_losses_choose_none(tmp_path):
     settings = "lambda_l1: 0.8\nloss_weight: 1\nname: l1\nssim_loss: true\n"
     root = checkout(tmp_path, {"train.py": code, "a.yaml": settings, "b.json": '{"l1_loss": 0.8, "type": "l1"}'})
     os.mkfifo(root / "pipe.yaml")
-    assert list(trained_instead(root, (), read_files(root, ())[0])) == []
+    assert list(trained_instead(root, (), plan(root).findings)) == []
 
 
 def test_squares_of_poses_and_definitions_are_not_the_image_loss(tmp_path, run):

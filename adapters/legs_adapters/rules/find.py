@@ -7,7 +7,7 @@ the syntax tree; a term that cannot be decided becomes a problem that needs a ma
 from __future__ import annotations
 
 import re
-from typing import Any, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, FrozenSet, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 from legs_adapters.code.limits import Budget
 from legs_adapters.code.module import Function, Module
@@ -109,7 +109,19 @@ class _Finder:
         elif not self.by_hand:
             found.doubts.extend(problem for left, problem in self.doubtful if self._trains_alone(left))
         found.unreadable.extend(program.unreadable[path] for path in sorted(program.unreadable))
-        return found
+        return found._replace(unsettled=self._unsettled())
+
+    def _unsettled(self) -> FrozenSet[str]:
+        """Return the files that train Gaussians, and whose loss has no term that is weighted or reported."""
+        found, training = self.found, self.analysis.training
+        entries: List[Any] = [*found.sites, *found.patched, *found.problems, *found.doubts]
+        above = [site.scope for site in found.sites]
+        for function in above:  # which grows
+            above += [caller for caller, _ in training.sites.get(function, ()) if caller not in above]
+        settled = {entry.path for entry in entries} | {function.module.path for function in above}
+        open_roots = [root for root in training.roots if root.module.path not in settled]
+        about = [] if self.by_hand else [root for root in open_roots if self.analysis.splats.is_about(root)]
+        return frozenset(root.module.path for root in about)
 
     def _trains_alone(self, left: Left) -> bool:
         """Return whether its file trains, and has no term that is weighted or reported as a problem."""

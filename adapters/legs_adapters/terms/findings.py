@@ -157,8 +157,9 @@ class Problem(NamedTuple):
 class Findings(NamedTuple):
     """All findings, in the order of the files.
 
-    ``doubts`` are skipped terms that may be the loss: of files that train and have no weighted term. ``trace`` is what
-    a run showed, and ``ran`` the (path, line) of the terms that it met.
+    ``doubts`` are skipped terms that may be the loss: of files that train and have no weighted term, which are
+    ``unsettled`` where they have none at all. ``trace`` is what a run showed, and ``ran`` the (path, line) of the terms
+    that it met.
     """
 
     sites: List[Site]
@@ -168,6 +169,7 @@ class Findings(NamedTuple):
     patched: List[Left]
     unreadable: List[Unreadable]
     program: Program
+    unsettled: FrozenSet[str] = frozenset()
     trace: Optional[Trace] = None
     ran: FrozenSet[Tuple[str, int]] = frozenset()
 

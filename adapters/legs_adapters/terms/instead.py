@@ -5,10 +5,9 @@ from __future__ import annotations
 import contextlib
 import re
 from pathlib import Path
-from typing import Iterable, Iterator, Pattern, Sequence, Set
+from typing import Iterator, Pattern, Sequence, Set
 
 from legs_adapters.code.folders import first_of, walk
-from legs_adapters.code.sources import Source
 from legs_adapters.lexicon.names import kind_of_words
 from legs_adapters.terms.findings import Findings
 from legs_loss.system import read_regular
@@ -57,6 +56,7 @@ _INSTEAD = (
         "a gradient by a diffusion model (SDS) seems to be used, of no photograph",
     ),
 )
+_BY_CHOICE = [row for row in _INSTEAD if row[1].startswith(_CHOSEN[:20])]
 # In YAML, JSON or TOML: an L1 as the value of a key of losses, or of a kind, a few lines below such a key.
 _L1_VALUE = r"[\"']?\s*[:=]\s*[\"']?(?:[\w.]+\.)?(?:l1|l1[_-]?loss|mae|photometric\w*)\b"
 _KIND = rf"\b(?:type|name|kind|_target_){_L1_VALUE}"
@@ -84,11 +84,16 @@ def offered(findings: Findings, command: str = "") -> str:
     return f"if a skipped line is the loss, take it with {first_of(list(lines), 3, ' or ')}"
 
 
-def trained_instead(root: Path, exclude: Sequence[str], sources: Iterable[Source]) -> Iterator[str]:
-    """Yield ``file:line: what`` for each row of the table that the files speak of, and for an L1 that settings name."""
-    files = sorted(sources, key=lambda source: (source.path.count("/"), source.path))
+def trained_instead(root: Path, exclude: Sequence[str], findings: Findings) -> Iterator[str]:
+    """Yield ``file:line: what`` for each row of the table that the files speak of, and for an L1 that settings name.
+
+    Beside a weighted term it is where the files choose a loss that train and have none.
+    """
+    files = sorted(findings.program.sources.values(), key=lambda source: (source.path.count("/"), source.path))
+    is_decided = bool(findings.sites or findings.patched)
+    files = [source for source in files if not is_decided or source.path in findings.unsettled]
     said: Set[str] = set()
-    for pattern, what in _INSTEAD:
+    for pattern, what in _INSTEAD if not is_decided else _BY_CHOICE:
         found = ((source, hit) for source in files for hit in _bounded(pattern).finditer(source.text))
         for source, hit in found:
             before = source.text[max(0, hit.start() - _MOST_SIGNS) : hit.start()].rpartition("\n")[2]
@@ -100,7 +105,7 @@ def trained_instead(root: Path, exclude: Sequence[str], sources: Iterable[Source
                     yield f"{place}: {what}"
                 said.add(place)
                 break
-    for path in list(walk(root, exclude, (".yaml", ".yml", ".json", ".toml")))[:_MOST_SETTINGS]:
+    for path in [] if is_decided else list(walk(root, exclude, (".yaml", ".yml", ".json", ".toml")))[:_MOST_SETTINGS]:
         with contextlib.suppress(OSError):  # larger, or no file
             text = read_regular(root / path, _LARGEST).decode("utf-8", "replace")
             named = _bounded(_IN_SETTINGS).search(text)

@@ -14,7 +14,10 @@ from string import Template
 HERE = Path(__file__).resolve().parent
 DOCS = HERE.parent
 PAGE = DOCS / "compatibility.md"
-KINDS = ("static", "dynamic", "avatar", "SLAM", "feed-forward", "framework", "other")
+KINDS = (
+    *("static", "surfels", "dynamic", "avatar", "SLAM", "feed-forward", "language", "generation", "compression"),
+    *("framework", "other"),
+)
 
 # A row with several failures carries the gravest of them: this order, after "right".
 VERDICTS = {
@@ -166,7 +169,10 @@ def figures():
         "last_now_fair": fair_of(latest, "now"),
         "last_now_wrong": sum(row["now"] == "wrong term" for row in latest),
         "last_now_alarms": sum(row["now"] == "false alarm" for row in latest),
-        "last_kinds": ", ".join(f"{kind} {right_of(rows)}" for kind, rows in by_kind(latest).items()),
+        "last_with": right_of([row for row in latest if row["sites"] != "none"]),
+        "last_kinds": ", ".join(
+            f"{kind} {right_of(rows).split(' (')[0].replace(' of ', '/')}" for kind, rows in by_kind(latest).items()
+        ),
         "verdicts": verdict_table(blind),
         "rounds": round_table(blind),
         "known": len(known),
@@ -187,7 +193,6 @@ def figures():
         "deciding_words": parts_that_decide("words"),
         "idle": parts_that_do_not("rule", "form", "reader"),
         "idle_words": parts_that_do_not("words").count(",") + 1,
-        "kinds": ", ".join(f"{kind} {count}" for kind, count in Counter(row["kind"] for row in rows).most_common()),
     }
 
 

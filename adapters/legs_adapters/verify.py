@@ -30,6 +30,8 @@ from legs_loss import LegsError
 __all__ = ["Run", "Verdict", "check_verifiable", "verify"]
 
 SECONDS = 1800  # that a run may take
+# For runs that are compared; of two threads one may wait for its turn, and counts as work.
+_THE_SAME = {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 NOT_COPIED = (".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs")
 MAX_COPIED = 64 << 20  # bytes of a file
 FIRST_STEP, LATER_STEPS = 1e-5, 1e-3  # relative differences of losses that rounding explains
@@ -41,7 +43,7 @@ class Run(NamedTuple):
     Attributes:
         code: its exit code.
         losses: the value of every loss that was trained on, as float.hex has it.
-        seconds: from each step to the next.
+        seconds: of the processor, from each step to the next: other work does not change them much.
         weighted, plain: calls of legs_loss.l1_loss.
         stored, computed, remembered: where weight maps came from.
         terms: the differences under its losses, as `legs_adapters.terms.traced.Traced` reads them.
@@ -61,7 +63,7 @@ class Run(NamedTuple):
 
     @property
     def step(self) -> Optional[float]:
-        """The seconds that a step takes, by the median; None without two steps."""
+        """The seconds of the processor that a step takes, by the median; None without two steps."""
         return statistics.median(self.seconds) if self.seconds else None
 
 
@@ -235,7 +237,7 @@ def _run(
 ) -> Run:
     with tempfile.TemporaryFile() as errors:
         streams: Dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": errors, "timeout": SECONDS}
-        settings = {"PYTHONHASHSEED": "0", **settings}
+        settings = {**_THE_SAME, **settings}
         code, seen = run_watched(root, work, words, True, photos, {"losses": iterations}, settings=settings, **streams)
         errors.seek(0)
         lines = errors.read().decode("utf-8", "replace").replace("\r", "\n").strip().splitlines()

@@ -38,11 +38,11 @@ def main():
     from legs_adapters.shims.modules import diff_gaussian_rasterization_fastgs as fastgs
     from legs_adapters.shims.modules import diff_surfel_rasterization as surfels
 
+    from legs_loss.kernels.contract import terms_of
     from legs_loss.kernels.numba_loss import BACKEND
     from legs_loss.lab.embedded import write_embedded_scene
     from legs_loss.lab.rasterizer import Gaussians, rasterize
     from legs_loss.scenes import read_scene
-    from legs_loss.weights import Weights
 
     torch.set_num_threads(args.threads)
     with tempfile.TemporaryDirectory() as folder:
@@ -166,9 +166,9 @@ def main():
         image, results = contestants[name](raw)
         drawn = now()
         if name == "surfels, all channels":
-            torch.autograd.backward([BACKEND.loss(image, target, Weights(), 0.2), results[2]], [None, others])
+            torch.autograd.backward([BACKEND.loss(terms_of(0.2), image, target), results[2]], [None, others])
         else:
-            BACKEND.loss(image, target, Weights(), 0.2).backward()
+            BACKEND.loss(terms_of(0.2), image, target).backward()
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         return drawn - begin, now() - begin

@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import re
 import statistics
 import sys
 import time
@@ -27,7 +28,7 @@ from benchmarks import cuda_instructions
 from legs_loss.kernels.codes import NORMS, STENCILS
 from legs_loss.kernels.cuda.backend import VALUES
 from legs_loss.kernels.cuda.modules import Variant, options, source
-from legs_loss.kernels.cuda.nvrtc import Compiler, NotFound, find_compiler, resources
+from legs_loss.kernels.cuda.nvrtc import Compiler, NotFound, find_compiler
 
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
 MAJORS = ("11", "12", "13")
@@ -101,7 +102,7 @@ def measured(compiler: Compiler, architecture: int, chosen: List[Variant]) -> Li
     for variant in chosen:
         given = [*options(variant), "--ptxas-options=-v"]
         before = time.perf_counter()
-        log = compiler.compile(source(), given, f"sm_{architecture}").log
+        _, log = compiler.compile(source(), given, f"sm_{architecture}")
         seconds.append(time.perf_counter() - before)
         kernels = resources(log)
         if not kernels:
@@ -130,6 +131,23 @@ def row(
         "spills": spills,
         "shared": shared,
     }
+
+
+def resources(log: str) -> List[Tuple[str, int, int, int, int]]:
+    """Return of each kernel in the log of ``--ptxas-options=-v``: name, registers, stack, spills, shared bytes."""
+    found = []
+    for part in re.split(r"Compiling entry function '", log)[1:]:
+        numbers = [
+            sum(map(int, re.findall(pattern, part)))
+            for pattern in (
+                r"Used (\d+) registers",
+                r"(\d+) bytes stack frame",
+                r"(\d+) bytes spill (?:stores|loads)",
+                r"(\d+) bytes smem",
+            )
+        ]
+        found.append((part.split("'")[0], numbers[0], numbers[1], numbers[2], numbers[3]))
+    return found
 
 
 if __name__ == "__main__":

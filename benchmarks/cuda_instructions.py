@@ -226,7 +226,7 @@ def counted(compiler: Any, architecture: int, nvdisasm: Path) -> Dict[str, Dict[
     """Return of each row of BUDGET the warp instructions for 32 values, by pipe, their "total" and "range"."""
     texts = {}
     for variant in (PLAIN, RANGE):
-        binary = compiler.compile(source(), options(variant), f"sm_{architecture}").binary
+        binary = compiler.compile(source(), options(variant), f"sm_{architecture}")[0]
         with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
             file.write(binary)
             file.flush()

@@ -33,27 +33,21 @@ if TYPE_CHECKING:
     from legs_loss.weights import weight_map as weight_map
 
 # No module has the name of what it publishes: Python binds an imported module to its name here.
-_HOMES = {
-    "OPERATORS": "operators",
-    "PRESETS": "spec",
-    "LEGSLoss": "runtime.terms",
-    "LegsError": "errors",
-    "WeightSpec": "spec",
-    "__version__": "_version",
-    "apply_to": "upstreams",
-    "configure": "runtime",
-    "coverage": "runtime.terms",
-    "d_ssim": "similarity",
-    "l1_loss": "runtime",
-    "masked": "runtime.terms",
-    "legs_loss": "loss",
-    "register_curve": "curves",
-    "response": "responses",
-    "ssim": "runtime.terms",
-    "unweighted": "runtime",
-    "weight_map": "weights",
-    "weighted_l1": "loss",
+_NAMES = {
+    "_version": ["__version__"],
+    "curves": ["register_curve"],
+    "errors": ["LegsError"],
+    "loss": ["legs_loss", "weighted_l1"],
+    "operators": ["OPERATORS"],
+    "responses": ["response"],
+    "runtime": ["configure", "l1_loss", "unweighted"],
+    "runtime.terms": ["LEGSLoss", "coverage", "masked", "ssim"],
+    "similarity": ["d_ssim"],
+    "spec": ["PRESETS", "WeightSpec"],
+    "upstreams": ["apply_to"],
+    "weights": ["weight_map"],
 }
+_HOMES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [*_HOMES]
 

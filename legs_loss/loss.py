@@ -12,6 +12,7 @@ from legs_loss.counting import counted, note_graph, said, say_first
 from legs_loss.errors import LegsError
 from legs_loss.images import read_pair
 from legs_loss.kernels.backends import Plan, fused, plan_of
+from legs_loss.kernels.contract import Terms, terms_of
 from legs_loss.responses import NEEDS_LEVELS
 from legs_loss.similarity import WINDOW_SIZE, d_ssim
 from legs_loss.spec import PRESETS, Spec, as_spec
@@ -121,8 +122,7 @@ def legs_loss(
     own = None if weight is not None or spec.beta == 0.0 else spec
     if own is not None and own.over == "scene":
         raise LegsError(NEEDS_LEVELS.format(where="one call does not know", then="and give LEGSLoss that store="))
-    operation = whole(lambda_dssim, padding)
-    plan, image, photograph = plan_of(operation, lambda_dssim, own, prediction, target, channels_last)
+    plan, image, photograph = plan_of(whole(lambda_dssim, padding), own, prediction, target, channels_last)
     if own is not None and not (prediction.requires_grad and torch.is_grad_enabled()):
         check_order(prediction, target)
     weights, made = Weights(own), "" if own is None else "by legs_loss"
@@ -133,9 +133,10 @@ def legs_loss(
     return total_loss(plan, image, photograph, weights, lambda_dssim, padding, made)
 
 
-def whole(lambda_dssim: float, padding: str) -> Optional[str]:
-    """Return the operation of a plan of :func:`total_loss`; None where it is torch's."""
-    return "loss" if padding == "zeros" and lambda_dssim > 0.0 and not is_compiling() else None
+def whole(lambda_dssim: float, padding: str) -> Optional[Terms]:
+    """Return the terms of a plan of :func:`total_loss`; None where it is torch's."""
+    by_torch = padding != "zeros" or lambda_dssim == 0.0 or is_compiling()
+    return None if by_torch else terms_of(float(lambda_dssim))  # a tensor's hash is its place
 
 
 def total_loss(

@@ -122,13 +122,7 @@ class Backends:
         found = self._known_already(name, device, case)
         if found is None:
             with self._lock:
-                found = self._known_already(name, device, case)
-                if found is None:
-                    try:
-                        found = self._tried(name, device, case)
-                    except (NotNow, MemoryError, OUT_OF_MEMORY) as error:
-                        return Availability(None, True, _in_words(error))
-                    self._record(self.place(name, device), found)
+                found = self._known_already(name, device, case) or self._tried(name, device, case)
         return found
 
     def _known_already(self, name: str, device: torch.device, case: _Case) -> Optional[Availability]:
@@ -137,7 +131,7 @@ class Backends:
 
     def give_up(self, name: str, device: torch.device, error: Exception) -> None:
         """Leave a backend that failed after its trial."""
-        self._record(self.place(name, device), Availability(None, True, _in_words(error)))
+        self._recorded(self.place(name, device), Availability(None, True, _in_words(error)))
 
     def place(self, name: str, device: torch.device) -> Tuple[str, torch.device]:
         """Return where in ``found`` stands what was found of a backend on a device, which "cuda" alone does not say."""
@@ -150,43 +144,38 @@ class Backends:
         self._lock = threading.RLock()
 
     def _tried(self, name: str, device: torch.device, case: _Case) -> Availability:
-        missing = _why_missing(name)
-        if missing:
-            return Availability(None, False, missing)
-        try:
-            return self._trial(name, device, case)
-        except (NotNow, OUT_OF_MEMORY):  # torch's allocator holds what is free
-            if device.type == "cuda":
-                torch.cuda.empty_cache()
-            return self._trial(name, device, case)
-
-    def _trial(self, name: str, device: torch.device, case: _Case) -> Availability:
         from legs_loss.kernels.trial import difference_from_torch
 
+        place, missing = self.place(name, device), _why_missing(name)
+        if missing:
+            return self._recorded(place, Availability(None, False, missing))
         try:
             backend = importlib.import_module(self._known[name].module).BACKEND
-            before = self.found.get(self.place(name, device))
-            tried = frozenset() if before is None else before.tried
             operation, settings = case
-            operations = [each for each in sorted(backend.offers) if operation in (None, each)]
             spec = None if settings is None else WeightSpec(*settings)
             # The first call may be in an evaluation, and the trial needs gradients; or in a checkpoint, which counts by
             # hooks what is saved, and would count what the trial saves.
             with torch.inference_mode(False), _own_hooks(), backend.preparing():
-                problem = difference_from_torch(backend, device, operations, spec)
-        except (NotNow, MemoryError, OUT_OF_MEMORY, DeviceFault):
+                problem = difference_from_torch(backend, device, operation, spec)
+        except (NotNow, MemoryError, OUT_OF_MEMORY) as error:  # it is tried again
+            return Availability(None, True, _in_words(error))
+        except DeviceFault:
             raise
         except Exception as error:  # anything that a broken install, compiler or driver raises
             if "CUDA error" in str(error):
                 raise DeviceFault(str(error)) from error  # torch's own: it computes nothing on this device either
-            return Availability(None, True, _in_words(error))
-        cases = {case, *((each, settings) for each in operations)}
-        return Availability(None if problem else backend, True, problem or "its trial agreed with torch", tried | cases)
+            return self._recorded(place, Availability(None, True, _in_words(error)))
+        if problem:
+            return self._recorded(place, Availability(None, True, problem))
+        cases = {case} if operation else {(each, settings) for each in (None, "l1", "ssim", "loss")}
+        tried = self.found[place].tried | cases if place in self.found else frozenset(cases)
+        return self._recorded(place, Availability(backend, True, "its trial agreed with torch", tried))
 
-    def _record(self, key: Tuple[str, torch.device], found: Availability) -> None:
-        self.found[key] = found
-        if found.backend is None and (found.installed or forced_backend() == key[0]):
-            print(f"legs-loss: {key[0]} is unavailable, torch is used: {found.reason}", file=sys.stderr, flush=True)
+    def _recorded(self, place: Tuple[str, torch.device], found: Availability) -> Availability:
+        self.found[place] = found
+        if found.backend is None and (found.installed or forced_backend() == place[0]):
+            print(f"legs-loss: {place[0]} is unavailable, torch is used: {found.reason}", file=sys.stderr, flush=True)
+        return found
 
 
 BACKENDS = Backends(

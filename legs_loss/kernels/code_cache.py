@@ -41,7 +41,7 @@ class _CodeCache(FunctionCache):
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         base = re.sub(r"-\d+\.", ".", self._impl.filename_base)  # without the line
-        files = _Files(Path(self.cache_path), base, _stamp(Path(function.__code__.co_filename).parent))
+        files = _Files(Path(self.cache_path), base, _stamp(function.__module__))
         self._cache_file: Any = files
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -70,7 +70,8 @@ class _Files:
         self.folder, self.base, self.stamp = folder, base, stamp
 
     def _path(self, key: Any) -> Path:
-        return self.folder / f"{self.base}.{self.stamp}.{_digest(repr(key).encode())}.nbc"
+        given = repr((key, [*map(_fields, key[0])]))  # the signature's own text has no names of fields
+        return self.folder / f"{self.base}.{self.stamp}.{_digest(given.encode())}.nbc"
 
     def load(self, key: Any) -> Optional[Any]:
         try:
@@ -93,19 +94,27 @@ class _Files:
 
 
 @lru_cache(maxsize=None)
-def _stamp(folder: Path) -> str:
-    """Return a digest of numba's version and of all sources whose functions may be compiled into those of a folder.
+def _stamp(module: str) -> str:
+    """Return a digest of numba's version and of all sources whose functions and numbers a module may compile in.
 
-    They stand in the folder, in those beside it and in this one, and speak of numba or of compiling.py; and the tables
-    whose numbers are compiled in.
+    These are its own, those of the modules that it imports names from, in its package or folder, and of theirs in turn.
     """
-    here = Path(__file__).parent
-    paths = sorted({*folder.parent.glob("*/*.py"), *here.glob("*.py")})
-    texts = [text for text in (path.read_bytes() for path in paths) if b"numba" in text or b"compiling" in text]
-    tables = [
-        (here.parent / name).read_bytes() for name in ("curves.py", "operators.py", "similarity.py", "kernels/codes.py")
-    ]
-    return _digest(b"\0".join([numba.__version__.encode(), *texts, *tables]))
+    texts, names = {}, [module]
+    folder = Path(sys.modules[module].__file__ or "").parent
+    for name in names:
+        path = Path(getattr(sys.modules.get(name), "__file__", None) or "")
+        if path.suffix == ".py" and name not in texts and (_top(name) == _top(module) or path.parent == folder):
+            texts[name] = path.read_bytes()
+            names += (found.decode() for found in re.findall(rb"(?m)^from ([\w.]+) import", texts[name]))
+    return _digest(b"\0".join([numba.__version__.encode(), *(texts[name] for name in sorted(texts))]))
+
+
+def _fields(kind: Any) -> Any:
+    return getattr(kind, "fields", ()), [*map(_fields, getattr(kind, "types", ()))]
+
+
+def _top(name: str) -> str:
+    return name.split(".")[0]
 
 
 def _digest(data: bytes) -> str:

@@ -20,7 +20,10 @@ from legs_loss.errors import LegsError
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
-__all__ = ["Backend", "DeviceFault", "Failed", "NotNow", "Prepared", "Terms", "node"]
+__all__ = ["L1", "SSIM", "Backend", "DeviceFault", "Failed", "NotNow", "Prepared", "Terms", "node", "terms_of"]
+
+
+_NO_WEIGHTS = Weights()
 
 
 class NotNow(Exception):
@@ -43,10 +46,19 @@ class Terms(NamedTuple):
     ssim: float = 0.0
     constant: float = 0.0
 
-    @classmethod
-    def of(cls, lambda_dssim: float) -> Terms:
-        """Return (1 - lambda) * L1 + lambda * (1 - SSIM)."""
-        return cls(1.0 - lambda_dssim, -lambda_dssim, lambda_dssim)
+    @property
+    def name(self) -> str:
+        """Return which kernels compute them: "l1", "ssim", or "loss" for both."""
+        return "l1" if self.ssim == 0.0 else ("loss" if self.l1 else "ssim")
+
+
+L1, SSIM = Terms(1.0), Terms(0.0, 1.0)
+
+
+@lru_cache(maxsize=64)
+def terms_of(lambda_dssim: float) -> Terms:
+    """Return (1 - lambda) * L1 + lambda * (1 - SSIM)."""
+    return Terms(1.0 - lambda_dssim, -lambda_dssim, lambda_dssim)
 
 
 class Prepared:
@@ -84,17 +96,13 @@ class Backend:
 
     Attributes:
         name: as in LEGS_BACKEND.
-        offers: of "loss", "l1" and "ssim": which of :meth:`loss`, :meth:`weighted_l1` and :meth:`ssim` there are.
-        dtypes: of the images.
-        own_dtypes: of images that are computed as they are; others, and pairs of two types, are converted to float32.
+        dtypes: of the images; of two types they are computed in float32.
         most_channels, most_pixels: how many channels and pixels an image may have.
         operators, norms, curves: of the specs whose weights the backend makes by itself; torch makes a map for others.
     """
 
     name: str
-    offers: FrozenSet[str] = frozenset()
     dtypes: FrozenSet[torch.dtype] = frozenset({torch.float32, torch.float16, torch.bfloat16})
-    own_dtypes: FrozenSet[torch.dtype] = dtypes
     most_channels: int = 4
     most_pixels: int = 2**31 - 1
     operators: FrozenSet[str] = frozenset()
@@ -118,34 +126,12 @@ class Backend:
         Args:
             terms: of the loss.
             spec: of weights that are made from the target, one of those that are known here.
-            prediction, target: examples, of one type in ``own_dtypes``.
+            prediction, target: examples.
         """
         raise NotImplementedError
 
-    def converts(self, prediction: Tensor, target: Tensor) -> bool:
-        """Return whether images are computed as float32, and are not."""
-        return prediction.dtype != target.dtype or prediction.dtype not in self.own_dtypes
-
-    def response_range(self, target: Tensor, spec: WeightSpec) -> Tensor:
-        """Return :meth:`Prepared.response_range` of a target."""
-        target = target.detach().float() if self.converts(target, target) else target.detach()
-        return self.prepare(Terms(1.0), spec, target, target, False).response_range(target)
-
-    def loss(self, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
-        """Return (1 - lambda) * L_w + lambda * (1 - SSIM), differentiable once in the prediction."""
-        return self._of(Terms.of(lambda_dssim), prediction, target, weights)
-
-    def weighted_l1(self, prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
-        """Return the weighted L1."""
-        return self._of(Terms(1.0), prediction, target, weights)
-
-    def ssim(self, prediction: Tensor, target: Tensor) -> Tensor:
-        """Return the mean SSIM."""
-        return self._of(Terms(0.0, 1.0), prediction, target, Weights())
-
-    def _of(self, terms: Terms, prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
-        if self.converts(prediction, target):
-            prediction, target = prediction.float(), target.float()
+    def loss(self, terms: Terms, prediction: Tensor, target: Tensor, weights: Weights = _NO_WEIGHTS) -> Tensor:
+        """Return a loss of images [C, H, W] or [B, C, H, W], differentiable once in the prediction."""
         wanted = prediction.requires_grad and torch.is_grad_enabled()
         prepared = self.prepare(terms, weights.spec, prediction, target, wanted)
         try:
@@ -170,16 +156,10 @@ class _FusedLoss(torch.autograd.Function):
         except Exception as error:
             raise Failed from error
         if gradient is not None:
-            ctx.prepared, ctx.gradient = prepared, gradient
-            if prediction.is_inference():  # of such a tensor a copy, whose changes autograd can count
-                prediction = prediction.clone()
-            if target.is_inference():
-                target = target.clone()
-            if map_ is not None and map_.is_inference():
-                map_ = map_.clone()
-            if range_ is not None and range_.is_inference():
-                range_ = range_.clone()
-            ctx.save_for_backward(prediction, target, map_, range_)
+            ctx.prepared, ctx.gradient, saved = prepared, gradient, []
+            for one in (prediction, target, map_, range_):  # of inference mode a copy, whose changes autograd can count
+                saved.append(one.clone() if one is not None and one.is_inference() else one)
+            ctx.save_for_backward(*saved)
         return loss
 
     @staticmethod

@@ -28,8 +28,6 @@ _NO_RANGE, _NO_MAP = np.empty((0, 2), np.float32), np.empty(0, np.float32)
 
 class _NumbaBackend(Backend):
     name = "numba"
-    offers: FrozenSet[str] = frozenset({"loss", "l1", "ssim"})
-    own_dtypes: FrozenSet[torch.dtype] = frozenset({torch.float32})
     operators: FrozenSet[str] = frozenset(STENCILS)
     norms: FrozenSet[float] = frozenset(NORMS)
     curves: FrozenSet[str] = frozenset(FORMULAS)
@@ -59,7 +57,7 @@ class _Prepared(Prepared):
         self.eps = np.float32(0.0 if spec is None else spec.eps)
         made = WeightSpec() if spec is None else spec
         curve, beta = 0 if spec is None else CURVES[spec.curve], np.float32(made.beta)
-        self.source = WeightSource(curve, beta, _NO_RANGE, *operator_of(made), _NO_MAP)
+        self.source = WeightSource(curve, beta, _NO_RANGE, operator_of(made), _NO_MAP)
         self.steps = np.float32(terms.l1 / self.size), np.float32(2.0 * terms.ssim / self.size)  # of halves of slopes
         down, across = -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
         self.tiles, self.strips = (self.sizes[0] * down * across, down, across), self.sizes[0] * -(-height // _ROWS)
@@ -89,7 +87,7 @@ class _Prepared(Prepared):
             error, similarity = np.add.reduce(sums)
         loss = float((self.terms.l1 * error + self.terms.ssim * similarity) / self.size + self.terms.constant)
         made = torch.from_numpy(gradient).reshape(self.shape) if self.wanted else None
-        return prediction.new_tensor(loss), made
+        return prediction.new_tensor(loss, dtype=torch.float32), made
 
     def scaled(self, gradient: Tensor, step: Tensor) -> Tensor:
         return gradient if step.item() == 1.0 else gradient.mul_(step)

@@ -42,17 +42,14 @@ class WeightSource(NamedTuple):
     curve: of the weight that is made from the target; 0 makes none.
     beta: of that weight.
     ranges: float32 [views, 2]: the min response, and the reciprocal of max - min + eps.
-    stencil, side, middle, norm: an OperatorCode's; a parallel loop takes no group in a group.
+    operator: of the response that it is made from.
     map: float32 [height * width] for all views, or [views * height * width], or empty.
     """
 
     curve: int
     beta: np.float32
     ranges: np.ndarray
-    stencil: int
-    side: np.float32
-    middle: np.float32
-    norm: int
+    operator: OperatorCode
     map: np.ndarray
 
 
@@ -81,8 +78,7 @@ def weights_of_row(images, source, view, row, left, right, out):  # type: ignore
             out[j] = _ONE
     else:
         shape = Shape(images.views, images.channels, height, width)
-        operator = OperatorCode(source.stencil, source.side, source.middle, source.norm)
-        response_row(images.y, shape, operator, view, row, left, right, out)
+        response_row(images.y, shape, source.operator, view, row, left, right, out)
         _weigh(out, count, source.curve, source.beta, source.ranges[view, 0], source.ranges[view, 1])
     if source.map.size > 0:
         at = (row if source.map.size == height * width else view * height + row) * width + left

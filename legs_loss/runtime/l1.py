@@ -16,6 +16,7 @@ from legs_loss.counting import counted
 from legs_loss.errors import LegsError
 from legs_loss.images import read_pair
 from legs_loss.kernels.backends import fused, plan_of
+from legs_loss.kernels.contract import L1
 from legs_loss.loss import mean_error
 from legs_loss.runtime import state
 from legs_loss.runtime.own import check_own
@@ -92,7 +93,7 @@ def l1_loss(
     if not trains:
         check_order(prediction, target)
     spec, mean = run.config.spec, own is None and reduction == "mean"
-    plan, image, photograph = plan_of("l1" if mean else None, 0.0, spec, prediction, target, channels_last)
+    plan, image, photograph = plan_of(L1 if mean else None, spec, prediction, target, channels_last)
     counted.weighted += torch.is_grad_enabled()  # the second pass of a checkpoint counts, not the first
     if plan.makes and run.computes and view is None and mask is None and photograph.device.type == "cpu":
         loss = fused(plan, image, photograph, Weights(spec))

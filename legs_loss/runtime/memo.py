@@ -17,7 +17,8 @@ import mmap
 import threading
 import weakref
 from collections import OrderedDict
-from typing import Any, Callable, Hashable, Optional, TypeVar
+from dataclasses import dataclass
+from typing import Any, Callable, Hashable, Optional, Tuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -74,7 +75,7 @@ class WeightMemo:
             entry = self._entries.get(key)
             if entry is not None:
                 entry.used = True
-                kept: Value = entry.kept if entry.shape is None else entry.value()  # type: ignore[assignment]
+                kept: Value = entry.value()
                 return kept
         value = make()
         size = _size(value)
@@ -120,30 +121,28 @@ def _size(value: object) -> int:
     return _OVERHEAD + (-(-size // mmap.PAGESIZE) * mmap.PAGESIZE if size >= _LARGE else size)
 
 
+@dataclass
 class _Entry:
-    """An entry of the memo; a large map of the CPU is stored as bytes in separate pages.
+    """An entry of the memo; a large map of the CPU is kept as bytes in pages of their own, with its type and shape.
 
     A tensor that stays on the heap is surrounded by the temporaries of its computation, which fragments the heap: a
     memo of such tensors took twice the memory that it counted.
     """
 
-    __slots__ = ("dtype", "kept", "owner", "shape", "size", "used")
+    kept: Any
+    size: int
+    owner: Optional[weakref.ref[Tensor]]
+    form: Optional[Tuple[torch.dtype, torch.Size]] = None
+    used: bool = False
 
-    def __init__(self, value: object, size: int, owner: Optional[weakref.ref[Tensor]]) -> None:
-        self.size = size
-        self.owner = owner
-        self.used = False
-        self.kept: Any = value
-        self.shape: Optional[torch.Size] = None
+    def __post_init__(self) -> None:
+        value = self.kept
         if type(value) is Tensor and value.device.type == "cpu" and value.numel() * value.element_size() >= _LARGE:
-            self.kept = mmap.mmap(-1, value.numel() * value.element_size())
-            self.dtype, self.shape = value.dtype, value.shape
+            self.kept, self.form = mmap.mmap(-1, value.numel() * value.element_size()), (value.dtype, value.shape)
             torch.frombuffer(self.kept, dtype=value.dtype).copy_(value.reshape(-1))
 
-    def value(self) -> Tensor:
-        """Return the map that is kept as bytes."""
-        assert self.shape is not None
-        return torch.frombuffer(self.kept, dtype=self.dtype).reshape(self.shape)
+    def value(self) -> Any:
+        return self.kept if self.form is None else torch.frombuffer(self.kept, dtype=self.form[0]).reshape(self.form[1])
 
 
 def _key(target: Tensor) -> Optional[Hashable]:
@@ -151,7 +150,7 @@ def _key(target: Tensor) -> Optional[Hashable]:
 
 
 def _content_key(target: Tensor) -> Hashable:
-    values = target.detach().contiguous()
+    values = target.detach().resolve_neg().contiguous()
     digest = hashlib.sha256(values.reshape(-1).view(torch.uint8).numpy().data).digest()
     return digest, tuple(target.shape), target.dtype
 

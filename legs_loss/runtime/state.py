@@ -143,16 +143,15 @@ class Run:
 
     def _weight(self, image: Tensor, view: Optional[str], mean: bool) -> Union[Tensor, Weights]:
         """Return an image's weight map [1, H, W], or its spec and the range that a backend makes its weights of."""
-        before = counted.stored + counted.computed
         if is_transformed() or is_capturing(image.device):
             # A CUDA graph is replayed with other pixels in the target's memory: their weight is part of the graph.
-            counted.computed += 1
             return self._computed(image, mean)
         if mean and self.computes and image.device.type == "cpu":
             found = fused_range(image, self.config.spec)
             if found is not None:
                 counted.computed += 1
                 return Weights(self.config.spec, found)
+        before = counted.stored + counted.computed
         weight = self.memo.recall(image, partial(self._made, image, view, mean), mean)
         counted.remembered += counted.stored + counted.computed == before
         return weight
@@ -162,11 +161,11 @@ class Run:
         if weight is not None:
             counted.stored += 1
             return weight
-        counted.computed += 1
         return self._computed(image, mean)
 
     def _computed(self, image: Tensor, mean: bool) -> Union[Tensor, Weights]:
         spec = self.config.spec
+        counted.computed += 1
         if spec.over == "scene":
             return weight_map(image, spec, False, self.stored.scene_levels(image.shape[-2] * image.shape[-1]))
         found = fused_range(image, spec) if mean else None

@@ -15,6 +15,7 @@ from legs_loss.config import find_config, is_off
 from legs_loss.counting import counted
 from legs_loss.images import Layout, read_pair
 from legs_loss.kernels.backends import fused, plan_of
+from legs_loss.kernels.contract import SSIM
 from legs_loss.loss import legs_loss, total_loss, whole
 from legs_loss.runtime import state
 from legs_loss.runtime.state import MASK, Run, current_run, refuse_masks, thread
@@ -132,8 +133,8 @@ def ssim(
     weights = Weights().masked(mask)
     trained = weights.hidden(trained, constant)
     if window_size == WINDOW_SIZE and size_average and trained.requires_grad and torch.is_grad_enabled():
-        operation = None if padding != "zeros" or is_compiling() or is_off() else "ssim"
-        plan, _, _ = plan_of(operation, 0.0, None, trained, constant, False)
+        by_torch = padding != "zeros" or is_compiling() or is_off()
+        plan, _, _ = plan_of(None if by_torch else SSIM, None, trained, constant, False)
         similarity = fused(plan, trained, constant, Weights())
         if similarity is not None:
             return _of_what_counts(similarity, weights)
@@ -198,8 +199,8 @@ class LEGSLoss(torch.nn.Module):
         return legs_loss(prediction, target, self.spec, weight, mask, *settings)
 
     def _by_store(self, run: Run, prediction: Tensor, target: Tensor, mask: Optional[Tensor]) -> Tensor:
-        share, operation = self.lambda_dssim, whole(self.lambda_dssim, self.padding)
-        plan, image, photograph = plan_of(operation, share, self.spec, prediction, target, self.channels_last)
+        share, terms = self.lambda_dssim, whole(self.lambda_dssim, self.padding)
+        plan, image, photograph = plan_of(terms, self.spec, prediction, target, self.channels_last)
         check_order(image, photograph)
         weights = run.weights(photograph, None, True)
         counted.hidden += weights.share is not None

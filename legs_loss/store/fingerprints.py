@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from functools import lru_cache
-from typing import Sequence, Tuple, Union
+from typing import Tuple, Union
 
 import numpy as np
 import torch
@@ -29,11 +29,7 @@ def fingerprint(image: Union[Tensor, np.ndarray]) -> str:
         >>> fingerprint(pixels) == fingerprint(torch.from_numpy(pixels).permute(2, 0, 1) / 255.0)
         True
     """
-    if isinstance(image, np.ndarray) and image.dtype in (np.uint8, np.uint16):
-        return _digest(image, image.shape)
-    tensor = torch.as_tensor(image).detach()
-    values = tensor.float().permute(1, 2, 0).cpu().numpy()
-    return _digest(_whole_numbers(values, tensor.dtype == torch.float16), values.shape)
+    return _digest(image, sampled=False)
 
 
 def sampled_fingerprint(image: Union[Tensor, np.ndarray]) -> str:
@@ -47,13 +43,7 @@ def sampled_fingerprint(image: Union[Tensor, np.ndarray]) -> str:
         >>> sampled_fingerprint(pixels) == sampled_fingerprint(torch.from_numpy(pixels).permute(2, 0, 1) / 255.0)
         True
     """
-    if isinstance(image, np.ndarray) and image.dtype in (np.uint8, np.uint16):
-        places = [axis.numpy() for axis in _places(*image.shape[:2], torch.device("cpu"))]
-        return _digest(image[places[0], places[1]], image.shape)
-    tensor = torch.as_tensor(image).detach()
-    rows, columns = _places(*tensor.shape[1:], tensor.device)
-    values = tensor[:, rows, columns].float().cpu().numpy().T
-    return _digest(_whole_numbers(values, tensor.dtype == torch.float16), (*tensor.shape[1:], tensor.shape[0]))
+    return _digest(image, sampled=True)
 
 
 @lru_cache(maxsize=64)
@@ -63,7 +53,16 @@ def _places(height: int, width: int, device: torch.device) -> Tuple[Tensor, Tens
     return (pixels // width).to(device), (pixels % width).to(device)
 
 
-def _digest(values: np.ndarray, shape: Sequence[int]) -> str:
+def _digest(image: Union[Tensor, np.ndarray], sampled: bool) -> str:
+    if isinstance(image, np.ndarray) and image.dtype in (np.uint8, np.uint16):
+        rows, columns = _places(*image.shape[:2], torch.device("cpu"))
+        values, shape = image[rows.numpy(), columns.numpy()] if sampled else image, image.shape
+    else:
+        tensor = torch.as_tensor(image).detach().resolve_neg()
+        shape = (*tensor.shape[1:], tensor.shape[0])
+        rows, columns = _places(*shape[:2], tensor.device)
+        taken = tensor[:, rows, columns] if sampled else tensor.flatten(1)
+        values = _whole_numbers(taken.float().cpu().numpy().T, tensor.dtype == torch.float16)
     if values.dtype == np.uint16 and not (values % 257).any():
         values = (values // 257).astype(np.uint8)  # an 8-bit photograph in 16 bits
     kind = "" if values.dtype == np.uint8 else values.dtype.name

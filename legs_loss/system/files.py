@@ -84,7 +84,9 @@ def read_text(path: PathLike, limit: int) -> str:
         raise ValueError(f"line {number + 1} is not in UTF-{16 if is_16 else 8}: {str(line[:100])[2:-1]}") from None
 
 
-def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]], folders: bool = False) -> None:
+def write_whole(
+    path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]], folders: bool = False, mode: int = 0o666
+) -> None:
     """Write a file atomically: to a temporary file beside it, flushed to the disk, then renamed.
 
     Several processes may write one file at once: it is always one's whole. An existing file stays until then. A link is
@@ -94,6 +96,7 @@ def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]]
         path: the file.
         data: its bytes, or what writes them.
         folders: make the folders above it.
+        mode: of a new file, before the user's mask.
 
     Raises:
         LegsError: it cannot be written; the message says why.
@@ -107,7 +110,7 @@ def write_whole(path: PathLike, data: Union[bytes, Callable[[BinaryIO], object]]
             raise OSError(errno.EINVAL, "a folder, a pipe, a socket or a device is there", name)
         _sweep(name)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-        descriptor = os.open(part, flags, 0o666)
+        descriptor = os.open(part, flags, mode)
         try:
             with os.fdopen(descriptor, "wb") as file:
                 data(file) if callable(data) else file.write(data)

@@ -134,6 +134,48 @@ def test_a_changed_function_of_another_file_is_compiled_in_anew(code):
     assert code.run() == (1.5 * (RIGHT - 0.5) + 0.5, 0, "")
 
 
+def test_a_changed_number_of_a_file_that_compiles_nothing_is_compiled_in_anew(code):
+    numbers, inner = code.folder / "numbers_of_a_test.py", code.folder / "inner.py"
+    numbers.write_text("FACTOR = 2.0\n")
+    inner.write_text("from numbers_of_a_test import FACTOR\n" + INNER.replace("2.0 * value", "FACTOR * value"))
+    for loaded in (0, 1):
+        assert code.run() == (RIGHT, loaded, "")
+    numbers.write_text("FACTOR = 3.0\n")
+    assert code.run() == (1.5 * (RIGHT - 0.5) + 0.5, 0, "")
+
+
+def test_fields_in_another_order_are_read_anew(code):
+    """The class of an argument stands in a file that the compiled function's does not import from."""
+    groups, outer = code.folder / "groups_of_a_test.py", code.folder / "outer.py"
+    fields = "from typing import NamedTuple\n\n\nclass Pair(NamedTuple):\n    {}: object\n    {}: object\n"
+    outer.write_text(
+        OUTER.replace("Pair, ", "")
+        .replace("* pair.second", "+ pair.second")
+        .replace("Pair(first.astype(kind), second.astype", PAIR)
+    )
+    for order in (("first", "second"), ("second", "first")):
+        groups.write_text(fields.format(*order))
+        for loaded in (0, 1):
+            assert code.run()[:2] == (2.0 * 6.0 + 111.0 + 0.5, loaded)
+
+
+PAIR = "__import__('groups_of_a_test').Pair(first=first.astype(kind), second=second.astype"
+
+
+def test_the_sources_of_the_lab_are_those_that_it_compiles_in(monkeypatch):
+    from pathlib import Path
+
+    from legs_loss.kernels import code_cache
+    from legs_loss.lab.surfels import strips
+
+    read, bytes_of = [], Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append("/".join(path.parts[-2:])) or bytes_of(path))
+    code_cache._stamp.cache_clear()
+    code_cache._stamp(strips.__name__)
+    assert {"lab/conventions.py", "surfels/model.py", "surfels/strips.py", "simd/lanes.py"} <= set(read)
+    assert "rasterizer/oracle.py" not in read
+
+
 def test_processes_that_compile_at_once_do_not_mix_up(code):
     kinds = ["float64", "int32"]
     for loaded in (0, 1):

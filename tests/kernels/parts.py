@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from legs_loss.kernels.cuda.nvrtc import Compiled
-
 
 class FakeCompiler:
     """Compiles to the options that it was given."""
@@ -18,7 +16,7 @@ class FakeCompiler:
 
     def compile(self, source, options, target):
         self.calls.append((tuple(options), target))
-        return Compiled(" ".join([target, *options]).encode(), "")
+        return " ".join([target, *options]).encode(), ""
 
 
 class FakeDriver:

@@ -7,6 +7,7 @@ import torch
 
 from legs_loss import WeightSpec, legs_loss
 from legs_loss.kernels import backends
+from legs_loss.kernels.contract import L1, SSIM, terms_of
 from legs_loss.weights import Weights
 
 _NONE = Weights()
@@ -52,12 +53,18 @@ def by_signature(backend):
         weights = Weights(spec=weight) if isinstance(weight, WeightSpec) else Weights(map=weight)
         if weights.spec is not None and not backend.makes_weights_of(weights.spec):
             weights = weights.with_map(target)
-        return backend.loss(prediction, target, weights, lambda_dssim)
+        return backend.loss(terms_of(lambda_dssim), prediction, target, weights)
 
     return loss
 
 
+def range_of(backend, target, spec):
+    """Return the least response of each view and the span, by a backend."""
+    return backend.prepare(L1, spec, target, target, False).response_range(target)
+
+
 def fused(operation, prediction, target, weights=_NONE):
     """Return what a backend that is chosen for these images computes, None where torch has to."""
-    plan, prediction, target = backends.plan_of(operation, 0.0, weights.spec, prediction, target, False)
+    terms = {"l1": L1, "ssim": SSIM}[operation]
+    plan, prediction, target = backends.plan_of(terms, weights.spec, prediction, target, False)
     return backends.fused(plan, prediction, target, weights)

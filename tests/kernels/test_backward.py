@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from legs_loss import legs_loss
+from legs_loss.kernels.contract import L1, SSIM, terms_of
 from legs_loss.spec import PRESETS
 from legs_loss.weights import Weights
 from tests.kernels.on_device import DEVICE, MISSING, new_backend
@@ -40,9 +41,9 @@ def given(backend):
 
 
 OPERATIONS = {
-    "loss": lambda backend, x, y, weights: backend.loss(x, y, weights, 0.2),
-    "l1": lambda backend, x, y, weights: backend.weighted_l1(x, y, weights),
-    "ssim": lambda backend, x, y, _: backend.ssim(x, y),
+    "loss": lambda backend, x, y, weights: backend.loss(terms_of(0.2), x, y, weights),
+    "l1": lambda backend, x, y, weights: backend.loss(L1, x, y, weights),
+    "ssim": lambda backend, x, y, _: backend.loss(SSIM, x, y),
 }
 
 
@@ -103,6 +104,6 @@ def test_a_target_of_inference_mode(backend, given, grey):
         target = given["target"] * 1.0
         target = target[:1].expand(3, -1, -1) if grey else target  # whose copy has other strides
     weights = Weights(spec=LEGS)
-    loss = backend.loss(given["prediction"], target, weights, 0.2)
+    loss = backend.loss(terms_of(0.2), given["prediction"], target, weights)
     (gradient,) = torch.autograd.grad(loss, given["prediction"], retain_graph=True)
     assert torch.equal(gradient.clone(), torch.autograd.grad(loss, given["prediction"])[0])

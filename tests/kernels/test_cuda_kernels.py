@@ -9,6 +9,7 @@ import contextlib
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,7 @@ from legs_loss.curves import FORMULAS
 from legs_loss.kernels import backends
 from legs_loss.kernels.available import BACKENDS, Availability, Known
 from legs_loss.kernels.codes import STENCILS
+from legs_loss.kernels.contract import L1, SSIM, terms_of
 from legs_loss.kernels.trial import difference_from_torch
 from legs_loss.responses import response
 from legs_loss.runtime import state
@@ -38,7 +40,7 @@ from legs_loss.spec import PRESETS
 from legs_loss.weights import Weights
 from tests.cuda_emulation import COMPILER, TRIED
 from tests.kernels.on_device import DEVICE, MISSING, new_backend, new_driver
-from tests.kernels.support import by_signature, compare, fused, images, used
+from tests.kernels.support import by_signature, compare, fused, images, range_of, used
 from tests.support import legs_environment
 
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
@@ -84,7 +86,7 @@ def poisoned():
 
 
 def compare_l1(backend, prediction, target, weights, **reference):
-    loss = backend.weighted_l1(prediction, target, weights)
+    loss = backend.loss(L1, prediction, target, weights)
     (gradient,) = torch.autograd.grad(loss, prediction)
     exact = prediction.detach().double().requires_grad_()
     if weights.spec is not None:
@@ -124,7 +126,7 @@ class TestLoss:
         prediction, target = images((3, 40, 130))
         prediction, target = prediction.detach().to(dtypes[0]).requires_grad_(), target.to(dtypes[1])
         for weights in (Weights(spec=LEGS), Weights(map=torch.rand(1, 40, 130))):
-            loss = backend.loss(prediction, target, weights, 0.2)
+            loss = backend.loss(terms_of(0.2), prediction, target, weights)
             # As a gradient scaler does it: unscaled, a step would be below float16's smallest number.
             (gradient,) = torch.autograd.grad(1024.0 * loss, prediction)
             exact = prediction.detach().double().requires_grad_()
@@ -139,8 +141,8 @@ class TestLoss:
         target, prediction = torch.full((3, 33, 147), 0.7), torch.rand(3, 33, 147)
         for operator in STENCILS:
             spec = WeightSpec(operator=operator, eps=1e-30)
-            weighted = backend.loss(prediction, target, Weights(spec=spec), 0.2)
-            assert torch.equal(weighted, backend.loss(prediction, target, Weights(), 0.2))
+            weighted = backend.loss(terms_of(0.2), prediction, target, Weights(spec=spec))
+            assert torch.equal(weighted, backend.loss(terms_of(0.2), prediction, target, Weights()))
 
     @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])
     @pytest.mark.parametrize("operator", STENCILS)
@@ -148,12 +150,12 @@ class TestLoss:
         prediction, target = images((2, 3, 20, 30))
         target[1, 1, 3, 29] = float("nan")
         spec = WeightSpec(operator=operator, p=p)
-        found = backend.response_range(target, spec)
+        found = range_of(backend, target, spec)
         assert torch.isfinite(found[0]).all() and torch.isnan(found[1]).all()
-        loss = backend.weighted_l1(prediction, target, Weights(spec=spec))
+        loss = backend.loss(L1, prediction, target, Weights(spec=spec))
         loss.backward()
         assert torch.isnan(loss) and torch.isfinite(prediction.grad[0]).all()
-        assert torch.isnan(backend.loss(prediction, target, Weights(spec=spec), 0.2))
+        assert torch.isnan(backend.loss(terms_of(0.2), prediction, target, Weights(spec=spec)))
 
     def test_it_repeats_bit_for_bit_in_any_order_of_the_threads(self):
         prediction, target = images((2, 3, 61, 133))
@@ -164,9 +166,9 @@ class TestLoss:
             backend = new_backend(driver)
             for weights in (Weights(spec=LEGS), Weights(spec=WeightSpec(operator="sobel", p=float("inf")))):
                 for loss in (
-                    backend.loss(prediction, target, weights, 0.2),
-                    backend.weighted_l1(prediction, target, weights),
-                    backend.ssim(prediction, target),
+                    backend.loss(terms_of(0.2), prediction, target, weights),
+                    backend.loss(L1, prediction, target, weights),
+                    backend.loss(SSIM, prediction, target),
                 ):
                     results.append((loss, *torch.autograd.grad(loss, prediction)))
         third = len(results) // 3
@@ -175,14 +177,14 @@ class TestLoss:
 
     def test_a_range_that_is_kept_gives_the_same_bits(self, backend):
         prediction, target = images((2, 3, 40, 50))
-        kept = torch.cat([backend.response_range(view, LEGS) for view in target])
-        for operation in (backend.weighted_l1, lambda *args: backend.loss(*args, 0.2)):
+        kept = torch.cat([range_of(backend, view, LEGS) for view in target])
+        for operation in (partial(backend.loss, L1), partial(backend.loss, terms_of(0.2))):
             made = operation(prediction, target, Weights(spec=LEGS))
             assert torch.equal(made, operation(prediction, target, Weights(spec=LEGS, range=kept)))
 
     def test_a_range_for_other_images_is_refused(self, backend):
         with pytest.raises(ValueError, match=r"a range \[1, 2\] does not fit images \[2, 3, 8, 8\]"):
-            backend.weighted_l1(*images((2, 3, 8, 8)), Weights(spec=LEGS, range=torch.zeros(1, 2)))
+            backend.loss(L1, *images((2, 3, 8, 8)), Weights(spec=LEGS, range=torch.zeros(1, 2)))
 
 
 class TestRounding:
@@ -205,9 +207,12 @@ class TestRounding:
             return legs_loss(images, exact, weight=map_.to(images.dtype), padding="zeros", channels_last=False)
 
         for own, reference in (
-            (lambda: backend.loss(prediction, target, Weights(map=map_), 0.2), whole),
-            (lambda: backend.loss(prediction, target, Weights(LEGS), 0.2), lambda x, y: legs_loss(x, y, LEGS)),
-            (lambda: backend.ssim(prediction, target), ssim),
+            (lambda: backend.loss(terms_of(0.2), prediction, target, Weights(map=map_)), whole),
+            (
+                lambda: backend.loss(terms_of(0.2), prediction, target, Weights(LEGS)),
+                lambda x, y: legs_loss(x, y, LEGS),
+            ),
+            (lambda: backend.loss(SSIM, prediction, target), ssim),
         ):
             exact = prediction.detach().double().requires_grad_()
             expected = reference(exact, target.double())
@@ -241,7 +246,7 @@ class TestRange:
     def test_it_is_the_responses(self, backend, operator, p):
         for shape in ((3, 1, 1), (2, 3, 1, 40), (3, 5, 2), (2, 4, 33, 90), (3, 200, 210)):
             target = torch.rand(shape)
-            found = backend.response_range(target, WeightSpec(operator=operator, p=p))
+            found = range_of(backend, target, WeightSpec(operator=operator, p=p))
             exact = response(target.double(), operator, p, False).reshape(found.shape[0], -1)
             low, high = exact.min(1).values, exact.max(1).values
             torch.testing.assert_close(found.double(), torch.stack([low, high - low], 1), rtol=1e-6, atol=1e-6)
@@ -261,7 +266,7 @@ class TestWeightedL1:
         prediction, target = images((2, 3, 40, 50))
         for mask in (torch.rand(40, 50) > 0.4, torch.rand(2, 1, 40, 50), torch.zeros(1, 40, 50)):
             weights = Weights(spec=LEGS).masked(mask if mask.dim() > 2 else mask[None], renormalise)
-            loss = weights.of_what_counts(backend.weighted_l1(prediction, target, weights))
+            loss = weights.of_what_counts(backend.loss(L1, prediction, target, weights))
             expected = weighted_l1(prediction, target, weight_map(target), mask, renormalise)
             assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
             gradients = [torch.autograd.grad(value, prediction)[0] for value in (loss, expected)]
@@ -270,7 +275,7 @@ class TestWeightedL1:
     def test_where_both_are_equal_the_gradient_is_zero(self, backend):
         target = torch.rand(3, 20, 20)
         prediction = target.clone().requires_grad_()
-        loss = backend.weighted_l1(prediction, target, Weights(spec=LEGS))
+        loss = backend.loss(L1, prediction, target, Weights(spec=LEGS))
         loss.backward()
         assert loss.item() == 0.0 and not prediction.grad.any()
 
@@ -279,7 +284,7 @@ class TestSsim:
     @pytest.mark.parametrize("shape", SHAPES)
     def test_value_and_gradient_equal_the_reference(self, backend, shape):
         prediction, target = images(shape)
-        found = backend.ssim(prediction, target)
+        found = backend.loss(SSIM, prediction, target)
         exact = prediction.detach().double().requires_grad_()
         expected = ssim(exact, target.double(), channels_last=False)
         (gradient,), (reference,) = torch.autograd.grad(found, prediction), torch.autograd.grad(expected, exact)
@@ -288,7 +293,7 @@ class TestSsim:
 
     def test_equal_images_have_one(self, backend):
         image = torch.rand(3, 20, 300)
-        assert backend.ssim(image, image).item() == pytest.approx(1.0, abs=1e-6)
+        assert backend.loss(SSIM, image, image).item() == pytest.approx(1.0, abs=1e-6)
 
 
 class TestAutograd:
@@ -306,7 +311,7 @@ class TestAutograd:
     def test_what_arrives_in_backward_is_a_factor(self, backend):
         prediction, target = images((3, 20, 30))
         for factor in (1.0, 3.0, 0.0):
-            loss = backend.loss(prediction, target, Weights(spec=LEGS), 0.2)
+            loss = backend.loss(terms_of(0.2), prediction, target, Weights(spec=LEGS))
             (once,) = torch.autograd.grad(loss, prediction, retain_graph=True)
             once = once.clone()
             (scaled,) = torch.autograd.grad(factor * loss, prediction)
@@ -315,9 +320,9 @@ class TestAutograd:
     def test_without_a_gradient_it_is_the_same_number(self, backend):
         prediction, target = images((3, 40, 300))
         for operation in (
-            lambda: backend.loss(prediction, target, Weights(spec=LEGS), 0.2),
-            lambda: backend.weighted_l1(prediction, target, Weights(spec=LEGS)),
-            lambda: backend.ssim(prediction, target),
+            lambda: backend.loss(terms_of(0.2), prediction, target, Weights(spec=LEGS)),
+            lambda: backend.loss(L1, prediction, target, Weights(spec=LEGS)),
+            lambda: backend.loss(SSIM, prediction, target),
         ):
             with torch.no_grad():
                 plain = operation()
@@ -326,14 +331,14 @@ class TestAutograd:
 
     def test_second_derivatives_are_refused(self, backend):
         prediction, target = images((3, 8, 8))
-        (gradient,) = torch.autograd.grad(backend.ssim(prediction, target), prediction, create_graph=True)
+        (gradient,) = torch.autograd.grad(backend.loss(SSIM, prediction, target), prediction, create_graph=True)
         with pytest.raises(LegsError, match="no second derivative: set LEGS_BACKEND=torch"):
             gradient.sum().backward()
 
 
 class TestSelection:
     def test_its_trial_agrees_with_torch(self, backend):
-        assert difference_from_torch(backend, DEVICE, backend.offers, LEGS) is None
+        assert difference_from_torch(backend, DEVICE, None, LEGS) is None
 
     @pytest.mark.parametrize("channels_last", [False, True])
     def test_the_front_ends_mean_the_same_as_torch(self, chosen, channels_last):
@@ -390,6 +395,17 @@ class TestSelection:
         assert used(loss) == "fused" and "legs_range" not in dict(driver.launches)
         assert loss.item() == pytest.approx(legs_loss(prediction.double(), target.double(), spec).item(), rel=2e-5)
 
+    @pytest.mark.parametrize("which", ["prediction", "target", "weight"])
+    def test_memory_that_is_to_be_read_negated_is_torchs(self, chosen, which):
+        given = dict(zip(("prediction", "target", "weight"), (*images((3, 20, 30)), 1.0 + torch.rand(20, 30))))
+        given[which] = torch._neg_view(-given[which].detach()).requires_grad_(which == "prediction")
+        given["prediction"].requires_grad_()
+        for weight in (None, given["weight"]) if which != "weight" else (given["weight"],):
+            found = legs_loss(given["prediction"], given["target"], weight=weight)
+            exact = [None if one is None else one.double() for one in (given["prediction"], given["target"], weight)]
+            assert used(found) == "torch"
+            assert found.item() == pytest.approx(legs_loss(*exact[:2], weight=exact[2]).item(), rel=2e-5)
+
     def test_what_it_does_not_take_is_torchs(self, chosen):
         prediction, target = images((3, 20, 30))
         assert used(legs_loss(prediction.double(), target.double())) == "torch"
@@ -409,6 +425,7 @@ def test_no_access_is_out_of_bounds():
     code = (
         "import torch\n"
         "from legs_loss import WeightSpec\n"
+        "from legs_loss.kernels.contract import L1, SSIM, terms_of\n"
         "from legs_loss.weights import Weights\n"
         "from tests.cuda_emulation import emulated\n"
         "backend = emulated(flags=['-fsanitize=address,undefined', '-fno-sanitize-recover=all', '-O1'])\n"
@@ -418,12 +435,12 @@ def test_no_access_is_out_of_bounds():
         "        mask = torch.rand(shape[-2:])\n"
         "        for spec in (WeightSpec(curve='C5'), WeightSpec(operator='scharr', p=float('inf'))):\n"
         "            weights = Weights(spec=spec, map=mask)\n"
-        "            backend.loss(x, y, weights, 0.2).backward()\n"
-        "            backend.weighted_l1(x, y, weights).backward()\n"
-        "        backend.ssim(x, y).backward()\n"
+        "            backend.loss(terms_of(0.2), x, y, weights).backward()\n"
+        "            backend.loss(L1, x, y, weights).backward()\n"
+        "        backend.loss(SSIM, x, y).backward()\n"
         "        with torch.no_grad():\n"
-        "            backend.loss(x, y, Weights(map=mask), 0.2)\n"
-        "            backend.ssim(x, y)\n"
+        "            backend.loss(terms_of(0.2), x, y, Weights(map=mask))\n"
+        "            backend.loss(SSIM, x, y)\n"
         "print('done')\n"
     )
     environment = {**legs_environment(), "LD_PRELOAD": library, "ASAN_OPTIONS": "detect_leaks=0"}

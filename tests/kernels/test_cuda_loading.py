@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 
 import pytest
 
 from legs_loss.kernels.contract import NotNow
-from legs_loss.kernels.cuda import modules as modules_file
 from legs_loss.kernels.cuda import nvrtc
 from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules, Variant, cache_folder
 from legs_loss.kernels.cuda.nvrtc import Compiler, CompilerError, NotFound, candidates, find_compiler
@@ -70,16 +68,16 @@ class TestCache:
     def test_two_processes_compile_at_once(self, tmp_path):
         """Each writes a file of its own and puts it in place in one step: whoever comes second finds a whole one."""
         writers = [BinaryCache(tmp_path) for _ in range(2)]
-        first, second = tempfile.mkstemp, []
+        first, second = os.replace, []
 
-        def meanwhile(**options):
+        def meanwhile(*paths):
             if not second:
                 second.append(True)
                 writers[1].put(b"key", b"binary")
-            return first(**options)
+            return first(*paths)
 
         with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(modules_file.tempfile, "mkstemp", meanwhile)
+            patched.setattr(os, "replace", meanwhile)
             writers[0].put(b"key", b"binary")
         assert writers[0].get(b"key") == b"binary" and len(list(tmp_path.iterdir())) == 1
 
@@ -226,9 +224,9 @@ class TestCompiler:
         compiler = Compiler(library)
         assert compiler.target(80) == "sm_80" and compiler.target(86) == "compute_80"
         assert compiler.target(120) == "compute_90"
-        assert compiler.compile(b"good", ["-DVALUE=0"], "sm_80").binary == b"\x7fELF"
+        assert compiler.compile(b"good", ["-DVALUE=0"], "sm_80")[0] == b"\x7fELF"
         assert library.options == ["--gpu-architecture=sm_80", "-DVALUE=0"]
-        assert compiler.compile(b"good", [], "compute_90").binary == b".version"
+        assert compiler.compile(b"good", [], "compute_90")[0] == b".version"
         with pytest.raises(CompilerError, match=r"NVRTC 12.9 does not compile for sm_50"):
             compiler.target(50)
 

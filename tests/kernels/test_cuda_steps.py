@@ -11,6 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from legs_loss import LegsError, configure, l1_loss, legs_loss, ssim
 from legs_loss.kernels import available, backends, trial
 from legs_loss.kernels.available import BACKENDS, Availability, Known
+from legs_loss.kernels.contract import SSIM
 from legs_loss.kernels.cuda.backend import CudaBackend, Strides, Task, chunks_of, strip_of
 from legs_loss.kernels.cuda.driver import DriverError
 from legs_loss.kernels.cuda.modules import BinaryCache, Modules
@@ -51,7 +52,7 @@ class TestLaunch:
         monkeypatch.setattr(parts[0], "launch", lambda task, *kernels: tasks.append((kernels[0][0], task)))
         windows = torch.empty(1 << 17, device="meta").as_strided((1, 65536, 256, 256), (0, 1, 2, 512))
         backend = CudaBackend(lambda _: parts[2])
-        backend.ssim(windows.requires_grad_(), torch.empty(windows.shape, device="meta"))
+        backend.loss(SSIM, windows.requires_grad_(), torch.empty(windows.shape, device="meta"))
         layout = dict(tasks)["legs_ssim_gradient"].of_gradient
         assert 255 * (layout.row + layout.column) < 2**31
 
@@ -233,5 +234,5 @@ class TestFailures:
             legs_loss(*(torch.empty(3, 8, 8, device="meta") for _ in range(2)), weight=torch.empty(4, 4, device="meta"))
 
     def test_shares(self, parts):
-        assert CudaBackend(lambda _: parts[2]).ssim(*(torch.empty(3, 8, 8, device="meta"),) * 2).dim() == 0
+        assert CudaBackend(lambda _: parts[2]).loss(SSIM, *(torch.empty(3, 8, 8, device="meta"),) * 2).dim() == 0
         assert parts[0].launches == ["legs_ssim_value", "legs_finish"]

@@ -345,6 +345,16 @@ class TestSelection:
         said = capfd.readouterr().err.replace(OF_THE_FIRST_STEP, "")
         assert said == "legs-loss: numba is unavailable, torch is used: RuntimeError: no such instruction\n"
 
+    def test_memory_that_is_to_be_read_negated_is_torchs(self, chosen, capfd):
+        image, target = images((3, 20, 30))
+        negated = torch._neg_view(-image.detach()).requires_grad_()
+        for pair in ((negated, target), (image, torch._neg_view(-target))):
+            loss = legs_loss(*pair)
+            assert used(loss) == "torch"
+            assert loss.item() == pytest.approx(legs_loss(image.double(), target.double()).item(), rel=2e-5)
+        assert used(legs_loss(image, target)) == "fused"  # it was not given up
+        assert "unavailable" not in capfd.readouterr().err
+
     def test_a_backend_that_fails_after_its_trial_is_left(self, chosen, monkeypatch, capfd):
         own = numba_loss._Prepared.compute
 

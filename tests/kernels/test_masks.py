@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from legs_loss import weight_map
+from legs_loss.kernels.contract import L1, terms_of
 from legs_loss.similarity import d_ssim
 from legs_loss.spec import PRESETS
 from legs_loss.weights import Weights
@@ -77,7 +78,7 @@ def test_a_masked_loss_is_the_mean_over_what_counts(backend, shape, kind, renorm
 
 def of_backend(backend, prediction, target, weights, share):  # noqa: F811
     seen = weights.hidden(prediction, target) if share else prediction
-    one = backend.loss(seen, target, weights, share) if share else backend.weighted_l1(seen, target, weights)
+    one = backend.loss(terms_of(share), seen, target, weights) if share else backend.loss(L1, seen, target, weights)
     return weights.of_what_counts(one)
 
 

@@ -61,6 +61,12 @@ class TestByContent:
         memo.recall(target, make)
         assert make.made == 2
 
+    def test_memory_that_is_to_be_read_negated_is_what_is_read(self):
+        memo, make, target = WeightMemo(), Maker(), torch.rand(3, 4, 4)
+        for same in (target, torch._neg_view(-target), torch._neg_view(target)):
+            memo.recall(same, make)
+        assert make.made == 2
+
     def test_shape_and_type_belong_to_it(self):
         memo, make = WeightMemo(), Maker()
         zeros = torch.zeros(3, 4, 4)

@@ -73,7 +73,6 @@ class CudaBackend(Backend):
     """
 
     name = "cuda"
-    offers: FrozenSet[str] = frozenset({"loss", "l1", "ssim"})
     most_channels = 1 << 16
     operators: FrozenSet[str] = frozenset(STENCILS)
     norms: FrozenSet[float] = frozenset(NORMS)
@@ -108,8 +107,10 @@ class _Prepared(Prepared):
     def __init__(
         self, modules: Modules, terms: Terms, spec: Optional[WeightSpec], x: Tensor, y: Tensor, wanted: bool
     ) -> None:
-        self._launch, self._dtype, self._shape, self._ssim = modules.driver.launch, x.dtype, x.shape, terms.ssim
-        x, y = _batch(x.detach()), _batch(y.detach())
+        shape = x.shape
+        self._mixed = x.dtype != y.dtype
+        x, y = (_batch(one.detach().float() if self._mixed else one.detach()) for one in (x, y))
+        self._launch, self._dtype, self._shape, self._ssim = modules.driver.launch, x.dtype, shape, terms.ssim
         spec = spec if terms.l1 else None
         plain, weighted = variant_of(x.dtype, None), variant_of(x.dtype, spec)
         modules.load(weighted, plain, PLAIN)  # backward's too, which a capture may contain alone
@@ -132,10 +133,9 @@ class _Prepared(Prepared):
             self._ranging = launch("range", weighted, self._ranged), launch("range_finish", weighted, views)
         task.l1_step, task.ssim_step = terms.l1 / x.numel(), 4.0 * terms.ssim / x.numel()
         task.constant = terms.constant
-        term = "l1" if terms.ssim == 0.0 else ("loss" if terms.l1 else "ssim")
-        if term != "l1":
+        if terms.ssim:
             task.strip, task.count = strip_of(x, modules.driver.multiprocessors, wanted)
-        own = launch(f"{term}_{'gradient' if wanted else 'value'}", weighted if term == "l1" else plain, task.count)
+        own = launch(f"{terms.name}_{'gradient' if wanted else 'value'}", plain if terms.ssim else weighted, task.count)
         self._kernels = own, launch("finish", PLAIN, 1)
         self._strides: Optional[Tuple[int, ...]] = None
         if wanted:  # dense, where x may be windows that overlap
@@ -148,6 +148,8 @@ class _Prepared(Prepared):
     def compute(
         self, prediction: Tensor, target: Tensor, map_: Optional[Tensor], range_: Optional[Tensor]
     ) -> Tuple[Tensor, Optional[Tensor]]:
+        if self._mixed:
+            prediction, target = prediction.float(), target.float()
         x = prediction.contiguous() if self._copies[0] else prediction
         y = target.contiguous() if self._copies[1] else target
         task = Task.from_buffer_copy(self._task)

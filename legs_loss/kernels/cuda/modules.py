@@ -6,16 +6,17 @@ import hashlib
 import os
 import re
 import sys
-import tempfile
 import threading
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, NamedTuple, Optional
 
+from legs_loss.errors import LegsError
 from legs_loss.kernels import codes
 from legs_loss.kernels.contract import NotNow
 from legs_loss.kernels.cuda.driver import UNSUPPORTED_PTX, DriverError
 from legs_loss.spec import WeightSpec
+from legs_loss.system import write_whole
 
 __all__ = ["FORMULAS", "PLAIN", "BinaryCache", "Modules", "Variant", "cache_folder", "options", "source"]
 
@@ -110,11 +111,9 @@ class Modules:
         key = "\n".join([self._compiler.version, target, *given, hashlib.sha256(text).hexdigest()]).encode()
         binary = self._cache.get(key)
         if binary is not None:
-            try:
+            with suppress(DriverError):  # whatever it was compiled for: it is written over
                 return self.driver.load(binary)
-            except DriverError:  # whatever it was compiled for
-                self._cache.discard(key)
-        binary = self._compiler.compile(text, given, target).binary
+        binary, _ = self._compiler.compile(text, given, target)
         try:
             module = self.driver.load(binary)
         except DriverError as error:
@@ -170,26 +169,10 @@ class BinaryCache:
         """Keep a binary: the file appears whole or not at all, whoever else writes it meanwhile."""
         if self.folder is None:
             return
-        try:
+        with suppress(OSError, LegsError):
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            if not _is_private(os.stat(str(self.folder))):
-                return
-            handle, name = tempfile.mkstemp(dir=str(self.folder))
-        except OSError:
-            return
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(hashlib.sha256(key + binary).digest() + binary)
-            os.replace(name, str(_path(self.folder, key)))
-        except OSError:
-            with suppress(OSError):
-                os.unlink(name)
-
-    def discard(self, key: bytes) -> None:
-        """Remove what is kept under a key."""
-        if self.folder is not None:
-            with suppress(OSError):
-                _path(self.folder, key).unlink()
+            if _is_private(os.stat(str(self.folder))):
+                write_whole(_path(self.folder, key), hashlib.sha256(key + binary).digest() + binary, mode=0o600)
 
 
 def _is_private(found: os.stat_result) -> bool:

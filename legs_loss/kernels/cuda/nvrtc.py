@@ -7,12 +7,10 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import Any, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Iterable, Iterator, List, Optional, Sequence, Tuple
 
-__all__ = ["Compiled", "Compiler", "CompilerError", "NotFound", "candidates", "find_compiler", "resources"]
+__all__ = ["Compiler", "CompilerError", "NotFound", "candidates", "find_compiler"]
 
-_LINUX = re.compile(r"libnvrtc(-[0-9a-f]+)?\.so(\.[0-9.]+)?$")
-_WINDOWS = re.compile(r"nvrtc64_[0-9]+_0\.dll$")
 _BUILTINS = re.compile(r"(libnvrtc-builtins(-[0-9a-f]+)?\.so\.[0-9.]+|nvrtc-builtins64_[0-9]+\.dll)$")
 
 
@@ -24,18 +22,6 @@ class CompilerError(Exception):
     """NVRTC refused; the message is its log's first error."""
 
 
-class Compiled(NamedTuple):
-    """The result of a compilation.
-
-    Attributes:
-        binary: for ``cuModuleLoadData``: machine code, or PTX where the compiler is older than the GPU.
-        log: what the compiler said.
-    """
-
-    binary: bytes
-    log: str
-
-
 def candidates(folders: Iterable[Path], major: str, platform: str = sys.platform) -> Iterator[Path]:
     """Yield the NVRTC libraries in folders, by name for a major version of CUDA.
 
@@ -44,25 +30,16 @@ def candidates(folders: Iterable[Path], major: str, platform: str = sys.platform
         major: of CUDA, as "12".
         platform: as ``sys.platform``.
     """
-    pattern = _WINDOWS if platform == "win32" else _LINUX
+    # CUDA 11 kept the number 11.2 (Windows: 112_0) in all of its versions.
+    linux = rf"libnvrtc(-[0-9a-f]+)?\.so(\.{major}(\.[0-9.]+)?)?$"
+    name = re.compile(rf"nvrtc64_{major}\d?_0\.dll$" if platform == "win32" else linux)
     for folder in folders:
         wheels = folder / "nvidia"
         nested = [folder] if folder.name == "lib" else sorted([*wheels.glob("*/*"), *wheels.glob("*/bin/x86_64")])
         for place in nested:
             if not place.is_dir():
                 continue
-            for path in sorted(place.iterdir()):
-                if pattern.match(path.name) and _of_major(path, major):
-                    yield path
-
-
-def _of_major(path: Path, major: str) -> bool:
-    # CUDA 11 kept the number 11.2 (Windows: 112_0) in all of its versions.
-    version = re.search(r"\.so\.(\d+)|nvrtc64_(\d+)_0", path.name)
-    if version is None:
-        return True
-    number = version.group(1) or version.group(2)[:2]
-    return number == major
+            yield from (path for path in sorted(place.iterdir()) if name.match(path.name))
 
 
 def _plain_name(major: str, platform: str = sys.platform) -> str:
@@ -126,8 +103,8 @@ class Compiler:
             raise CompilerError(f"NVRTC {self.version} does not compile for sm_{architecture}")
         return f"compute_{max(older)}"
 
-    def compile(self, source: bytes, options: Sequence[str], target: str) -> Compiled:
-        """Compile a source.
+    def compile(self, source: bytes, options: Sequence[str], target: str) -> Tuple[bytes, str]:
+        """Compile a source: machine code for ``cuModuleLoadData``, or PTX for a GPU that is newer; and the log.
 
         Raises:
             CompilerError: it does not compile.
@@ -142,7 +119,7 @@ class Compiler:
             if code != 0:
                 errors = [line for line in log.splitlines() if "error" in line]
                 raise CompilerError(errors[0] if errors else self._message(code))
-            return Compiled(self._text(program, "CUBIN" if target.startswith("sm_") else "PTX"), log)
+            return self._text(program, "CUBIN" if target.startswith("sm_") else "PTX"), log
         finally:
             library.nvrtcDestroyProgram(ctypes.byref(program))
 
@@ -168,20 +145,3 @@ class Compiler:
     def _message(self, code: int) -> str:
         self._library.nvrtcGetErrorString.restype = ctypes.c_char_p
         return (self._library.nvrtcGetErrorString(code) or b"unknown error").decode()
-
-
-def resources(log: str) -> List[Tuple[str, int, int, int, int]]:
-    """Return of each kernel in the log of ``--ptxas-options=-v``: name, registers, stack, spills, shared bytes."""
-    found = []
-    for part in re.split(r"Compiling entry function '", log)[1:]:
-        numbers = [
-            sum(map(int, re.findall(pattern, part)))
-            for pattern in (
-                r"Used (\d+) registers",
-                r"(\d+) bytes stack frame",
-                r"(\d+) bytes spill (?:stores|loads)",
-                r"(\d+) bytes smem",
-            )
-        ]
-        found.append((part.split("'")[0], numbers[0], numbers[1], numbers[2], numbers[3]))
-    return found

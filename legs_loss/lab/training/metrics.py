@@ -92,9 +92,10 @@ def _both(pixels: Tensor, counts: Optional[Tensor]) -> Tensor:
 
 
 def _ssim(prediction: Tensor, target: Tensor) -> float:
+    from legs_loss.kernels.contract import SSIM
     from legs_loss.kernels.numba_loss import BACKEND
 
-    return float(BACKEND.ssim(prediction, target))  # many times as fast as torch's
+    return float(BACKEND.loss(SSIM, prediction, target))  # many times as fast as torch's
 
 
 METRICS: Mapping[str, Metric] = {

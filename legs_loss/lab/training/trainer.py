@@ -77,9 +77,12 @@ class TrainingResult:
 
 def step_loss(prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float) -> Tensor:
     """Return the loss of one iteration: of a rendering [3, H, W], its photograph and the weights of its pixels."""
+    from legs_loss.kernels.contract import terms_of
     from legs_loss.kernels.numba_loss import BACKEND
 
-    return weights.of_what_counts(BACKEND.loss(weights.hidden(prediction, target), target, weights, lambda_dssim))
+    return weights.of_what_counts(
+        BACKEND.loss(terms_of(lambda_dssim), weights.hidden(prediction, target), target, weights)
+    )
 
 
 def compile_step(command: str) -> None:

@@ -1,7 +1,7 @@
 """Speed of the compiled rasterizer, forward and backward, against the readable oracle and gsplat's torch reference.
 
-    python benchmarks/rasterizer.py --threads 1
-    python benchmarks/rasterizer.py --threads 1 --gsplat DIR    # after: pip install --target DIR gsplat==1.5.3
+    python -m benchmarks.rasterizer --threads 1
+    python -m benchmarks.rasterizer --threads 1 --gsplat DIR    # after: pip install --target DIR gsplat==1.5.3
 
 All contestants draw the same Gaussians, one after the other in every round, so that whatever else the machine does
 falls on all of them; the table shows medians over the rounds, the least time of all, the processor's own time (the
@@ -28,6 +28,9 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import torch
 
+from legs_loss.lab import rasterizer
+from tests.lab import oracle
+
 BACKGROUND = (0.0, 0.0, 0.0)
 
 
@@ -49,16 +52,13 @@ def make_scene(count, width, height, degree, seed=0):
     return leaves, camera, torch.randn(3, height, width, generator=generator)
 
 
-def ours(backend, camera, degree):
-    from legs_loss.lab.rasterizer import rasterize
-
-    return lambda *leaves: rasterize(*leaves, camera, BACKGROUND, degree, backend=backend).image
+def ours(home, camera, degree):
+    return lambda *leaves: home.rasterize(*leaves, camera, BACKGROUND, degree).image
 
 
 def project(leaves, camera):
     """Splats, and the bounds of their tiles; the camera stands in the origin."""
     from legs_loss.lab.conventions import View
-    from legs_loss.lab.rasterizer import oracle
 
     view = View.from_camera(camera)
     splats = oracle.project(*(leaf.detach() for leaf in leaves[:3]), view)
@@ -205,7 +205,7 @@ def main():
     width, height = options.size
     leaves, camera, weights = make_scene(options.gaussians, width, height, options.degree)
     title = describe(leaves, camera, options.threads)
-    contestants = {"numba": ours("numba", camera, options.degree)}
+    contestants = {"numba": ours(rasterizer, camera, options.degree)}
     results["full"] = {"title": title, **report(title, *measure(contestants, leaves, weights, options.rounds))}
 
     if options.peer_rounds:
@@ -214,8 +214,8 @@ def main():
         leaves, camera, weights = make_scene(count, width, height, options.degree)
         title = describe(leaves, camera, options.threads)
         contestants = {
-            "numba": ours("numba", camera, options.degree),
-            "torch oracle": ours("torch", camera, options.degree),
+            "numba": ours(rasterizer, camera, options.degree),
+            "torch oracle": ours(oracle, camera, options.degree),
         }
         if options.gsplat:
             pairs = contributing_pairs(leaves, camera)

@@ -16,7 +16,7 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Dict, Iterable, Optional
+from typing import TYPE_CHECKING, Any, Dict, Iterable, Optional, Tuple
 
 from legs_loss.cli.shared.scene_arguments import add_images, add_resolution
 from legs_loss.system import cores, say
@@ -69,15 +69,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the stores; 1 when a photograph was skipped, or one of several scenes failed."""
+    from tqdm import tqdm
+
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import precompute_scene
     from legs_loss.system.executors import outcomes
 
     tasks = _tasks(args)
     failed = 0
-    with _Bar(len(tasks)) as bar:
-        for task, done in outcomes(precompute_scene, tasks, args.scheduler, bar.listen):
-            with bar.above():
+    views: Dict[str, Tuple[int, int]] = {}  # of each scene those that are done, and all
+    # With a delay, nothing is shown before the first view or for earlier failures.
+    with tqdm(total=0, desc="weight maps", unit="view", delay=0.001) as bar:
+
+        def listen(message: Dict[str, Any]) -> None:
+            """Handle a task's message; a restarted task replaces its earlier messages."""
+            views[message["scene"]] = message["done"], message["of"]
+            bar.total = sum(of for _, of in views.values())
+            bar.update(sum(done for done, _ in views.values()) - bar.n)
+
+        for ended, (task, done) in enumerate(outcomes(precompute_scene, tasks, args.scheduler, listen), 1):
+            with bar.external_write_mode():
                 if isinstance(done, LegsError) and len(tasks) == 1:
                     raise done
                 if isinstance(done, LegsError):
@@ -85,7 +96,8 @@ def run(args: argparse.Namespace) -> int:
                     failed += 1
                 else:
                     failed += _say(tasks[task], done)
-            bar.finish_one()
+            if len(tasks) > 1:
+                bar.set_description(f"weight maps, {ended} of {len(tasks)} scenes")
     if args.out is not None:
         _say_where(tasks)
     return 1 if failed else 0
@@ -203,40 +215,3 @@ def _say_where(tasks: Iterable[SceneTask]) -> None:
             f"the store with LEGS_STORE={shlex.quote(str(away[0].store))}, or as `store` in legs.toml",
             sys.stderr,
         )
-
-
-class _Bar:
-    """One progress bar for the views of all scenes, local and on workers."""
-
-    def __init__(self, scenes: int) -> None:
-        self._scenes, self._finished = scenes, 0
-        self._views: Dict[str, Any] = {}
-
-    def __enter__(self) -> _Bar:
-        from tqdm import tqdm
-
-        # With a delay, nothing is shown before the first view or for earlier failures.
-        self._bar = tqdm(total=0, desc=self._title(), unit="view", delay=0.001)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def listen(self, message: Dict[str, Any]) -> None:
-        """Handle a task's message; a restarted task replaces its earlier messages."""
-        self._views[message["scene"]] = message["done"], message["of"]
-        views = list(self._views.values())
-        self._bar.total = sum(of for _, of in views)
-        self._bar.update(sum(done for done, _ in views) - self._bar.n)
-
-    def above(self) -> Any:
-        """Suspend the bar for a print."""
-        return self._bar.external_write_mode()
-
-    def finish_one(self) -> None:
-        """Count a scene that has ended."""
-        self._finished += 1
-        self._bar.set_description(self._title())
-
-    def _title(self) -> str:
-        return "weight maps" if self._scenes == 1 else f"weight maps, {self._finished} of {self._scenes} scenes"

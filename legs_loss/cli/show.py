@@ -41,11 +41,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw and save the sheet."""
+    from tqdm import tqdm
+
     from legs_loss.cli.shared.scene_arguments import read_noted
     from legs_loss.cli.shared.sheet import save_sheet
     from legs_loss.errors import LegsError
     from legs_loss.precompute.user_maps import UserMaps, is_below
-    from legs_loss.scenes import View
+    from legs_loss.responses import levels_of
+    from legs_loss.scenes import View, image_tensor, load_training_image
     from legs_loss.spec import as_spec
     from legs_loss.store import MANIFEST
 
@@ -60,7 +63,9 @@ def run(args: argparse.Namespace) -> int:
     else:
         views = (View(path.name, path),) if path.is_file() else read_noted(path).views
         views = tuple(view for view in views if not is_below(view.path, path, UserMaps(args.masks)))
-        masks, scene = _masks(path, views, args.masks), _levels(views, spec)
+        masks = _masks(path, views, args.masks)
+        read = tqdm(views, "levels of the scene", unit="view", disable=spec.over == "image")
+        scene = levels_of((image_tensor(load_training_image(view)) for view in read), spec)
         shown = {view.name: partial(_computed, view, spec, scene, masks.get(view.name)) for view in views}
     names = _choose(list(shown), args.views)
     title = f"{args.preset}: {spec.operator}, p = {spec.p:g}, {spec.curve}, beta = {spec.beta:g}"
@@ -89,6 +94,7 @@ def _masks(path: Path, views: Sequence[View], named: Optional[str]) -> Dict[str,
 def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor], mask: Optional[Callable[[], np.ndarray]]) -> Shown:
     from legs_loss.cli.shared.sheet import Shown
     from legs_loss.precompute import normalised_map, response_map
+    from legs_loss.responses import over_scene
     from legs_loss.scenes import load_training_image
     from legs_loss.scenes.user_maps import averaged
 
@@ -96,37 +102,17 @@ def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor], mask: Optio
     if spec.over == "image":
         normalised = normalised_map(photograph, spec)
     else:
-        normalised = _over_scene(response_map(photograph, spec), spec, scene)
+        normalised = over_scene(response_map(photograph, spec)[None], spec, scene)[0].numpy()
     height, width = normalised.shape
     return Shown(view.name, photograph, normalised, None if mask is None else averaged(mask(), (width, height)))
 
 
-def _over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor]) -> np.ndarray:
-    """Normalise a response [H, W] over its scene, or by itself for a single photograph."""
-    from legs_loss.responses import over_scene
-
-    return over_scene(strength[None], spec, scene)[0].numpy()
-
-
-def _levels(views: Sequence[View], spec: WeightSpec) -> Optional[Tensor]:
-    """Read all photographs for the levels of the scene, if the spec is normalised over it."""
-    from tqdm import tqdm
-
-    from legs_loss.precompute import response_map
-    from legs_loss.responses import response_levels, scene_levels
-    from legs_loss.scenes import load_training_image
-
-    if spec.over == "image":
-        return None
-    return scene_levels(
-        response_levels(response_map(load_training_image(view), spec)[None], spec)
-        for view in tqdm(views, "levels of the scene", unit="view")
-    )
-
-
 def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
+    import torch
+
     from legs_loss.cli.shared.sheet import Shown
     from legs_loss.errors import LegsError
+    from legs_loss.responses import over_scene
     from legs_loss.store import MASK, WEIGHTS, WeightStore
     from legs_loss.store.origin import scene_of_store
 
@@ -136,16 +122,14 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
     def draw(entry: Entry) -> Shown:
         view = views.get(entry.view)
         photograph = None if view is None else _photograph(view, entry)
-        normalised = store.normalised_response(entry) if spec.over == "image" else over_scene(entry)
+        if spec.over == "image":
+            normalised = store.normalised_response(entry)
+        else:
+            levels = store.scene_levels(spec, entry.width * entry.height)
+            normalised = over_scene(torch.from_numpy(store.response(entry))[None], spec, levels)[0].numpy()
         found = [store.beside(entry, kind) for kind in (MASK, WEIGHTS)]
         mask, weights = (None if one is None else store.user_map(one) for one in found)
         return Shown(f"{entry.view}\n{entry.width}x{entry.height}", photograph, normalised, mask, weights)
-
-    def over_scene(entry: Entry) -> np.ndarray:
-        import torch
-
-        scene = store.scene_levels(spec, entry.width * entry.height)
-        return _over_scene(torch.from_numpy(store.response(entry)), spec, scene)
 
     # Of a view with several sizes, the largest comes last and stays.
     entries = sorted(store.entries.values(), key=lambda entry: (entry.view, entry.width))

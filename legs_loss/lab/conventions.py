@@ -1,4 +1,4 @@
-"""The numbers that make a rasterizer 3DGS's (Kerbl et al. 2023), each in one place for both implementations."""
+"""The numbers that make a rasterizer 3DGS's (Kerbl et al. 2023), each in one place for it and its oracle."""
 
 from __future__ import annotations
 

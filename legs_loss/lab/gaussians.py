@@ -10,7 +10,7 @@ from torch import Tensor
 
 from legs_loss.lab.conventions import SH_C0
 
-__all__ = ["Gaussians"]
+__all__ = ["Gaussians", "rotations"]
 
 
 @dataclass
@@ -56,6 +56,17 @@ class Gaussians:
         quaternions[:, 0] = 1
         logits = torch.logit(torch.full((count, 1), opacity))
         return cls(means, log_scales[:, None].repeat(1, 3), quaternions, logits, sh)
+
+
+def rotations(quaternions: Tensor) -> Tensor:
+    """Return the rotation matrices [N, 3, 3] of quaternions [N, 4], wxyz of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=1).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
 
 def _mean_square_distance(points: Tensor) -> Tensor:

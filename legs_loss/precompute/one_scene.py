@@ -7,12 +7,13 @@ import time
 from collections import Counter
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Callable, Dict, List, Optional, Union
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
-from legs_loss.precompute.one_view import Job, ViewTask, make
+from legs_loss.precompute.one_view import Job, ViewResult, ViewTask, make
 from legs_loss.precompute.photograph import compile_response
 from legs_loss.precompute.user_maps import NO_MAPS, UserMaps, is_below, stage_user_maps
 from legs_loss.precompute.workers import in_processes
@@ -21,6 +22,7 @@ from legs_loss.spec import Spec, as_spec
 from legs_loss.store import Entry, StoreWriter
 from legs_loss.store.origin import note_scene
 from legs_loss.system import held_back
+from legs_loss.system.executors import Listener
 
 __all__ = ["Report", "precompute"]
 
@@ -100,12 +102,15 @@ def precompute(
         if workers > 1 and any(not task.known for task in tasks):
             with suppress(LegsError):  # a photograph that cannot be read is skipped later, with the reason
                 compile_response(*training_size(*image_size(tasks[0].view.path), resolution), spec)
-        results = in_processes(job, tasks, workers) if workers > 1 else (make(job, task) for task in tasks)
+        one_by_one = ((task, make(job, task)) for task in tasks)
+        results = in_processes(partial(_made, job), tasks, workers) if workers > 1 else one_by_one
         staged: List[Entry] = []
         due = time.monotonic()  # the first at once, so that there is a store
         with closing(results):
             try:
-                for result in tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress):
+                for task, result in tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress):
+                    if isinstance(result, LegsError):
+                        result = ViewResult(task.view.name, problem=f"{task.view.path}: {result}")
                     if result.unwritable is not None:
                         raise LegsError(f"cannot write to {out}: {result.unwritable}")
                     if result.problem is not None:
@@ -125,6 +130,11 @@ def precompute(
     if out.is_dir() and out.resolve().parent != scene.root.resolve():
         note_scene(out, scene)
     return report
+
+
+def _made(job: Job, task: ViewTask, _: Listener) -> ViewResult:
+    """Make a view's map in a worker process, which has nothing to tell before."""
+    return make(job, task)
 
 
 def _commit(writer: StoreWriter, staged: List[Entry]) -> None:

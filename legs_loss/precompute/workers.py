@@ -1,4 +1,4 @@
-"""Distribute views to processes, each with one photograph in memory at a time."""
+"""Share tasks out to processes of this machine, as ``system.executors`` does to a cluster's."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any, Dict, Generator, Sequence, Tuple
 
 import torch
 
-from legs_loss.precompute.one_view import Job, ViewResult, ViewTask, make
+from legs_loss.errors import LegsError
 from legs_loss.system import Child
+from legs_loss.system.executors import Listener, Task
 
 __all__ = ["in_processes"]
 
@@ -20,49 +21,65 @@ _PATIENCE = 5.0  # seconds; a process that is killed leaves numba's semaphore be
 _PILLOW = {"PILLOW_BLOCK_SIZE": "64m", "PILLOW_BLOCKS_MAX": "2"}
 
 
-def in_processes(job: Job, tasks: Sequence[ViewTask], workers: int) -> Generator[ViewResult, None, None]:
-    """Yield the results of worker processes, in the order they come.
+def in_processes(
+    task: Task, arguments: Sequence[Any], workers: int, listen: Listener = lambda message: None
+) -> Generator[Tuple[Any, Any], None, None]:
+    """Yield each argument with the result of its task, or the LegsError that this ended in, in the order they end.
 
-    Each worker has one task at a time and a pipe of its own: a worker that dies costs one view, and when this process
-    dies, the workers find their pipes closed and end.
+    Each process has one thread, one task at a time and a pipe of its own: one that dies costs one task, and when this
+    process dies, they find their pipes closed and end.
+
+    Args:
+        task: what is run, of an argument and of what it tells meanwhile.
+        arguments: of the tasks.
+        workers: processes.
+        listen: gets what all tasks tell.
     """
-    waiting = list(reversed(tasks))
-    crew: Dict[Any, Tuple[Child, ViewTask]] = {}  # by this side's end of their pipes
+    waiting = list(reversed(arguments))
+    crew: Dict[Any, Tuple[Child, Any]] = {}  # by this side's end of their pipes
 
     def give(worker: Child) -> None:
-        task = waiting.pop()
-        crew[worker.connection] = worker, task
+        argument = waiting.pop()
+        crew[worker.connection] = worker, argument
         with suppress(OSError):  # it died; its pipe will say so
-            worker.connection.send(task)
+            worker.connection.send(argument)
 
     try:
-        for _ in range(min(workers, len(tasks))):
-            give(Child(_work, job))
+        for _ in range(min(workers, len(arguments))):
+            give(Child(_work, task))
         while crew:
             for connection in wait(list(crew)):
-                worker, task = crew.pop(connection)
+                worker, argument = crew[connection]
                 try:
-                    result = worker.connection.recv()
+                    ended, message = worker.connection.recv()
                 except (EOFError, OSError):
-                    reason = f"{task.view.path}: the process that read it was killed (out of memory?)"
-                    result = ViewResult(task.view.name, problem=reason)
+                    ended, message = True, LegsError("its process was killed (out of memory?)")
                     worker.end()
-                    worker = Child(_work, job) if waiting else worker
+                    worker = Child(_work, task) if waiting else worker
+                if not ended:
+                    listen(message)
+                    continue
+                del crew[connection]
                 if waiting:
                     give(worker)
                 else:
                     worker.end(_PATIENCE)
-                yield result
+                yield argument, message
     finally:
         for worker, _ in crew.values():
             worker.end()
 
 
-def _work(connection: Any, job: Job) -> None:
-    """Make maps until the parent has ended."""
+def _work(connection: Any, task: Task) -> None:
+    """Run tasks until the parent has ended."""
     if not any(name in os.environ for name in _PILLOW):
         os.environ.update(_PILLOW)  # before Pillow is imported, which reads them
     torch.set_num_threads(1)
     with suppress(EOFError, OSError):
         while True:
-            connection.send(make(job, connection.recv()))
+            argument = connection.recv()
+            try:
+                result = task(argument, lambda message: connection.send((False, message)))
+            except (LegsError, OSError) as error:  # a full disk is no fault of the code either
+                result = LegsError(str(error))
+            connection.send((True, result))

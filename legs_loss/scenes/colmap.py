@@ -15,29 +15,14 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
 from legs_loss.system import open_regular, read_text
 
-__all__ = ["find_model", "read_colmap", "read_points"]
+__all__ = ["read_colmap"]
 
-# COLMAP's camera models in the order of their ids, each with its number of parameters and of focal lengths among them,
-# which come first.
+# COLMAP's camera models in the order of their ids, each with its number of parameters.
 MODELS = {
-    "SIMPLE_PINHOLE": (3, 1),
-    "PINHOLE": (4, 2),
-    "SIMPLE_RADIAL": (4, 1),
-    "RADIAL": (5, 1),
-    "OPENCV": (8, 2),
-    "OPENCV_FISHEYE": (8, 2),
-    "FULL_OPENCV": (12, 2),
-    "FOV": (5, 2),
-    "SIMPLE_RADIAL_FISHEYE": (4, 1),
-    "RADIAL_FISHEYE": (5, 1),
-    "THIN_PRISM_FISHEYE": (12, 2),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (16, 2),
-    "SIMPLE_DIVISION": (4, 1),
-    "DIVISION": (5, 2),
-    "SIMPLE_FISHEYE": (3, 1),
-    "FISHEYE": (4, 2),
-    "EUCM": (6, 2),
-    "EQUIRECTANGULAR": (2, 0),
+    **{"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8},
+    **{"FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12},
+    **{"RAD_TAN_THIN_PRISM_FISHEYE": 16, "SIMPLE_DIVISION": 4, "DIVISION": 5, "SIMPLE_FISHEYE": 3, "FISHEYE": 4},
+    **{"EUCM": 6, "EQUIRECTANGULAR": 2},
 }
 
 _CAMERA_LINE = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
@@ -64,33 +49,24 @@ class _Image(NamedTuple):
     translation: Tuple[float, ...]
 
 
-def find_model(root: Path) -> Optional[Path]:
-    """Return the folder of a scene's sparse model, ``sparse/0`` or else ``sparse``; None without one."""
-    for folder in (root / "sparse" / "0", root / "sparse"):
-        if (folder / "images.bin").is_file() or (folder / "images.txt").is_file():
-            return folder
-    return None
-
-
 def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
     """Read a scene in COLMAP's layout, its photographs from the folder ``images``.
 
-    A photograph is looked for under its whole COLMAP name and then, as 3DGS does, under the last
-    part of it; ``prefix`` goes before its name in :class:`View`. Cameras other than PINHOLE and
-    SIMPLE_PINHOLE leave ``View.camera`` None. Raises :class:`LegsError` when the model is damaged.
+    The model is in ``sparse/0`` or else in ``sparse``. A photograph is looked for under its whole COLMAP name and then,
+    as 3DGS does, under the last part of it; ``prefix`` goes before its name in :class:`View`. Cameras other than
+    PINHOLE and SIMPLE_PINHOLE leave ``View.camera`` None. Raises :class:`LegsError` when the model is damaged.
     """
-    model = find_model(root)
-    if model is None:
+    listed = [_images_file(folder) for folder in (root / "sparse" / "0", root / "sparse")]
+    file = next((file for file in listed if file.is_file()), None)
+    if file is None:
         raise LegsError(f"{root} has no COLMAP model: there is no sparse/0/images.bin or .txt")
-    kind = "bin" if (model / "images.bin").is_file() else "txt"
-    cameras = _parse(model / f"cameras.{kind}", _cameras_bin if kind == "bin" else _cameras_txt)
-    entries, kind = _entries(model)
+    cameras_file, points_file = (file.with_name(f"{what}{file.suffix}") for what in ("cameras", "points3D"))
+    cameras = _read(cameras_file)
     views = []
-    for image in entries:
+    for image in _read(file):
         if image.camera_id not in cameras:
             raise LegsError(
-                f"{model / f'images.{kind}'}: {image.name!r} has camera {image.camera_id}, "
-                f"which cameras.{kind} does not list"
+                f"{file}: {image.name!r} has camera {image.camera_id}, which {cameras_file.name} does not list"
             )
         name = image.name.replace("\\", "/")
         path = images / name
@@ -98,16 +74,15 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
             path, name = images / path.name, path.name
         lens = cameras[image.camera_id]
         views.append(View(f"{prefix}{name}", path, _pinhole(lens, image), camera_model=lens.model))
-    points = model / f"points3D.{kind}"
-    read = partial(read_points, points) if points.is_file() else None
+    points = partial(_read, points_file) if points_file.is_file() else None
     views.sort(key=lambda view: view.name)
-    return Scene(root, "colmap", tuple(views), read, notes=_larger_models(root, model, len(views)))
+    return Scene(root, "colmap", tuple(views), points, notes=_larger_models(root, file.parent, len(views)))
 
 
-def _entries(model: Path) -> Tuple[List[_Image], str]:
-    """Return the images that a model lists, and the kind of its files, bin or txt."""
-    kind = "bin" if (model / "images.bin").is_file() else "txt"
-    return _parse(model / f"images.{kind}", _images_bin if kind == "bin" else _images_txt), kind
+def _images_file(model: Path) -> Path:
+    """Return the file that lists a model's images, by whose ending the others are chosen."""
+    binary = model / "images.bin"
+    return binary if binary.is_file() else model / "images.txt"
 
 
 def _larger_models(root: Path, model: Path, count: int) -> Tuple[str, ...]:
@@ -116,7 +91,7 @@ def _larger_models(root: Path, model: Path, count: int) -> Tuple[str, ...]:
     for folder in sorted((root / "sparse").iterdir()):
         if folder.name.isdigit() and folder != model:
             with suppress(LegsError):
-                sizes[folder.name] = len(_entries(folder)[0])
+                sizes[folder.name] = len(_read(_images_file(folder)))
     name = max(sizes, key=lambda name: sizes[name], default="")
     if sizes.get(name, 0) <= count:
         return ()
@@ -126,20 +101,20 @@ def _larger_models(root: Path, model: Path, count: int) -> Tuple[str, ...]:
     )
 
 
-def read_points(path: Path) -> PointCloud:
-    """Read a points3D.bin or points3D.txt. Raises :class:`LegsError` when it is damaged."""
-    return _parse(path, _points_bin if path.suffix == ".bin" else _points_txt)
-
-
-def _parse(path: Path, parser: Callable[[Any], Any]) -> Any:
+def _read(path: Path) -> Any:
+    """Return the cameras by number, the images or the points of a model's file, by its name."""
+    binary, text = _READERS[path.stem]
     try:
         if path.suffix == ".txt":
-            return parser(read_text(path, _LARGEST))
+            return text(read_text(path, _LARGEST))
         with open_regular(path) as file:
-            return parser(file)
+            cursor = _Cursor(file)
+            found = binary(cursor)
+            cursor.finish()
+            return found
     except OSError as error:
         raise LegsError(f"cannot read {path}: {error.strerror}") from None
-    except (struct.error, ValueError, IndexError, OverflowError) as error:
+    except (struct.error, ValueError, OverflowError) as error:
         raise LegsError(f"{path} is not as COLMAP writes it: {error}") from None
 
 
@@ -175,21 +150,19 @@ class _Cursor:
         return struct.unpack(f"<{layout}", self.file.read(struct.calcsize(f"<{layout}")))
 
     def name(self) -> str:
-        name = bytearray()
-        while name[-1:] != b"\0":
-            letter = self.file.read(1)
-            if not letter or len(name) > _LONGEST:
-                raise ValueError("a name does not end")
-            name += letter
+        start = self.file.tell()
+        name, end, _ = self.file.read(_LONGEST).partition(b"\0")
+        if not end:
+            raise ValueError("a name does not end")
+        self.file.seek(start + len(name) + 1)
         try:
-            return name[:-1].decode()
+            return name.decode()
         except UnicodeDecodeError:
-            raise ValueError(f"the name {str(bytes(name[:-1]))[1:]} of an image is not in UTF-8") from None
+            raise ValueError(f"the name {str(name)[1:]} of an image is not in UTF-8") from None
 
     def skip(self, size: int) -> None:
-        left = self.size - self.file.tell()
-        if size > left:
-            raise ValueError(f"it ends {size - left} bytes too early")
+        if size > self.size - self.file.tell():
+            raise ValueError("it ends too early")
         self.file.seek(size, os.SEEK_CUR)
 
     def finish(self) -> None:
@@ -197,39 +170,34 @@ class _Cursor:
             raise ValueError(f"{self.size} bytes where its own counts say {self.file.tell()}")
 
 
-def _cameras_bin(file: BinaryIO) -> Dict[int, _Intrinsics]:
-    cursor, cameras = _Cursor(file), {}
+def _cameras_bin(cursor: _Cursor) -> Dict[int, _Intrinsics]:
+    cameras = {}
     for _ in range(cursor.take("Q")[0]):
         number, model, width, height = cursor.take("iiQQ")
         if not 0 <= model < len(MODELS):
             known = f"known here are 0 to {len(MODELS) - 1}"
             raise ValueError(f"camera {number} has model {model}; {known}: convert it to text (colmap model_converter)")
         name = list(MODELS)[model]
-        cameras[number] = _intrinsics(name, width, height, cursor.take(f"{MODELS[name][0]}d"))
-    cursor.finish()
+        cameras[number] = _intrinsics(name, width, height, cursor.take(f"{MODELS[name]}d"))
     return cameras
 
 
-def _images_bin(file: BinaryIO) -> List[_Image]:
-    cursor, images = _Cursor(file), []
+def _images_bin(cursor: _Cursor) -> List[_Image]:
+    images = []
     for _ in range(cursor.take("Q")[0]):
-        pose = cursor.take("i7d")
-        (camera,) = cursor.take("i")
-        images.append(_image(cursor.name(), camera, pose[1:5], pose[5:8]))
+        record = (*cursor.take("i7di"), cursor.name())
+        images.append(_image(*record))
         cursor.skip(24 * cursor.take("Q")[0])  # the image's points, each x, y and an id
-    cursor.finish()
     return images
 
 
-def _points_bin(file: BinaryIO) -> PointCloud:
-    cursor, xyz, rgb = _Cursor(file), [], []
+def _points_bin(cursor: _Cursor) -> PointCloud:
+    points = []
     for _ in range(cursor.take("Q")[0]):
-        point = cursor.take("Q3d3BdQ")
-        xyz.append(point[1:4])
-        rgb.append(point[4:7])
-        cursor.skip(8 * point[8])  # the track: pairs of an image and a point in it
-    cursor.finish()
-    return _cloud(xyz, rgb)
+        *point, track = cursor.take("Q3d3BdQ")
+        points.append(point[1:7])
+        cursor.skip(8 * track)  # pairs of an image and a point in it
+    return _cloud(points)
 
 
 Lines = Iterator[Tuple[int, str]]  # with their numbers
@@ -243,26 +211,22 @@ def _rows(text: str, layout: str, read: Callable[[str, Lines], Any]) -> List[Any
         if line.strip():
             try:
                 rows.append(read(line, lines))
-            except (ValueError, IndexError) as error:
-                why = "too few values" if isinstance(error, IndexError) else error
+            except (ValueError, TypeError) as error:
+                why = "too few values" if isinstance(error, TypeError) else error
                 raise ValueError(f"line {number}, {line.strip()[:80]!r}: {why} (expected: {layout})") from None
     return rows
 
 
 def _cameras_txt(text: str) -> Dict[int, _Intrinsics]:
-    def camera(line: str, _: Lines) -> Tuple[int, _Intrinsics]:
-        words = line.split()
-        params = tuple(float(word) for word in words[4:])
-        return int(words[0]), _intrinsics(words[1], int(words[2]), int(words[3]), params)
+    def camera(number: str, model: str, width: str, height: str, *params: str) -> Tuple[int, _Intrinsics]:
+        return int(number), _intrinsics(model, int(width), int(height), tuple(map(float, params)))
 
-    return dict(_rows(text, _CAMERA_LINE, camera))
+    return dict(_rows(text, _CAMERA_LINE, lambda line, _: camera(*line.split())))
 
 
 def _images_txt(text: str) -> List[_Image]:
     def image(line: str, lines: Lines) -> _Image:
-        words = line.split(None, 9)  # the name comes last and may have spaces
-        numbers = tuple(float(word) for word in words[1:8])
-        found = _image(words[9].rstrip(), int(words[8]), numbers[:4], numbers[4:])
+        found = _image(*line.rstrip().split(None, 9))  # the name comes last and may have spaces
         number, points = next(lines, (0, ""))
         if not _are_points(points.split()):
             raise ValueError(
@@ -282,19 +246,16 @@ def _are_points(words: List[str]) -> bool:
 
 
 def _points_txt(text: str) -> PointCloud:
-    def point(line: str, _: Lines) -> Tuple[List[float], List[int]]:
-        words = line.split(None, 7)
-        return [float(word) for word in words[1:4]], [int(word) for word in words[4:7]]
+    def point(_: str, x: str, y: str, z: str, r: str, g: str, b: str, *track: str) -> List[float]:
+        return [float(x), float(y), float(z), int(r), int(g), int(b)]
 
-    rows = _rows(text, _POINT_LINE, point)
-    return _cloud([xyz for xyz, _ in rows], [rgb for _, rgb in rows])
+    return _cloud(_rows(text, _POINT_LINE, lambda line, _: point(*line.split(None, 7))))
 
 
 def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) -> _Intrinsics:
-    count, focal_lengths = MODELS.get(model, (len(params), 0))
-    if len(params) != count:
+    if len(params) != MODELS.get(model, len(params)):
         raise ValueError(f"a camera of model {model} has {len(params)} parameters")
-    focal = params[:focal_lengths]
+    focal = params[: 2 if model == "PINHOLE" else 1]
     if not (
         0 < width <= _SIDE and 0 < height <= _SIDE and _is_within(params, _LONGEST_FOCAL) and min(focal, default=1) > 0
     ):
@@ -302,29 +263,41 @@ def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) 
     return _Intrinsics(model, width, height, params)
 
 
-def _image(name: str, camera_id: int, quaternion: Tuple[float, ...], translation: Tuple[float, ...]) -> _Image:
+def _image(_: Any, w: Any, x: Any, y: Any, z: Any, tx: Any, ty: Any, tz: Any, camera_id: Any, name: str) -> _Image:
+    """Return an image by the values of its line, or of its record."""
     if not name or "\0" in name:
         raise ValueError(f"an image has the name {name!r}, which no file can have")
     parts = name.replace("\\", "/").split("/")
     if ".." in parts or not parts[0] or os.path.isabs(name):
         raise ValueError(f"an image has the name {name!r}, which leads out of the scene")
-    if len(quaternion) != 4 or len(translation) != 3:
-        raise ValueError(f"the pose of {name!r} has {len(quaternion) + len(translation)} numbers, not 7")
-    largest = max(map(abs, quaternion))
-    if not (1e-150 < largest < 1e150 and _is_within(quaternion, 1e150) and _is_within(translation, _FARTHEST_CAMERA)):
+    image = _Image(name, int(camera_id), tuple(map(float, (w, x, y, z))), tuple(map(float, (tx, ty, tz))))
+    largest = max(map(abs, image.quaternion))
+    if not (
+        1e-150 < largest < 1e150
+        and _is_within(image.quaternion, 1e150)
+        and _is_within(image.translation, _FARTHEST_CAMERA)
+    ):
         raise ValueError(f"the pose of {name!r} is not a number")
-    return _Image(name, camera_id, quaternion, translation)
+    return image
 
 
 def _is_within(values: Tuple[float, ...], limit: float) -> bool:
     return all(abs(value) < limit for value in values)  # of NaN, too, this is false
 
 
-def _cloud(xyz: List[Any], rgb: List[Any]) -> PointCloud:
-    positions = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
-    colours = np.asarray(rgb).reshape(-1, 3)
-    if len(positions) != len(colours) or not (np.abs(positions) <= _FARTHEST).all():
+def _cloud(points: List[Any]) -> PointCloud:
+    """Return points of x, y, z, red, green and blue."""
+    table = np.asarray(points, dtype=np.float64).reshape(-1, 6)
+    positions, colours = table[:, :3], table[:, 3:]
+    if not (np.abs(positions) <= _FARTHEST).all():
         raise ValueError("a point is nowhere: its position is no number, or none that float32 can hold")
     if colours.size and (colours.min() < 0 or colours.max() > 255):
         raise ValueError("a point's colour is outside of 0..255")
     return PointCloud(positions.astype(np.float32), colours.astype(np.uint8))
+
+
+_READERS = {
+    "cameras": (_cameras_bin, _cameras_txt),
+    "images": (_images_bin, _images_txt),
+    "points3D": (_points_bin, _points_txt),
+}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 from typing import Any, Dict, Iterable, List, Sequence, Tuple, Type
@@ -12,7 +13,7 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.folder import SUFFIXES, files_below
 from legs_loss.scenes.images import colour_mode, open_image
 from legs_loss.scenes.model import View
-from legs_loss.system import open_regular, write_whole
+from legs_loss.system import read_regular, write_whole
 
 __all__ = [
     "ALPHA",
@@ -29,7 +30,7 @@ __all__ = [
 
 ALPHA, MASK_PATH = "alpha", "mask_path"  # in place of a path: the photographs' own, those that transforms.json names
 _GRAY = 32  # of 255: the colours of a pixel of a gray JPEG differ less
-_LARGEST = 1 << 29  # values of a .npy
+_LARGEST = 4 << 30  # bytes of a .npy
 _DARK = 0.1  # of white: a mask whose lightest pixel is darker shows something else
 _BOX = 4  # Image.BOX, whose home differs between versions of Pillow
 
@@ -124,7 +125,7 @@ def read_map_file(path: Path, size: Tuple[int, int]) -> np.ndarray:
 
     Args:
         path: the file.
-        size: width and height of its photograph, checked before the map's pixels are read.
+        size: width and height of its photograph, checked before an image's pixels are read.
 
     Raises:
         LegsError: it cannot be read, its ratio of sides is not the photograph's, it is in colour, or has negative
@@ -209,21 +210,16 @@ def _check_ratio(map_size: Tuple[int, int], size: Tuple[int, int]) -> None:
 
 def _array(path: Path, size: Tuple[int, int]) -> np.ndarray:
     try:
-        with open_regular(path) as file:
-            version = np.lib.format.read_magic(file)
-            if version != (1, 0):
-                raise LegsError("not the version 1.0 of .npy")
-            shape, by_columns, kind = np.lib.format.read_array_header_1_0(file)
-            if len(shape) != 2 or not 0 < shape[0] * shape[1] <= _LARGEST or kind.kind != "f" or by_columns:
-                raise LegsError(f"not floats of [height, width] by rows, but {kind} {list(shape)}")
-            _check_ratio((shape[1], shape[0]), size)
-            data = file.read(shape[0] * shape[1] * kind.itemsize)
-        values = np.frombuffer(data, kind).reshape(shape).astype(np.float32)
+        found = np.load(io.BytesIO(read_regular(path, _LARGEST)), allow_pickle=False)
+        if not isinstance(found, np.ndarray) or found.ndim != 2 or found.dtype.kind != "f":
+            raise LegsError("not floats of [height, width]")
+        _check_ratio(found.shape[::-1], size)
+        values: np.ndarray = found.astype(np.float32)
         if not (np.isfinite(values).all() and values.min() >= 0):
             raise LegsError("it has negative values, or values that are not finite")
+        return values
     except LegsError as error:
         raise LegsError(f"{path}: {error}") from None
     except Exception as error:  # numpy reads a header as Python, whose tokenizer and parser raise many kinds
         why = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise LegsError(f"{path}: not an array that can be read ({why})") from None
-    return values

@@ -154,7 +154,7 @@ def test_train(disk, tiny_scene, capsys):
     assert len(read_ply(out / "point_cloud" / "iteration_8" / "point_cloud.ply")) > 0
 
 
-def in_this_process(arms, processes, on_progress, on_done=lambda name, metrics: None):
+def in_this_process(arms, processes, on_progress, on_done=lambda name, metrics: None, scheduler=None):
     """Train arms one after another, in place of a process for each."""
     from legs_loss.lab.training.side_by_side import train_arm
 

@@ -82,7 +82,7 @@ def _in_this_process():
     from legs_loss.lab.experiments import running
     from legs_loss.lab.training.side_by_side import train_arm
 
-    def train(arms, processes, on_progress, on_done=None):
+    def train(arms, processes, on_progress, on_done, scheduler):
         for arm in arms:
             on_done(arm.name, train_arm(arm, lambda progress: None))
 

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from legs_loss.lab.rasterizer import rasterize
+from legs_loss.lab import rasterizer
+from tests.lab import oracle
 
 NAMES = ("means", "scales", "quaternions", "opacities", "sh", "viewspace")
 
@@ -42,7 +43,8 @@ def run(inputs, view, degree=3, backend="numba", dtype=torch.float32):
     """Rendering, and the gradients of a fixed random weighting of its pixels, by name."""
     leaves = [tensor.detach().to(dtype).requires_grad_() for tensor in inputs]
     leaves.append(torch.zeros(len(leaves[0]), 4, dtype=dtype, requires_grad=True))
-    rendering = rasterize(*leaves[:5], view, BACKGROUND, degree, leaves[5], backend=backend)
+    rasterize = oracle.rasterize if backend == "torch" else rasterizer.rasterize
+    rendering = rasterize(*leaves[:5], view, BACKGROUND, degree, leaves[5])
     weights = torch.randn(3, view.height, view.width, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     (rendering.image * weights.to(dtype)).sum().backward()
     return rendering, dict(zip(NAMES, (leaf.grad for leaf in leaves)))

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from legs_loss.lab.conventions import SH_C0, SH_C1
-from legs_loss.lab.rasterizer import rasterize
-from legs_loss.lab.rasterizer.oracle import colours
+from tests.lab.oracle import colours, rasterize
 
 BACKGROUND = (0.1, 0.2, 0.3)
 
@@ -40,7 +39,7 @@ def balls(centres, opacities, rgb, scale=0.1):
 
 
 def draw(inputs, view=None, degree=0, **options):
-    return rasterize(*inputs, view or camera(), BACKGROUND, degree, backend="torch", **options)
+    return rasterize(*inputs, view or camera(), BACKGROUND, degree, **options)
 
 
 def random_scene(count, degree, seed):

@@ -327,7 +327,7 @@ class TestInterrupted:
         _, errors = process.communicate(timeout=60)
         assert process.returncode == 1
         assert errors.count(b"legs: skipped") == 1
-        assert b"5a.png: the process that read it was killed" in errors
+        assert b"5a.png: its process was killed" in errors
         self.finish(scene, out, 6)
 
 

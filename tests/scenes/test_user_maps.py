@@ -283,7 +283,7 @@ class TestRefused:
         for values, message in (
             (np.full((8, 12), -1.0), "negative values"),
             (np.full((8, 12), np.nan), "not finite"),
-            (np.ones((8, 12), object), "not floats"),
+            (np.ones((8, 12), object), "Object arrays cannot be loaded"),
             (np.ones((12, 8)), "ratio of sides"),
             (np.ones(96), "not floats of"),
             (np.full((8, 12), 1e9), r"a weight of 1e\+09"),

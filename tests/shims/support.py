@@ -17,7 +17,7 @@ from legs_adapters.shims.modules import diff_gaussian_rasterization as inria
 from legs_adapters.shims.modules import diff_gaussian_rasterization_fastgs as fastgs
 
 from legs_loss.lab.conventions import NEAR, TILE
-from legs_loss.lab.rasterizer import oracle
+from tests.lab import oracle
 
 WIDTH, HEIGHT = 72, 50
 

@@ -13,7 +13,7 @@ from legs_adapters.shims.modules import FasterGSCudaBackend as fastergs
 from legs_adapters.shims.modules.MortonEncoding import morton_encode
 
 from legs_loss import LegsError
-from legs_loss.lab.rasterizer import oracle
+from tests.lab import oracle
 
 NAMES = ("means", "scales", "rotations", "opacities", "sh_0", "sh_rest")
 

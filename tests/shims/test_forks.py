@@ -12,7 +12,7 @@ from legs_adapters.shims.inria import forks
 from legs_adapters.shims.inria.survey import Call, Interface
 from legs_adapters.shims.missing import MissingShim
 
-from legs_loss.lab.rasterizer import oracle
+from tests.lab import oracle
 from tests.shims.support import BACKGROUND, Dense, camera, close, gaussians, view_of
 
 

@@ -110,7 +110,7 @@ def table(metrics: Dict[str, Dict[str, Any]]) -> str:
     lines = []
     for name, values in metrics.items():
         summary = summarise([{"arm": name, "metrics": values}])
-        lines.append([name, *score_cells(summary.mean, summary.spread), f"{values['seconds']:.0f} s"])
+        lines.append([name, *score_cells(summary), f"{values['seconds']:.0f} s"])
     return markdown(*with_values(["method", *LABELS, "time"], lines))
 
 

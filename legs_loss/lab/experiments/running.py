@@ -22,7 +22,6 @@ from legs_loss._version import __version__
 from legs_loss.errors import LegsError
 from legs_loss.lab.experiments.arms import BASELINE, ArmSpec, needed, parse_arm
 from legs_loss.lab.experiments.baseline import prove_unweighted
-from legs_loss.lab.experiments.on_cluster import train_on_cluster
 from legs_loss.lab.experiments.schema import ROW, SETTINGS, what_is_wrong
 from legs_loss.lab.training.checkpoint import CHECKPOINT, alone_in
 from legs_loss.lab.training.dataset import Dataset, load_dataset
@@ -137,10 +136,8 @@ class Comparison:
                 arm, seed = plans[name]
                 self._finish(arm, seed, metrics)
 
-            if scheduler is None:
-                train_side_by_side(trainings, processes, on_progress, done)
-            elif trainings:
-                train_on_cluster(trainings, scheduler, on_progress, done)
+            if trainings:
+                train_side_by_side(trainings, processes, on_progress, done, scheduler)
         rows = [self.row(arm, seed) for seed in seeds for arm in needed(arms)]
         return [row for row in rows if row is not None]
 

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import math
-from typing import List, Mapping, Optional, Sequence, Tuple, TypeVar
+from typing import List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.lab.experiments.arms import parse_arm
-from legs_loss.lab.experiments.statistics import COLUMNS, Difference, Rows, difference, summarise_all, times_gaussians
+from legs_loss.lab.experiments.statistics import (
+    COLUMNS,
+    Difference,
+    Rows,
+    Summary,
+    difference,
+    summarise_all,
+    times_gaussians,
+)
 from legs_loss.lab.training.metrics import METRICS
 
 __all__ = [
+    "DIFFERENCES",
     "LABELS",
     "MISSING",
+    "Table",
     "difference_cell",
     "differences_table",
     "markdown",
@@ -23,7 +33,7 @@ __all__ = [
     "with_values",
 ]
 
-Cell = TypeVar("Cell", str, Tuple[str, str])
+Table = Tuple[List[str], List[List[str]]]  # heads, and lines of as many cells
 
 LABELS = [column.label for column in COLUMNS]
 MISSING = "–"  # of a row that is older than the metric, or of held-out views where there are none
@@ -56,35 +66,34 @@ def label(arm: str) -> str:
     return name if name == arm else f"{arm} ({name})"
 
 
-def score_cells(mean: Mapping[str, float], spread: Mapping[str, float]) -> List[str]:
+def score_cells(summary: Summary) -> List[str]:
     """Return the cells of :data:`COLUMNS`: mean ± standard deviation where there is one."""
     cells = []
     for column in COLUMNS:
-        middle, deviation = mean[column.label], spread[column.label]
+        middle, deviation = summary.mean[column.label], summary.spread[column.label]
         cell = MISSING if math.isnan(middle) else format(middle, column.format)
         has_spread = column.spread and not math.isnan(deviation)
         cells.append(f"{cell} ± {format(deviation, column.format)}" if has_spread else cell)
     return cells
 
 
-def scores_table(rows: Rows, arms: Sequence[str]) -> str:
+def scores_table(rows: Rows, arms: Sequence[str]) -> Table:
     """Return every arm's scores, mean ± standard deviation over seeds."""
     lines = []
     for arm in arms:
         for summary in summarise_all(rows, [parse_arm(arm).name]):
-            lines.append([label(arm), *score_cells(summary.mean, summary.spread), str(summary.seeds)])
-    return markdown(*with_values(["arm", *LABELS, "seeds"], lines))
+            lines.append([label(arm), *score_cells(summary), str(summary.seeds)])
+    return with_values(["arm", *LABELS, "seeds"], lines)
 
 
-def with_values(heads: Sequence[str], lines: Sequence[Sequence[Cell]]) -> Tuple[List[str], List[List[Cell]]]:
-    """Return a table without the columns of optional metrics that no row has; a cell is a text, or begins with it."""
+def with_values(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> Table:
+    """Return a table without the columns of optional metrics that no row has."""
     optional = {column.label for column in COLUMNS if column.metric and METRICS[column.metric[1]].available}
-
-    def shown(place: int) -> bool:
-        texts = [line[place] if isinstance(line[place], str) else line[place][0] for line in lines]
-        return heads[place] not in optional or any(text != MISSING for text in texts)
-
-    places = [place for place in range(len(heads)) if shown(place)]
+    places = [
+        place
+        for place, head in enumerate(heads)
+        if head not in optional or any(line[place] != MISSING for line in lines)
+    ]
     return [heads[place] for place in places], [[line[place] for place in places] for line in lines]
 
 
@@ -96,8 +105,8 @@ DIFFERENCES: Mapping[str, Tuple[str, str]] = {
 }
 
 
-def differences_table(rows: Rows, arms: Sequence[str]) -> str:
-    """Return each arm's differences from its reference arm, with their intervals."""
+def differences_table(rows: Rows, arms: Sequence[str], metrics: Mapping[str, Tuple[str, str]] = DIFFERENCES) -> Table:
+    """Return each arm's differences from its reference arm in some metrics, with their intervals."""
     lines = []
     for arm in arms:
         name, reference = parse_arm(arm).name, parse_arm(arm).reference
@@ -105,10 +114,10 @@ def differences_table(rows: Rows, arms: Sequence[str]) -> str:
         if reference is not None and ratio is not None:
             cells = [
                 difference_cell(difference(rows, name, reference, split, score), score)
-                for split, score in DIFFERENCES.values()
+                for split, score in metrics.values()
             ]
             lines.append([f"{label(arm)} − {reference}", *cells, times_cell(ratio)])
-    return markdown(*with_values(["difference", *DIFFERENCES, "Gaussians"], lines))
+    return with_values(["difference", *metrics, "Gaussians"], lines)
 
 
 def too_short(rows: Rows) -> str:
@@ -121,7 +130,8 @@ def too_short(rows: Rows) -> str:
 
 def tables(rows: Rows, arms: Sequence[str]) -> str:
     """Return the scores of the arms, and their differences or why none is given."""
-    return f"{scores_table(rows, arms)}\n\n{too_short(rows) or differences_table(rows, arms)}"
+    differences = too_short(rows) or markdown(*differences_table(rows, arms))
+    return f"{markdown(*scores_table(rows, arms))}\n\n{differences}"
 
 
 def difference_cell(value: Optional[Difference], score: str) -> str:

@@ -1,4 +1,4 @@
-"""Gaussians to an image: the readable oracle, the compiled rasterizer that must agree with it, and their one entry.
+"""Gaussians to an image by the compiled rasterizer, which must agree with the readable oracle of the tests.
 
 `rasterize` is the entry for 3DGS's own rasterizer; `draw` is the one for forks that change or return more. Modules that
 need numba are imported on first use.
@@ -13,7 +13,7 @@ from legs_loss.lab.conventions import MIN_ALPHA as MIN_ALPHA
 from legs_loss.lab.conventions import NEAR as NEAR
 from legs_loss.lab.conventions import View as View
 from legs_loss.lab.gaussians import Gaussians as Gaussians
-from legs_loss.lab.rasterizer.oracle import rotations as rotations
+from legs_loss.lab.gaussians import rotations as rotations
 from legs_loss.lab.rasterizer.rasterize import Rendering as Rendering
 from legs_loss.lab.rasterizer.rasterize import rasterize as rasterize
 

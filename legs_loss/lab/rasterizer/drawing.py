@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from legs_loss.lab.conventions import DILATION, NEAR, SQUARE, View
+from legs_loss.lab.gaussians import rotations
 from legs_loss.lab.rasterizer import compiled, contributions, sorting
 from legs_loss.lab.rasterizer.compiled import Clip, Tensors
 from legs_loss.lab.rasterizer.groups import Footprint
-from legs_loss.lab.rasterizer.oracle import rotations
 
 __all__ = ["Contributions", "Drawn", "Lens", "compensation", "covariance", "draw", "full"]
 

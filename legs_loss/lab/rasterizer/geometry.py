@@ -1,7 +1,8 @@
 """A splat's geometry and its gradient: formulas on one Gaussian's numbers, written into the loops that use them.
 
-The steps are those of oracle.py, in float64. Nothing here branches or is handed an array (references to it would be
-counted in the loop), so that the compiler takes four Gaussians at a time; reading and keeping is left to the loops.
+The steps are those of the tests' oracle, in float64. Nothing here branches or is handed an array (references to it
+would be counted in the loop), so that the compiler takes four Gaussians at a time; reading and keeping is left to the
+loops.
 A 3x3 matrix is nine numbers, row by row; a 2x3 one is six.
 """
 

@@ -1,4 +1,4 @@
-"""One signature for the two rasterizers: the fast one with numba, and the reference with torch."""
+"""Draw Gaussians as 3DGS does: the arguments are checked here."""
 
 from __future__ import annotations
 
@@ -32,9 +32,8 @@ def rasterize(
     background: Union[Tensor, Sequence[float]],
     sh_degree: int,
     viewspace: Optional[Tensor] = None,
-    backend: str = "numba",
 ) -> Rendering:
-    """Draw 3D Gaussians as 3DGS does, differentiable in all five tensors.
+    """Draw 3D Gaussians as 3DGS does, differentiable in all five tensors, float32 on the CPU.
 
     Args:
         means: [N, 3], world units.
@@ -49,7 +48,6 @@ def rasterize(
         viewspace: an optional leaf of zeros, [N, 2] or [N, 4]: after backward its gradient holds, in columns 1 and 2,
             the gradient with respect to the splat's centre in pixels times half the image's width and height (3DGS's
             units, for densification); in columns 3 and 4 the sums over the pixels of the absolute values of the same.
-        backend: "numba" (float32 on the CPU, fast), or "torch" (the oracle: any floating type, slow).
 
     Returns:
         `Rendering(image [3, H, W], radii int32 [N])`.
@@ -63,7 +61,7 @@ def rasterize(
         >>> one = torch.ones(1, 1)
         >>> image, radii = rasterize(
         ...     torch.tensor([[0.0, 0.0, 1.0]]), torch.full((1, 3), 0.1), torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        ...     0.5 * one, torch.zeros(1, 1, 3), camera, (0, 0, 0), sh_degree=0, backend="torch")
+        ...     0.5 * one, torch.zeros(1, 1, 3), camera, (0, 0, 0), sh_degree=0)
         >>> image[0, 1, 1].item(), radii.tolist()  # the centre: opacity 0.5 times the gray of zero coefficients, 0.5
         (0.25, [3])
     """
@@ -74,15 +72,7 @@ def rasterize(
     if tuple(background.shape) != (3,):
         raise LegsError(f"background has shape {tuple(background.shape)}; pass 3 numbers, red, green and blue")
     _check_values(tensors, background)
-    if backend == "torch":
-        from legs_loss.lab.rasterizer.oracle import render
-
-        return Rendering(*render(means, scales, quaternions, opacities, sh, view, background, sh_degree, viewspace))
-    if backend != "numba":
-        raise LegsError(f"no rasterizer backend {backend!r}; choose one of numba, torch")
-    if means.dtype != torch.float32:
-        raise LegsError(f"the numba rasterizer computes in float32, not {means.dtype}; convert, or use backend='torch'")
-    require("the rasterizer (but for backend='torch')", "cpu", "numba")
+    require("the rasterizer", "cpu", "numba")
     from legs_loss.lab.rasterizer import compiled
 
     given = compiled.Tensors(means, scales, quaternions, opacities, sh, None, viewspace)
@@ -109,13 +99,9 @@ def _check_shapes(tensors: Any, sh_degree: int, viewspace: Optional[Tensor]) -> 
         )
     if viewspace is not None and tuple(viewspace.shape) not in ((count, 2), (count, 4)):
         raise LegsError(f"viewspace has shape {list(viewspace.shape)}; expected [{count}, 2] or [{count}, 4]: {shapes}")
-    kinds = {tensor.dtype for tensor in tensors.values()} | ({viewspace.dtype} if viewspace is not None else set())
-    if len(kinds) > 1 or not tensors["means"].is_floating_point():
-        found = ", ".join(f"{name} {tensor.dtype}" for name, tensor in tensors.items())
-        raise LegsError(f"the tensors must share one floating type; found {found}")
-    for name, tensor in tensors.items():
-        if tensor.device.type != "cpu":
-            raise LegsError(f"{name} is on {tensor.device}; the reference rasterizer runs on the CPU")
+    for name, tensor in {**tensors, "viewspace": tensors["means"] if viewspace is None else viewspace}.items():
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise LegsError(f"{name} is {tensor.dtype} on {tensor.device}; the rasterizer takes float32 on the CPU")
 
 
 def _check_values(tensors: Any, background: Tensor) -> None:

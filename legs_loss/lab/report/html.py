@@ -5,26 +5,22 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import math
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
+from typing import Any, Dict, List, Mapping, Optional, Sequence
 
 from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.lab.experiments.arms import BASELINE, parse_arm
 from legs_loss.lab.experiments.running import Row, read_rows, scene_of
-from legs_loss.lab.experiments.statistics import COLUMNS, Difference, difference, summarise_all, times_gaussians
+from legs_loss.lab.experiments.statistics import COLUMNS, Difference, difference, times_gaussians
 from legs_loss.lab.experiments.tables import (
-    LABELS,
     MISSING,
-    difference_cell,
-    score_cells,
-    times_cell,
+    differences_table,
+    scores_table,
     too_short,
-    with_values,
 )
 from legs_loss.lab.report.html_pictures import FORMATS as IMAGE_FORMATS
 from legs_loss.lab.report.html_pictures import ViewPictures, draw_row, encode
@@ -107,6 +103,7 @@ def _page(
     seeds = sorted({row["seed"] for row in rows})
     others = [arm for arm in arms if arm != BASELINE]
     preferred = "legs" if "legs" in others else others[-1] if others else arms[0]
+    metrics = {column.label: column.metric for column in COLUMNS if column.metric is not None}
     data = {
         "views": [view._asdict() for view in views],
         "arms": list(arms),
@@ -122,9 +119,8 @@ def _page(
         ),
         verdict=too_short(rows) or _verdict(rows, arms, preferred),
         short=too_short(rows),
-        scores=_scores(rows, arms),
-        differences=_differences(rows, others) if BASELINE in arms and others else None,
-        baseline=BASELINE,
+        scores=scores_table(rows, arms),
+        differences=differences_table(rows, others, metrics) if BASELINE in arms and others else None,
         by_iterations=Markup(by_iterations(rows, arms)),
         by_gaussians=[Markup(plot) for plot in by_gaussians(rows, arms)],
         seed=first[arms[0]]["seed"],
@@ -155,35 +151,6 @@ def _verdict(rows: Sequence[Row], arms: Sequence[str], arm: str) -> str:
 def _in_words(found: Difference) -> str:
     amount = f"{abs(found.mean):.2f} dB {'more' if found.mean > 0 else 'less'} PSNR than"
     return amount if found.clear else f"no clear difference in PSNR ({found.mean:+.2f} dB, may be chance) to"
-
-
-# The heads of a table and its lines; each cell is its text and the value that it sorts by.
-Table = Tuple[List[str], List[List[Tuple[str, str]]]]
-
-
-def _scores(rows: Sequence[Row], arms: Sequence[str]) -> Table:
-    body = []
-    for summary in summarise_all(rows, arms):
-        cells = score_cells(summary.mean, summary.spread)
-        values = [_sortable(summary.mean[label]) for label in LABELS]
-        seeds = str(summary.seeds)
-        body.append([(summary.arm, summary.arm), *zip(cells, values), (seeds, seeds)])
-    return with_values(["arm", *LABELS, "seeds"], body)
-
-
-def _differences(rows: Sequence[Row], arms: Sequence[str]) -> Table:
-    columns = {column.label: column.metric for column in COLUMNS if column.metric is not None}
-    body = []
-    for arm in arms:
-        found = [difference(rows, arm, BASELINE, split, score) for split, score in columns.values()]
-        cells = [
-            (difference_cell(one, score), _sortable(one.mean if one is not None else math.nan))
-            for one, (_, score) in zip(found, columns.values())
-        ]
-        ratio = times_gaussians(rows, arm, BASELINE)
-        times = (MISSING, _sortable(math.nan)) if ratio is None else (times_cell(ratio), _sortable(ratio))
-        body.append([(arm, arm), *cells, times])
-    return with_values(["arm", *columns, "Gaussians"], body)
 
 
 def _settings_of_arms(arms: Sequence[str], first: Mapping[str, Row]) -> List[Dict[str, str]]:
@@ -284,7 +251,3 @@ def _views(scene: Scene, wanted: Optional[Sequence[str]]) -> List[View]:
             raise LegsError(f"{scene.root}: no view has {part!r} in its name")
         chosen.append(found[0])
     return chosen
-
-
-def _sortable(value: float) -> str:
-    return "-1e99" if math.isnan(value) else repr(float(value))

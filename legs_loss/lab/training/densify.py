@@ -7,8 +7,7 @@ from typing import NamedTuple, Optional
 import torch
 from torch import Tensor
 
-from legs_loss.lab.gaussians import Gaussians
-from legs_loss.lab.rasterizer import rotations
+from legs_loss.lab.gaussians import Gaussians, rotations
 from legs_loss.lab.training.adam import select, stack
 
 __all__ = ["Change", "Schedule", "densify", "prunable"]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+from contextlib import suppress
 from pathlib import Path
-from typing import List, NamedTuple, Optional, Tuple
+from typing import Iterator, List, Mapping, NamedTuple, Optional, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+from torch.nn.functional import conv2d, max_pool2d
 
 from legs_loss.errors import LegsError
 
@@ -21,78 +23,68 @@ _LEAST = 32  # pixels, which leave AlexNet one
 
 
 class Network(NamedTuple):
-    """A network's features as torchvision builds them, to the last that counts; ``taps``: those that count."""
+    """A network's features, to the last that counts: how torchvision lays them out.
+
+    Attributes:
+        layers: c a convolution, r ReLU, p pooling, f a Fire module of SqueezeNet; of capitals the outcome counts.
+        stride, padding: of the first convolution; the others keep the size.
+        pool: pixels of the pooling's side; ``ceil``: whether a rest of an image is pooled, too.
+    """
+
+    layers: str
+    stride: int
+    padding: int
+    pool: int
+    ceil: bool = False
+
+
+_NETWORKS = {
+    "squeeze": Network("cRpfFpfFpFFFF", 2, 0, 3, True),
+    "alex": Network("cRpcRpcRcRcR", 4, 2, 3),
+    "vgg": Network("crcRpcrcRpcrcrcRpcrcrcRpcrcrcR", 1, 1, 2),
+}
+
+
+class LPIPS(NamedTuple):
+    """LPIPS by a network: its name, the weights of its features, and of the linear layers above those that count.
+
+    Source: Zhang et al. 2018, version 0.1.
+    """
 
     name: str
-    features: nn.Sequential
-    taps: Tuple[int, ...]
+    state: Mapping[str, Tensor]
+    linear: Sequence[Tensor]
 
-
-class Fire(nn.Module):
-    """A module of SqueezeNet; its parts have torchvision's names."""
-
-    def __init__(self, inputs: int, squeezed: int, each: int) -> None:
-        super().__init__()
-        self.squeeze: nn.Module = nn.Conv2d(inputs, squeezed, 1)
-        self.expand1x1: nn.Module = nn.Conv2d(squeezed, each, 1)
-        self.expand3x3: nn.Module = nn.Conv2d(squeezed, each, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return both expansions of the squeezed image."""
-        x = self.squeeze(x).relu()
-        return torch.cat([self.expand1x1(x).relu(), self.expand3x3(x).relu()], 1)
-
-
-def _squeeze() -> Network:
-    def pool() -> nn.Module:
-        return nn.MaxPool2d(3, 2, ceil_mode=True)
-
-    fires = (Fire(64, 16, 64), Fire(128, 16, 64), pool(), Fire(128, 32, 128), Fire(256, 32, 128), pool())
-    last = (Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256))
-    features = nn.Sequential(nn.Conv2d(3, 64, 3, 2), nn.ReLU(), pool(), *fires, *last)
-    return Network("squeeze", features, (1, 4, 7, 9, 10, 11, 12))
-
-
-def _alex() -> Network:
-    layers: List[nn.Module] = [nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2)]
-    layers += [nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)]
-    for inputs, outputs in ((192, 384), (384, 256), (256, 256)):
-        layers += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
-    return Network("alex", nn.Sequential(*layers), (1, 4, 7, 9, 11))
-
-
-def _vgg() -> Network:
-    layers: List[nn.Module] = []
-    inputs = 3
-    for outputs, count in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
-        layers += [nn.MaxPool2d(2, 2)] if layers else []
-        for _ in range(count):
-            layers += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
-            inputs = outputs
-    return Network("vgg", nn.Sequential(*layers), (3, 8, 15, 22, 29))
-
-
-class LPIPS(nn.Module):
-    """LPIPS of images [3, H, W] in [0, 1], 0 for equal ones. Source: Zhang et al. 2018, version 0.1."""
-
-    def __init__(self, network: Network) -> None:
-        super().__init__()
-        self.name: str = network.name
-        self.features: nn.Sequential = network.features
-        self.taps: Tuple[int, ...] = network.taps
-        self.linear: List[Tensor] = _linear(network.name)
-
-    def forward(self, prediction: Tensor, target: Tensor) -> Tensor:
-        """Return the distance: of unit features, squared, weighted by channel, a mean over pixels, summed over taps."""
-        x = torch.stack([prediction, target]) * 2.0 - 1.0
+    def features(self, x: Tensor) -> Iterator[Tensor]:
+        """Yield the features [B, C, H, W] that count of images [B, 3, H, W] in [-1, 1]."""
+        network = _NETWORKS[self.name]
         x = (x - x.new_tensor(_SHIFT)[:, None, None]) / x.new_tensor(_SCALE)[:, None, None]
-        total = x.new_zeros(())
-        weights = iter(self.linear)
-        for at, layer in enumerate(self.features):
-            x = layer(x)
-            if at in self.taps:
-                unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
-                total = total + (next(weights).to(x) * (unit[0] - unit[1]).square()).sum(0).mean()
+        for at, layer in enumerate(network.layers):
+            if layer == "c":
+                x = self._convolved(x, str(at), *((network.stride, network.padding) if at == 0 else ()))
+            elif layer == "p":
+                x = max_pool2d(x, network.pool, 2, ceil_mode=network.ceil)
+            elif layer in "rR":
+                x = x.relu()
+            else:
+                x = self._convolved(x, f"{at}.squeeze").relu()
+                x = torch.cat([self._convolved(x, f"{at}.expand{side}").relu() for side in ("1x1", "3x3")], 1)
+            if layer.isupper():
+                yield x
+
+    def _convolved(self, x: Tensor, part: str, stride: int = 1, padding: Optional[int] = None) -> Tensor:
+        weight, bias = (self.state[f"{part}.{what}"].to(x) for what in ("weight", "bias"))
+        return conv2d(x, weight, bias, stride, weight.shape[-1] // 2 if padding is None else padding)
+
+    def distance(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """Return LPIPS of images [3, H, W] in [0, 1], 0 for equal ones.
+
+        It is of unit features, squared, weighted by channel, a mean over pixels, summed over what counts.
+        """
+        total = torch.zeros((), device=target.device)
+        for x, weights in zip(self.features(torch.stack([prediction, target]) * 2.0 - 1.0), self.linear):
+            unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
+            total = total + (weights.to(x) * (unit[0] - unit[1]).square()).sum(0).mean()
         return total
 
 
@@ -126,7 +118,7 @@ def lpips(prediction: Tensor, target: Tensor) -> float:
     if min(target.shape[1:]) < _LEAST:
         raise LegsError(f"LPIPS needs at least {_LEAST} pixels a side, got {tuple(target.shape[1:])}: omit --lpips")
     with torch.no_grad():
-        return float(_used.to(prediction.device)(prediction.float(), target.float()))
+        return float(_used.distance(prediction.float(), target.float()))
 
 
 def _read(path: Path) -> LPIPS:
@@ -141,12 +133,11 @@ def _read(path: Path) -> LPIPS:
         raise LegsError(f"{path}: this file holds more than tensors{_MAKE}") from None
     state = state if isinstance(state, dict) else {}
     found = {name[9:]: value for name, value in state.items() if str(name).startswith("features.")}
-    for make in (_squeeze, _alex, _vgg):
-        network = make()
-        needed = network.features.state_dict()
-        if all(getattr(found.get(name), "shape", None) == value.shape for name, value in needed.items()):
-            network.features.load_state_dict({name: found[name] for name in needed})
-            return LPIPS(network)
+    for name in _NETWORKS:
+        with suppress(KeyError, AttributeError, RuntimeError, TypeError):  # what it has not, or of other shapes
+            used = LPIPS(name, found, _linear(name))
+            used.distance(*torch.zeros(2, 3, 2 * _LEAST, 2 * _LEAST))
+            return used
     raise LegsError(f"{path}: these are the weights of another network{_MAKE}")
 
 

@@ -1,18 +1,22 @@
-"""Run several trainings at once, each in a separate process with one thread: a fair and fast comparison."""
+"""Run several trainings at once, each in a process with one thread, or on a cluster: a fair and fast comparison."""
 
 from __future__ import annotations
 
-from multiprocessing.connection import Connection, wait
+import time
+from contextlib import closing
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, Mapping, NamedTuple, Optional, Sequence
 
 from legs_loss.errors import LegsError
 from legs_loss.lab.training.perceptual import use_lpips
 from legs_loss.lab.training.trainer import Progress, TrainConfig, train
+from legs_loss.precompute.workers import in_processes
 from legs_loss.scenes import read_scene
-from legs_loss.system import Child
+from legs_loss.system.executors import Listener, outcomes
 
 __all__ = ["Arm", "train_arm", "train_side_by_side"]
+
+_TELL_SECONDS = 0.5
 
 
 class Arm(NamedTuple):
@@ -34,46 +38,48 @@ def train_side_by_side(
     arms: Sequence[Arm],
     processes: int,
     on_progress: Callable[[str, Progress], None],
-    on_done: Optional[Callable[[str, Dict[str, Any]], None]] = None,
+    on_done: Callable[[str, Dict[str, Any]], None] = lambda name, metrics: None,
+    scheduler: Optional[str] = None,
 ) -> Dict[str, Dict[str, Any]]:
     """Train all arms, in order, ``processes`` at a time; return their metrics by name.
 
-    ``on_done`` gets the name and the metrics of each as soon as it ends.
-
     Uses fresh processes, so a script that calls it needs its ``if __name__ == "__main__"``.
 
+    Args:
+        arms: the trainings.
+        processes: at a time.
+        on_progress: gets a name and its progress.
+        on_done: gets the name and the metrics of each as soon as it ends.
+        scheduler: the address of a dask scheduler, whose workers train them, sharing the file system; paths are
+            absolute then. If a worker dies, another one resumes its training from the last checkpoint.
+
     Raises:
-        LegsError: an arm failed; the message names it. The others are ended.
+        LegsError: an arm failed; the message names it. The others are ended, or, on a cluster, first trained.
     """
-    waiting: List[Arm] = list(reversed(arms))
-    running: Dict[Any, Tuple[str, Child]] = {}  # by this side's end of their pipes
     metrics: Dict[str, Dict[str, Any]] = {}
-    try:
-        while waiting or running:
-            while waiting and len(running) < processes:
-                arm = waiting.pop()
-                child = Child(_work, arm)
-                running[child.connection] = arm.name, child
-            ready: List[Any] = wait(list(running))
-            for connection in ready:
-                name, child = running[connection]
-                try:
-                    message = connection.recv()
-                except (EOFError, OSError):
-                    raise LegsError(f"{name}: its process was killed (out of memory?)") from None
-                if isinstance(message, Progress):
-                    on_progress(name, message)
-                    continue
-                if isinstance(message, str):
-                    raise LegsError(f"{name}: {message}")
-                metrics[name] = message
-                del running[connection]
-                child.end()
-                if on_done is not None:
-                    on_done(name, message)
-    finally:
-        for _, child in running.values():
-            child.end()
+    failed: Dict[str, LegsError] = {}
+
+    def listen(message: Dict[str, Any]) -> None:
+        on_progress(message["name"], Progress(*message["progress"]))
+
+    if scheduler is None:
+        results: Any = in_processes(_train, arms, processes, listen)
+    else:
+        for arm in arms:
+            if arm.out is not None:
+                arm.out.mkdir(parents=True, exist_ok=True)  # made by a worker it would be on its own disk
+        results = outcomes(_train_there, arms, scheduler, listen)
+    with closing(results):
+        for arm, outcome in results:
+            if not isinstance(outcome, LegsError):
+                metrics[arm.name] = outcome
+                on_done(arm.name, outcome)
+                continue
+            failed[arm.name] = outcome
+            if scheduler is None:
+                break
+    for name, error in failed.items():
+        raise LegsError(f"{name}: {error}")
     return {arm.name: metrics[arm.name] for arm in arms}
 
 
@@ -95,11 +101,21 @@ def train_arm(arm: Arm, on_progress: Callable[[Progress], None]) -> Dict[str, An
     ).metrics
 
 
-def _work(connection: Connection, arm: Arm) -> None:
-    try:
-        try:
-            connection.send(train_arm(arm, connection.send))
-        except (LegsError, OSError) as error:  # a full disk is no fault of the code either
-            connection.send(str(error))
-    except OSError:
-        pass  # the parent was killed: the training resumes from its files
+def _train(arm: Arm, tell: Listener) -> Dict[str, Any]:
+    return train_arm(arm, lambda progress: tell({"name": arm.name, "progress": list(progress)}))
+
+
+def _train_there(arm: Arm, tell: Listener) -> Dict[str, Any]:
+    """Train one arm on a cluster's worker; it tells its progress a few times a second."""
+    for folder, what in ((arm.scene, "the scene"), (arm.out, "the results")):
+        if folder is not None and not folder.is_dir():
+            raise LegsError(f"there is no folder {folder} here: is the file system with {what} mounted?")
+    due = 0.0
+
+    def seldom(message: Dict[str, Any]) -> None:
+        nonlocal due
+        if time.monotonic() >= due or message["progress"][0] == arm.config.iterations:
+            due = time.monotonic() + _TELL_SECONDS
+            tell(message)
+
+    return _train(arm, seldom)

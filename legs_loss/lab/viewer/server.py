@@ -14,9 +14,8 @@ import numpy as np
 
 from legs_loss.errors import LegsError, require
 from legs_loss.lab.conventions import SH_C0
-from legs_loss.lab.gaussians import Gaussians
+from legs_loss.lab.gaussians import Gaussians, rotations
 from legs_loss.lab.ply import read_ply
-from legs_loss.lab.rasterizer import rotations
 from legs_loss.lab.training.dataset import open_store
 from legs_loss.lab.viewer.content import Content
 from legs_loss.lab.viewer.guard import Guard, check_address

@@ -20,7 +20,7 @@ from PIL import Image
 from legs_loss import LegsError, weight_map
 from legs_loss.cli import main
 from legs_loss.lab.experiments.arms import parse_arm, parse_arms
-from legs_loss.lab.experiments.tables import scores_table
+from legs_loss.lab.experiments.tables import markdown, scores_table
 from legs_loss.weights import Weights
 
 pytest.importorskip("numba")
@@ -206,7 +206,7 @@ def test_the_command(tiny_scene: Path, tmp_path: Path) -> None:
     assert "6 of 6 trainings to do" in done.stdout
     rows = read_rows(tmp_path / "out")[1]
     assert len(rows) == 6
-    assert scores_table(rows, ["3dgs", "legs", "legs@3dgs"]) in done.stdout
+    assert markdown(*scores_table(rows, ["3dgs", "legs", "legs@3dgs"])) in done.stdout
     assert "Too short to decide: 20 iterations" in done.stdout and "legs − 3dgs" not in done.stdout
     again = subprocess.run(arguments, env=environment(), capture_output=True, text=True, encoding="utf-8")
     assert again.returncode == 0

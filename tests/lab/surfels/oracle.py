@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from legs_loss.lab.conventions import FARTHEST, NEAR, TILE
-from legs_loss.lab.rasterizer.oracle import colours, cover, tile_bounds, unit_rotations
 from legs_loss.lab.surfels.model import (
     CHANNELS,
     CUTOFF,
@@ -26,6 +25,7 @@ from legs_loss.lab.surfels.model import (
     Surfels,
     SurfelView,
 )
+from tests.lab.oracle import colours, cover, tile_bounds, unit_rotations
 
 
 class Bounds(NamedTuple):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from legs_loss.lab.conventions import MAX_ALPHA, MIN_ALPHA
-from legs_loss.lab.rasterizer import oracle
+from tests.lab import oracle
 from tests.lab.surfels import oracle as surfels_oracle
 from tests.lab.surfels.support import (
     ALPHA,

@@ -1,4 +1,4 @@
-"""The reference rasterizer: plain torch, autograd, any floating type. The fast one is tested against it.
+"""The oracle: 3D Gaussian Splatting in plain torch, autograd, any floating type. The compiled one is tested against it.
 
 Each function below is one step of 3D Gaussian Splatting's forward pass; docs/rasterizer.md has the formulas. The
 gradient is autograd's, but for the two places where 3DGS's own differs from the derivative, marked "as upstream".
@@ -26,6 +26,7 @@ from legs_loss.lab.conventions import (
     TILE,
     View,
 )
+from legs_loss.lab.rasterizer import Rendering
 
 
 class Projections(NamedTuple):
@@ -161,6 +162,23 @@ class _Offsets(torch.autograd.Function):
         return summed, both[:, : ctx.columns], None, None
 
 
+def rasterize(
+    means: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    camera: Any,
+    background: Any,
+    sh_degree: int,
+    viewspace: Optional[Tensor] = None,
+) -> Rendering:
+    """Draw as the compiled `rasterize`, whose arguments these are, in any floating type; nothing is checked."""
+    background = torch.as_tensor(background, dtype=means.dtype)
+    view = View.from_camera(camera)
+    return Rendering(*render(means, scales, quaternions, opacities, sh, view, background, sh_degree, viewspace))
+
+
 def render(
     means: Tensor,
     scales: Tensor,
@@ -172,7 +190,7 @@ def render(
     sh_degree: int,
     viewspace: Optional[Tensor],
 ) -> Tuple[Tensor, Tensor]:
-    """Return image [3, H, W] and radii int32 [N]; arguments as `rasterize` has checked them."""
+    """Return image [3, H, W] and radii int32 [N]; arguments as of `rasterize`."""
     dtype = means.dtype
     to_camera = torch.as_tensor(view.world_to_camera, dtype=dtype)
     points = means @ to_camera[:3, :3].T + to_camera[:3, 3]

@@ -22,7 +22,8 @@ from legs_loss.cli.shared.scene_arguments import add_images, add_resolution
 from legs_loss.system import cores, say
 
 if TYPE_CHECKING:
-    from legs_loss.precompute.many_scenes import SceneDone, SceneTask
+    from legs_loss.precompute import Report
+    from legs_loss.precompute.many_scenes import SceneTask
 
 HELP = "compute the weight maps of scenes once, for every later training"
 
@@ -168,22 +169,15 @@ def _refuse_photographs_of_a_scene(folder: Path) -> None:
         )
 
 
-def _say(store: Path, done: SceneDone) -> int:
+def _say(store: Path, report: Report) -> int:
     """Print the result of a scene; return 1 if any of it failed."""
     from legs_loss.cli.shared.scene_arguments import say_skipped
     from legs_loss.store import MANIFEST, WeightStore
     from legs_loss.store.sharpness import unsharp_views
 
-    report = done.report
     say_skipped(report.skipped)
     for note in report.notes:
         say(f"legs: note: {note}", sys.stderr)
-    if done.alike:
-        say(
-            f"legs: note: {done.alike} views share a name in 3DGS, which drops folders and extensions; "
-            "codebases that use these names compute their weights instead",
-            sys.stderr,
-        )
     unsharp = unsharp_views(WeightStore(report.store)) if (report.store / MANIFEST).is_file() else []
     if unsharp:
         say(
@@ -191,8 +185,6 @@ def _say(store: Path, done: SceneDone) -> int:
             "map is normalised by its own range, so such photographs get larger weights",
             sys.stderr,
         )
-    if report.unmasked:
-        say(f"legs: note: counted whole, without a mask: {', '.join(report.unmasked)}", sys.stderr)
     for kind, count in report.user_maps.items():
         say(f"{store}: {count} {kind if kind.endswith('s') else kind + 's'} of your own")
     say(f"{store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")

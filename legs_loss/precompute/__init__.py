@@ -1,9 +1,9 @@
 """Compute the normalised response of every photograph of a scene, and write the store for all later trainings.
 
-Views are distributed to processes, each with one photograph in memory at a time; the response is computed in strips of
-rows. Finished maps are in the store within about a second, so an interrupted or killed run can be
-resumed. A view is up to date, and left alone, while its photograph's file has the size and time of change that were
-recorded, its map's checksum holds, and size, operator and background are those asked for.
+Views are distributed to processes, each with one photograph in memory at a time. Finished maps are in the store within
+about a second, so an interrupted or killed run can be resumed. A view is up to date, and left alone, while its
+photograph's file has the size and time of change that were recorded, its map's checksum holds, and size, operator and
+background are those asked for.
 """
 
 from __future__ import annotations

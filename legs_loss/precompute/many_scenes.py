@@ -6,7 +6,7 @@ import glob
 import os
 import time
 from collections import Counter
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import List, NamedTuple, Optional, Sequence
 
 from legs_loss.config import STORE_FOLDER
@@ -17,7 +17,7 @@ from legs_loss.spec import Spec
 from legs_loss.system import read_text
 from legs_loss.system.executors import Listener
 
-__all__ = ["SceneDone", "SceneTask", "find_scenes", "precompute_scene", "stores_of"]
+__all__ = ["SceneTask", "find_scenes", "precompute_scene", "stores_of"]
 
 _TELL_SECONDS = 0.25
 _LARGEST = 64 << 20  # bytes of a list
@@ -34,13 +34,6 @@ class SceneTask(NamedTuple):
     white_background: bool
     workers: int
     maps: UserMaps = UserMaps()
-
-
-class SceneDone(NamedTuple):
-    """The report of a scene; ``alike`` is the number of its views that share a name in 3DGS with another."""
-
-    report: Report
-    alike: int
 
 
 def find_scenes(given: Sequence[str]) -> List[Path]:
@@ -101,7 +94,7 @@ def stores_of(scenes: Sequence[Path], out: Optional[str]) -> List[Path]:
     return [Path(out) / scene.resolve().name for scene in scenes]
 
 
-def precompute_scene(task: SceneTask, tell: Listener) -> SceneDone:
+def precompute_scene(task: SceneTask, tell: Listener) -> Report:
     """Precompute a scene, and tell ``{"scene": path, "done": views, "of": views}`` a few times a second.
 
     Raises:
@@ -121,6 +114,4 @@ def precompute_scene(task: SceneTask, tell: Listener) -> SceneDone:
             tell({"scene": str(task.scene), "done": done, "of": of})
 
     settings = task.spec, task.resolution, task.white_background, task.workers
-    report = precompute(scene, task.store, *settings, on_progress=on_progress, maps=task.maps)
-    short = Counter(PurePosixPath(view.name).name.split(".")[0] for view in scene.views)
-    return SceneDone(report, sum(count for count in short.values() if count > 1))
+    return precompute(scene, task.store, *settings, on_progress=on_progress, maps=task.maps)

@@ -8,8 +8,8 @@ from collections import Counter
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from typing import Callable, Dict, List, Optional, Union
+from pathlib import Path, PurePosixPath
+from typing import Callable, Dict, Iterator, List, Optional, Union
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
@@ -33,8 +33,7 @@ _COMMIT_SECONDS = 1.0
 class Report:
     """The result of :func:`precompute`, by names of views: maps made, maps kept, views skipped with the reason.
 
-    ``user_maps`` are the numbers of the user's own maps, a kind each; ``unmasked`` has no mask where other views have;
-    ``notes`` are sentences for the user.
+    ``user_maps`` are the numbers of the user's own maps, a kind each; ``notes`` are sentences for the user.
     """
 
     store: Path
@@ -42,7 +41,6 @@ class Report:
     kept: List[str] = field(default_factory=list)
     skipped: Dict[str, str] = field(default_factory=dict)
     user_maps: Dict[str, int] = field(default_factory=dict)
-    unmasked: List[str] = field(default_factory=list)
     notes: List[str] = field(default_factory=list)
 
 
@@ -92,8 +90,8 @@ def precompute(
         mine = stage_user_maps(scene.root, list(views.values()), resolution, maps, writer.entries(), writer.staging)
         if mine.added:  # all at once, before any response: what is found in the store is never without its mask
             writer.commit(mine.added, mine.dropped)
-        report.user_maps, report.unmasked = Counter(entry.operator for entry in mine.added), mine.unmasked
-        report.notes += [*scene.notes, *mine.notes]
+        report.user_maps = Counter(entry.operator for entry in mine.added)
+        report.notes += [*scene.notes, *mine.notes, *_shared_names(scene)]
         job = Job(spec, resolution, white_background, out, writer.staging)
         known: Dict[str, List[Entry]] = {}
         for entry in writer.entries():
@@ -130,6 +128,17 @@ def precompute(
     if out.is_dir() and out.resolve().parent != scene.root.resolve():
         note_scene(out, scene)
     return report
+
+
+def _shared_names(scene: Scene) -> Iterator[str]:
+    """Yield a note where views have one name in 3DGS."""
+    views = Counter(PurePosixPath(view.name).name.split(".")[0] for view in scene.views)
+    alike = sum(count for count in views.values() if count > 1)
+    if alike:
+        yield (
+            f"{alike} views share a name in 3DGS, which drops folders and extensions; codebases that use these names "
+            "compute their weights instead"
+        )
 
 
 def _made(job: Job, task: ViewTask, _: Listener) -> ViewResult:

@@ -1,15 +1,13 @@
-"""Photograph -> normalised response, in strips of rows, by compiled code where that is worth loading."""
+"""Photograph -> normalised response, by compiled code where that is worth loading."""
 
 from __future__ import annotations
 
-import math
 from typing import Any, Dict, Tuple
 
 import numpy as np
 import torch
 
 from legs_loss.kernels.available import BACKENDS
-from legs_loss.operators import OPERATORS
 from legs_loss.responses import response, response_levels
 from legs_loss.scenes import image_tensor
 from legs_loss.scenes.images import row_strips
@@ -21,18 +19,24 @@ _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer
 
 
 def normalised_map(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
-    """Return E^ of a photograph uint8 or uint16 [H, W, C] as float16 [H, W], with one strip's temporaries at a time."""
-    return _normalised(response_map(image, spec), spec)[0]
+    """Return E^ of a photograph uint8 or uint16 [H, W, C] as float16 [H, W]."""
+    return normalised_map_and_levels(image, spec)[0]
 
 
 def normalised_map_and_levels(image: np.ndarray, spec: WeightSpec) -> Tuple[np.ndarray, Dict[str, Any]]:
-    """Return E^ of a photograph, and the entry's further values for a normalisation over the scene."""
+    """Return E^ of a photograph, and of a spec over the scene the entry's further values: E was low + span * E^."""
+    levels: Dict[str, Any] = {}
     strength = response_map(image, spec)
-    if spec.over == "image":
-        return _normalised(strength, spec)[0], {}
-    median, strong = response_levels(strength[None], spec).tolist()
-    normalised, low, span = _normalised(strength, spec)
-    return normalised, {"low": low, "span": span, "median": median, "strong": strong}
+    low, high = strength.amin(), strength.amax()
+    span = high - low + spec.eps
+    if spec.over == "scene":
+        median, strong = response_levels(strength[None], spec).tolist()
+        levels = {"low": float(low), "span": float(span), "median": median, "strong": strong}
+    height, width = strength.shape
+    normalised = np.empty((height, width), np.float16)  # numpy asks for large pages; torch does not
+    for rows in row_strips(height, width):  # in place: new memory would have to be mapped
+        torch.from_numpy(normalised[rows]).copy_(strength[rows].sub_(low).div_(span))
+    return normalised, levels
 
 
 def compile_response(width: int, height: int, spec: WeightSpec) -> None:
@@ -50,23 +54,4 @@ def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
         if supports_response(spec):
             with said("legs precompute", "1 to 5 s"):
                 return torch.from_numpy(photograph_response(image, spec))
-    height, width = image.shape[:2]
-    reach = OPERATORS[spec.operator].reach + math.ceil(3.0 * spec.smooth)
-    strength = torch.from_numpy(np.empty((height, width), np.float32))
-    for rows in row_strips(height, width):
-        # Rows that the operator reaches; at the photograph's own border it reflects.
-        above, below = max(rows.start - reach, 0), min(rows.stop + reach, height)
-        strip = response(image_tensor(image[above:below]), spec.operator, spec.p, False, spec.smooth)
-        strength[rows] = strip[0, rows.start - above : rows.stop - above]
-    return strength
-
-
-def _normalised(strength: torch.Tensor, spec: WeightSpec) -> Tuple[np.ndarray, float, float]:
-    """Return E^ of a response [H, W], which is overwritten, as float16; it was low + span * E^."""
-    low, high = strength.amin(), strength.amax()
-    span = high - low + spec.eps
-    height, width = strength.shape
-    normalised = np.empty((height, width), np.float16)  # numpy asks for large pages; torch does not
-    for rows in row_strips(height, width):  # in place: new memory would have to be mapped
-        torch.from_numpy(normalised[rows]).copy_(strength[rows].sub_(low).div_(span))
-    return normalised, float(low), float(span)
+    return response(image_tensor(image), spec.operator, spec.p, False, spec.smooth)[0]

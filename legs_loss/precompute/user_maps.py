@@ -41,11 +41,10 @@ NO_MAPS: UserMaps = UserMaps()
 
 
 class Staged(NamedTuple):
-    """Entries to add to a store and to remove from it, views without a mask where others have one, and notes."""
+    """Entries to add to a store and to remove from it, and notes for the user."""
 
     added: List[Entry]
     dropped: List[Entry]
-    unmasked: List[str]
     notes: List[str]
 
 
@@ -73,7 +72,7 @@ def stage_user_maps(
     """
     if not 0.0 < maps.scale <= _LARGEST:
         raise LegsError(f"--weight_scale must be above 0 and at most {_LARGEST:g}, got {maps.scale:g}")
-    result = Staged([], [], [], [])
+    result = Staged([], [], [])
     masked = sum(view.mask is not None for view in views)
     if masked and maps.masks is None:
         result.notes.append(f"transforms.json names masks of {masked} photograph(s): --masks mask_path applies them")
@@ -107,8 +106,9 @@ def stage_user_maps(
                 values = read_mask(file, named, size) if kind == MASK else read_map_file(file, size)
                 for size in sorted(trained[view.name]):
                     result.added.append(_staged(kind, view, file, averaged(values, size), maps.scale, staging))
-            elif kind == MASK:
-                result.unmasked.append(view.name)
+        whole = [view.name for view in views if view.name not in files]
+        if kind == MASK and whole:
+            result.notes.append(f"counted whole, without a mask: {', '.join(whole)}")
         result.dropped.extend(entry for entry in known if entry.operator == kind)
     return result
 

@@ -59,7 +59,8 @@ class TestReading:
         np.testing.assert_array_equal(mask_of(scene), third() / 255)
         assert mask_of(scene, "images/b.png") is None
         report = precompute(read_scene(scene), maps=UserMaps("masks"))
-        assert (report.user_maps, report.unmasked, len(report.kept)) == ({MASK: 1}, ["images/b.png", "images/c.png"], 3)
+        assert (report.user_maps, len(report.kept)) == ({MASK: 1}, 3)
+        assert report.notes == ["counted whole, without a mask: images/b.png, images/c.png"]
 
     @pytest.mark.parametrize("name", ["a.png.png", "images/a.png", "a.tif", "a.bmp"])
     def test_the_names_of_colmap_nerfstudio_and_folders(self, scene, name):
@@ -109,7 +110,7 @@ class TestReading:
     def test_those_of_no_photograph_are_named_and_left_out(self, scene):
         Image.fromarray(third()).save(scene / "masks/z.png")
         report = precompute(read_scene(scene), maps=UserMaps("masks"))
-        assert report.user_maps == {MASK: 1} and len(report.notes) == 1
+        assert report.user_maps == {MASK: 1} and len(report.notes) == 2
         assert "1 file(s) are left out" in report.notes[0] and str(scene / "masks/z.png") in report.notes[0]
 
     def test_one_for_all(self, scene):
@@ -130,7 +131,7 @@ class TestReading:
         report = precompute(read_scene(scene))
         assert "masks of 1 photograph(s): --masks mask_path applies them" in report.notes[0]
         report = precompute(read_scene(scene), maps=UserMaps("mask_path"))
-        assert (report.user_maps, report.unmasked, report.notes) == ({MASK: 1}, ["images/b.png"], [])
+        assert (report.user_maps, report.notes) == ({MASK: 1}, ["counted whole, without a mask: images/b.png"])
         np.testing.assert_array_equal(mask_of(scene, masks="mask_path"), third() / 255)
 
     def test_gray_counts_in_part(self, scene):

@@ -121,8 +121,9 @@ def precompute(
                     if on_progress is not None:
                         on_progress(len(report.made) + len(report.kept) + len(report.skipped), len(tasks))
                     if staged and time.monotonic() >= due:
-                        _commit(writer, staged)
-                        due = time.monotonic() + _COMMIT_SECONDS
+                        began = time.monotonic()
+                        _commit(writer, staged)  # it lists all maps anew: of 100,000 for longer than a second
+                        due = time.monotonic() + max(_COMMIT_SECONDS, 10 * (time.monotonic() - began))
             finally:
                 _commit(writer, staged)
     if out.is_dir() and out.resolve().parent != scene.root.resolve():

@@ -313,6 +313,11 @@ TEXTS = {
     "a_word.py": "lossmask",
     "open_brackets.py": "loss[",
     "calls_in_a_line.py": "eval(",
+    "blanks.py": "  ",
+    "annotations.py": "l1:",
+    "words.py": "l1loss",
+    "dots.py": ".l1",
+    "comments_in_a_line.py": "#,",
     "weighted.py": "legs_loss.ssim;",
     "a.yaml": "loss: {",
     ".gitmodules": "\n",
@@ -330,7 +335,7 @@ def test_long_texts_are_searched_once(command, tmp_path):
     root = checkout(tmp_path, texts)
     done = subprocess.run(
         [sys.executable, "-m", "legs_adapters.cli", command, str(root)],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=legs_environment(), timeout=100,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=legs_environment(), timeout=300,
     )  # fmt: skip
     assert (done.returncode, b"Traceback" in done.stdout) == (2, False), done.stdout
 

@@ -35,8 +35,8 @@ __all__ = ["Purposes"]
 _DEPTH = 3
 _Step = Tuple[Function, cst.Call, Set[str]]  # with the words of whose method runs it
 _Value = Tuple[Function, cst.CSTNode]
-_STEPS = re.compile(r"step\w*\s*\(")
-_CALLED = re.compile(r"(\w+)\s*\(")
+_STEPS = re.compile(r"step(?:(?!step)\w)*\s*\(")
+_CALLED = re.compile(r"\b(\w+)\s*\(")
 _Round = Tuple[Function, Tuple[int, ...], int]
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 

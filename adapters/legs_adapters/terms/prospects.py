@@ -20,21 +20,24 @@ __all__ = ["Prospects"]
 _WORD = re.compile(r"(?<![\w\"'])[^\W\d]\w*(?![\"'])")  # no key, no setting: ``split="train"``
 _DEFINITION = re.compile(r"^([ \t]*)(?:async[ \t]+)?(def|class)[ \t]+(\w+)", re.M)
 # A value goes on where its line ends in an opening bracket, a comma or a backslash.
-_VALUE = r"((?:[^\n]*[\[({,\\][ \t]*(?:#[^\n]*)?\n)*[^\n]*)"
+_VALUE = r"((?:[^\n]*[\[({,\\][ \t]*(?:#[^\n]*)?(?:\n|\Z))*[^\n]*)"
 _GIVEN = re.compile(
     r"^(?:[ \t]*self\.)?(\w+)(?:\[[^\]\n]*\]|\.\w+)*[ \t]*(?::[^=\n]+|[-+*/])?=(?!=)[ \t]*" + _VALUE, re.M
 )
 _UNPACKED = re.compile(
-    r"^(?:[ \t]+(?=[^=\n]*\bself\.))?[(\[]?((?:[\w.]+[ \t]*,[ \t]*)+[\w.]*)[)\]]?[ \t]*=(?!=)[ \t]*" + _VALUE, re.M
+    r"^(?:[ \t]+(?![ \t])(?=[^=\n]*\bself\.))?[(\[]?((?:[\w.]+[ \t]*,[ \t]*)+[\w.]*)[)\]]?[ \t]*=(?!=)[ \t]*" + _VALUE,
+    re.M,
 )
-_TARGET = re.compile(r"(\w+)[ \t]*(?:,|$)")
+_TARGET = re.compile(r"\b(\w+)[ \t]*(?:,|$)")
 _RETURNED = re.compile(r"\breturn[ \t(]+" + _VALUE)
 _ADDED = re.compile(r"\bself\.(\w+)\.(?:append|add|extend|update|setdefault)\(([^\n]*)")
-_SINGLE_CALL = re.compile(r"([\w.]+)[ \t]*\((?:[^()]|\([^()]*\))*\)[ \t]*(?:#.*)?$")
+_SINGLE_CALL = re.compile(r"(?<![\w.])([\w.]+)[ \t]*\((?:[^()]|\([^()]*\))*\)[ \t]*(?:#.*)?$")
 _RENAMED = re.compile(r"(?<=\w)[ \t]+as[ \t]+(\w+)")
-_LAST_WORD = re.compile(r"\w*$")
+_LAST_WORD = re.compile(r"(?<!\w)\w*$")
 _WITH_L1 = re.compile(r"^.*[lL]1.*$", re.M)
-_DEFAULT = re.compile(r"\b(\w+)(?:[ \t]*:[^=,()\n]+)?[ \t]*=[ \t]*([\w.]*[lL]1\w*)(?![\w.]*[ \t]*\()")
+_DEFAULT = re.compile(
+    r"\b(\w+)(?:[ \t]*:[^=,()\n]{1,200})?[ \t]*=[ \t]*([\w.]{0,99}[lL]1\w{0,99})(?![\w.]{0,99}[ \t]*\()"
+)
 _BRANCHES = re.compile(r"^[ \t]+(?:if|for|while|with|try|async)\b", re.M)
 # What is computed is no function: arithmetic, or what a method returns that is no module's own.
 _COMPUTED = re.compile(

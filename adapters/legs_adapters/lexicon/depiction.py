@@ -106,13 +106,9 @@ class Meanings:
 
     def _subscript(self, function: Function, node: cst.Subscript) -> Meaning:
         key = key_of(node) or formatted_key(node) or default_key(function, node)
-        last = node.slice[-1].slice
-        is_fourth = len(node.slice) > 1 and isinstance(last, cst.Index) and constant(last.value) == 3
-        cuts = [cut for cut in (each.slice for each in node.slice) if isinstance(cut, cst.Slice) and code(cut) != ":"]
-        is_behind = len(cuts) == 1 and constant(cuts[0].lower) == 3  # no block of a matrix, no border: 3:-3
-        if is_fourth or (is_behind and (cuts[0].upper is None or constant(cuts[0].upper, 0) > 3)):
+        if _is_fourth(node):
             return Meaning("depth", self.meaning(function, node.value).role)  # of RGB+D: render[0, ..., 3], render[3:]
-        keys = [key] if isinstance(key, str) else self._keys(function, last)
+        keys = [key] if isinstance(key, str) else self._keys(function, node.slice[-1].slice)
         return mix(self._member(function, node, each) for each in keys) if keys else self.meaning(function, node.value)
 
     def _keys(self, function: Function, index: cst.CSTNode) -> List[str]:
@@ -238,7 +234,7 @@ def _parts(node: cst.CSTNode) -> List[cst.CSTNode]:
     if isinstance(node, (cst.BinaryOperation, cst.BooleanOperation)):
         parts: List[cst.CSTNode] = [node.left, node.right]
         has_only_its_shape = isinstance(node.operator, cst.Multiply) and 0 in map(constant, parts)  # image * 0 + color
-        return [] if has_only_its_shape else parts
+        return [] if has_only_its_shape else [part for part in parts if not _is_opacity(part, node)]
     if isinstance(node, cst.IfExp):
         return [node.body, node.orelse]
     if isinstance(node, (cst.Tuple, cst.List)):
@@ -246,6 +242,26 @@ def _parts(node: cst.CSTNode) -> List[cst.CSTNode]:
     if isinstance(node, (cst.ListComp, cst.GeneratorExp)):
         return [node.elt]
     return [node.expression] if isinstance(node, cst.UnaryOperation) else []
+
+
+def _is_fourth(node: cst.Subscript) -> bool:
+    """Return whether it is what lies behind the colours."""
+    parts = [each.slice for each in node.slice]
+    cuts = [cut for cut in parts if isinstance(cut, cst.Slice) and code(cut) != ":"]
+    is_behind = len(cuts) == 1 and constant(cuts[0].lower) == 3  # no block of a matrix, no border: 3:-3
+    last = parts[-1] if len(parts) > 1 else None
+    is_one = isinstance(last, cst.Index) and constant(last.value) == 3
+    return is_one or (is_behind and (cuts[0].upper is None or constant(cuts[0].upper, 0) > 3))
+
+
+def _is_opacity(part: cst.CSTNode, node: cst.BinaryOperation | cst.BooleanOperation) -> bool:
+    """Return whether a part of an operation is the opacity of a layer: ``1 - layer[3:]``, ``layer[3:] * layer[:3]``."""
+    if not isinstance(part, cst.Subscript) or not _is_fourth(part):
+        return False
+    left, right = node.left, node.right
+    colours = left if part is right else right
+    is_over = isinstance(colours, cst.Subscript) and same(colours.value, part.value)
+    return constant(left) == 1 if isinstance(node.operator, cst.Subtract) else is_over
 
 
 def _is_of_neighbours(node: cst.BinaryOperation) -> bool:

@@ -490,11 +490,16 @@ def test_squares_of_poses_and_definitions_are_not_the_image_loss(tmp_path, run):
 
 def test_models_that_are_only_used_are_not_searched_and_a_script_by_the_name_of_a_test_is(tmp_path, run):
     texts = files("inria")
-    elsewhere = {"src/dust3r/croco/criterion.py": texts["train.py"], "splat_test.py": texts["train.py"], **texts}
-    shown = run("--check", checkout(tmp_path, elsewhere)).stdout
-    patched = [row.split(":")[0] for row in shown.splitlines() if " patched " in row]
+    untrained = "def l1(self, image, gt):\n    return (image - gt).abs().mean()\n"
+    elsewhere = {"src/dust3r/croco/criterion.py": untrained, "splat_test.py": texts["train.py"], **texts}
+    root = checkout(tmp_path, {**elsewhere, **{f"vggt/{path}": text for path, text in texts.items()}})
+    done = run("--check", root)
+    patched = [row.split(":")[0] for row in done.stdout.splitlines() if " patched " in row]
     assert patched == ["splat_test.py", "train.py"]
-    assert "dust3r" not in shown
+    assert "dust3r" not in done.stdout + done.stderr
+    [beside] = [line for line in done.stderr.splitlines() if "vggt" in line]
+    assert re.search(r"vggt/train\.py:\d+ may be the loss, and vggt is not searched", beside)
+    assert beside.endswith(f": legs-patch {root}/vggt")
 
 
 def test_the_pre_commit_hook_fails_until_the_checkout_is_patched(tmp_path):

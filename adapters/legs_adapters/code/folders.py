@@ -33,7 +33,7 @@ _FOREIGN = {
     name: why
     for why, names in (
         (VENDORED, "submodules third_party third-party thirdparty external externals extern SIBR_viewers"),
-        ("a model that it only uses", "croco dust3r mast3r vggt"),
+        (VENDORED, "croco dust3r mast3r vggt"),  # models that a checkout uses, some with trainers of its own beside
         (_TESTS, "tests test testing"),
         ("installed packages", "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs"),
         (

@@ -109,7 +109,13 @@ def is_off(environ: Optional[Mapping[str, str]] = None) -> bool:
     Raises:
         LegsError: it is neither 1 nor 0 nor a synonym of these.
     """
-    return _is_true((os.environ if environ is None else environ).get("LEGS_OFF", ""))
+    value = (os.environ if environ is None else environ).get("LEGS_OFF", "")
+    word = value.strip().lower()
+    if word not in _TRUE + _FALSE:
+        raise LegsError(
+            f"environment variable LEGS_OFF must be 1 or 0 (or true, false, yes, no, on, off), got {value!r}"
+        )
+    return word in _TRUE
 
 
 def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> Config:
@@ -161,15 +167,6 @@ def _store(value: Any, base: Path) -> Optional[Path]:
         return base / Path(value).expanduser()
     except RuntimeError:
         raise LegsError(f"store must be a path, got {repr(value)[:100]}, and there is no such user") from None
-
-
-def _is_true(value: str) -> bool:
-    word = value.strip().lower()
-    if word not in _TRUE + _FALSE:
-        raise LegsError(
-            f"environment variable LEGS_OFF must be 1 or 0 (or true, false, yes, no, on, off), got {value!r}"
-        )
-    return word in _TRUE
 
 
 def _unknown_variables(environ: Mapping[str, str]) -> Tuple[str, ...]:

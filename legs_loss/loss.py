@@ -119,13 +119,13 @@ def legs_loss(
     spec = PRESETS[spec] if spec.__class__ is str and spec in PRESETS else as_spec(spec)
     if not 0.0 <= lambda_dssim <= 1.0:
         raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
-    own = None if weight is not None or spec.beta == 0.0 else spec
-    if own is not None and own.over == "scene":
+    made_by = None if weight is not None or spec.beta == 0.0 else spec
+    if made_by is not None and made_by.over == "scene":
         raise LegsError(NEEDS_LEVELS.format(where="one call does not know", then="and give LEGSLoss that store="))
-    plan, image, photograph = plan_of(whole(lambda_dssim, padding), own, prediction, target, channels_last)
-    if own is not None and not (prediction.requires_grad and torch.is_grad_enabled()):
+    plan, image, photograph = plan_of(whole(lambda_dssim, padding), made_by, prediction, target, channels_last)
+    if made_by is not None and not (prediction.requires_grad and torch.is_grad_enabled()):
         check_order(prediction, target)
-    weights, made = Weights(own), "" if own is None else "by legs_loss"
+    weights, made = Weights(made_by), "" if made_by is None else "by legs_loss"
     if weight is not None:
         weights, made = weights.times(plan.layout.map_first(weight, photograph, "weight")), "the map given to legs_loss"
     if mask is not None:

@@ -119,11 +119,8 @@ class Backends:
         return self._answer(name, device, (operation, (spec.operator, spec.p, spec.curve)))
 
     def _answer(self, name: str, device: torch.device, case: _Case) -> Availability:
-        found = self._known_already(name, device, case)
-        if found is None:
-            with self._lock:
-                found = self._known_already(name, device, case) or self._tried(name, device, case)
-        return found
+        with self._lock:
+            return self._known_already(name, device, case) or self._tried(name, device, case)
 
     def _known_already(self, name: str, device: torch.device, case: _Case) -> Optional[Availability]:
         found = self.found.get(self.place(name, device))

@@ -67,7 +67,7 @@ class Run:
         self.said: bool = False
         self.memo: WeightMemo = WeightMemo(memo_bytes)
         self.stored: Stored = Stored(config, self.say_once)
-        self._has_own: Optional[bool] = None
+        self._has_users_maps: Optional[bool] = None
         self._said: Set[str] = set()
         for note in config.notes:
             self.say_once(note, note)
@@ -75,13 +75,13 @@ class Run:
     @property
     def active(self) -> bool:
         """Return whether anything is weighted or masked."""
-        return self.weighted or (not self.config.off and self.has_own())
+        return self.weighted or (not self.config.off and self.has_users_maps())
 
-    def has_own(self) -> bool:
+    def has_users_maps(self) -> bool:
         """Return whether the store has masks or weights of the user's, which hold for every preset."""
-        if self._has_own is None:
-            self._has_own = self.stored.has(MASK) or self.stored.has(WEIGHTS)
-        return self._has_own
+        if self._has_users_maps is None:
+            self._has_users_maps = self.stored.has(MASK) or self.stored.has(WEIGHTS)
+        return self._has_users_maps
 
     def weights(self, target: Tensor, view: View, mean: bool) -> Weights:
         """Return the weights of a target [C, H, W] or [B, C, H, W], with the user's own, and count their sources.
@@ -92,18 +92,18 @@ class Run:
             mean: only the mean is requested: a backend needs no weight map in memory for it.
 
         Raises:
-            LegsError: another number of names than of images, or a name that is no text or number; as :meth:`own`.
+            LegsError: another number of names than of images, or a name that is no text or number; :meth:`users_map`.
         """
-        if view is None and target.dim() == 3 and self.weighted and not self.has_own():
+        if view is None and target.dim() == 3 and self.weighted and not self.has_users_maps():
             found = self._weight(target, None, mean)
             return found if isinstance(found, Weights) else Weights(map=found)
         images = [target] if target.dim() == 3 else list(target)
         names = _names(view, target, len(images))
         weights = Weights() if self.config.spec.unweighted else self._made_weights(images, names, mean)
-        mask = self.own(target, MASK, names)
-        return weights.times(self.own(target, WEIGHTS, names)).masked(mask)
+        mask = self.users_map(target, MASK, names)
+        return weights.times(self.users_map(target, WEIGHTS, names)).masked(mask)
 
-    def own(self, target: Tensor, kind: str, names: Sequence[Optional[str]] = ()) -> Optional[Tensor]:
+    def users_map(self, target: Tensor, kind: str, names: Sequence[Optional[str]] = ()) -> Optional[Tensor]:
         """Return the user's masks or weights of a target, [1, H, W] or [B, 1, H, W]; None where all counts whole.
 
         Args:
@@ -112,7 +112,7 @@ class Run:
             names: of the views, for messages. With them what was found is counted.
 
         Raises:
-            LegsError: they cannot be looked up in a CUDA graph; or as :meth:`Stored.own`.
+            LegsError: they cannot be looked up in a CUDA graph; or as :meth:`Stored.users_map`.
         """
         if not self.stored.has(kind):
             return None
@@ -120,7 +120,7 @@ class Run:
             raise LegsError(_NOT_IN_A_GRAPH)
         images = [target] if target.dim() == 3 else list(target)
         maps = [
-            self.memo.recall(image, partial(self.stored.own, image, name, kind), kind)
+            self.memo.recall(image, partial(self.stored.users_map, image, name, kind), kind)
             for image, name in zip(images, names or [None] * len(images))
         ]
         if kind == MASK and names:
@@ -249,7 +249,7 @@ def refuse_masks(number: int) -> None:
         number: the generation of the settings, for which alone the graph holds.
     """
     run = _run_of(number)
-    if not run.config.off and run.has_own():
+    if not run.config.off and run.has_users_maps():
         raise LegsError(_NOT_IN_A_GRAPH)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from enum import Enum
-from typing import TYPE_CHECKING, Callable, Dict, Optional, Set, Tuple, Union
+from typing import TYPE_CHECKING, Callable, Optional, Set, Tuple, Union
 
 import torch
 from torch import Tensor
@@ -12,7 +12,6 @@ from torch import Tensor
 from legs_loss.config import Config
 from legs_loss.errors import LegsError
 from legs_loss.responses import NEEDS_LEVELS
-from legs_loss.weights import weight_from_response, weight_over_scene
 
 if TYPE_CHECKING:
     from legs_loss.store import Found, WeightStore
@@ -76,7 +75,6 @@ class Stored:
         self._say_once = say_once
         self._misses = 0  # since an image was found
         self._last: Optional[Tuple[weakref.ref[Tensor], int, Optional[Found]]] = None
-        self._levels: Dict[int, Optional[Tensor]] = {}
         self._store: Optional[WeightStore] = None
         self._kinds: Set[str] = set()
         self._opened = False
@@ -89,30 +87,21 @@ class Stored:
             view: its name, if the call gave one, for messages.
         """
         store = self._open()
-        if store is None:
+        found = None if store is None else self._find(store, image, view)
+        if store is None or found is None or found.response is None:
             return None
-        found = self._find(store, image, view)
-        if found is None or found.response is None:
-            return None
-        spec, over_scene = self._config.spec, self._config.spec.over == "scene"
         try:
-            values = store.response(found.response) if over_scene else store.normalised_response(found.response)
+            return store.weight(found.response, self._config.spec, image.device)
         except LegsError as error:
             self._say_once("damaged", f"{error}; the weights of such views are computed")
             return None
-        known = torch.from_numpy(values).to(image.device).unsqueeze(0)
-        return (
-            weight_over_scene(known, spec, self.scene_levels(known.numel()))
-            if over_scene
-            else weight_from_response(known, spec)
-        )
 
     def has(self, kind: str) -> bool:
         """Return whether the store has maps of the user's own of a kind."""
         self._open()
         return kind in self._kinds
 
-    def own(self, image: Tensor, view: Optional[str], kind: str) -> Union[Tensor, Whole]:
+    def users_map(self, image: Tensor, view: Optional[str], kind: str) -> Union[Tensor, Whole]:
         """Return the user's mask or weights of an image, float32 [1, H, W]; or why it counts whole.
 
         Raises:
@@ -141,9 +130,7 @@ class Stored:
             LegsError: there is no store, or it lacks the levels of views of this size.
         """
         store = self._open()
-        if store is not None and pixels not in self._levels:
-            self._levels[pixels] = store.scene_levels(self._config.spec, pixels)
-        levels = self._levels.get(pixels)
+        levels = None if store is None else store.scene_levels(self._config.spec, pixels)
         if levels is None:
             where = "no store of this run has" if store is None else f"{store.path} does not have for {pixels} pixels"
             raise LegsError(

@@ -129,7 +129,7 @@ def ssim(
     if mask is not None and trained.dim() == 4 and not size_average:
         masks = mask.expand(len(trained), *mask.shape[-3:])
         one_by_one = functools.partial(ssim, window_size=window_size, padding=padding, channels_last=False)
-        return torch.stack([one_by_one(*images, mask=own) for *images, own in zip(first, second, masks)])
+        return torch.stack([one_by_one(*images, mask=one) for *images, one in zip(first, second, masks)])
     weights = Weights().masked(mask)
     trained = weights.hidden(trained, constant)
     if window_size == WINDOW_SIZE and size_average and trained.requires_grad and torch.is_grad_enabled():
@@ -234,7 +234,7 @@ def _step(
     check_order(prediction, target)
     layout, prediction, target = read_pair(prediction, target, channels_last)
     with torch.no_grad():
-        mask = run.own(target, MASK)
+        mask = run.users_map(target, MASK)
         weights = Weights().masked(mask)
     run.tell_at_end()
     return None if mask is None else (layout, prediction, target, weights)

@@ -11,25 +11,17 @@ leftover of a killed writer, and the next writer deletes it.
 
 from __future__ import annotations
 
-from legs_loss.store.fingerprints import fingerprint, sampled_fingerprint
-from legs_loss.store.manifest import MANIFEST, MASK, WEIGHTS, DamagedStoreError, Entry
-from legs_loss.store.maps import is_intact, read_map, stage
-from legs_loss.store.reading import Damage, Found, WeightStore
-from legs_loss.store.writing import StoreWriter
-
-__all__ = [
-    "MANIFEST",
-    "MASK",
-    "WEIGHTS",
-    "Damage",
-    "DamagedStoreError",
-    "Entry",
-    "Found",
-    "StoreWriter",
-    "WeightStore",
-    "fingerprint",
-    "is_intact",
-    "read_map",
-    "sampled_fingerprint",
-    "stage",
-]
+from legs_loss.store.fingerprints import fingerprint as fingerprint
+from legs_loss.store.fingerprints import sampled_fingerprint as sampled_fingerprint
+from legs_loss.store.manifest import MANIFEST as MANIFEST
+from legs_loss.store.manifest import MASK as MASK
+from legs_loss.store.manifest import WEIGHTS as WEIGHTS
+from legs_loss.store.manifest import DamagedStoreError as DamagedStoreError
+from legs_loss.store.manifest import Entry as Entry
+from legs_loss.store.maps import is_intact as is_intact
+from legs_loss.store.maps import read_map as read_map
+from legs_loss.store.maps import stage as stage
+from legs_loss.store.reading import Damage as Damage
+from legs_loss.store.reading import Found as Found
+from legs_loss.store.reading import WeightStore as WeightStore
+from legs_loss.store.writing import StoreWriter as StoreWriter

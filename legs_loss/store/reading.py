@@ -54,6 +54,7 @@ class WeightStore:
         self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in read_manifest(self.path)}
         self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
         self._by_image: Dict[Tuple[Any, ...], List[Entry]] = {}
+        self._levels: Dict[Tuple[WeightSpec, int], Optional[Tensor]] = {}
         for entry in self.entries.values():
             for name in (entry.fingerprint, entry.sample):
                 self._by_image.setdefault((name, entry.height, entry.width), []).append(entry)
@@ -88,9 +89,14 @@ class WeightStore:
         if not entries:
             return None
         fits = [entry for entry in entries if self.fits(entry, spec)]
-        return Found(entries[0].view, fits[0] if fits else None, self._own(entries, MASK), self._own(entries, WEIGHTS))
+        return Found(
+            entries[0].view,
+            fits[0] if fits else None,
+            self._users_map(entries, MASK),
+            self._users_map(entries, WEIGHTS),
+        )
 
-    def _own(self, entries: List[Entry], kind: str) -> Optional[Entry]:
+    def _users_map(self, entries: List[Entry], kind: str) -> Optional[Entry]:
         found = {entry.view: self.beside(entry, kind) for entry in entries}
         first, *others = found.values()
         if any((other and other.sha256) != (first and first.sha256) for other in others):
@@ -123,12 +129,15 @@ class WeightStore:
 
         None where the store holds none for this spec: ``legs precompute`` was run for another preset.
         """
-        views = [
-            torch.tensor([entry.median, entry.strong])
-            for entry in self.entries.values()
-            if self.fits(entry, spec) and entry.width * entry.height == pixels
-        ]
-        return scene_levels(views) if views else None
+        key = spec, pixels
+        if key not in self._levels:
+            views = [
+                torch.tensor([entry.median, entry.strong])
+                for entry in self.entries.values()
+                if self.fits(entry, spec) and entry.width * entry.height == pixels
+            ]
+            self._levels[key] = scene_levels(views) if views else None
+        return self._levels[key]
 
     def response(self, entry: Entry) -> np.ndarray:
         """Return an entry's response before it was normalised, float32 [H, W]; the entry must have ``span``.
@@ -148,14 +157,18 @@ class WeightStore:
         """
         return read_map(self.path, entry)
 
+    def weight(self, entry: Entry, spec: WeightSpec, device: Union[str, torch.device] = "cpu") -> Tensor:
+        """Return the weight map [1, H, W] of an entry that fits a spec, made on a device; :meth:`response` raises."""
+        over_scene = spec.over == "scene"
+        values = self.response(entry) if over_scene else self.normalised_response(entry)
+        made = torch.from_numpy(values).to(device)[None]
+        if over_scene:
+            return weight_over_scene(made, spec, self.scene_levels(spec, values.size))
+        return weight_from_response(made, spec)
+
     def final_weight(self, entry: Entry, spec: WeightSpec) -> np.ndarray:
         """Return the weight map of an entry that fits a spec, times the user's weights and mask, float32 [H, W]."""
-        if spec.over == "scene":
-            scene = self.scene_levels(spec, entry.width * entry.height)
-            made = weight_over_scene(torch.from_numpy(self.response(entry))[None], spec, scene)
-        else:
-            made = weight_from_response(torch.from_numpy(self.normalised_response(entry))[None], spec)
-        weight: np.ndarray = made[0].numpy()
+        weight: np.ndarray = self.weight(entry, spec)[0].numpy()
         for users in filter(None, (self.beside(entry, kind) for kind in (MASK, WEIGHTS))):
             weight = weight * self.user_map(users)
         return weight

@@ -15,6 +15,7 @@ from legs_loss import legs_loss
 from legs_loss.kernels import available, trial
 from legs_loss.kernels.available import BACKENDS, Known
 from legs_loss.kernels.contract import L1, SSIM, DeviceFault, NotNow, terms_of
+from legs_loss.kernels.cuda import driver as driver_module
 from legs_loss.kernels.cuda.backend import THREADS, CudaBackend, Task
 from legs_loss.kernels.cuda.driver import CudaDriver, DriverError, OutOfMemory
 from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules, Variant
@@ -152,7 +153,7 @@ class TestLoading:
     def test_the_stand_in_ends_a_capture_where_the_mode_is_not_relaxed(self, driver, cuda, monkeypatch):
         cuda.test_capture(1)
         binary = Compiler(libraries().nvrtc).compile(b"struct Task {};", [], "sm_86")[0]
-        monkeypatch.setattr(CudaDriver, "_relaxed", lambda self: self._current())
+        monkeypatch.setattr(driver_module, "_RELAXED", 0)
         with pytest.raises(DriverError, match=r"\(900\)"):
             driver.load(binary)
         assert not cuda.test_capture_is_valid()

@@ -7,8 +7,8 @@ changes nothing where it is 1). What depends on shapes, strides, types and setti
 from __future__ import annotations
 
 import ctypes
-import threading
-from typing import Any, Callable, Dict, FrozenSet, Optional, Tuple
+from functools import lru_cache
+from typing import Any, Callable, FrozenSet, Optional, Tuple
 
 import torch
 from torch import Tensor
@@ -20,16 +20,7 @@ from legs_loss.kernels.cuda.modules import FORMULAS, PLAIN, BinaryCache, Modules
 from legs_loss.kernels.cuda.nvrtc import find_compiler
 from legs_loss.spec import WeightSpec
 
-__all__ = [
-    "BACKEND",
-    "THREADS",
-    "VALUES",
-    "CudaBackend",
-    "Strides",
-    "Task",
-    "chunks_of",
-    "strip_of",
-]
+__all__ = ["BACKEND", "THREADS", "VALUES", "CudaBackend", "Strides", "Task", "chunks_of", "strip_of"]
 
 THREADS = 256
 RUN = 8  # rows of a thread of the pixelwise passes
@@ -79,23 +70,13 @@ class CudaBackend(Backend):
     curves: FrozenSet[str] = frozenset(FORMULAS)
 
     def __init__(self, open_device: Callable[[torch.device], Modules]) -> None:
-        self._open = open_device
-        self._devices: Dict[torch.device, Modules] = {}
-        self._lock = threading.Lock()
+        self._open = lru_cache(maxsize=None)(open_device)  # the trial of a device, under a lock, is the first to ask
 
     def prepare(
         self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, target: Tensor, wanted: bool
     ) -> Prepared:
         """Return the launches of a loss of such images."""
-        return _Prepared(self._modules_of(target), terms, spec, prediction, target, wanted)
-
-    def _modules_of(self, images: Tensor) -> Modules:
-        modules = self._devices.get(images.device)
-        if modules is None:
-            with self._lock:
-                modules = self._devices.get(images.device) or self._open(images.device)
-                self._devices[images.device] = modules
-        return modules
+        return _Prepared(self._open(target.device), terms, spec, prediction, target, wanted)
 
 
 _Launch = Tuple[Any, int, int]  # a kernel, its blocks and threads
@@ -135,8 +116,8 @@ class _Prepared(Prepared):
         task.constant = terms.constant
         if terms.ssim:
             task.strip, task.count = strip_of(x, modules.driver.multiprocessors, wanted)
-        own = launch(f"{terms.name}_{'gradient' if wanted else 'value'}", plain if terms.ssim else weighted, task.count)
-        self._kernels = own, launch("finish", PLAIN, 1)
+        name, variant = f"{terms.name}_{'gradient' if wanted else 'value'}", plain if terms.ssim else weighted
+        self._kernels = launch(name, variant, task.count), launch("finish", PLAIN, 1)
         self._strides: Optional[Tuple[int, ...]] = None
         if wanted:  # dense, where x may be windows that overlap
             dense = torch.empty_like(x, dtype=torch.float32)

@@ -100,7 +100,7 @@ class CudaDriver:
             DriverError: it cannot be loaded.
         """
         module = ctypes.c_void_p()
-        with self._current(), self._relaxed():
+        with self._current():
             try:
                 self._call("cuModuleLoadData", ctypes.byref(module), binary)
             except OutOfMemory:
@@ -112,7 +112,7 @@ class CudaDriver:
     def function(self, module: int, name: str) -> int:
         """Return a kernel of a module."""
         function = ctypes.c_void_p()
-        with self._current(), self._relaxed():
+        with self._current():
             self._call("cuModuleGetFunction", ctypes.byref(function), module, name.encode())
         assert function.value is not None
         return function.value
@@ -141,26 +141,18 @@ class CudaDriver:
 
     @contextmanager
     def _current(self) -> Iterator[None]:
-        # A thread of autograd's, or another device's, may have no context or another one.
-        before = ctypes.c_void_p()
+        """Make torch's context the current one of a thread, which may have none or another device's.
+
+        What is loaded meanwhile does not end the capture of another thread's stream.
+        """
+        before, mode = ctypes.c_void_p(), ctypes.c_int(_RELAXED)
         self._call("cuCtxGetCurrent", ctypes.byref(before))
-        if before.value == self._context:
-            yield
-            return
-        self._call("cuCtxSetCurrent", self._context)
+        self._call("cuThreadExchangeStreamCaptureMode", ctypes.byref(mode))
         try:
+            self._call("cuCtxSetCurrent", self._context)
             yield
         finally:
             self._call("cuCtxSetCurrent", before)
-
-    @contextmanager
-    def _relaxed(self) -> Iterator[None]:
-        """Let what is loaded here not end the capture of another thread's stream."""
-        mode = ctypes.c_int(_RELAXED)
-        self._call("cuThreadExchangeStreamCaptureMode", ctypes.byref(mode))
-        try:
-            yield
-        finally:
             self._call("cuThreadExchangeStreamCaptureMode", ctypes.byref(mode))
 
     def _call(self, name: str, *arguments: Any) -> None:

@@ -15,7 +15,7 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes import Camera, Scene, View, image_tensor, load_training_image
 from legs_loss.spec import WeightSpec
 from legs_loss.store import Entry, Found, WeightStore
-from legs_loss.weights import weight_from_response, weight_map, weight_maps, weight_over_scene
+from legs_loss.weights import weight_map, weight_maps
 
 __all__ = [
     "Dataset",
@@ -208,19 +208,8 @@ def _weights(store: Optional[WeightStore], views: List[TrainingView], spec: Weig
     # Where a map is missing, the levels of the scene are not known.
     if store is None or (spec.over == "scene" and None in found):
         return weight_maps([view.image for view in views], spec)
-    if spec.over == "scene":
-        return [_over_scene(store, entry, spec) for entry in found if entry is not None]
-    return [
-        weight_map(view.image, spec)
-        if entry is None
-        else weight_from_response(torch.from_numpy(store.normalised_response(entry))[None], spec)
-        for view, entry in zip(views, found)
-    ]
-
-
-def _over_scene(store: WeightStore, entry: Entry, spec: WeightSpec) -> Tensor:
-    strength = torch.from_numpy(store.response(entry))[None]
-    return weight_over_scene(strength, spec, store.scene_levels(spec, entry.width * entry.height))
+    pairs = zip(views, found)
+    return [weight_map(view.image, spec) if one is None else store.weight(one, spec) for view, one in pairs]
 
 
 def _entry(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional[Entry]:

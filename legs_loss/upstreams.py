@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from typing import Any, Dict, List, Tuple
+from contextlib import ExitStack
+from typing import Any, Dict
 
 from legs_loss.errors import LegsError
 from legs_loss.system import plugins
@@ -13,11 +14,8 @@ __all__ = ["Applied", "apply_to"]
 _applied: Dict[str, Applied] = {}
 
 
-class Applied:
+class Applied(ExitStack):
     """Replaced functions of a library; `undo`, or the end of a ``with`` block, restores them."""
-
-    def __init__(self) -> None:
-        self._replaced: List[Tuple[Any, str, Any]] = []
 
     def replace(self, owner: Any, name: str, new: Any) -> None:
         """Set an attribute of a module or class, and in every module that imported the old value by name."""
@@ -28,21 +26,12 @@ class Applied:
             held = ((module, dict(getattr(module, "__dict__", {}))) for module in modules)
             places += [(module, key) for module, names in held for key, value in names.items() if value is old]
         for place, key in places:
-            self._replaced.append((place, key, old))
+            self.callback(setattr, place, key, old)
             setattr(place, key, new)
 
     def undo(self) -> None:
         """Restore everything; a second call does nothing."""
-        while self._replaced:
-            setattr(*self._replaced.pop())
-        for name in [name for name, applied in _applied.items() if applied is self]:
-            del _applied[name]
-
-    def __enter__(self) -> Applied:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.undo()
+        self.close()
 
 
 def apply_to(library: str) -> Applied:
@@ -84,4 +73,5 @@ def apply_to(library: str) -> Applied:
     except AttributeError as error:
         raise LegsError(f"this {library} does not have the expected loss: {error}") from None
     _applied[library] = applied
+    applied.callback(_applied.pop, library, None)
     return applied

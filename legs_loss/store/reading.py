@@ -89,12 +89,8 @@ class WeightStore:
         if not entries:
             return None
         fits = [entry for entry in entries if self.fits(entry, spec)]
-        return Found(
-            entries[0].view,
-            fits[0] if fits else None,
-            self._users_map(entries, MASK),
-            self._users_map(entries, WEIGHTS),
-        )
+        mask, weights = (self._users_map(entries, kind) for kind in (MASK, WEIGHTS))
+        return Found(entries[0].view, fits[0] if fits else None, mask, weights)
 
     def _users_map(self, entries: List[Entry], kind: str) -> Optional[Entry]:
         found = {entry.view: self.beside(entry, kind) for entry in entries}

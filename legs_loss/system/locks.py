@@ -8,8 +8,7 @@ import os
 import stat
 import sys
 import time
-from types import TracebackType
-from typing import Optional, Type, Union
+from typing import Optional, Union
 
 from legs_loss.errors import LegsError
 
@@ -72,9 +71,7 @@ class FileLock:
     def __enter__(self) -> FileLock:
         return self
 
-    def __exit__(
-        self, kind: Optional[Type[BaseException]], error: Optional[BaseException], where: Optional[TracebackType]
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.release()
 
     def _take(self, until: Optional[float]) -> None:

@@ -35,10 +35,8 @@ class Strides(ctypes.Structure):
     """The strides of images [B, C, H, W], in values."""
 
     _fields_ = [
-        ("view", ctypes.c_longlong),
-        ("channel", ctypes.c_longlong),
-        ("row", ctypes.c_int),
-        ("column", ctypes.c_int),
+        *((name, ctypes.c_longlong) for name in ("view", "channel")),
+        *((name, ctypes.c_int) for name in ("row", "column")),
     ]
 
 

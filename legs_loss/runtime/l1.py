@@ -95,14 +95,7 @@ def l1_loss(
     spec, mean = run.config.spec, own is None and reduction == "mean"
     plan, image, photograph = plan_of(L1 if mean else None, spec, prediction, target, channels_last)
     counted.weighted += torch.is_grad_enabled()  # the second pass of a checkpoint counts, not the first
-    if plan.makes and run.computes and view is None and mask is None and photograph.device.type == "cpu":
-        loss = fused(plan, image, photograph, Weights(spec))
-        if loss is not None:
-            counted.computed += photograph.shape[0] if photograph.dim() == 4 else 1
-            if not run.said:
-                run.say_what_is_used()
-            return loss
-    weights = masked = run.weights(photograph, view, mean)
+    weights = masked = run.weights(photograph, view, plan.makes)
     if mask is not None:
         masked = weights.masked(plan.layout.map_first(mask, photograph, "mask"), renormalise=False)
     loss = fused(plan, image, photograph, masked) if mean else None

@@ -83,23 +83,27 @@ class Run:
             self._has_users_maps = self.stored.has(MASK) or self.stored.has(WEIGHTS)
         return self._has_users_maps
 
-    def weights(self, target: Tensor, view: View, mean: bool) -> Weights:
+    def weights(self, target: Tensor, view: View, made: bool) -> Weights:
         """Return the weights of a target [C, H, W] or [B, C, H, W], with the user's own, and count their sources.
 
         Args:
             target: the photographs.
             view: the name of each, as for :func:`~legs_loss.l1_loss`.
-            mean: only the mean is requested: a backend needs no weight map in memory for it.
+            made: a backend makes the weights of the run's spec by itself, and needs no map in memory for them.
 
         Raises:
             LegsError: another number of names than of images, or a name that is no text or number; :meth:`users_map`.
         """
+        count = 1 if target.dim() == 3 else target.shape[0]
+        names = [None] * count if view is None else _names(view, target, count)
+        if made and self.computes and target.device.type == "cpu":
+            counted.computed += count
+            return Weights(self.config.spec)
         if view is None and target.dim() == 3 and self.weighted and not self.has_users_maps():
-            found = self._weight(target, None, mean)
+            found = self._weight(target, None, made)
             return found if isinstance(found, Weights) else Weights(map=found)
         images = [target] if target.dim() == 3 else list(target)
-        names = _names(view, target, len(images))
-        weights = Weights() if self.config.spec.unweighted else self._made_weights(images, names, mean)
+        weights = Weights() if self.config.spec.unweighted else self._made_weights(images, names, made)
         mask = self.users_map(target, MASK, names)
         return weights.times(self.users_map(target, WEIGHTS, names)).masked(mask)
 
@@ -132,8 +136,8 @@ class Run:
         whole = [one if isinstance(one, Tensor) else ones for one in maps]
         return whole[0] if target.dim() == 3 else torch.stack(whole)
 
-    def _made_weights(self, images: List[Tensor], names: Sequence[Optional[str]], mean: bool) -> Weights:
-        found = [self._weight(image, name, mean) for image, name in zip(images, names)]
+    def _made_weights(self, images: List[Tensor], names: Sequence[Optional[str]], made: bool) -> Weights:
+        found = [self._weight(image, name, made) for image, name in zip(images, names)]
         spec = self.config.spec
         ranges = [one.range for one in found if isinstance(one, Weights)]
         if len(ranges) == len(found):
@@ -141,34 +145,29 @@ class Run:
         maps = [one if isinstance(one, Tensor) else weight_map(image, spec, False) for image, one in zip(images, found)]
         return Weights(map=torch.stack(maps))
 
-    def _weight(self, image: Tensor, view: Optional[str], mean: bool) -> Union[Tensor, Weights]:
+    def _weight(self, image: Tensor, view: Optional[str], made: bool) -> Union[Tensor, Weights]:
         """Return an image's weight map [1, H, W], or its spec and the range that a backend makes its weights of."""
         if is_transformed() or is_capturing(image.device):
             # A CUDA graph is replayed with other pixels in the target's memory: their weight is part of the graph.
-            return self._computed(image, mean)
-        if mean and self.computes and image.device.type == "cpu":
-            found = fused_range(image, self.config.spec)
-            if found is not None:
-                counted.computed += 1
-                return Weights(self.config.spec, found)
+            return self._computed(image, made)
         before = counted.stored + counted.computed
-        weight = self.memo.recall(image, partial(self._made, image, view, mean), mean)
+        weight = self.memo.recall(image, partial(self._made, image, view, made), made)
         counted.remembered += counted.stored + counted.computed == before
         return weight
 
-    def _made(self, image: Tensor, view: Optional[str], mean: bool) -> Union[Tensor, Weights]:
+    def _made(self, image: Tensor, view: Optional[str], made: bool) -> Union[Tensor, Weights]:
         weight = self.stored.weight(image, view)
         if weight is not None:
             counted.stored += 1
             return weight
-        return self._computed(image, mean)
+        return self._computed(image, made)
 
-    def _computed(self, image: Tensor, mean: bool) -> Union[Tensor, Weights]:
+    def _computed(self, image: Tensor, made: bool) -> Union[Tensor, Weights]:
         spec = self.config.spec
         counted.computed += 1
         if spec.over == "scene":
             return weight_map(image, spec, False, self.stored.scene_levels(image.shape[-2] * image.shape[-1]))
-        found = fused_range(image, spec) if mean else None
+        found = fused_range(image, spec) if made else None
         return weight_map(image, spec, False) if found is None else Weights(spec, found)
 
     def say_once(self, kind: str, message: str) -> None:
@@ -327,9 +326,7 @@ def counts() -> Counts:
     return replace(counted)
 
 
-def _names(view: View, target: Tensor, count: int) -> List[Optional[str]]:
-    if view is None:
-        return [None] * count
+def _names(view: Any, target: Tensor, count: int) -> List[Optional[str]]:
     names: List[Any] = list(view) if isinstance(view, (list, tuple)) else [view]
     if len(names) != count or not all(isinstance(name, (str, int)) for name in names):
         raise LegsError(f"view must be one name a view: target {shape_of(target)} holds {count}, got {view!r}")

@@ -202,7 +202,7 @@ class LEGSLoss(torch.nn.Module):
         share, terms = self.lambda_dssim, whole(self.lambda_dssim, self.padding)
         plan, image, photograph = plan_of(terms, self.spec, prediction, target, self.channels_last)
         check_order(image, photograph)
-        weights = run.weights(photograph, None, True)
+        weights = run.weights(photograph, None, plan.makes)
         counted.hidden += weights.share is not None
         mask = plan.layout.map_first(mask, photograph, "mask")
         weights = weights.masked(mask, self.renormalise and weights.share is None)

@@ -23,7 +23,7 @@ __all__ = ["MANIFEST", "MASK", "WEIGHTS", "DamagedStoreError", "Entry", "is_map_
 
 MANIFEST = "manifest.json"
 MASK, WEIGHTS = "mask", "weights"  # in place of an operator: of the maps that are the user's own
-VERSION = 3  # 1 or 2 is written where no entry has what came later, so that older versions read it
+VERSION = 3  # 1 and 2 had fewer fields
 _LARGEST = 256 << 20  # bytes: some 500,000 entries
 _SIDE = 1 << 20  # pixels
 _FILE_NAME = re.compile(r"[0-9a-z_]+-[0-9a-f]{16}\.npy")
@@ -90,8 +90,8 @@ class Entry:
 
 _STRONGEST = 1e6  # response: images are in [0, 1]; weights of larger ones would overflow
 _LEVELS = ("low", "span", "percentile", "median", "strong")
-# By which version, and what they are where they are not written.
-_ADDED = {"smooth": (2, 0.0), **dict.fromkeys(_LEVELS, (2, None)), "sample": (3, "")}
+# What is not written: it came with later versions, and few maps have it.
+_ABSENT = {"smooth": 0.0, **dict.fromkeys(_LEVELS), "sample": ""}
 
 
 def _is_level(value: Any) -> bool:
@@ -124,17 +124,12 @@ def is_map_name(name: str) -> bool:
     return _FILE_NAME.fullmatch(name) is not None
 
 
-def manifest_bytes(entries: Iterable[Entry]) -> bytes:
+def manifest_bytes(entries: Iterable[Entry], version: int = VERSION) -> bytes:
     """Return the manifest's one spelling for these entries."""
-    entries = list(entries)
-    rows, version = [], VERSION if any(entry.is_users for entry in entries) else 1
+    rows = []
     for entry in sorted(entries, key=lambda entry: entry.key):
         values = dict(vars(entry), p=entry.p if math.isfinite(entry.p) else "inf")
-        for name, (since, absent) in _ADDED.items():
-            if values[name] == absent:
-                del values[name]
-            else:
-                version = max(version, since)
+        values = {name: value for name, value in values.items() if name not in _ABSENT or value != _ABSENT[name]}
         rows.append(json.dumps(values, sort_keys=True, allow_nan=False))
     body = '"entries": [\n' + ",\n".join(rows) + f'\n],\n"version": {version}'
     return f'{{"checksum": "{hashlib.sha256(body.encode()).hexdigest()}",\n{body}}}\n'.encode()
@@ -165,7 +160,7 @@ def read_manifest(folder: Path) -> List[Entry]:
         entries = [Entry(**dict(row, p=float(row["p"]))) for row in document["entries"]]
         wrong = [name for entry in entries for name, fits in _FIELDS.items() if not fits(getattr(entry, name))]
         wrong += [entry.view for entry in entries if len({getattr(entry, name) is None for name in _LEVELS}) > 1]
-        intact = not wrong and manifest_bytes(entries) == data
+        intact = not wrong and manifest_bytes(entries, document["version"]) == data
     except LegsError:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError):

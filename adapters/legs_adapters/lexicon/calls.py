@@ -11,8 +11,18 @@ from typing import Callable, Dict, List, Optional, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, call_name, constant, dotted, words
+from legs_adapters.code.program import Program, Reference
+from legs_adapters.code.returned import returned
+from legs_adapters.code.syntax import (
+    arguments,
+    attribute_chain,
+    call_name,
+    constant,
+    dotted,
+    same,
+    walk_expressions,
+    words,
+)
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import RENDERERS, STATISTICS
@@ -20,6 +30,7 @@ from legs_adapters.tensors.operations import (
     ASKS,
     EXTREMES,
     JOINS,
+    KEEPS_PICTURES,
     MODULES,
     NUMBERS,
     PICTURE_FUNCTIONS,
@@ -27,7 +38,7 @@ from legs_adapters.tensors.operations import (
     REDUCES,
 )
 
-__all__ = ["CallReading", "MeaningOf", "meaning_of_call", "meaning_returned"]
+__all__ = ["CallReading", "MeaningOf", "is_of_neighbours", "meaning_of_call", "meaning_returned"]
 
 
 MeaningOf = Callable[[Function, cst.CSTNode], Meaning]  # of an expression of a function
@@ -106,6 +117,13 @@ def _statistic(call: CallReading) -> Optional[Meaning]:
     return Meaning("feature", call.ask(call.values[0]).role) if is_statistic else None
 
 
+def _behind(call: CallReading) -> Optional[Meaning]:
+    """Channels behind the colours: ``image.narrow(0, 3, 1)``."""
+    of, *axes = [*([] if call.owner is None else [call.owner]), *call.positional, None]
+    is_behind = call.name == "narrow" and of is not None and constant(axes[1] if len(axes) > 2 else None) == 3
+    return Meaning("depth", call.ask(of).role) if is_behind and of is not None else None
+
+
 def _filtered(call: CallReading) -> Optional[Meaning]:
     filters = call.name in ("conv2d", "filter2d", "spatial_gradient") and "stride" not in call.keywords
     return Meaning("gradient", call.ask(call.values[0]).role) if filters and call.values else None
@@ -138,23 +156,48 @@ def _named(call: CallReading) -> Optional[Meaning]:
 
 
 def _of_images(call: CallReading) -> Optional[Meaning]:
-    """A function of an image is an image, unless its name says otherwise: exposure, appearance, a background.
+    """A function of an image is an image, unless its name or body says otherwise: exposure, appearance, a background.
 
-    What an object of a library makes of one, ``dwt(image)``, or an unknown member, ``self.net(image)``, is not known.
+    What an object of a library makes of one, ``dwt(image)``, an unknown member, ``self.net(image)``, or an operation of
+    torch that is in no list, ``torch.diff(image)``, is not known. Of a depth alone it is no image: ``colormap(depth)``.
     """
     references = call.program.resolve(call.function, call.node.func)
     is_member = call.owner is not None and dotted(call.owner) == "self"
-    if any(reference.kind == "made by" for reference in references) or (is_member and not references):
+    if any(map(_is_unlisted, references)) or (is_member and not references):
         return None
-    images = [meaning for meaning in map(call.ask, call.values) if meaning.kind == "image"]
-    return mix(images) if images else None
+    given = [call.ask(value) for value in call.values if constant(value) is None]
+    images = [meaning for meaning in given if meaning.kind == "image"]
+    if not images:
+        kinds = ("depth", "normal", "flow", *(["feature"] if given and given[0].role == "target" else []))
+        return given[0] if len(given) == 1 and given[0].kind in kinds else None
+    bodies = [returned(target) for target in (each.target for each in references) if isinstance(target, Function)]
+    changes = any(is_of_neighbours(part) for body in bodies if body is not None for part in attribute_chain(body))
+    return mix(images)._replace(kind="gradient") if changes else mix(images)
+
+
+def is_of_neighbours(
+    node: cst.CSTNode, value_of: Callable[[cst.CSTNode], Optional[cst.CSTNode]] = lambda _: None
+) -> bool:
+    """Return whether it is a change in one picture: between shifted parts, ``x[1:] - x[:-1]``, or ``x - blur(x)``."""
+    if not isinstance(node, cst.BinaryOperation) or not isinstance(node.operator, cst.Subtract):
+        return False
+    left, right = node.left, value_of(node.right) or node.right
+    are_parts = isinstance(left, cst.Subscript) and isinstance(right, cst.Subscript) and same(left.value, right.value)
+    inner = walk_expressions(right.args[0].value) if isinstance(right, cst.Call) and right.args else ()
+    return are_parts or any(same(part, left) for part in inner)
+
+
+def _is_unlisted(reference: Reference) -> bool:
+    """Return whether it is made by a library, or an operation of torch that is in no list."""
+    name = str(reference.target)
+    is_of_torch = reference.kind == "external" and name.startswith("torch.")
+    return reference.kind == "made by" or (is_of_torch and name.rpartition(".")[2] not in KEEPS_PICTURES)
 
 
 def meaning_returned(call: CallReading) -> Optional[Meaning]:
     """Return what the called function returns."""
     for reference in call.program.resolve(call.function, call.node.func):
-        target = reference.target
-        if reference.kind == "function" and isinstance(target, Function):
+        for target in call.program.run_by(reference):
             found = [call.meaning_of(target, value) for value in target.flow.returns]
             if found and UNKNOWN not in found:
                 return mix(found)
@@ -167,6 +210,6 @@ def _of_owner(call: CallReading) -> Optional[Meaning]:
 
 
 _SURE: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
-    *(_number, _extreme, _reduced, _statistic, _filtered, _moved),
+    *(_number, _extreme, _reduced, _statistic, _behind, _filtered, _moved),
     *(_rendered, _named),
 )

@@ -29,13 +29,15 @@ from legs_adapters.code.syntax import (
     walk_expressions,
     words,
 )
-from legs_adapters.lexicon.calls import CallReading, meaning_of_call
+from legs_adapters.lexicon.calls import CallReading, is_of_neighbours, meaning_of_call
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import BACKGROUND, COLORS, DATA, KIND_OF, LOSS, RENDER, RENDERERS
 from legs_adapters.tensors.backward import Training
 
 __all__ = ["Meanings"]
+
+_LITERALS = (cst.Dict, cst.List, cst.Tuple)
 
 
 class Meanings:
@@ -86,11 +88,14 @@ class Meanings:
         if isinstance(node, cst.Subscript):
             return self._subscript(function, node)
         if isinstance(node, cst.Call):
+            table = _table_of(function, node)
+            if table is not None:
+                return mix(self.meaning(function, each.value) for each in table.elements)
             return meaning_of_call(CallReading(self.program, function, node, self.meaning))
         if isinstance(node, cst.Comparison):
             return Meaning("mask", None)
-        if isinstance(node, cst.BinaryOperation) and _is_of_neighbours(node):
-            return Meaning("gradient", self.meaning(function, node.left).role)
+        if is_of_neighbours(node, function.flow.value_of):
+            return Meaning("gradient", self.meaning(function, node.left).role)  # type: ignore[attr-defined]
         return mix((self.meaning(function, part) for part in _parts(node)), isinstance(node, cst.BinaryOperation))
 
     def _name(self, function: Function, node: cst.Name, flow: Meaning) -> Meaning:
@@ -106,10 +111,19 @@ class Meanings:
 
     def _subscript(self, function: Function, node: cst.Subscript) -> Meaning:
         key = key_of(node) or formatted_key(node) or default_key(function, node)
-        if _is_fourth(node):
+        if _is_fourth(node) or self._is_behind(function, node):
             return Meaning("depth", self.meaning(function, node.value).role)  # of RGB+D: render[0, ..., 3], render[3:]
         keys = [key] if isinstance(key, str) else self._keys(function, node.slice[-1].slice)
         return mix(self._member(function, node, each) for each in keys) if keys else self.meaning(function, node.value)
+
+    def _is_behind(self, function: Function, node: cst.Subscript) -> bool:
+        """Return whether one channel behind the colours is taken: ``x[3]``, ``x[-1]``, ``x.split([3, 1])[1]``."""
+        index = node.slice[0].slice if len(node.slice) == 1 else None
+        at = constant(index.value) if isinstance(index, cst.Index) else None
+        if isinstance(node.value, cst.Call) and isinstance(at, int):
+            return _picked_from(node.value, at) >= 3
+        held = function.flow.value_of(node.value) or node.value  # a list or a batch has whole images: images[-1]
+        return at in (3, -1) and isinstance(held, cst.Subscript) and isinstance(key_of(held), str)
 
     def _keys(self, function: Function, index: cst.CSTNode) -> List[str]:
         """Return the kinds of pictures that an index takes: in a loop over a literal, or by its function's calls."""
@@ -117,7 +131,11 @@ class Meanings:
         for made in function.flow.reaching(index.value) if isinstance(index, cst.Index) else ():
             calls = self.training.sites.get(function, ()) if made.kind == "parameter" else ()
             found += [given for given in (function.given(call, made.place) for _, call in calls) if given is not None]
-            found += walk_expressions(made.value) if made.kind == "element" and made.value is not None else ()
+            looped = list(walk_expressions(made.value)) if made.kind == "element" and made.value is not None else []
+            tables = [
+                table for part in looped for table in function.flow.assigned(part) if isinstance(table, _LITERALS)
+            ]
+            found += [*looped, *(part for table in tables for part in walk_expressions(table))]
         keys = [constant(each) for each in found if isinstance(each, cst.SimpleString)]
         return [key for key in keys if isinstance(key, str) and kind_of_words(key) is not None]
 
@@ -182,6 +200,8 @@ class Meanings:
 
     def _element(self, function: Function, value: cst.CSTNode, index: int) -> Meaning:
         """Return the meaning of an element of what is unpacked."""
+        if _table_of(function, value) is not None and index == 1:
+            return self.meaning(function, value)
         if not isinstance(value, cst.Call):
             held = function.flow.value_of(value) or value
             literal = held.elements if isinstance(held, (cst.Tuple, cst.List)) else ()
@@ -190,6 +210,8 @@ class Meanings:
                 return mix(self.meaning(function, row[index].value) for row in rows)
             return Meaning(None, self.meaning(function, value).role)
         given = arguments(value)[0]
+        if _picked_from(value, index) >= 3:
+            return Meaning("depth", self.meaning(function, value).role)
         if call_name(value) == "zip" and index < len(given):
             return self.meaning(function, given[index])
         # A renderer that returns a tuple returns the image first; the rest have names of their own.
@@ -229,6 +251,25 @@ class Meanings:
         return meaning._replace(kind=kind_of_words(owner)) if says_kind else meaning
 
 
+def _table_of(function: Function, node: cst.CSTNode) -> Optional[cst.Dict]:
+    """Return the dictionary whose values are gone through: ``targets.values()``, ``targets.items()``."""
+    if not isinstance(node, cst.Call) or call_name(node) not in ("values", "items"):
+        return None
+    table = function.flow.value_of(node.func.value) if isinstance(node.func, cst.Attribute) else None
+    return table if isinstance(table, cst.Dict) else None
+
+
+def _picked_from(call: cst.Call, index: int) -> int:
+    """Return the channel at which a part of a picture begins: the second of ``split([3, 1])`` at the fourth; else 0."""
+    sizes = [constant(arg.value) for arg in call.args]
+    found = next((size for size in sizes if isinstance(size, (list, tuple))), None)
+    return (
+        sum(found[:index])
+        if call_name(call) == "split" and found and all(isinstance(size, int) for size in found)
+        else 0
+    )
+
+
 def _parts(node: cst.CSTNode) -> List[cst.CSTNode]:
     """Return the parts of an operation whose meanings are those of the whole."""
     if isinstance(node, (cst.BinaryOperation, cst.BooleanOperation)):
@@ -248,10 +289,10 @@ def _is_fourth(node: cst.Subscript) -> bool:
     """Return whether it is what lies behind the colours."""
     parts = [each.slice for each in node.slice]
     cuts = [cut for cut in parts if isinstance(cut, cst.Slice) and code(cut) != ":"]
-    is_behind = len(cuts) == 1 and constant(cuts[0].lower) == 3  # no block of a matrix, no border: 3:-3
+    start, end = (constant(cuts[0].lower), cuts[0].upper) if len(cuts) == 1 else (None, None)  # no block of a matrix
     last = parts[-1] if len(parts) > 1 else None
     is_one = isinstance(last, cst.Index) and constant(last.value) == 3
-    return is_one or (is_behind and (cuts[0].upper is None or constant(cuts[0].upper, 0) > 3))
+    return is_one or (start == -1 and end is None) or (start == 3 and (end is None or constant(end, 0) > 3))  # no 3:-3
 
 
 def _is_opacity(part: cst.CSTNode, node: cst.BinaryOperation | cst.BooleanOperation) -> bool:
@@ -262,11 +303,3 @@ def _is_opacity(part: cst.CSTNode, node: cst.BinaryOperation | cst.BooleanOperat
     colours = left if part is right else right
     is_over = isinstance(colours, cst.Subscript) and same(colours.value, part.value)
     return constant(left) == 1 if isinstance(node.operator, cst.Subtract) else is_over
-
-
-def _is_of_neighbours(node: cst.BinaryOperation) -> bool:
-    """Return whether it is a change in one picture: between shifted parts, ``x[1:] - x[:-1]``, or ``x - blur(x)``."""
-    left, right = node.left, node.right
-    are_parts = isinstance(left, cst.Subscript) and isinstance(right, cst.Subscript) and same(left.value, right.value)
-    is_filtered = isinstance(right, cst.Call) and bool(right.args) and same(right.args[0].value, left)
-    return (are_parts or is_filtered) and isinstance(node.operator, cst.Subtract)

@@ -44,7 +44,7 @@ class Ways(Meanings):
             call = CallReading(self.program, function, node, self.meaning)
             if RENDERERS & set(words(call.name)) and not self._draws_splats(function, node):
                 return meaning_returned(call) or UNKNOWN
-            known = meaning_of_call(call, by_arguments=False)
+            known = meaning_returned(call) or meaning_of_call(call, by_arguments=False)
             is_method = known == UNKNOWN and isinstance(node.func, cst.Attribute)
             return self._member(function, node.func, call.name) if is_method else known  # type: ignore[arg-type]
         known = super()._of(function, node)

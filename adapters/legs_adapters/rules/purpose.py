@@ -6,7 +6,7 @@ An L1 whose gradients update only poses is tracking; one whose gradients are onl
 from __future__ import annotations
 
 import re
-from typing import Dict, List, Optional, Set, Tuple
+from typing import Dict, List, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
@@ -33,7 +33,8 @@ from legs_adapters.terms.findings import Evidence
 __all__ = ["Purposes"]
 
 _DEPTH = 3
-_Step = Tuple[Function, cst.Call, Set[str]]  # with the words of whose method runs it
+# With the words of whose method runs it, and the calls that made those.
+_Step = Tuple[Function, cst.Call, Set[str], List[Tuple[Function, cst.Call]]]
 _Value = Tuple[Function, cst.CSTNode]
 _STEPS = re.compile(r"step(?:(?!step)\w)*\s*\(")
 _CALLED = re.compile(r"\b(\w+)\s*\(")
@@ -109,7 +110,7 @@ class Purposes:
     def _steps(self, function: Function, call: cst.Call, depth: int = 0) -> List[_Step]:
         """Return the steps of a call: its own, or those of the functions that it calls and that take no gradient."""
         if is_step(call):
-            return [(function, call, set())]
+            return [(function, call, set(), [])]
         name = call_name(call)
         if name not in self._stepping() or depth > _DEPTH:
             return []
@@ -118,8 +119,13 @@ class Purposes:
             found = self.program.methods_named(name)  # one of them may run
         runs = [each for each in found if not any(map(is_backward, each.flow.calls))]
         steps = [step for each in runs for inner in each.flow.calls for step in self._steps(each, inner, depth + 1)]
-        receiver = words_in(call.func.value) if isinstance(call.func, cst.Attribute) else set()
-        return [(where, step, said | receiver) for where, step, said in steps]
+        holder = call.func.value if isinstance(call.func, cst.Attribute) else None
+        makers = (
+            [(by, each.value) for by, each in _definitions(self.program, function, holder)] if holder and steps else []
+        )
+        made = [(by, value) for by, value in makers if isinstance(value, cst.Call)]
+        receiver = words_in(holder) if holder is not None else set()
+        return [(where, step, said | receiver, by + made) for where, step, said, by in steps]
 
     def _stepping(self) -> Set[str]:
         """Return the names of the functions with a step in them, and of those that call one in its file."""
@@ -164,16 +170,18 @@ class Purposes:
 
     def _moved(self, step: _Step) -> Set[str]:
         """Return the words in an optimiser's name, and in the parameters that it was made with."""
-        function, call, said = step
+        function, call, said, makers = step
         assert isinstance(call.func, cst.Attribute)
         optimiser = call.func.value
         name = set(words(optimiser.attr.value)) if isinstance(optimiser, cst.Attribute) else set()
         found = said | (name if name & POSES else words_in(optimiser))  # gaussians.optimizer_cam moves cameras
-        for where, given in self._given(function, optimiser):
-            found |= words_in(given, *(where.flow.assigned(given)))
+        for where, given in self._given(function, optimiser, makers):
+            found |= set().union(*map(_named_in, [given, *where.flow.assigned(given)]))
         return found - PLUMBING
 
-    def _given(self, function: Function, optimiser: cst.CSTNode, depth: int = 0) -> List[_Value]:
+    def _given(
+        self, function: Function, optimiser: cst.CSTNode, makers: Sequence[Tuple[Function, cst.Call]], depth: int = 0
+    ) -> List[_Value]:
         """Return what an optimiser was made with, or what is passed for it where that is not known."""
         found: List[_Value] = []
         for where, definition in _definitions(self.program, function, optimiser):
@@ -181,7 +189,7 @@ class Purposes:
             if definition.kind == "parameter" and depth < _DEPTH:
                 passed = given_to(self.program, where, definition.place)
                 for caller, value in ((caller, value) for caller, value in passed if value is not None):
-                    found += self._given(caller, value, depth + 1) or [(caller, value)]
+                    found += self._given(caller, value, makers, depth + 1) or [(caller, value)]
             calls = [(where, made)]
             if definition.kind == "element" and made is not None:  # for each in optimizers.values()
                 held = [each for part in attribute_chain(made) for each in _definitions(self.program, where, part)]
@@ -192,16 +200,29 @@ class Purposes:
                     passed_on = maker.given(made, of.value) if isinstance(of, cst.Name) else None  # type: ignore[arg-type]
                     found += [(where, passed_on)] if passed_on is not None else []
             known = [(by, of) for by, of in ((by, _optimised(each)) for by, each in calls) if of is not None]
-            found += known if len(known) == len(calls) else []
+            for by, of in known if len(known) == len(calls) else ():
+                found += self._passed(where, of, makers) or [(by, of)]
         return found
+
+    def _passed(self, where: Function, of: cst.CSTNode, makers: Sequence[Tuple[Function, cst.Call]]) -> List[_Value]:
+        """Return what a parameter of a constructor was given, where calls are known that made the object."""
+        if where.name != "__init__" or not isinstance(of, cst.Name) or not where.is_parameter(of):
+            return []
+        owner, resolve = self.program.owner_of(where), self.program.resolve
+        of_class = [each for each in makers if owner in [made.target for made in resolve(each[0], each[1].func)]]
+        given = [(by, where.given(maker, of.value)) for by, maker in of_class]
+        return [(by, value) for by, value in given if value is not None]
 
     def _is_beside(self, step: _Step) -> bool:
         """Return whether an optimiser has tensors alone that are made for it, none for each Gaussian."""
         assert isinstance(step[1].func, cst.Attribute)
-        leaves = [leaf for given in self._given(step[0], step[1].func.value) for leaf in self._leaves(*given)]
-        made = [_definitions(self.program, *leaf) for leaf in leaves]
-        values = [(where, definition.value) for definitions in made for where, definition in definitions]
-        return bool(leaves) and all(made) and all(_is_own_tensor(*value) for value in values)
+        leaves = [leaf for given in self._given(step[0], step[1].func.value, step[3]) for leaf in self._leaves(*given)]
+        made = [[leaf] if isinstance(leaf[1], cst.Call) else _made(self.program, *leaf) for leaf in leaves]
+        return (
+            bool(leaves)
+            and all(made)
+            and all(_is_own_tensor(self.program, *each) for several in made for each in several)
+        )
 
     def _leaves(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[_Value]:
         """Return the parameters in ``[{"params": [a, b]}, c]``, or in a name of such a list."""
@@ -212,7 +233,18 @@ class Purposes:
             literal = [each for each in node.elements if isinstance(each, cst.DictElement)]
             entries = [each.value for each in literal if constant(each.key) == "params"]
         elif isinstance(node, cst.Name):
-            entries = [value for value in function.flow.assigned(node) if isinstance(value, (cst.List, cst.Tuple))]
+            values = function.flow.assigned(node)
+            entries = [value for value in values if isinstance(value, (cst.List, cst.Tuple))]
+            made = [value for value in values if isinstance(value, cst.Call)]
+            helpers = [helper for value in made for helper in callees(self.program, function, value)]
+            lists = [(by, of) for by in helpers for of in by.flow.returns if isinstance(of, (cst.List, cst.Tuple))]
+            if lists and not entries and depth < _DEPTH:
+                return [leaf for several in lists for leaf in self._leaves(*several, depth + 1)]
+        elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) == "values":
+            table = function.flow.value_of(node.func.value)
+            entries = [each.value for each in table.elements] if isinstance(table, cst.Dict) else []
+        elif isinstance(node, cst.Call) and call_name(node) == "list":
+            entries = [arg.value for arg in node.args]
         if not entries or depth > _DEPTH:
             return [(function, node)]
         return [leaf for entry in entries for leaf in self._leaves(function, entry, depth + 1)]
@@ -241,12 +273,23 @@ def _definitions(program: Program, function: Function, node: cst.CSTNode) -> Lis
     return []
 
 
+def _made(program: Program, function: Function, node: cst.CSTNode) -> List[Tuple[Function, Optional[cst.CSTNode]]]:
+    """Return the values of a name's definitions, each with its function."""
+    return [(where, definition.value) for where, definition in _definitions(program, function, node)]
+
+
 def _optimised(made: Optional[cst.CSTNode]) -> Optional[cst.CSTNode]:
     """Return what an optimiser is made with; None for what makes none."""
     if not isinstance(made, cst.Call) or not _OPTIMISER.search(call_name(made)):
         return None
     positional, keywords, _ = arguments(made)
     return keywords.get("params") or next(iter(positional), None)
+
+
+def _named_in(given: cst.CSTNode) -> Set[str]:
+    """Return the words of what is given; of ``[cam.pose for cam in scene.cameras]`` those of the pose."""
+    elements = words_in(given.elt) - PLUMBING if isinstance(given, cst.ListComp) else set()
+    return elements if elements & (POSES | EMBEDDING | MODELS) else words_in(given)
 
 
 def _entries(value: Optional[cst.CSTNode]) -> List[Optional[cst.CSTNode]]:
@@ -256,10 +299,16 @@ def _entries(value: Optional[cst.CSTNode]) -> List[Optional[cst.CSTNode]]:
     return [value.elt if isinstance(value, cst.ListComp) else value.value if isinstance(value, cst.DictComp) else value]
 
 
-def _is_own_tensor(function: Function, value: Optional[cst.CSTNode]) -> bool:
-    """Return whether a value is a new tensor whose values and sizes are none of Gaussians."""
+def _is_own_tensor(program: Program, function: Function, value: Optional[cst.CSTNode]) -> bool:
+    """Return whether a value is a new tensor, also by a helper, whose values and sizes are none of Gaussians."""
     made = [part for part in attribute_chain(value) if isinstance(part, cst.Call)] if value is not None else []
-    if not made or call_name(made[-1]) not in NEW_TENSORS:
+    if not made:
         return False
     sizes = [part for arg in made[-1].args for part in walk_expressions(arg.value)]
-    return not words_in(*sizes, *(each for part in sizes for each in function.flow.assigned(part))) & TENSORS
+    sizes += [each for part in sizes for each in function.flow.assigned(part)]
+    counts = [part for part in sizes if isinstance(part, cst.Call) and call_name(part) == "len"]
+    if words_in(*sizes) & TENSORS or words_in(*counts) & GAUSSIANS:
+        return False
+    helpers = [(each, of) for each in callees(program, function, made[-1]) for of in each.flow.returns]
+    of_helpers = bool(helpers) and all(_is_own_tensor(program, *helper) for helper in helpers)
+    return call_name(made[-1]) in NEW_TENSORS or of_helpers

@@ -9,14 +9,15 @@ import libcst as cst
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.syntax import one_line, words, words_in
-from legs_adapters.lexicon.meaning import UNKNOWN, swapped
-from legs_adapters.lexicon.words import MESH, PERCEPTUAL, TRACKING, WARPED
+from legs_adapters.code.syntax import attribute_chain, call_name, one_line, same, words, words_in
+from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, swapped
+from legs_adapters.lexicon.words import DATA, MESH, PERCEPTUAL, TRACKING, WARPED
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.causes.other import is_of_other_framework
 from legs_adapters.rules.order import RULES, first
 from legs_adapters.rules.rule import Term
 from legs_adapters.rules.uses import uses_of
+from legs_adapters.tensors.operations import KEEPS_PICTURES
 from legs_adapters.terms.error_maps import is_measured, reads_of
 from legs_adapters.terms.findings import Evidence, Left, Problem, Site
 from legs_adapters.terms.form import Form
@@ -137,6 +138,11 @@ class Verdicts:
             return _ByHand(f"nothing shows that {one_line(term.target)} is a photograph")
         if UNKNOWN in (pair.a, pair.b) and not by_hand:
             return _ByHand(f"nothing shows that {one_line(term.prediction)} is a rendering")
+        made = self._made_by_a_value(term.function, term.target)
+        if made is not None and not by_hand:
+            return _ByHand(f"nothing shows what {one_line(made)} makes of the photograph")
+        if _is_any_entry(term.function, term.prediction) and not by_hand:
+            return _ByHand(f"nothing shows which pictures {one_line(term.prediction)} takes")
         if term.has_rows:
             why = "the sides are lists of pixels: a weight map needs whole images"
             return _ByHand(why, "weight the L1 of the whole images, before pixels are picked or flattened")
@@ -147,6 +153,20 @@ class Verdicts:
             return _ByHand(why, _OF_DIFFERENCE)
         return None
 
+    def _made_by_a_value(self, function: Function, target: cst.CSTNode) -> Optional[cst.Call]:
+        """Return the call of a value of unknown kind, ``teacher(photo)``, that a photograph is given to and made by."""
+        made = function.flow.value_of(target) or target
+        if not isinstance(made, cst.Call) or call_name(made) in KEEPS_PICTURES:
+            return None
+        root = list(attribute_chain(made.func))[-1]
+        if DATA & words_in(root):
+            return None  # a camera's own method
+        kinds = {found.kind for found in function.flow.reaching(root)}
+        if not kinds or kinds & {"import", "function", "class"} or self.analysis.program.resolve(function, made.func):
+            return None
+        given = [self.analysis.meanings.meaning(function, arg.value) for arg in made.args]
+        return made if Meaning("image", "target") in given else None
+
     def _why_photograph(self, term: Term) -> str:
         """Return what shows that a side is the photograph."""
         name = one_line(term.target)
@@ -155,3 +175,12 @@ class Verdicts:
             return f"{name} is {'' if is_place else 'made from '}the photograph"
         where = "a parameter, " if term.function.is_parameter(term.target) else ""
         return f"{name} is {where}the photograph by its name"
+
+
+def _is_any_entry(function: Function, side: cst.CSTNode) -> bool:
+    """Return whether a side is under each key of its holder in turn: ``package[name]`` of ``for name in package``."""
+    entry = function.flow.value_of(side) or side
+    index = entry.slice[-1].slice if isinstance(entry, cst.Subscript) else None
+    looped = [made.value for made in function.flow.reaching(index.value)] if isinstance(index, cst.Index) else []
+    holders = [part for value in looped if value is not None for part in attribute_chain(value)]
+    return isinstance(entry, cst.Subscript) and any(same(entry.value, holder) for holder in holders)

@@ -7,7 +7,7 @@ from typing import Callable, Dict, List, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import given_to, handed
+from legs_adapters.code.calls import callees, given_to, handed, sure_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.reaching import Definition, Reaching
@@ -28,6 +28,7 @@ __all__ = ["TRAINS", "Training"]
 
 TRAINS = re.compile(r"\b((manual_)?backward|grad)\s*\(")  # a text that runs a backward pass
 _ANY = object()
+_DEPTH = 2
 
 
 class Training:
@@ -60,7 +61,7 @@ class Training:
             for function in module.scopes(TRAINS.search):
                 grads = [call for call in function.flow.calls if self._is_grad(function, call)]
                 passes = [call for call in function.flow.calls if is_backward(call)]
-                passes += [call for call in grads if _is_applied(function, call)]
+                passes += [call for call in grads if self._is_applied(function, call, set())]
                 scoring += [(function, call) for call in grads if call not in passes]
                 self._begin(function, [value for call in passes for value in _trained_by(call)], bool(passes))
         for method in (method for name in sorted(HOOKS) for method in program.methods_named(name)):
@@ -69,6 +70,36 @@ class Training:
         for self._scoring in scoring:
             self._begin(self._scoring[0], _trained_by(self._scoring[1]), False)
             self._follow()
+
+    def _is_applied(self, function: Function, call: Optional[cst.Call], names: Set[str], depth: int = 0) -> bool:
+        """Return whether a parameter steps by a gradient, a call's or one of these names: ``p.grad = g``, ``p -= g``.
+
+        It is followed into functions that are given it, callers that get it, and methods of the class that stores it.
+        """
+
+        def has(value: cst.CSTNode) -> bool:
+            return any(part is call for part in walk_expressions(value)) or depends(function, value, names)
+
+        made = [(each, each.value) for each in function.flow.every_definition if each.value is not None]
+        names = names | {each.place for each, value in made if call is not None and call in walk_expressions(value)}
+        given = [value for each, value in made if _is_less(each) or each.place.endswith(".grad")]
+        given += [arg.value for each in function.flow.calls if _is_downhill(each) for arg in each.args]
+        if any(has(value) and not any(map(_loses_sign, attribute_chain(value))) for value in given):
+            return True
+        inner: List[Tuple[Function, Optional[cst.Call], Set[str]]] = []
+        for each in function.flow.calls if depth < _DEPTH else ():
+            for callee in callees(self.program, function, each):
+                taken = [(name, callee.given(each, name)) for name in callee.parameters]
+                inner += [(callee, None, {name}) for name, value in taken if value is not None and has(value)]
+        if depth < _DEPTH and any(map(has, function.flow.returns)):
+            inner += [(caller, site, set()) for caller, site in sure_calls(self.program, function)]
+        owner = self.program.owner_of(function)
+        stored = {
+            each.place for each, value in made if each.place.startswith("self.") and depth < _DEPTH and has(value)
+        }
+        others = owner.methods.values() if owner is not None and stored else ()
+        inner += [(method, None, stored) for method in others if method is not function]
+        return any(self._is_applied(*each, depth + 1) for each in inner)
 
     def _follow(self) -> None:
         while self._work:
@@ -210,16 +241,6 @@ def _takes_gradient(reference: Reference) -> bool:
     return reference.kind == "external" and str(reference.target).endswith("autograd.grad")
 
 
-def _is_applied(function: Function, call: cst.Call) -> bool:
-    """Return whether a function steps by a gradient that it takes: ``p.grad = g``, ``p -= rate * g``."""
-    made = [(each, each.value) for each in function.flow.every_definition if each.value is not None]
-    names = {each.place for each, value in made if call in walk_expressions(value)}
-    given = [value for each, value in made if _is_less(each) or each.place.endswith(".grad")]
-    given += [arg.value for each in function.flow.calls if _is_downhill(each) for arg in each.args]
-    given = [value for value in given if not any(_loses_sign(part) for part in attribute_chain(value))]
-    return any(call in walk_expressions(value) or depends(function, value, names) for value in given)
-
-
 def _is_less(made: Definition) -> bool:
     """Return whether a place becomes less: ``p -= rate * g``, ``p = (p - rate * g).detach()``."""
     parts = [part for part in attribute_chain(made.value or made.node) if isinstance(part, cst.BinaryOperation)]
@@ -234,6 +255,8 @@ def _loses_sign(node: cst.CSTNode) -> bool:
 
 def _is_downhill(call: cst.Call) -> bool:
     """Return whether a call may step by its arguments: ``p.add_(g, alpha=-rate)``, no sum: ``scores.add_(g.abs())``."""
+    if call_name(call) == "setattr" and len(call.args) == 3:
+        return constant(call.args[1].value) == "grad"
     is_sum = call_name(call) == "add_" and not any(isinstance(part, cst.Minus) for part in walk_expressions(call))
     return call_name(call) in APPLIES and not is_sum
 

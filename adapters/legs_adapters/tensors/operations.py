@@ -11,13 +11,13 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Reaching
-from legs_adapters.code.syntax import children, word_set
+from legs_adapters.code.syntax import children, path_of, word_set
 
 # The same values: on another device, of another type or copied; where they are in range; in another order or shape.
 _MOVES = word_set(
     "astype clone contiguous copy cpu cuda deepcopy detach double float half numpy requires_grad_ to type type_as"
 )
-_LIMITS = word_set("clamp clamp_ clamp_max clamp_min clip nan_to_num round")
+LIMITS = word_set("clamp clamp_ clamp_max clamp_min clip nan_to_num round")
 _AXES = word_set(
     """
     T expand expand_as flatten flip movedim permute rearrange repeat reshape reshape_as roll rot90 squeeze transpose
@@ -26,7 +26,7 @@ _AXES = word_set(
 )
 _MAKES = word_set("BoolTensor FloatTensor Tensor array as_tensor asarray from_numpy tensor")  # of the same values
 JOINS = word_set("cat concat concatenate hstack stack vstack")  # several values as one
-KEEPS_AXES = _MOVES | _LIMITS  # every value keeps its place
+KEEPS_AXES = _MOVES | LIMITS  # every value keeps its place
 LIKE = word_set("expand_as reshape_as to type_as view_as")  # uses a tensor's type or shape, not its values
 ASKS = word_set("isfinite isinf isnan ones_like zeros_like")  # tests of values
 CONSTANTS = word_set("full full_like ones ones_like zeros zeros_like")  # one value for every pixel
@@ -57,13 +57,15 @@ OPTIMISERS = word_set("optimiser optimisers optimizer optimizers")
 STEPS = word_set("adam optim optimise optimize sgd step steps update")
 SCHEDULES = word_set("bar lr pbar profiler progress sched scheduler schedulers strategy tqdm")
 _PICKS = word_set("chunk index_select narrow select split unbind")
-_COMPUTES = word_set("add cumsum div div_ masked_fill mean mul mul_ pow sub sum")
+_COMPUTES = word_set("add div div_ masked_fill mean mul mul_ pow sub sum")
 _FILTERS = word_set("abs conv2d einsum gather masked_select relu sigmoid")
 _RESAMPLES = word_set("avg_pool2d center_crop crop gaussian_blur grid_sample interpolate max_pool2d pad resize")
 _PASSES_ON = word_set("DataLoader checkpoint enumerate iter list next no_grad reversed tqdm tuple zip")
 VIEWS = word_set("T data mT")  # attributes that are the same values
 PICTURE_METHODS = KEEPS_AXES | _AXES | _PICKS | _COMPUTES | {"abs"}  # of an image, they return an image
 PICTURE_FUNCTIONS = PICTURE_METHODS | _MAKES | _FILTERS | _RESAMPLES | _PASSES_ON
+_MIXES = word_set("addcmul bmm lerp matmul mm where")  # an exposure, a background
+KEEPS_PICTURES = PICTURE_FUNCTIONS | TRANSFORMS | _MIXES
 
 
 def depends(function: Function, node: cst.CSTNode, names: Set[str]) -> bool:
@@ -72,9 +74,9 @@ def depends(function: Function, node: cst.CSTNode, names: Set[str]) -> bool:
     work: List[cst.CSTNode] = [node]
     while work:
         part = work.pop()
+        if isinstance(part, (cst.Name, cst.Attribute)) and path_of(part) in names:
+            return True
         if isinstance(part, cst.Name):
-            if part.value in names:
-                return True
             work.extend(made.value for made in function.flow.reaching(part).new(met) if made.value is not None)
         elif not (isinstance(part, cst.Attribute) and part.attr.value in SIZES):
             work.extend(children(part))

@@ -23,7 +23,7 @@ from legs_adapters.code.syntax import (
 from legs_adapters.lexicon.names import TORCH_L1, has_perceptual_name, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
 from legs_adapters.tensors.absolute import abs_argument, is_difference, mean_of
-from legs_adapters.tensors.operations import ASKS, LIKE, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
+from legs_adapters.tensors.operations import ASKS, LIKE, LIMITS, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
 from legs_adapters.terms.prospects import Prospects
 
 __all__ = ["L1Functions"]
@@ -157,6 +157,8 @@ class L1Functions:
             return None
         if is_difference(node) and body.is_pair(node.left, node.right):
             calls = [part for part in walk_expressions(node.left) if isinstance(part, cst.Call)]
+            if LIMITS & set(map(call_name, calls)):
+                return None  # a weighted difference would be cut off
             made = [r for call in calls for r in self.program.resolve(body.function, call.func)]
             return None if any(r.kind == "function" for r in made) else [node]  # edges(a) - edges(b)
         return [node] if isinstance(node.operator, cst.Multiply) and constant(node.right, 1) == 0 else []
@@ -170,6 +172,11 @@ class L1Functions:
 
     def _in_attribute(self, body: _Body, node: cst.Attribute) -> List[cst.CSTNode]:
         return [node.value] if node.attr.value in SIZES else []
+
+    def _in_comparison(self, body: _Body, node: cst.Comparison) -> Optional[List[cst.CSTNode]]:
+        """Return nothing to follow, or None of a threshold of the difference: a weight would move pixels over it."""
+        of_both = all(depends(body.function, node, {name}) for name in body.pairs[0])
+        return None if of_both else []
 
     def _in_subscript(self, body: _Body, node: cst.Subscript) -> Optional[List[cst.CSTNode]]:
         """Return nothing to follow, or None of an entry of a dictionary: its parameter is no picture itself."""
@@ -197,6 +204,7 @@ _MAY_BE: Dict[type, Callable[..., Optional[Iterable[cst.CSTNode]]]] = {
     cst.BinaryOperation: L1Functions._in_operation,
     cst.Call: L1Functions._in_call,
     cst.Attribute: L1Functions._in_attribute,
+    cst.Comparison: L1Functions._in_comparison,
     cst.Subscript: L1Functions._in_subscript,
     cst.Assign: L1Functions._in_assignment,
     cst.AugAssign: L1Functions._in_assignment,

@@ -98,7 +98,8 @@ class OtherName(Rule):
         """Return whether it is the plain L1: no threshold may be taken of it, nor features beside it."""
         if self.id == "robust":
             return not term.form.is_map
-        return self.id != "perceptual" or _are_proven(term.analysis, term.function)
+        is_step = term.function in term.analysis.training.roots  # its name says nothing of one term in it
+        return self.id != "perceptual" or is_step or _are_proven(term.analysis, term.function)
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether the name may mean something else: it is reported where no other term was found."""

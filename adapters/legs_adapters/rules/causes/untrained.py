@@ -6,10 +6,11 @@ from typing import AbstractSet, Iterator, List
 
 from legs_adapters.code.calls import likely_calls
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import words
+from legs_adapters.code.syntax import attribute_chain, call_name, words
 from legs_adapters.lexicon.words import LOSS, REPORTING, SCORING
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.tensors.gradients import is_detached, no_grad_around
+from legs_adapters.tensors.operations import ENDS_GRADIENT
 from legs_adapters.terms.findings import Decider
 
 __all__ = ["UNTRAINED", "Evaluation", "Scoring", "Untrained"]
@@ -68,7 +69,9 @@ class Untrained(Rule):
         return term.here if term.analysis.training.touches(term.function) else [header(term.function)]
 
     def may_be_loss(self, term: Term) -> bool:
-        return True
+        """Return whether no gradient is cut of it: ``error = l1_loss(image, gt).detach()`` is a weight or a number."""
+        cuts = [call for call in term.function.flow.calls if call_name(call) in ENDS_GRADIENT]
+        return not any(term.form.node in attribute_chain(call) for call in cuts)
 
 
 UNTRAINED = (Scoring(), Evaluation(), Untrained())

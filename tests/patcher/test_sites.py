@@ -329,3 +329,11 @@ def test_a_product_with_the_photograph_is_not_said_to_be_the_photograph(tmp_path
     )
     whys = [site.why for site in plan(checkout(tmp_path, texts)).findings.sites]
     assert whys == ["gt_image * attention is made from the photograph"]
+
+
+def test_a_function_that_is_weighted_by_hand_is_not_weighted_again_at_its_calls(tmp_path):
+    texts = files("inria")
+    body = "import legs_loss\n\n\ndef l1_loss(network_output, gt):\n    return legs_loss.l1_loss(network_output, gt)\n"
+    found = plan(checkout(tmp_path, {**texts, "utils/loss_utils.py": body})).findings
+    assert not found.sites
+    assert [(entry.path, entry.line) for entry in found.patched] == [("utils/loss_utils.py", 5)]

@@ -117,9 +117,10 @@ class Meanings:
         return mix(self._member(function, node, each) for each in keys) if keys else self.meaning(function, node.value)
 
     def _is_behind(self, function: Function, node: cst.Subscript) -> bool:
-        """Return whether one channel behind the colours is taken: ``x[3]``, ``x[-1]``, ``x.split([3, 1])[1]``."""
+        """Return whether one channel behind the colours is taken: ``x[3]``, ``x[-1:]``, ``x.split([3, 1])[1]``."""
         index = node.slice[0].slice if len(node.slice) == 1 else None
-        at = constant(index.value) if isinstance(index, cst.Index) else None
+        is_last = isinstance(index, cst.Slice) and index.upper is None and constant(index.lower) == -1
+        at = constant(index.value) if isinstance(index, cst.Index) else -1 if is_last else None
         if isinstance(node.value, cst.Call) and isinstance(at, int):
             return _picked_from(node.value, at) >= 3
         held = function.flow.value_of(node.value) or node.value  # a list or a batch has whole images: images[-1]
@@ -292,7 +293,8 @@ def _is_fourth(node: cst.Subscript) -> bool:
     start, end = (constant(cuts[0].lower), cuts[0].upper) if len(cuts) == 1 else (None, None)  # no block of a matrix
     last = parts[-1] if len(parts) > 1 else None
     is_one = isinstance(last, cst.Index) and constant(last.value) == 3
-    return is_one or (start == -1 and end is None) or (start == 3 and (end is None or constant(end, 0) > 3))  # no 3:-3
+    is_last = start == -1 and end is None and len(parts) > 1
+    return is_one or is_last or (start == 3 and (end is None or constant(end, 0) > 3))  # no border: 3:-3
 
 
 def _is_opacity(part: cst.CSTNode, node: cst.BinaryOperation | cst.BooleanOperation) -> bool:

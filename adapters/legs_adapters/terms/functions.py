@@ -25,6 +25,7 @@ from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
 from legs_adapters.tensors.absolute import abs_argument, is_difference, mean_of
 from legs_adapters.tensors.operations import ASKS, LIKE, LIMITS, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
 from legs_adapters.terms.prospects import Prospects
+from legs_adapters.terms.writing import PACKAGE
 
 __all__ = ["L1Functions"]
 
@@ -115,8 +116,8 @@ class L1Functions:
     def shape_of_reference(self, reference: Reference, depth: int = 0) -> Optional[str]:
         """Return what `shape` does for what is called, torch's functions included."""
         name = str(getattr(reference.target, "name", reference.target))
-        if has_perceptual_name(name.split(".")[-1]):
-            return None  # whatever its body: an L1 of features
+        if has_perceptual_name(name.split(".")[-1]) or name.startswith(f"{PACKAGE}."):
+            return None  # whatever its body: an L1 of features; or weighted before
         if reference.kind == "external" and name == "gsplat.losses.l1_loss":
             return "none"
         if reference.kind == "external":

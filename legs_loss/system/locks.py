@@ -15,6 +15,7 @@ from legs_loss.errors import LegsError
 __all__ = ["FileLock", "HeldError", "is_held"]
 
 _POLL = 0.02  # seconds
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EBADF)  # EBADF: another user's, on NFS
 _FAR = 1 << 30  # the byte that Windows locks, and no other process can read: after all text
 
 
@@ -24,6 +25,8 @@ class HeldError(LegsError):
 
 class FileLock:
     """An exclusive lock on a file; a context manager.
+
+    Where the file system has no locks, as that of some clusters, it is taken as free: `is_certain` is False then.
 
     Args:
         path: the file, made where it is missing, never through a link.
@@ -43,7 +46,7 @@ class FileLock:
         note: str = "",
         remove: bool = False,
     ) -> None:
-        self._path, self._remove = os.fspath(path), remove
+        self._path, self._remove, self.is_certain = os.fspath(path), remove, True
         until = None if wait is None else time.monotonic() + wait
         while True:
             self._descriptor = _open(self._path)
@@ -75,19 +78,28 @@ class FileLock:
         self.release()
 
     def _take(self, until: Optional[float]) -> None:
-        while not _try_lock(self._descriptor, block=until is None):
+        while not self._try(until is None):
             if until is not None and time.monotonic() >= until:
                 raise HeldError(os.pread(self._descriptor, 500, 0).decode("utf-8", "replace") if _PREAD else "")
             time.sleep(_POLL)
+
+    def _try(self, block: bool) -> bool:
+        try:
+            return _try_lock(self._descriptor, block)
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            self.is_certain = False
+            return True
 
 
 def is_held(path: Union[str, os.PathLike[str]]) -> bool:
     """Return whether another holds the lock of a file, or whether that cannot be found out."""
     try:
-        FileLock(path, wait=0.0).release()
+        with FileLock(path, wait=0.0) as lock:
+            return not lock.is_certain
     except (OSError, HeldError):
         return True
-    return False
 
 
 _PREAD = hasattr(os, "pread")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -29,11 +30,13 @@ from legs_loss.lab.experiments.running import read_json, read_rows, write_json
 from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import read_ply, write_ply
 from legs_loss.lab.training.checkpoint import read_checkpoint, write_checkpoint
+from legs_loss.precompute import precompute
 from legs_loss.scenes import Camera, PointCloud, View, load_training_image, read_scene
-from legs_loss.system import write_whole
+from legs_loss.store import StoreWriter, WeightStore
+from legs_loss.system import locks, write_whole
 from tests.hostile.forked import forked
 from tests.patcher.support import checkout, legs_patch, snapshot
-from tests.support import legs_command, legs_environment
+from tests.support import colmap_scene, legs_command, legs_environment
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork, to start at the same moment")
 
@@ -154,6 +157,38 @@ def test_who_holds_the_lock_is_said(tmp_path, monkeypatch, capsys):
     os.waitpid(child, 0)
     assert main(["--undo", str(root)]) == 0
     assert not list(root.glob(".legs-patch*"))
+
+
+@pytest.mark.parametrize("name", ["ENOLCK", "ENOSYS", "EOPNOTSUPP", "EBADF"])
+def test_a_file_system_without_locks(name, tmp_path, monkeypatch):
+    """Clusters mount such: what was refused there goes on, and no other writer's work is taken for a killed one's."""
+
+    def flock(*_):
+        raise OSError(getattr(errno, name), "no locks")
+
+    monkeypatch.setattr(locks.fcntl, "flock", flock)
+    root = checkout(tmp_path / "code", SOURCES)
+    assert legs_patch_here(root) == 0
+    assert legs_patch_here("--undo", root) == 0
+    assert snapshot(root) == PLAIN
+    scene = colmap_scene(tmp_path / "scene")
+    store = scene / "legs_weights"
+    with StoreWriter(store) as another:
+        assert locks.is_held(another.staging / ".lock")
+        assert len(precompute(read_scene(scene), workers=1).made) == 3
+        assert another.staging.is_dir()
+    assert WeightStore(store).check() == ([], [])
+
+
+def test_a_lock_that_fails_otherwise_is_refused(tmp_path, monkeypatch, capsys):
+    def flock(*_):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(locks.fcntl, "flock", flock)
+    root = checkout(tmp_path, SOURCES)
+    assert main([str(root)]) == 2
+    assert "Input/output error; nothing was changed" in capsys.readouterr().err
+    assert {name: data for name, data in snapshot(root).items() if name in PLAIN} == PLAIN
 
 
 OURS = (

@@ -152,7 +152,7 @@ def alone_in(folder: Optional[Path], make: bool) -> Iterator[None]:
         lock = FileLock(folder / LOCK, wait=WAIT, note=f"process {os.getpid()} on {platform.node()}", remove=True)
     except HeldError as error:
         raise LegsError(f"{folder}: another training writes there ({error}): choose another folder") from None
-    except OSError:  # no folder; a file system without locks, or without room: what is written next says so
+    except OSError:  # no folder, or no room: what is written next says so
         pass
     try:
         yield

@@ -9,11 +9,11 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Callable, Dict, Iterator, List, Optional, Union
+from typing import Any, Callable, Dict, Iterator, List, Optional, Union
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
-from legs_loss.precompute.one_view import Job, ViewResult, ViewTask, make
+from legs_loss.precompute.one_view import Job, UnwritableError, ViewTask, make
 from legs_loss.precompute.photograph import compile_response
 from legs_loss.precompute.user_maps import NO_MAPS, UserMaps, is_below, stage_user_maps
 from legs_loss.precompute.workers import in_processes
@@ -22,7 +22,7 @@ from legs_loss.spec import Spec, as_spec
 from legs_loss.store import Entry, StoreWriter
 from legs_loss.store.origin import note_scene
 from legs_loss.system import held_back
-from legs_loss.system.executors import Listener
+from legs_loss.system.executors import outcomes
 
 __all__ = ["Report", "precompute"]
 
@@ -100,26 +100,26 @@ def precompute(
         if workers > 1 and any(not task.known for task in tasks):
             with suppress(LegsError):  # a photograph that cannot be read is skipped later, with the reason
                 compile_response(*training_size(*image_size(tasks[0].view.path), resolution), spec)
-        one_by_one = ((task, make(job, task)) for task in tasks)
-        results = in_processes(partial(_made, job), tasks, workers) if workers > 1 else one_by_one
+        work = partial(make, job)
+        results: Any = in_processes(work, tasks, workers) if workers > 1 else outcomes(work, tasks, None, print)
         staged: List[Entry] = []
         due = time.monotonic()  # the first at once, so that there is a store
-        with closing(results):
+        with closing(results), tqdm(total=len(tasks), desc="weight maps", unit="view", disable=not progress) as bar:
             try:
-                for task, result in tqdm(results, "weight maps", len(tasks), unit="view", disable=not progress):
+                for done, (task, result) in enumerate(results, 1):
+                    bar.update()
+                    name = task.view.name
+                    if isinstance(result, UnwritableError):
+                        raise LegsError(f"cannot write to {out}: {result}")
                     if isinstance(result, LegsError):
-                        result = ViewResult(task.view.name, problem=f"{task.view.path}: {result}")
-                    if result.unwritable is not None:
-                        raise LegsError(f"cannot write to {out}: {result.unwritable}")
-                    if result.problem is not None:
-                        report.skipped[result.view] = result.problem
-                    elif result.entry is None:
-                        report.kept.append(result.view)
+                        report.skipped[name] = str(result)
+                    elif result is None:
+                        report.kept.append(name)
                     else:
-                        report.made.append(result.view)
-                        staged.append(result.entry)
+                        report.made.append(name)
+                        staged.append(result)
                     if on_progress is not None:
-                        on_progress(len(report.made) + len(report.kept) + len(report.skipped), len(tasks))
+                        on_progress(done, len(tasks))
                     if staged and time.monotonic() >= due:
                         began = time.monotonic()
                         _commit(writer, staged)  # it lists all maps anew: of 100,000 for longer than a second
@@ -140,11 +140,6 @@ def _shared_names(scene: Scene) -> Iterator[str]:
             f"{alike} views share a name in 3DGS, which drops folders and extensions; codebases that use these names "
             "compute their weights instead"
         )
-
-
-def _made(job: Job, task: ViewTask, _: Listener) -> ViewResult:
-    """Make a view's map in a worker process, which has nothing to tell before."""
-    return make(job, task)
 
 
 def _commit(writer: StoreWriter, staged: List[Entry]) -> None:

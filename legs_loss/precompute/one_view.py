@@ -11,8 +11,9 @@ from legs_loss.precompute.photograph import normalised_map_and_levels
 from legs_loss.scenes import View, image_size, load_training_image, training_size
 from legs_loss.spec import WeightSpec
 from legs_loss.store import Entry, fingerprint, is_intact, sampled_fingerprint, stage
+from legs_loss.system.executors import Listener
 
-__all__ = ["Job", "ViewResult", "ViewTask", "make"]
+__all__ = ["Job", "UnwritableError", "ViewTask", "make"]
 
 
 class Job(NamedTuple):
@@ -32,20 +33,17 @@ class ViewTask(NamedTuple):
     known: Sequence[Entry]  # what the store has of this view
 
 
-class ViewResult(NamedTuple):
-    """Of one view: a staged entry, or a problem, or neither where the store's map is up to date.
+class UnwritableError(LegsError):
+    """The store cannot be written: unlike a photograph's, an error that ends the run."""
 
-    ``problem`` is the photograph's and costs the view; ``unwritable`` is the store's and ends the run.
+
+def make(job: Job, task: ViewTask, _: Listener) -> Optional[Entry]:
+    """Make the map of a view, and return its staged entry; None where the store's map is up to date.
+
+    Raises:
+        LegsError: the photograph cannot be used.
+        UnwritableError: nor can the store.
     """
-
-    view: str
-    entry: Optional[Entry] = None
-    problem: Optional[str] = None
-    unwritable: Optional[str] = None
-
-
-def make(job: Job, task: ViewTask) -> ViewResult:
-    """Make the map of a view; errors are in the result."""
     view = task.view
     try:
         source = os.stat(str(view.path))
@@ -65,15 +63,13 @@ def make(job: Job, task: ViewTask) -> ViewResult:
         }
         known = [entry for entry in task.known if entry.sample and wanted.items() <= vars(entry).items()]
         if any(is_intact(job.store, entry) for entry in known):
-            return ViewResult(view.name)
+            return None
         image = load_training_image(view, job.resolution, job.white_background)
         made, levels = normalised_map_and_levels(image, job.spec)
         entry = Entry(fingerprint=fingerprint(image), sample=sampled_fingerprint(image), **wanted, **levels)
-        try:
-            return ViewResult(view.name, stage(job.staging, entry, made))
-        except OSError as error:  # a full disk, a missing folder: all later views would fail too
-            return ViewResult(view.name, unwritable=error.strerror or str(error))
-    except LegsError as error:
-        return ViewResult(view.name, problem=str(error))
     except (OSError, MemoryError) as error:
-        return ViewResult(view.name, problem=f"{view.path}: {error or 'not enough memory'}")
+        raise LegsError(f"{view.path}: {error or 'not enough memory'}") from None
+    try:
+        return stage(job.staging, entry, made)
+    except OSError as error:  # a full disk, a missing folder: all later views would fail too
+        raise UnwritableError(error.strerror or str(error)) from None

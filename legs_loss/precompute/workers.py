@@ -80,6 +80,8 @@ def _work(connection: Any, task: Task) -> None:
             argument = connection.recv()
             try:
                 result = task(argument, lambda message: connection.send((False, message)))
-            except (LegsError, OSError) as error:  # a full disk is no fault of the code either
+            except LegsError as error:
+                result = error
+            except OSError as error:  # a full disk is no fault of the code either
                 result = LegsError(str(error))
             connection.send((True, result))

@@ -20,6 +20,7 @@ from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import write_ply
 from legs_loss.lab.training.trainer import TrainConfig
 from legs_loss.scenes import read_scene
+from tests.lab.training import train_one
 
 pytestmark = pytest.mark.slow
 
@@ -57,7 +58,7 @@ def compared(tiny_scene, tmp_path_factory):
     out = folder / f"{FORMS[0]} out"
     trainings = Comparison(scene, TrainConfig(iterations=6, resolution=2), out)
     for arm in parse_arms(["3dgs", "legs"]):
-        trainings.train_one(arm, 0)
+        train_one(trainings, arm, 0)
     return scene, out
 
 

@@ -94,13 +94,3 @@ def test_eight_rows_transposed_are_their_columns():
     rows, result = np.arange(64, dtype=np.float32), np.empty(64, np.float32)
     turn(rows, result)
     assert (result.reshape(8, 8) == rows.reshape(8, 8).T).all()
-
-
-def test_a_number_multiplies_every_lane():
-    import numba
-
-    @numba.njit
-    def thrice(a, b):
-        return np.float32(3) * b
-
-    assert by_lanes(thrice, A, range(8)) == [0, 3, 6, 9, 12, 15, 18, 21]

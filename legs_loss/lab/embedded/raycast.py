@@ -7,6 +7,7 @@ scene, and keeps the result as a small light map.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, List, NamedTuple, Optional, Sequence, Tuple, Union
 
 import numpy as np
@@ -60,34 +61,26 @@ def _bilinear(table: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return top * (1 - fy) + bottom * fy
 
 
+@dataclass(eq=False)
 class Quad:
     """A parallelogram ``corner + u * across + v * down`` with a texture, or the ellipse inside it (``round=True``).
 
     It is seen and lit from both sides.
     """
 
-    corner: np.ndarray
-    across: np.ndarray
-    down: np.ndarray
+    corner: Any  # three numbers each, arrays from here on
+    across: Any
+    down: Any
     texture: np.ndarray
-    round: bool
-    casts_shadow: bool
+    round: bool = False
+    casts_shadow: bool = True
+    light: Optional[np.ndarray] = None
 
-    def __init__(
-        self,
-        corner: Vector,
-        across: Vector,
-        down: Vector,
-        texture: np.ndarray,
-        round: bool = False,
-        casts_shadow: bool = True,
-    ) -> None:
-        self.corner, self.across, self.down = (np.asarray(vector, float) for vector in (corner, across, down))
-        self.texture, self.round, self.casts_shadow = texture, round, casts_shadow
+    def __post_init__(self) -> None:
+        self.corner, self.across, self.down = (np.asarray(one, float) for one in (self.corner, self.across, self.down))
         self.normal: np.ndarray = _unit(np.cross(self.across, self.down))
         # Rows: the dual basis, so that row @ (point - corner) is u, v and the height over the plane.
         self._dual = np.linalg.inv(np.stack([self.across, self.down, self.normal], axis=1))
-        self.light: Optional[np.ndarray] = None
 
     def hull(self) -> np.ndarray:
         """Return points whose convex hull holds the surface."""

@@ -26,7 +26,7 @@ from legs_loss.lab.experiments.schema import ROW, SETTINGS, what_is_wrong
 from legs_loss.lab.training.checkpoint import CHECKPOINT, alone_in
 from legs_loss.lab.training.dataset import Dataset, load_dataset
 from legs_loss.lab.training.perceptual import network_name, use_lpips
-from legs_loss.lab.training.side_by_side import Arm, train_arm, train_side_by_side
+from legs_loss.lab.training.side_by_side import Arm, train_side_by_side
 from legs_loss.lab.training.trainer import Progress, TrainConfig, default_threshold
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
@@ -140,15 +140,6 @@ class Comparison:
                 train_side_by_side(trainings, processes, on_progress, done, scheduler)
         rows = [self.row(arm, seed) for seed in seeds for arm in needed(arms)]
         return [row for row in rows if row is not None]
-
-    def train_one(self, arm: ArmSpec, seed: int) -> Row:
-        """Train one row in this process, unless it exists; the row whose numbers it uses must exist."""
-        if self.row(arm, seed) is None:
-            training = self._training(arm.name, arm, seed)
-            self._finish(arm, seed, train_arm(training, lambda progress: None))
-        row = self.row(arm, seed)
-        assert row is not None
-        return row
 
     def _training(self, name: str, arm: ArmSpec, seed: int) -> Arm:
         """Return the training of a row; it resumes from a checkpoint in its folder."""

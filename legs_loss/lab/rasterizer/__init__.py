@@ -28,17 +28,12 @@ if TYPE_CHECKING:
     from legs_loss.lab.rasterizer.drawing import covariance as covariance
     from legs_loss.lab.rasterizer.drawing import draw as draw
 
-_HOMES = {
-    "CompactBox": "compact_box",
-    "Contributions": "drawing",
-    "Drawn": "drawing",
-    "Lens": "drawing",
-    "Tensors": "compiled",
-    "compensation": "drawing",
-    "covariance": "drawing",
-    "draw": "drawing",
-    "said": "compiled",
+_NAMES = {
+    "compact_box": ["CompactBox"],
+    "compiled": ["Tensors", "said"],
+    "drawing": ["Contributions", "Drawn", "Lens", "compensation", "covariance", "draw"],
 }
+_HOMES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = ["MIN_ALPHA", "NEAR", "Gaussians", "Rendering", "View", "rasterize", "rotations", *_HOMES]
 
 

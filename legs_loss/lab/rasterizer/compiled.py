@@ -137,21 +137,13 @@ def attach(drawing: Drawing, tensors: Tensors) -> Tuple[Tensor, Tensor]:
     """Return a drawing as image [3, H, W] and radii int32 [N], with the gradient to the tensors it was drawn from."""
     # A colour is 1 / C0 of its constant harmonic, for the backward pass.
     sh = tensors.sh if tensors.colours is None else tensors.colours[:, None] / SH_C0
-    return _Attach.apply(*tensors[:4], sh, tensors.covariances, tensors.viewspace, drawing)
+    return _Attach.apply(drawing, tensors.viewspace, *tensors[:4], sh, tensors.covariances)
 
 
 class _Attach(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        means: Tensor,
-        scales: Optional[Tensor],
-        quaternions: Optional[Tensor],
-        opacities: Tensor,
-        sh: Tensor,
-        covariances: Optional[Tensor],
-        viewspace: Optional[Tensor],
-        drawing: Drawing,
+        ctx: Any, drawing: Drawing, viewspace: Optional[Tensor], *given: Optional[Tensor]
     ) -> Tuple[Tensor, Tensor]:
         # The returned image may be changed in place; the one for the backward pass may not.
         image, radii = torch.from_numpy(drawing.image.copy()), torch.from_numpy(drawing.radii)
@@ -159,7 +151,7 @@ class _Attach(torch.autograd.Function):
         # So that torch detects changed inputs, and frees the drawing's arrays after the backward pass.
         large = [name for name, value in drawing._asdict().items() if isinstance(value, np.ndarray) and name != "radii"]
         arrays = (torch.from_numpy(getattr(drawing, name)) for name in large)
-        ctx.save_for_backward(means, scales, quaternions, opacities, sh, covariances, *arrays)
+        ctx.save_for_backward(*given, *arrays)
         ctx.columns = 2 if viewspace is None else viewspace.shape[1]
         nothing: Dict[str, Any] = dict.fromkeys(large)
         ctx.large, ctx.drawing = large, drawing._replace(**nothing)
@@ -176,7 +168,7 @@ class _Attach(torch.autograd.Function):
             strips.render_backward, len(it.bands), it.bands, it.across, it.ranges, it.draws, it.entries, it.ends,
             it.image, _array(g_image), moments, sums.reshape(-1),
         )  # fmt: skip
-        shapes = [None if array is None else array.shape for array in it.parameters] + [(len(it.radii), ctx.columns)]
+        shapes = [(len(it.radii), ctx.columns), *(None if array is None else array.shape for array in it.parameters)]
         gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
         filled: List[Any] = [None if gradient is None else gradient.numpy() for gradient in gradients]
         in_threads(
@@ -188,8 +180,8 @@ class _Attach(torch.autograd.Function):
             it.clamped,
             it.firsts,
             sums,
-            Parameters(*filled[:-1]),
-            filled[-1],
+            Parameters(*filled[1:]),
+            filled[0],
         )
-        found = [gradient if wanted else None for gradient, wanted in zip(gradients, ctx.needs_input_grad)]
-        return (*found, None)
+        found = [gradient if wanted else None for gradient, wanted in zip(gradients, ctx.needs_input_grad[1:])]
+        return (None, *found)

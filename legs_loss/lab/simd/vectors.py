@@ -71,19 +71,6 @@ for _symbol, _kind, _instruction in (
     _operator(_symbol, _kind, _instruction)
 
 
-class _Scaled(_First):
-    cases = [signature(float8, types.float32, float8)]
-
-
-infer_global(operator.mul)(_Scaled)
-
-
-@lower_builtin(operator.mul, types.float32, float8)
-def _scaled(context: Any, builder: Any, sig: Any, args: Sequence[Any]) -> Any:
-    first = builder.insert_element(ir.Constant(FLOATS, ir.Undefined), args[0], ir.Constant(ir.IntType(32), 0))
-    return builder.fmul(builder.shuffle_vector(first, first, ir.Constant(INTEGERS, [0] * LANES)), args[1])
-
-
 class _Negative(_First):
     cases = [signature(float8, float8)]
 

@@ -79,8 +79,8 @@ class _Render(torch.autograd.Function):
         pictures = Pictures(image, others, kept)
         backward = of_image, of_others, sums.reshape(-1)
         in_threads(strips.render_backward, len(work.bands), work, background, pictures, *backward)
-        results = [torch.empty(array.shape) for array in discs]
-        viewspace = torch.empty(len(discs.means), 3)
+        results = [torch.zeros(array.shape) for array in discs]
+        viewspace = torch.zeros(len(discs.means), 3)
         gradients = Discs(*(result.numpy() for result in results))
         blocks = -(-len(discs.means) // projection.BLOCK)
         in_threads(

@@ -75,18 +75,6 @@ def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, 
     sums = np.empty(GRADIENTS, np.float64)
     for i in range(begin, end):
         if firsts[i, FIRST_SUM] == firsts[i + 1, FIRST_SUM]:
-            g_means[i] = 0
-            g_opacities[i] = 0
-            g_view[i] = 0
-            if given:
-                g_homographies[i] = 0
-            else:
-                g_scales[i] = 0
-                g_quaternions[i] = 0
-            if len(colours) > 0:
-                g_colours[i] = 0
-            else:
-                g_sh[i] = 0
             continue
         sums[:] = 0
         for row in range(firsts[i, FIRST_SUM], firsts[i + 1, FIRST_SUM]):
@@ -143,7 +131,7 @@ def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, 
 
 @compiled()
 def project_backward(counter, blocks, discs, camera, splats, clamped, firsts, sums, gradients, g_view):
-    """Fill the gradients of each disc from its sums in the bands; those of what was not given stay empty.
+    """Fill the gradients, zeros, of each disc that is drawn from its sums in the bands.
 
     Args:
         counter, blocks: of `in_threads`; a block is BLOCK discs.

@@ -64,16 +64,13 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "spec", as_spec(self.spec))
+        threshold = self.densify_grad_threshold
         for name, fits, wanted in (
             ("iterations", 1 <= self.iterations < 1 << 31, "at least 1 and below 2^31"),
             ("sh_degree", self.sh_degree in (0, 1, 2, 3), "0, 1, 2 or 3"),
             ("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "in [0, 1]"),
             ("l1_scale", 0.0 <= self.l1_scale < float("inf"), "at least 0"),
-            (
-                "densify_grad_threshold",
-                self.densify_grad_threshold is None or self.densify_grad_threshold > 0.0,
-                "above 0",
-            ),
+            ("densify_grad_threshold", threshold is None or threshold > 0.0, "above 0"),
             *((name, type(getattr(self, name)) is bool, "True or False") for name in SWITCHES),
             *((name, getattr(self, name) is None or getattr(self, name) >= 1, "at least 1") for name in COUNTS),
             ("seed", -(1 << 63) <= self.seed < 1 << 63, "an integer of 64 bits"),

@@ -14,7 +14,7 @@ from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.scenes import Camera, Scene, View, image_tensor, load_training_image
 from legs_loss.spec import WeightSpec
-from legs_loss.store import Entry, Found, WeightStore
+from legs_loss.store import Found, WeightStore
 from legs_loss.weights import weight_map, weight_maps
 
 __all__ = [
@@ -204,17 +204,13 @@ def open_store(scene: Scene, store: Optional[Path] = None) -> Optional[WeightSto
 
 def _weights(store: Optional[WeightStore], views: List[TrainingView], spec: WeightSpec) -> List[Tensor]:
     """Return the views' weight maps, of stored responses where a store has those of these very images."""
-    found = [] if store is None else [_entry(store, view, spec) for view in views]
+    known = [] if store is None else [_found(store, view, spec) for view in views]
+    found = [None if one is None else one.response for one in known]
     # Where a map is missing, the levels of the scene are not known.
     if store is None or (spec.over == "scene" and None in found):
         return weight_maps([view.image for view in views], spec)
     pairs = zip(views, found)
     return [weight_map(view.image, spec) if one is None else store.weight(one, spec) for view, one in pairs]
-
-
-def _entry(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional[Entry]:
-    found = _found(store, view, spec)
-    return None if found is None else found.response
 
 
 def _found(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional[Found]:

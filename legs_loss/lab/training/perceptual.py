@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from contextlib import suppress
 from pathlib import Path
-from typing import Iterator, List, Mapping, NamedTuple, Optional, Sequence
+from typing import Any, Iterator, List, Mapping, NamedTuple, Optional, Sequence
 
 import torch
 from torch import Tensor
@@ -76,16 +76,14 @@ class LPIPS(NamedTuple):
         weight, bias = (self.state[f"{part}.{what}"].to(x) for what in ("weight", "bias"))
         return conv2d(x, weight, bias, stride, weight.shape[-1] // 2 if padding is None else padding)
 
-    def distance(self, prediction: Tensor, target: Tensor) -> Tensor:
+    def distance(self, prediction: Tensor, target: Tensor) -> Any:
         """Return LPIPS of images [3, H, W] in [0, 1], 0 for equal ones.
 
         It is of unit features, squared, weighted by channel, a mean over pixels, summed over what counts.
         """
-        total = torch.zeros((), device=target.device)
-        for x, weights in zip(self.features(torch.stack([prediction, target]) * 2.0 - 1.0), self.linear):
-            unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
-            total = total + (weights.to(x) * (unit[0] - unit[1]).square()).sum(0).mean()
-        return total
+        features = self.features(torch.stack([prediction, target]) * 2.0 - 1.0)
+        units = [x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10) for x in features]
+        return sum((w.to(x) * (x[0] - x[1]).square()).sum(0).mean() for x, w in zip(units, self.linear))
 
 
 _used: Optional[LPIPS] = None

@@ -35,6 +35,7 @@ from legs_loss.lab.training.trainer import TrainConfig, train
 from legs_loss.precompute import UserMaps, precompute
 from legs_loss.scenes import read_scene
 from tests.lab.experiments.support import BASE
+from tests.lab.training import train_one
 from tests.support import without_times
 
 
@@ -84,7 +85,7 @@ def test_masks_of_the_scenes_store_hold_for_every_arm(tiny_scene: Path, tmp_path
         mask.save(str(tmp_path / "scene/masks" / f"{PurePosixPath(view.name).stem}.png"))
     precompute(read_scene(tmp_path / "scene"), resolution=2, maps=UserMaps("masks"))
     comparison = Comparison(tmp_path / "scene", BASE, tmp_path / "out")
-    rows = [comparison.train_one(arm, 0) for arm in parse_arms(["3dgs", "legs:scale"])]
+    rows = [train_one(comparison, arm, 0) for arm in parse_arms(["3dgs", "legs:scale"])]
     assert [row["metrics"]["masked_views"] for row in rows] == [10, 10]
     assert rows[0]["metrics"]["mean_weight"] == pytest.approx(1.0, abs=1e-6)
     maps = [weight_map(view.image, "legs")[..., 8:].double().mean() for view in comparison.data.train]
@@ -109,7 +110,7 @@ def test_weights_of_ones_own_in_the_store_are_refused_before_anything_is_written
 
 
 def test_an_interrupted_row_goes_on(tiny_scene: Path, tmp_path: Path) -> None:
-    whole = Comparison(tiny_scene, BASE, tmp_path / "whole").train_one(parse_arm("legs:shuffled"), 0)
+    whole = train_one(Comparison(tiny_scene, BASE, tmp_path / "whole"), parse_arm("legs:shuffled"), 0)
     out = tmp_path / "out"
     arm = parse_arm("legs:shuffled")
     begun = Comparison(tiny_scene, BASE, out)._training("a", arm, 0)
@@ -124,7 +125,7 @@ def test_an_interrupted_row_goes_on(tiny_scene: Path, tmp_path: Path) -> None:
     with pytest.raises(Killed):
         train_arm(begun, kill)
     assert (out / arm.folder / "seed-0" / CHECKPOINT).is_file()
-    row = Comparison(tiny_scene, BASE, out).train_one(arm, 0)
+    row = train_one(Comparison(tiny_scene, BASE, out), arm, 0)
     assert without_times(row["metrics"]) == without_times(whole["metrics"])
 
 
@@ -176,7 +177,7 @@ def test_another_comparison_in_the_folder_is_refused(tiny_scene: Path, tmp_path:
     with pytest.raises(LegsError, match=r"started with another base.iterations"):
         Comparison(tiny_scene, replace(BASE, iterations=50), tmp_path)
     with pytest.raises(LegsError, match="uses the numbers of 3dgs: train that first"):
-        Comparison(tiny_scene, BASE, tmp_path).train_one(parse_arm("legs@3dgs"), 0)
+        train_one(Comparison(tiny_scene, BASE, tmp_path), parse_arm("legs@3dgs"), 0)
     with pytest.raises(LegsError, match="none of this comparison's rows is trained yet"):
         read_rows(tmp_path)
     with pytest.raises(LegsError, match="no comparison here"):

@@ -31,6 +31,7 @@ from legs_loss.lab.training.dataset import TrainingView, load_view, split_views
 from legs_loss.lab.training.trainer import TrainConfig
 from legs_loss.scenes import read_scene
 from legs_loss.weights import weight_map
+from tests.lab.training import train_one
 
 ARMS = ("3dgs", "legs", "legs:scale", "legs:shuffled")
 
@@ -41,7 +42,7 @@ def comparison(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     trainings = Comparison(tiny_scene, TrainConfig(iterations=30, resolution=1), out)
     for arm in parse_arms(ARMS):
         for seed in (0, 1):
-            trainings.train_one(arm, seed)
+            train_one(trainings, arm, seed)
     return out
 
 

@@ -26,10 +26,10 @@ from legs_loss import LegsError
 from legs_loss.cli.shared.saving import save_png
 from legs_loss.lab.embedded import write_embedded_scene
 from legs_loss.lab.embedded.colmap_writer import write_colmap
-from legs_loss.lab.experiments.running import read_json, read_rows, write_json
+from legs_loss.lab.experiments.running import read_json, read_rows
 from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import read_ply, write_ply
-from legs_loss.lab.training.checkpoint import read_checkpoint, write_checkpoint
+from legs_loss.lab.training.checkpoint import read_checkpoint, write_checkpoint, write_json
 from legs_loss.precompute import precompute
 from legs_loss.scenes import Camera, PointCloud, View, load_training_image, read_scene
 from legs_loss.store import StoreWriter, WeightStore

@@ -20,8 +20,8 @@ from examples.reproduce_paper.codebases.profile import Profile
 from examples.reproduce_paper.codebases.training import Checkout, check_copy, copy_checkout, train_and_score
 from legs_loss.errors import LegsError
 from legs_loss.lab.experiments.arms import BASELINE, ArmSpec, needed, parse_arm
-from legs_loss.lab.experiments.running import Row, identity, read_json, versions, write_json, write_or_check
-from legs_loss.lab.training.checkpoint import alone_in
+from legs_loss.lab.experiments.running import Row, identity, read_json, versions, write_or_check
+from legs_loss.lab.training.checkpoint import alone_in, write_json
 from legs_loss.lab.training.dataset import load_view, split_views
 from legs_loss.lab.training.trainer import TrainConfig
 from legs_loss.scenes import Scene, read_scene, training_size

@@ -134,15 +134,11 @@ def say_scores(out: Path, arms: Sequence[str], seeds: Sequence[int]) -> None:
 
 
 def _embedded(root: Path) -> Path:
-    from legs_loss.errors import LegsError
     from legs_loss.lab.embedded import write_embedded_scene
 
     if not (root / "sparse" / "0" / "points3D.bin").is_file():  # what is written last
         say(f"making the embedded scene in {root}")
-        try:
-            write_embedded_scene(root, VIEWS, WIDTH, HEIGHT)
-        except OSError as error:
-            raise LegsError(f"cannot write {root}: {error.strerror or error}") from None
+        write_embedded_scene(root, VIEWS, WIDTH, HEIGHT)
     return root
 
 

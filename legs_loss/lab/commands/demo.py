@@ -7,7 +7,6 @@ has the number of Gaussians beside PSNR, since more Gaussians are part of the ga
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shlex
 import time
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any, Dict, List
 
 from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution, read_noted
-from legs_loss.system import say, write_whole
+from legs_loss.system import say
 
 HELP = "train four losses on the embedded scene or your own: weight maps, a table and pictures"
 
@@ -42,11 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make or read the scene, precompute, train, print the table and save the pictures."""
     from legs_loss.cli.shared.checks import check_writable
-    from legs_loss.errors import LegsError
+    from legs_loss.errors import LegsError, require
     from legs_loss.lab.commands.train import progress_bar, set_threads
     from legs_loss.lab.embedded import write_embedded_scene
-    from legs_loss.lab.report.comparison import check_matplotlib
-    from legs_loss.lab.training.checkpoint import CHECKPOINT
+    from legs_loss.lab.training.checkpoint import CHECKPOINT, write_json
     from legs_loss.lab.training.side_by_side import Arm, train_side_by_side
     from legs_loss.lab.training.trainer import TrainConfig, check_trainable, compile_step
     from legs_loss.precompute import precompute
@@ -54,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
     started = time.perf_counter()
     set_threads(None)  # fail now if numba is missing
-    check_matplotlib()
+    require("legs demo", "report", "matplotlib")
     if args.processes < 1:
         raise LegsError(f"--processes must be at least 1, got {args.processes}")
     out: Path = args.out
@@ -88,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
         metrics = train_side_by_side(arms[::-1], args.processes, lambda name, progress: bars[name](progress))
     metrics = {arm.name: metrics[arm.name] for arm in arms}
     view, sheet = _save_pictures(scene, arms, metrics, out / "pictures")
-    write_whole(out / "results.json", (json.dumps(metrics, indent=2) + "\n").encode())
+    write_json(out / "results.json", metrics)
     say(table(metrics), lines=True)
     say(conclusion(metrics))
     say(

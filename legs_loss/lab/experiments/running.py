@@ -23,14 +23,14 @@ from legs_loss.errors import LegsError
 from legs_loss.lab.experiments.arms import BASELINE, ArmSpec, needed, parse_arm
 from legs_loss.lab.experiments.baseline import prove_unweighted
 from legs_loss.lab.experiments.schema import ROW, SETTINGS, what_is_wrong
-from legs_loss.lab.training.checkpoint import CHECKPOINT, alone_in
+from legs_loss.lab.training.checkpoint import CHECKPOINT, alone_in, write_json
 from legs_loss.lab.training.dataset import Dataset, load_dataset
 from legs_loss.lab.training.perceptual import network_name, use_lpips
 from legs_loss.lab.training.side_by_side import Arm, train_side_by_side
 from legs_loss.lab.training.trainer import Progress, TrainConfig, default_threshold
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
-from legs_loss.system import read_regular, write_whole
+from legs_loss.system import read_regular
 from legs_loss.weights import Weights, weight_maps
 
 __all__ = [
@@ -41,7 +41,6 @@ __all__ = [
     "read_rows",
     "scene_of",
     "versions",
-    "write_json",
     "write_or_check",
 ]
 
@@ -296,8 +295,3 @@ def read_json(path: Path, names: Sequence[str]) -> Dict[str, Any]:
     if wrong is not None:
         raise LegsError(f"{path}: this file is damaged ({wrong}): delete it and run the comparison again")
     return values
-
-
-def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Write values to a JSON file, atomically."""
-    write_whole(path, (json.dumps(values, indent=1) + "\n").encode(), folders=True)

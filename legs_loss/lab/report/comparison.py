@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from legs_loss.cli.shared.saving import label, save_figure, save_png
-from legs_loss.errors import require
 from legs_loss.lab.report.html_pictures import as_bytes
 from legs_loss.lab.training.metrics import strongest
 from legs_loss.responses import normalise_response, response
 
-__all__ = ["Compared", "check_matplotlib", "save_pictures"]
+__all__ = ["Compared", "save_pictures"]
 
 _INK = "#222222"
 
@@ -27,11 +26,6 @@ class Compared(NamedTuple):
     rendering: Tensor
     weight: Tensor
     caption: str
-
-
-def check_matplotlib() -> None:
-    """Raise a LegsError now, and not after minutes of training, if pictures cannot be drawn."""
-    require("a picture", "report", "matplotlib")
 
 
 def save_pictures(folder: Path, title: str, photograph: Tensor, arms: Sequence[Compared]) -> Path:

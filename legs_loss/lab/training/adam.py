@@ -81,8 +81,7 @@ class Adam:
 
     def keep(self, kept: Tensor) -> None:
         """Keep the Gaussians of index ``kept`` with their moments, and no others."""
-        self.moment1, self.moment2 = select(self.moment1, kept), select(self.moment2, kept)
-        self._set(select(self.gaussians, kept))
+        self.replace(kept, select(self.gaussians, kept[:0]))
 
     def replace(self, kept: Tensor, new: Gaussians) -> None:
         """Keep the Gaussians of index ``kept`` with their moments, and append ``new`` ones, whose moments are 0."""

@@ -16,7 +16,8 @@ from legs_loss.errors import LegsError
 from legs_loss.system import FileLock, HeldError, open_regular, write_whole
 from legs_loss.system.values import each, is_count, is_number, is_pair, is_scores, is_text, optional, with_names
 
-__all__ = ["CHECKPOINT", "LOCK", "alone_in", "check_new", "read_checkpoint", "read_state", "write_checkpoint"]
+__all__ = ["CHECKPOINT", "LOCK", "alone_in", "check_new", "read_checkpoint", "read_state", "write_checkpoint",
+           "write_json"]  # fmt: skip
 
 CHECKPOINT = "checkpoint.npz"
 LOCK = ".lock"  # in a run's folder, held while it is trained
@@ -27,6 +28,11 @@ def write_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], facts: Mappin
     """Write arrays, and facts that JSON can hold. A checkpoint that was there is replaced as a whole, or not at all."""
     all_arrays: Dict[str, Any] = dict(arrays, __facts__=np.frombuffer(json.dumps(dict(facts)).encode(), np.uint8))
     write_whole(path, lambda file: np.savez(file, **all_arrays))
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write values to a JSON file, atomically; folders are made."""
+    write_whole(path, (json.dumps(values, indent=1) + "\n").encode(), folders=True)
 
 
 def read_checkpoint(path: Path) -> Tuple[Dict[str, np.ndarray], Dict[str, Any]]:

@@ -8,7 +8,6 @@ The same seed gives bit-identical Gaussians, whether or not the run was interrup
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import write_ply
 from legs_loss.lab.rasterizer import Rendering, rasterize
 from legs_loss.lab.training.adam import Adam, position_rate
-from legs_loss.lab.training.checkpoint import CHECKPOINT, alone_in, check_new, read_state, write_checkpoint
+from legs_loss.lab.training.checkpoint import CHECKPOINT, alone_in, check_new, read_state, write_checkpoint, write_json
 from legs_loss.lab.training.config import TrainConfig, default_threshold
 from legs_loss.lab.training.dataset import (
     Dataset,
@@ -37,7 +36,7 @@ from legs_loss.lab.training.dataset import (
 from legs_loss.lab.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.lab.training.metrics import mean_scores, psnr, score
 from legs_loss.scenes import Camera, Scene
-from legs_loss.system import keep_freed_memory, noted, write_whole
+from legs_loss.system import keep_freed_memory, noted
 from legs_loss.weights import Weights
 
 __all__ = [
@@ -172,7 +171,7 @@ def train(
         run = begun if not resume and begun is not None else _Run.restore(data, config, Path(out or ".") / CHECKPOINT)
         run.caps, run.evaluate_every = caps, evaluate_every
         if folder is not None:
-            _write_json(folder / "cfg.json", config.as_dict())
+            write_json(folder / "cfg.json", config.as_dict())
             if not resume:
                 run.save(folder / CHECKPOINT)
         run.go(folder, checkpoint_every, on_progress, min(stop or config.iterations, config.iterations))
@@ -180,7 +179,7 @@ def train(
         if folder is not None:
             if run.iteration == config.iterations:
                 write_ply(point_cloud(folder, config), run.adam.gaussians)
-            _write_json(folder / "metrics.json", metrics)
+            write_json(folder / "metrics.json", metrics)
         return TrainingResult(run.adam.gaussians, metrics)
 
 
@@ -325,7 +324,7 @@ class _Run:
             "test": mean_scores(list(test.values())) if test else None,
             "gaussians": len(self.adam.gaussians),
             "densify_grad_threshold": self.threshold,
-            "mean_weight": self._mean_weight(),
+            "mean_weight": sum(weights.mean_weight() for weights in self.weights) / len(self.weights),
             "iterations": self.iteration,
             "seconds": float(self.clocks[0]),
             "processor_seconds": float(self.clocks[1]),
@@ -336,14 +335,8 @@ class _Run:
 
     def _scores(self, split: str) -> Dict[str, Dict[str, float]]:
         views = self.data.train if split == "train" else self.data.test
-        return {view.name: score(view.hidden(self._drawn(view)), view.image, split, view.counts) for view in views}
-
-    def _drawn(self, view: TrainingView) -> Tensor:
-        return draw(self.adam.gaussians, view, self.config)
-
-    def _mean_weight(self) -> float:
-        means = [weights.mean_weight() for weights in self.weights]
-        return sum(means) / len(means)
+        drawn = ((view, draw(self.adam.gaussians, view, self.config)) for view in views)
+        return {view.name: score(view.hidden(image), view.image, split, view.counts) for view, image in drawn}
 
     def _evaluate(self) -> None:
         begun = _clocks()
@@ -351,7 +344,8 @@ class _Run:
         if self.psnr is not None:
             point["train_psnr"] = self.psnr
         if self.data.test:
-            values = [psnr(self._drawn(view).clamp(0.0, 1.0), view.image, view.counts) for view in self.data.test]
+            drawn = ((view, draw(self.adam.gaussians, view, self.config)) for view in self.data.test)
+            values = [psnr(image.clamp(0.0, 1.0), view.image, view.counts) for view, image in drawn]
             point["test_psnr"] = sum(values) / len(values)
         self.history.append(point)
         self.scoring += _clocks() - begun
@@ -397,7 +391,3 @@ def step_weights(weight: Optional[Tensor], view: TrainingView, config: TrainConf
 
 def _clocks() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
-
-
-def _write_json(path: Path, values: Mapping[str, Any]) -> None:
-    write_whole(path, (json.dumps(values, indent=2) + "\n").encode())

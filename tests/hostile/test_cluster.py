@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 from legs_loss.store import WeightStore
-from tests.scenes.test_cluster import Cluster, contents
+from tests.precompute.test_cluster import Cluster, contents
 from tests.support import legs, legs_command, legs_environment, photograph, save
 
 pytest.importorskip("distributed")

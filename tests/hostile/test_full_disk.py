@@ -22,7 +22,7 @@ from legs_loss.lab.ply import read_ply, write_ply
 from legs_loss.lab.training.checkpoint import read_state
 from legs_loss.scenes import View, load_training_image
 from legs_loss.store import WeightStore
-from tests.scenes.test_cluster import Cluster
+from tests.precompute.test_cluster import Cluster
 from tests.support import colmap_scene, legs
 
 pytestmark = pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="mounting a small disk needs root")

@@ -23,12 +23,12 @@ from legs_adapters.plan import plan, write
 from legs_adapters.undo import undo
 
 from legs_loss import LegsError
-from legs_loss.cli.shared.saving import save_png
 from legs_loss.lab.embedded import write_embedded_scene
 from legs_loss.lab.embedded.colmap_writer import write_colmap
 from legs_loss.lab.experiments.running import read_json, read_rows
 from legs_loss.lab.gaussians import Gaussians
 from legs_loss.lab.ply import read_ply, write_ply
+from legs_loss.lab.report.comparison import save_png
 from legs_loss.lab.training.checkpoint import read_checkpoint, write_checkpoint, write_json
 from legs_loss.precompute import precompute
 from legs_loss.scenes import Camera, PointCloud, View, load_training_image, read_scene

@@ -1,1 +1,1 @@
-"""Shared by the commands: the parser, checks of arguments, and the settings that are affordable on a CPU."""
+"""Shared by the commands: the parser, checks of arguments, a scene and its photographs, pictures."""

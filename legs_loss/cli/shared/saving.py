@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Union
 
-import numpy as np
-
 from legs_loss.errors import LegsError
 from legs_loss.system import printable, write_whole
 
-__all__ = ["label", "save_figure", "save_png"]
+__all__ = ["label", "save_figure"]
 
 
 def label(name: str) -> str:
@@ -35,14 +33,3 @@ def save_figure(figure: Any, path: Union[str, Path], dpi: int) -> None:
         raise
     except ValueError as error:
         raise LegsError(f"cannot write {path}: {error}") from None
-
-
-def save_png(pixels: np.ndarray, path: Path) -> None:
-    """Write a picture [H, W, 3] of bytes.
-
-    Raises:
-        LegsError: the file cannot be written.
-    """
-    from PIL import Image
-
-    write_whole(path, lambda file: Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG"), folders=True)

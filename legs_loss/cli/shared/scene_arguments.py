@@ -1,14 +1,12 @@
-"""The arguments for a scene and its photographs; those of demo and compare, for what a CPU trains in minutes."""
+"""The arguments for a scene and its photographs, and what is said of them."""
 
 from __future__ import annotations
 
-import argparse
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Iterable, Mapping, Optional, Union
 
-from legs_loss.system import cores, say
+from legs_loss.system import say
 
 if TYPE_CHECKING:
     from legs_loss.scenes import Scene
@@ -16,14 +14,10 @@ if TYPE_CHECKING:
 __all__ = [
     "add_images",
     "add_resolution",
-    "add_scene_arguments",
-    "default_resolution",
     "read_noted",
     "say_notes",
     "say_skipped",
 ]
-
-AFFORDABLE = 70_000  # pixels a photograph
 
 
 def add_images(parser: Any) -> None:
@@ -45,16 +39,6 @@ def say_skipped(skipped: Mapping[str, str], most: int = 20) -> None:
         say(f"legs: skipped {len(skipped) - most:,} more", sys.stderr)
 
 
-def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the scene, its photographs and their size, and the number of parallel trainings."""
-    parser.add_argument("scene", metavar="SCENE", nargs="?", help="a COLMAP scene; default: the embedded scene")
-    add_images(parser)
-    add_resolution(parser, f"about {AFFORDABLE:,} pixels, which a CPU trains in minutes")
-    parser.add_argument(
-        "--processes", type=int, default=cores(), metavar="N", help="trainings at a time; default: one per core"
-    )
-
-
 def read_noted(path: Union[str, Path], images: Optional[str] = None) -> Scene:
     """Read a scene, and say on stderr what was left out of it; see :func:`~legs_loss.scenes.read_scene`."""
     from legs_loss.scenes import read_scene
@@ -68,10 +52,3 @@ def say_notes(notes: Iterable[str]) -> None:
     """Say on stderr what was left out of a scene."""
     for note in notes:
         say(f"legs: note: {note}", sys.stderr)
-
-
-def default_resolution(scene: Scene) -> int:
-    """Return the width that leaves AFFORDABLE pixels, or the photographs' own size (1) where that is less."""
-    sizes = [(view.camera.width, view.camera.height) for view in scene.views if view.camera is not None]
-    width, height = max(sizes, default=(1, 1))
-    return 1 if width * height <= AFFORDABLE else round(width * math.sqrt(AFFORDABLE / (width * height)))

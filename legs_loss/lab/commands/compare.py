@@ -14,7 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Dict, Sequence
 
-from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution, read_noted
+from legs_loss.cli.shared.scene_arguments import read_noted
+from legs_loss.lab.commands.arguments import add_scene_arguments, default_resolution
 from legs_loss.system import say
 
 HELP = "train and compare several losses on a scene, with seeds, controls and intervals"

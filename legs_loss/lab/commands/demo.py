@@ -15,7 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, List
 
-from legs_loss.cli.shared.scene_arguments import add_scene_arguments, default_resolution, read_noted
+from legs_loss.cli.shared.scene_arguments import read_noted
+from legs_loss.lab.commands.arguments import add_scene_arguments, default_resolution
 from legs_loss.system import say
 
 HELP = "train four losses on the embedded scene or your own: weight maps, a table and pictures"

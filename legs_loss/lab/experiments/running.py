@@ -75,18 +75,10 @@ class Comparison:
         self.out: Path = Path(os.path.abspath(str(out)))
         self.scene: Scene = read_scene(self.root, images)
         self.base: TrainConfig = replace(base, spec=BASELINE, seed=0)
-        self._data: Optional[Dataset] = None
+        self.data: Dataset = load_dataset(self.scene, self.base.weights, base.resolution, base.white_background)
         self._mean_weights: Dict[WeightSpec, float] = {}
         self.threshold: float = base.densify_grad_threshold or default_threshold(self.data.train)
         self._begin()
-
-    @property
-    def data(self) -> Dataset:
-        """Return the baseline's views."""
-        if self._data is None:
-            base = self.base
-            self._data = load_dataset(self.scene, base.weights, base.resolution, base.white_background)
-        return self._data
 
     def mean_weight(self, spec: WeightSpec) -> float:
         """Return the mean weight of a spec's maps over what counts of the training views."""

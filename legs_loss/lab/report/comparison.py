@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.cli.shared.saving import label, save_figure, save_png
+from legs_loss.cli.shared.saving import label, save_figure
 from legs_loss.lab.report.html_pictures import as_bytes
 from legs_loss.lab.training.metrics import strongest
 from legs_loss.responses import normalise_response, response
+from legs_loss.system import write_whole
 
-__all__ = ["Compared", "save_pictures"]
+__all__ = ["Compared", "save_pictures", "save_png"]
 
 _INK = "#222222"
 
@@ -104,3 +105,14 @@ def _detail(photograph: Tensor) -> Tuple[slice, slice]:
     strength = torch.nn.functional.avg_pool2d(response(photograph)[None], size, stride=1)[0, 0]
     row, column = divmod(int(strength.argmax()), strength.shape[1])
     return slice(row, row + size[0]), slice(column, column + size[1])
+
+
+def save_png(pixels: np.ndarray, path: Path) -> None:
+    """Write a picture [H, W, 3] of bytes.
+
+    Raises:
+        LegsError: the file cannot be written.
+    """
+    from PIL import Image
+
+    write_whole(path, lambda file: Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG"), folders=True)

@@ -18,7 +18,7 @@ _Call = Tuple[Function, cst.Call]  # with the function that it stands in
 
 def _named(program: Program, function: Function, most: Optional[int] = None) -> Iterator[_Call]:
     """Yield the calls of a function's name elsewhere."""
-    for caller in islice(program.mentioning(function.name, called=True), most):
+    for caller in islice(program.mentioning(function.name, True), most):
         if caller is not function and caller.module.spend(len(caller.flow.calls)):
             yield from ((caller, call) for call in caller.flow.calls if call_name(call) == function.name)
 

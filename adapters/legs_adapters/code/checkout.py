@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import PurePosixPath
-from typing import Callable, Dict, Iterable, Iterator, List, Optional, Tuple
+from typing import Callable, Dict, Iterable, Iterator, List, Optional
 
 import libcst as cst
 
-from legs_adapters.code.limits import Budget
+from legs_adapters.code.limits import Budget, remembered
 from legs_adapters.code.module import Class, Function, Module, index_by_word, parse
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import dotted
@@ -32,9 +32,6 @@ class Checkout:
         self.when_read: Callable[[str], object] = len  # given the text of each file that was parsed
         self._unreadable: Dict[str, Unreadable] = {}
         self._modules: Dict[str, Optional[Module]] = {}
-        self._mentions: Dict[Tuple[str, bool], List[Function]] = {}
-        self._methods: Dict[str, List[Function]] = {}
-        self._by_import: Dict[Tuple[str, str, int, str], Optional[Module]] = {}
         self._by_stem: Dict[str, List[str]] = {}
         for path in map(PurePosixPath, self.sources):
             stem = path.parent.name if path.name == "__init__.py" else path.stem
@@ -77,21 +74,18 @@ class Checkout:
         """Return the paths of the files whose text matches."""
         return [path for path, source in self.sources.items() if pattern.search(source.text)]
 
+    @remembered
     def mentioning(self, name: str, called: bool = False) -> List[Function]:
         """Return the functions and top levels whose text mentions a name, or calls it."""
-        if (name, called) not in self._mentions:
-            modules = map(self.module, self._by_word.get(f"{name}(" if called else name, ()))
-            found = [function for module in modules if module for function in module.mentioning(name, called)]
-            self._mentions[name, called] = found
-        return self._mentions[name, called]
+        modules = map(self.module, self._by_word.get(f"{name}(" if called else name, ()))
+        return [function for module in modules if module for function in module.mentioning(name, called)]
 
+    @remembered
     def methods_named(self, name: str) -> List[Function]:
         """Return every method of this name in the checkout."""
-        if name not in self._methods:
-            modules = filter(None, map(self.module, self._by_definition.get(name, ())))
-            owners = [each for module in modules for each in module.by_node.values() if isinstance(each, Class)]
-            self._methods[name] = [owner.methods[name] for owner in owners if name in owner.methods]
-        return self._methods[name]
+        modules = filter(None, map(self.module, self._by_definition.get(name, ())))
+        owners = [each for module in modules for each in module.by_node.values() if isinstance(each, Class)]
+        return [owner.methods[name] for owner in owners if name in owner.methods]
 
     # -- imports
 
@@ -99,16 +93,14 @@ class Checkout:
         """Return the checkout's module that a ``from ... import`` statement names."""
         return self.find_module(module, imported_name(node), len(node.relative), member)
 
+    @remembered
     def find_module(self, module: Module, name: str, level: int, member: str = "") -> Optional[Module]:
         """Return the checkout's module of this name, resolved from another; None where it is not the checkout's.
 
         A script can add any folder to sys.path: a module of one word is only found there if it defines the member.
         """
-        question = (module.path, name, level, member)
-        if question not in self._by_import:
-            path = self._find_path(module.path, name.replace(".", "/"), level, member)
-            self._by_import[question] = self.module(path) if path is not None else None
-        return self._by_import[question]
+        path = self._find_path(module.path, name.replace(".", "/"), level, member)
+        return self.module(path) if path is not None else None
 
     def _find_path(self, path: str, inner: str, level: int, member: str) -> Optional[str]:
         above = list(PurePosixPath(path).parents)

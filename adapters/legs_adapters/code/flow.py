@@ -11,6 +11,7 @@ from typing import Any, Dict, List, Optional, Set, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.limits import remembered
 from legs_adapters.code.reaching import Definition, Env, Reaching
 from legs_adapters.code.syntax import (
     call_name,
@@ -63,7 +64,6 @@ class Flow:
         self.contexts: Dict[int, Tuple[cst.CSTNode, ...]] = {}
         self.conditions: Dict[int, Tuple[cst.Name | cst.Attribute, ...]] = {}
         self._reaching: Dict[int, Reaching] = {}
-        self._everywhere: Dict[str, Reaching] = {}
         self._visited: Dict[int, Tuple[cst.CSTNode, int]] = {}  # with the number of definitions made before
         self._made: Dict[Tuple[int, str, str], Definition] = {}
         self._holders: Set[str] = set()  # places of which a part is defined: ``x`` and ``x.y`` of ``x.y['z']``
@@ -96,11 +96,10 @@ class Flow:
         """Return the definitions that this use of a place can come from; empty for what is not local."""
         return self._reaching.get(id(node), _NOTHING)
 
+    @remembered
     def everywhere(self, place: str) -> Reaching:
         """Return all definitions of a place, joined."""
-        if place not in self._everywhere:
-            self._everywhere[place] = Reaching(self.definitions.get(place, ()))
-        return self._everywhere[place]
+        return Reaching(self.definitions.get(place, ()))
 
     def assigned(self, node: cst.CSTNode) -> List[cst.CSTNode]:
         """Return the values of the assignments that reach this use."""

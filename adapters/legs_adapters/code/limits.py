@@ -7,11 +7,12 @@ most 200 bytes. Steps are counted, so the result does not depend on the machine 
 
 from __future__ import annotations
 
+import functools
 import re
 from collections import Counter
-from typing import List, Optional
+from typing import Any, Callable, List, Optional, TypeVar
 
-__all__ = ["MAX_BYTES", "MAX_FILE_BYTES", "STRING", "Budget", "over_the_limits", "parsing_steps"]
+__all__ = ["MAX_BYTES", "MAX_FILE_BYTES", "STRING", "Budget", "over_the_limits", "parsing_steps", "remembered"]
 
 MAX_FILE_BYTES = 1 << 20
 MAX_BYTES = 32 << 20  # of all files
@@ -35,6 +36,20 @@ _TOKEN = re.compile(
     re.S,
 )
 _FIELD = re.compile(r"\{[^{}]*\}")
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+def remembered(method: _Method) -> _Method:
+    """Let an object answer each question to a method once, and keep the answer, by its positional arguments."""
+
+    @functools.wraps(method)
+    def ask(self: Any, *question: Any) -> Any:
+        known = vars(self).setdefault(f"_known {method.__name__}", {})
+        if question not in known:
+            known[question] = method(self, *question)
+        return known[question]
+
+    return ask  # type: ignore[return-value]
 
 
 class Budget:

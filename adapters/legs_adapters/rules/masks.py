@@ -14,6 +14,7 @@ from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Set, Tu
 
 import libcst as cst
 
+from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import Function, blocks_of
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.reaching import Reaching
@@ -132,8 +133,6 @@ class _Finder:
         self.lines: Dict[Tuple[Function, Optional[str]], List[_Line]] = {}  # by the rendering's function and place
         self.unnamed: List[_Pair] = []
         self.problems: List[Problem] = []
-        self._reads: Dict[Function, Dict[Optional[str], List[cst.CSTNode]]] = {}
-        self._given: Dict[Function, Dict[Optional[str], List[_Given]]] = {}
         self._blocks: Dict[int, _Spans] = {}
         self._edited: Dict[Function, List[Place]] = {}
         for site in sites:
@@ -171,7 +170,7 @@ class _Finder:
         function, resolve = line.pair.function, self.analysis.program.resolve
         pair = {path_of(line.pair.prediction), path_of(line.pair.target)}
         edited = _Spans(self._edited.get(function, ()))
-        for call, images in self._calls(function, path_of(line.pair.prediction)):
+        for call, images in self._calls(function).get(path_of(line.pair.prediction), ()):
             place = function.place(call)
             if not pair <= set().union(*images) or any(pair <= both for both in images) or edited.meets(place):
                 continue
@@ -229,32 +228,30 @@ class _Finder:
         pair.function.module.spend(len(met) + len(made_of))
         for function, place in carriers:
             lines = self.lines.get((function, place), ())
-            for read in self._others(function, place):
+            for read in filter(lambda _: function.module.spend(1), self._reads(function).get(place, ())):
                 if id(read) not in made_of and not any(line.covers(function, read) for line in lines):
                     return function, read
         return None
 
-    def _others(self, function: Function, place: Optional[str]) -> Iterator[cst.CSTNode]:
-        """Yield the reads of the same value, or of the whole of it, that a backward pass reaches."""
+    @remembered
+    def _reads(self, function: Function) -> Dict[Optional[str], List[cst.CSTNode]]:
+        """Return the reads of a function that a backward pass reaches, by their places."""
         training = self.analysis.training
-        if function not in self._reads:
-            self._reads[function] = {}
-            for read in _places(function.body):
-                if training.includes(read) or not training.touches(function):
-                    self._reads[function].setdefault(path_of(read), []).append(read)
-        for read in self._reads[function].get(place, ()):
-            if function.module.spend(1):
-                yield read
+        found: Dict[Optional[str], List[cst.CSTNode]] = {}
+        for read in _places(function.body):
+            if training.includes(read) or not training.touches(function):
+                found.setdefault(path_of(read), []).append(read)
+        return found
 
-    def _calls(self, function: Function, place: Optional[str]) -> List[_Given]:
-        """Return the trained calls that are given a place, each with the places in its arguments."""
-        if function not in self._given:
-            self._given[function] = {}
-            for call in filter(self.analysis.training.includes, function.flow.calls):
-                given = [{path_of(part) for part in _places(each)} for each in arguments(call)[0]]
-                for path in set().union(*given) if function.module.spend(1 + sum(map(len, given))) else ():
-                    self._given[function].setdefault(path, []).append((call, given))
-        return self._given[function].get(place, [])
+    @remembered
+    def _calls(self, function: Function) -> Dict[Optional[str], List[_Given]]:
+        """Return the trained calls of a function, by each place that they are given, with the places in arguments."""
+        found: Dict[Optional[str], List[_Given]] = {}
+        for call in filter(self.analysis.training.includes, function.flow.calls):
+            given = [{path_of(part) for part in _places(each)} for each in arguments(call)[0]]
+            for path in set().union(*given) if function.module.spend(1 + sum(map(len, given))) else ():
+                found.setdefault(path, []).append((call, given))
+        return found
 
     def _line(self, pair: _Pair) -> Union[_Line, str]:
         """Return the line, in the outermost block in which both images are defined before the term; or why not."""

@@ -11,6 +11,7 @@ from typing import Dict, List, Optional, Sequence, Set, Tuple
 import libcst as cst
 
 from legs_adapters.code.calls import callees, given_to, likely_calls
+from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition
@@ -48,7 +49,6 @@ class Purposes:
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
-        self._may_step: Optional[Set[str]] = None
         self._known: Dict[_Round, Optional[Evidence]] = {}
         self._moving: Dict[_Round, bool] = {}
 
@@ -127,18 +127,17 @@ class Purposes:
         receiver = words_in(holder) if holder is not None else set()
         return [(where, step, said | receiver, by + made) for where, step, said, by in steps]
 
+    @remembered
     def _stepping(self) -> Set[str]:
         """Return the names of the functions with a step in them, and of those that call one in its file."""
-        if self._may_step is None:
-            known: Set[str] = {"step"}
-            for module in self.program.matching(_STEPS):
-                calls = [(each.name, set(_CALLED.findall(each.text))) for each in module.scopes(bool) if each.name]
-                found = {name for name, called in calls if any("step" in each for each in called)}
-                while not found <= known:
-                    known |= found
-                    found = {name for name, called in calls if called & found}
-            self._may_step = known
-        return self._may_step
+        known: Set[str] = {"step"}
+        for module in self.program.matching(_STEPS):
+            calls = [(each.name, set(_CALLED.findall(each.text))) for each in module.scopes(bool) if each.name]
+            found = {name for name, called in calls if any("step" in each for each in called)}
+            while not found <= known:
+                known |= found
+                found = {name for name, called in calls if called & found}
+        return known
 
     def _of_callers(self, function: Function, depth: int) -> Optional[Evidence]:
         sites = self.training.sites.get(function, []) if depth < _DEPTH else []

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from typing import Dict, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import code
@@ -26,16 +26,10 @@ class Splats:
         self.program = program
         self.training = training
         self.forms = forms
-        self._known: Dict[Tuple[str, re.Pattern[str]], bool] = {}
-        self._about: Dict[Function, bool] = {}
 
+    @remembered
     def is_about(self, function: Function) -> bool:
         """Return whether the file, one that trains through it, or a neighbour mentions Gaussian splatting."""
-        if function not in self._about:  # each of its terms asks
-            self._about[function] = self._is_about(function)
-        return self._about[function]
-
-    def _is_about(self, function: Function) -> bool:
         module, above = function.module, [function]
         for current in above:  # which grows
             speaks = self._speaks(current.module.path, DRAWS_SPLATS) or self._takes_splats(current.module)
@@ -59,8 +53,6 @@ class Splats:
         found = [self.program.imported_from(module, node) for node in taken if isinstance(node, cst.ImportFrom)]
         return any(made is not None and self._speaks(made.path, DRAWS_SPLATS) for made in found)
 
+    @remembered
     def _speaks(self, path: str, words: re.Pattern[str]) -> bool:
-        if (path, words) not in self._known:
-            text = _COMMENT.sub("", self.program.sources[path].text)
-            self._known[path, words] = words.search(text) is not None
-        return self._known[path, words]
+        return words.search(_COMMENT.sub("", self.program.sources[path].text)) is not None

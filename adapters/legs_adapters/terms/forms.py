@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Set, Tuple, Type
+from typing import List, Set, Tuple, Type
 
 import libcst as cst
 
+from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import call_name, walk_expressions
 from legs_adapters.tensors.absolute import abs_argument
@@ -26,12 +27,10 @@ class Forms:
 
     def __init__(self, functions: L1Functions) -> None:
         self.functions = functions
-        self._known: Dict[Function, List[Form]] = {}
 
+    @remembered
     def in_function(self, function: Function) -> List[Form]:
         """Return the L1 expressions in a function's own body, in source order; the widest where they nest."""
-        if function in self._known:
-            return self._known[function]
         found: List[Form] = []
         inside = _transformed(function)
         for call in function.flow.calls:
@@ -41,7 +40,6 @@ class Forms:
                 found.append(form)
                 inside.add(id(form.call))
                 inside.update(id(n) for n in walk_expressions(form.node) if abs_argument(n))
-        self._known[function] = found
         return found
 
 

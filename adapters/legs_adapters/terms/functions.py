@@ -7,6 +7,7 @@ from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Sequenc
 
 import libcst as cst
 
+from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import returned
@@ -63,7 +64,6 @@ class L1Functions:
         self.program = program
         self._prospects = prospects
         self._only: Dict[Function, bool] = {}
-        self._shapes: Dict[Function, Optional[str]] = {}
 
     def may_be_called(self, function: Function, node: cst.CSTNode) -> bool:
         """Return whether an expression may be an L1 function, a variable or by its words: resolving it costs more."""
@@ -73,6 +73,7 @@ class L1Functions:
         values = [made.value for made in (found[1] if found else ()) if made.kind in ("assign", "element", "with")]
         return any(value is not None and self._prospects.may_hold(code(value)) for value in values)
 
+    @remembered
     def shape(self, function: Function) -> Optional[str]:
         """Return what a function of the checkout computes from its first two arguments.
 
@@ -80,9 +81,7 @@ class L1Functions:
             "mean" for ``abs(a - b).mean()``, "none" for ``abs(a - b)``, "own" for any other L1 that depends on
             the difference (and on further arguments) only; None where it is not an L1.
         """
-        if function not in self._shapes:  # each of its terms asks
-            self._shapes[function] = self._shape(function, 0)
-        return self._shapes[function]
+        return self._shape(function, 0)
 
     def _shape(self, function: Function, depth: int) -> Optional[str]:
         if len(function.parameters) < 2 or depth > _DEPTH or not self._prospects.may_have(function.text):

@@ -65,10 +65,3 @@ def test_one_assignment_alone_is_the_value_of_a_name():
     given = call(where, "use(x, y)").args
     assert where.flow.value_of(given[0].value).func.value == "f"
     assert where.flow.value_of(given[1].value) is None
-
-
-def test_a_name_is_unchanged_at_a_call_unless_it_is_assigned_between():
-    where = body("x = f()\nd = g(x)\nuse(d)\nx = h()\nlast(d)")
-    given = call(where, "g(x)").args[0].value
-    assert where.flow.unchanged_at(call(where, "use(d)"), given)
-    assert not where.flow.unchanged_at(call(where, "last(d)"), given)

@@ -123,16 +123,6 @@ class Flow:
                     return False
         return True
 
-    def unchanged_at(self, call: cst.CSTNode, *nodes: cst.CSTNode) -> bool:
-        """Return whether nothing is assigned to the names in expressions between them and a later call."""
-        end = self._visited[id(call)][1] if id(call) in self._visited else -1
-        for part in (part for node in nodes for part in walk_expressions(node)):
-            if isinstance(part, cst.Name) and id(part) in self._visited:
-                start = self._visited[id(part)][1]
-                if start > end or any(start < made.order <= end for made in self.definitions.get(part.value, ())):
-                    return False
-        return True
-
     def loops_around(self, node: cst.CSTNode) -> List[cst.CSTNode]:
         """Return the loops around a node of the body, the innermost first."""
         return [each for each in reversed(self.contexts.get(id(node), ())) if isinstance(each, (cst.For, cst.While))]

@@ -7,7 +7,7 @@ from typing import Callable, Dict, Iterable, Iterator, List, Optional, Sequence,
 
 import libcst as cst
 
-from legs_adapters.code.flow import MUTATORS, Flow
+from legs_adapters.code.flow import Flow
 from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps
 from legs_adapters.code.parsing import STUB, Lines, Part, Place, body_part, outline_part, refused
 from legs_adapters.code.reaching import Definition
@@ -20,19 +20,6 @@ CALLED = ("forward", "__call__")  # what calling an instance runs: a torch modul
 
 _T = TypeVar("_T")
 _WORD = re.compile(r"(\w+)(?:\s*(\())?")  # a word, and whether it is called
-# What a text has that assigns to an attribute or an item of it, or changes it; what has it may only read it.
-_STORES = (
-    r"""(?x)
-    self\s*\.\s*NAME\b[\s\\]*(
-        ([-+*/%@&|^]|\*\*|//|<<|>>)?=(?!=) | :[^=\n]*= | \[([^\n]*=|[^]\n]*\n) | [,)\]][^\n]*[^=!<>]=(?!=)
-        | \.\s*("""
-    + "|".join(sorted(MUTATORS))
-    + r"""|\w+_)\s*\(
-    )
-    | \b(as|for)\b((?!\bin\b)[^\n])*self\s*\.\s*NAME\b
-    | ^\s*[)\]]\s*=(?!=)
-"""
-)
 _DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
@@ -158,8 +145,7 @@ class Class:
 
     def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
         """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""
-        may_store = re.compile(_STORES.replace("NAME", re.escape(attribute)), re.M)
-        methods = [m for m in self.methods.values() if attribute in m.text and may_store.search(m.text) and where(m)]
+        methods = [method for method in self.methods.values() if attribute in method.text and where(method)]
         found = [(method, d) for method in methods for d in method.flow.definitions.get(f"self.{attribute}", ())]
         # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
         return [(method, made) for method, made in found if not str(made.key).startswith(".")]

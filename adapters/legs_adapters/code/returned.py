@@ -53,13 +53,11 @@ def _filled(node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> c
 
 
 def formatted_key(node: cst.Subscript) -> Optional[str]:
-    """Return the literal part of the key of ``outputs[f"image_{i}"]`` or ``outputs["color", i]``."""
-    values = [each.slice.value for each in node.slice if isinstance(each.slice, cst.Index)]
-    values += [each.value for value in values if isinstance(value, cst.Tuple) for each in value.elements]
-    texts = [text for text in map(constant, values) if isinstance(text, str)]
-    if not texts and len(node.slice) == len(values) == 1 and isinstance(values[0], cst.FormattedString):
-        texts = [part.value for part in values[0].parts if isinstance(part, cst.FormattedStringText)]
-    return "_".join(texts) or None
+    """Return the literal part of the key of ``outputs[f"image_{i}"]``."""
+    index = node.slice[0].slice
+    value = index.value if len(node.slice) == 1 and isinstance(index, cst.Index) else None
+    parts = value.parts if isinstance(value, cst.FormattedString) else ()
+    return "_".join(part.value for part in parts if isinstance(part, cst.FormattedStringText)) or None
 
 
 def default_key(function: Function, node: cst.Subscript) -> object:

@@ -32,12 +32,13 @@ from legs_adapters.code.syntax import (
 from legs_adapters.lexicon.calls import CallReading, is_of_neighbours, meaning_of_call
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
-from legs_adapters.lexicon.words import BACKGROUND, COLORS, DATA, KIND_OF, LOSS, RENDER, RENDERERS
+from legs_adapters.lexicon.words import BACKGROUND, COLORS, DATA, KIND_OF, LOSS, RENDER
 from legs_adapters.tensors.backward import Training
 
 __all__ = ["Meanings"]
 
 _LITERALS = (cst.Dict, cst.List, cst.Tuple)
+_Argument = Tuple[Function, cst.Call, Optional[cst.BaseExpression]]  # with the call, and the function around it
 
 
 class Meanings:
@@ -161,17 +162,10 @@ class Meanings:
         name = root_of(node)
         role = role_of_words(name)
         if role is None and set(words(name)) & DATA:
-            is_given = isinstance(node, cst.Name) and self._is_given_renderings(function, node)
-            return "render" if is_given else "target"  # a camera may have been anywhere before
+            return "target"  # a camera may have been anywhere before
         if isinstance(node, cst.Attribute):
             return role or self._role_of_holder(function, node.value)
         return role or self._flow(function, node).role
-
-    def _is_given_renderings(self, function: Function, node: cst.Name) -> bool:
-        """Return whether it is a parameter ``data`` that training gives ``data["render_results"]`` at each call."""
-        calls = self.training.sites.get(function, []) if function.is_parameter(node) else []
-        keys = [key_of(function.given(call, node.value) or node) for _, call in calls]
-        return bool(keys) and all(isinstance(key, str) and set(words(key)) & RENDERERS for key in keys)
 
     # -- definitions
 
@@ -237,19 +231,21 @@ class Meanings:
         """Return the meaning of a parameter: that of its arguments where training calls the function."""
         if definition.place not in function.parameters:
             return UNKNOWN
-        calls = self.training.sites.get(function) or list(sure_calls(self.program, function))
-        given = [(caller, function.given(call, definition.place)) for caller, call in calls[:12]]
-        found = [self.meaning(caller, value) for caller, value in given if value is not None]
+        given = self._given(function, definition.place)
+        found = [self.meaning(caller, value) for caller, _, value in given if value is not None]
         meaning = mix([meaning for meaning in found if meaning.kind == "image"] or found)
         owner = function.owner.name if function.owner is not None else ""
         says_kind = LOSS & set(words(owner)) and kind_of_words(owner) in ("depth", "normal", "flow")
         # What is nearer outweighs it: the parameter's name, or what one method is given that no other overrides.
         is_named = any(KIND_OF.get(word) == "image" and word not in RENDER for word in words(definition.place))
-        is_given = meaning.kind == "image" and not any(
-            (dotted(call.func) or "").startswith("self.") for _, call in calls
-        )
-        says_kind = says_kind and not (is_named or is_given)
+        is_own = any((dotted(call.func) or "").startswith("self.") for _, call, _ in given)
+        says_kind = says_kind and not (is_named or (meaning.kind == "image" and not is_own))
         return meaning._replace(kind=kind_of_words(owner)) if says_kind else meaning
+
+    def _given(self, function: Function, parameter: str) -> List[_Argument]:
+        """Return what training, or else what surely calls a function, gives it for a parameter, with each call."""
+        calls = self.training.sites.get(function) or list(sure_calls(self.program, function))
+        return [(caller, call, function.given(call, parameter)) for caller, call in calls[:12]]
 
 
 def _table_of(function: Function, node: cst.CSTNode) -> Optional[cst.Dict]:

@@ -9,7 +9,6 @@ from typing import AbstractSet, Dict, FrozenSet, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import sure_calls
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition, Reaching
@@ -107,8 +106,7 @@ class Ways(Meanings):
             return False
         root, call = chain[-1], chain[-2] if len(chain) > 1 else None
         if any(DATA & set(words(name)) for name in names):
-            is_drawn = isinstance(root, cst.Name) and self._is_given_renderings(function, root)
-            return not is_drawn and "render" not in map(role_of_words, names)
+            return "render" not in map(role_of_words, names)
         if isinstance(call, cst.Call) and call.args and call_name(call) in PICTURE_FUNCTIONS:
             return self._holds_data(function, call.args[0].value, depth + 1)
         found = self.program.lookup(function, root)
@@ -126,9 +124,8 @@ class Ways(Meanings):
     def _parameter(self, function: Function, definition: Definition) -> Meaning:
         if definition.place not in function.parameters:
             return UNKNOWN
-        calls = self.training.sites.get(function) or list(sure_calls(self.program, function))
-        given = [(caller, function.given(call, definition.place)) for caller, call in calls[:12]]
-        return _agreed({UNKNOWN if value is None else self.meaning(caller, value) for caller, value in given})
+        given = self._given(function, definition.place)
+        return _agreed({UNKNOWN if value is None else self.meaning(caller, value) for caller, _, value in given})
 
 
 def _agreed(ways: AbstractSet[Meaning]) -> Meaning:

@@ -60,7 +60,6 @@ WORDS = {
 KINDS = tuple(WORDS)
 KIND_OF = {word: kind for kind in reversed(KINDS) for word in WORDS[kind].split()}
 COLORS = word_set("color colors colour colours rgb rgbs")  # of a picture, or of Gaussians
-LAID_OVER_PICTURES = {"parameter", "mask", "gradient"}  # the kinds that a photograph's name may speak of, too
 TARGET = word_set("gt gts target targets tgt ground truth original orig real true observed reference pixels")
 RENDERERS = word_set("render rendering rasterize rasterization rasterizer renderer raster splat splatting")
 RENDER = RENDERERS | word_set(
@@ -131,7 +130,6 @@ RAYS = re.compile(
     r"|(octree|voxel|volume|volumetric|nerf)_?(render|raster)",
     re.I,
 )
-RAY_BUNDLES = word_set("ray_bundle ray_samples")
 OF_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
 STRUCTURAL = re.compile("ssim", re.I)
 NO_L1 = re.compile(r"ssim|lpips|vgg|percept|psnr|mse|l2|huber|smooth_?l1|charbonnier|cross_?entropy|cosine", re.I)

@@ -97,10 +97,9 @@ class _Line(NamedTuple):
         """The function and the place of the rendering."""
         return self.pair.function, path_of(self.pair.prediction)
 
-    def covers(self, function: Function, node: cst.CSTNode) -> bool:
-        """Return whether a read is of its rendering, and comes after it."""
-        is_same = function is self.pair.function and path_of(node) == path_of(self.pair.prediction)
-        return is_same and self.start <= function.place(node).start < self.end
+    def covers(self, node: cst.CSTNode) -> bool:
+        """Return whether a node of its function comes after it, in its block."""
+        return self.start <= self.pair.function.place(node).start < self.end
 
     @property
     def site(self) -> Site:
@@ -162,7 +161,7 @@ class _Finder:
             self.problems.append(pair.problem(pair.function, pair.node, line))
         else:
             known = self.lines.setdefault(line.place, [])
-            covered = any(one.start == line.start and one.covers(pair.function, pair.prediction) for one in known)
+            covered = any(one.start == line.start and one.covers(pair.prediction) for one in known)
             known += [] if covered else [line]
 
     def diluted(self, line: _Line) -> Iterator[Left]:
@@ -175,7 +174,7 @@ class _Finder:
             if not pair <= set().union(*images) or any(pair <= both for both in images) or edited.meets(place):
                 continue
             own = any(str(r.target).startswith(f"{PACKAGE}.") for r in resolve(function, call.func))
-            if own or not line.start <= place.start < line.end:
+            if own or not line.covers(call):
                 continue
             term, share = one_line(call), f"{_COVERAGE}({one_line(line.pair.prediction)}, {one_line(line.pair.target)})"
             is_similarity = STRUCTURAL.search(term) and not re.search("(?i)loss", call_name(call))
@@ -229,7 +228,7 @@ class _Finder:
         for function, place in carriers:
             lines = self.lines.get((function, place), ())
             for read in filter(lambda _: function.module.spend(1), self._reads(function).get(place, ())):
-                if id(read) not in made_of and not any(line.covers(function, read) for line in lines):
+                if id(read) not in made_of and not any(line.covers(read) for line in lines):
                     return function, read
         return None
 

@@ -32,8 +32,7 @@ class Splats:
         """Return whether the file, one that trains through it, or a neighbour mentions Gaussian splatting."""
         module, above = function.module, [function]
         for current in above:  # which grows
-            speaks = self._speaks(current.module.path, DRAWS_SPLATS) or self._takes_splats(current.module)
-            if speaks and self._runs_with(module, current.module):
+            if self._speaks(current.module.path, DRAWS_SPLATS) or self._takes_splats(current.module):
                 return True
             above += [caller for caller, _ in self.training.sites.get(current, []) if caller not in above]
         sides = [code(side) for form in self.forms.in_function(function) for side in (form.first, form.second)]
@@ -41,11 +40,6 @@ class Splats:
         folder = module.path[: module.path.find("/") + 1 if is_rendered else module.path.rfind("/") + 1]
         near = [path for path in self.program.sources if path.startswith(folder)]
         return not RAYS.search(module.text) and any(self._speaks(path, SPLATS) for path in near)
-
-    def _runs_with(self, module: Module, other: Module) -> bool:
-        """Return whether a module that calls a name can call this one: it lies near, or mentions this one."""
-        stem = module.path.rpartition("/")[2][: -len(".py")]
-        return module.path.split("/")[0] in (other.path.split("/")[0], stem + ".py") or stem in other.text
 
     def _takes_splats(self, module: Module) -> bool:
         """Return whether a file imports a Gaussian class, ``GazeGaussianNet``, from one that mentions splats."""

@@ -7,10 +7,10 @@ from typing import Optional, Tuple
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import attribute_chain, call_name, walk_expressions
+from legs_adapters.code.syntax import attribute_chain, call_name
 from legs_adapters.tensors.operations import ENDS_GRADIENT, NO_GRAD
 
-__all__ = ["detaches", "is_detached", "no_grad_around"]
+__all__ = ["is_detached", "no_grad_around"]
 
 
 def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Function, cst.CSTNode]]:
@@ -28,8 +28,3 @@ def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Fu
 def is_detached(node: cst.CSTNode) -> bool:
     """Return whether a chain of attributes and calls cuts the gradient."""
     return any(isinstance(part, cst.Call) and call_name(part) in ENDS_GRADIENT for part in attribute_chain(node))
-
-
-def detaches(node: cst.CSTNode) -> bool:
-    """Return whether a gradient is cut somewhere in an expression."""
-    return any(isinstance(part, cst.Call) and call_name(part) == "detach" for part in walk_expressions(node))

@@ -39,12 +39,10 @@ class _Body(NamedTuple):
 
     Attributes:
         pairs: its first two parameters, and the names of equal selections of both.
-        selecting: the ids of the parts of those selections.
     """
 
     function: Function
     pairs: Sequence[Tuple[str, str]]
-    selecting: Set[int]
     depth: int
 
     def is_pair(self, left: cst.CSTNode, right: cst.CSTNode) -> bool:
@@ -138,7 +136,7 @@ class L1Functions:
         """Return whether a function takes an L1 of its first two parameters, and does nothing else with them."""
         nodes = [node for statement in function.body.body for node in walk_expressions(statement)]
         pairs, selecting = _selected(function, nodes)
-        body, allowed = _Body(function, pairs, selecting, depth), set(selecting)
+        body, allowed = _Body(function, pairs, depth), set(selecting)
         for node in nodes:
             may_be = _MAY_BE.get(type(node))
             parts = may_be(self, body, node) if may_be is not None else ()
@@ -183,11 +181,6 @@ class L1Functions:
         is_entry = isinstance(node.value, cst.Name) and isinstance(key_of(node), str)
         return None if is_entry and node.value.value in body.pairs[0] else []  # type: ignore[attr-defined]
 
-    def _in_assignment(self, body: _Body, node: cst.Assign | cst.AugAssign) -> Optional[List[cst.CSTNode]]:
-        targets = [each.target for each in node.targets] if isinstance(node, cst.Assign) else [node.target]
-        is_new = any(isinstance(target, cst.Name) and target.value in body.pairs[0] for target in targets)
-        return None if is_new and id(node) not in body.selecting else []
-
     def _is_l1(self, body: _Body, node: cst.Call) -> bool:
         """Return whether a call is of an L1 with both, torch's or the codebase's own."""
         positional = arguments(node)[0]
@@ -206,8 +199,6 @@ _MAY_BE: Dict[type, Callable[..., Optional[Iterable[cst.CSTNode]]]] = {
     cst.Attribute: L1Functions._in_attribute,
     cst.Comparison: L1Functions._in_comparison,
     cst.Subscript: L1Functions._in_subscript,
-    cst.Assign: L1Functions._in_assignment,
-    cst.AugAssign: L1Functions._in_assignment,
 }  # by the type of a node: the parts in which it may have the two; None where the function is no L1
 
 

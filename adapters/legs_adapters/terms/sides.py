@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import functools
 import re
 from typing import List, NamedTuple, Sequence
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import attribute_chain, call_name, code, constant, key_of, same, walk_expressions, words
+from legs_adapters.code.syntax import call_name, code, constant, key_of, same, walk_expressions, words
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.masks import is_mask
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.ways import PHOTOGRAPH, RENDERING, Ways
-from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
+from legs_adapters.lexicon.words import OF_RAYS
 from legs_adapters.tensors.absolute import is_no_picture
 from legs_adapters.tensors.operations import MODULES
 from legs_adapters.terms.form import Form
 
-__all__ = ["Pair", "is_beside_ssim", "is_of_numbers", "is_role", "of_rays", "pair_of", "same_root", "surest"]
+__all__ = ["Pair", "is_of_numbers", "is_role", "of_rays", "pair_of", "same_root", "surest"]
 
 
 class Pair(NamedTuple):
@@ -98,26 +97,6 @@ def is_of_numbers(function: Function, side: cst.CSTNode) -> bool:
 def of_rays(form: Form) -> bool:
     """Return whether the names are about rays or a radiance field: lists of colours."""
     return any(OF_RAYS.search(code(node)) for node in (form.first, form.second))
-
-
-def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
-    """Return whether an SSIM is computed of the same two expressions: they are images then, whatever their names."""
-    calls = _similarities(function)
-    goes_on = function.module.spend(len(calls))
-    return goes_on and any(all(_is_given(function, call, side) for side in (first, second)) for call in calls)
-
-
-@functools.lru_cache(maxsize=1)
-def _similarities(function: Function) -> List[cst.Call]:
-    """Return the calls of a similarity in a function, cached: each of its terms asks."""
-    return [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
-
-
-def _is_given(function: Function, call: cst.Call, picture: cst.CSTNode) -> bool:
-    """Return whether an image, or one with another axis, ``image.unsqueeze(0)``, is an argument of a call beside it."""
-    flow, parts = function.flow, [part for arg in call.args for part in attribute_chain(arg.value)]
-    given = [part for part in parts if same(part, picture)]
-    return any(flow.unchanged_at(call, picture) or flow.unchanged_at(picture, part) for part in given)
 
 
 def is_role(node: cst.CSTNode) -> bool:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
+from typing import Any, List, NamedTuple, Optional, Sequence, Set, Tuple
 
+from legs_adapters.code.limits import remembered
 from legs_loss import LegsError
 
 __all__ = ["SIDE", "SURE", "Match", "Photographs", "as_planes", "is_another", "thumbnail", "uncut"]
@@ -63,8 +64,6 @@ class Photographs:
             is_photograph = _key(path) in every or not (any(models) or _OTHER.search(inside))
             is_photograph = is_photograph and (_key(path) in every or not every or bool(_PHOTOS.search(inside)))
             self._tiers[not (photos or is_photograph)].append(path)
-        self._known: List[Any] = [None, None]
-        self._fine: Dict[Tuple[str, int], Any] = {}
 
     def __len__(self) -> int:
         return sum(map(len, self._tiers))
@@ -102,18 +101,19 @@ class Photographs:
         scores = [_standardised(_high(other, scale)[:, inside]) for other in self._fine_of(path, scale)]
         return max((float(np.dot(score[::way].ravel(), one)) for score in scores for way in (1, -1)), default=0.0)
 
+    @remembered
     def _fine_of(self, path: str, scale: int) -> Any:
-        """Return a file's thumbnails of so many times the side, each file's but once."""
-        if (path, scale) not in self._fine:
-            self._fine[path, scale] = _thumbnails([path], scale * SIDE)[1]
-        return self._fine[path, scale]
+        """Return a file's thumbnails of so many times the side."""
+        return _thumbnails([path], scale * SIDE)[1]
+
+    @remembered
+    def _every(self, tier: int) -> Any:
+        return _thumbnails(self._tiers[tier])
 
     def _best(self, tier: int, picture: Picture) -> Optional[Match]:
         import numpy as np
 
-        if self._known[tier] is None:
-            self._known[tier] = _thumbnails(self._tiers[tier])
-        files, stack = self._known[tier]  # [F], [F, 3, 256]
+        files, stack = self._every(tier)  # [F], [F, 3, 256]
         thumb, kept, _, shape = picture
         if not len(files) or kept.sum() < 16:
             return None

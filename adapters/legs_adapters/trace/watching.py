@@ -18,6 +18,7 @@ import torch
 
 import legs_loss
 import legs_loss.runtime
+from legs_adapters.code.limits import remembered
 from legs_adapters.trace.graph import KEY, Graph
 from legs_adapters.trace.photographs import SURE, Photographs, as_planes, is_another, thumbnail, uncut
 from legs_loss.runtime import counts
@@ -115,7 +116,6 @@ class Watch:
         self.scripted: Set[Tuple[str, str]] = set()  # files and names of functions of TorchScript: nothing is edited
         self._waiting: Dict[Any, Set[int]] = {}  # terms whose step is awaited, with the ids of the leaves under each
         self._samples: Dict[int, _Sample] = {}
-        self._files: Dict[str, Optional[str]] = {}
         self._names: Dict[int, str] = {}
         self._inside = False
 
@@ -221,12 +221,11 @@ class Watch:
             frame = frame.f_back
         return tuple(found)
 
+    @remembered
     def _inside_root(self, name: str) -> Optional[str]:
-        if name not in self._files:
-            path = os.path.realpath(name)
-            inside = path.startswith(self.root) and "site-packages" not in path and not name.startswith("<")
-            self._files[name] = path[len(self.root) :].replace(os.sep, "/") if inside else None
-        return self._files[name]
+        path = os.path.realpath(name)
+        inside = path.startswith(self.root) and "site-packages" not in path and not name.startswith("<")
+        return path[len(self.root) :].replace(os.sep, "/") if inside else None
 
     # -- backward passes
 

@@ -8,7 +8,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.rules.rule import Rule, Term, source_of
-from legs_adapters.tensors.gradients import detaches
+from legs_adapters.tensors.gradients import is_detached
 from legs_adapters.terms.findings import Decider
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class Distillation(Rule):
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether no side is detached; a photograph needs no ``detach()``."""
-        return not any(detaches(side) for side in term.sides)
+        return not any(map(is_detached, term.sides))
 
 
 def is_rendered(analysis: Analysis, function: Function, target: cst.CSTNode) -> bool:

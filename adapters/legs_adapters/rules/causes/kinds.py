@@ -6,13 +6,9 @@ from typing import List
 
 import libcst as cst
 
-from legs_adapters.code.syntax import call_name, key_of, words
-from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words
-from legs_adapters.lexicon.words import LAID_OVER_PICTURES
 from legs_adapters.rules.rule import Rule, Term, source_of
 from legs_adapters.terms.findings import Decider
-from legs_adapters.terms.sides import is_beside_ssim
 
 __all__ = ["KINDS", "OtherKind"]
 
@@ -46,8 +42,8 @@ class OtherKind(Rule):
     def evidence(self, term: Term) -> List[Decider]:
         """Return what shows the kind of the first side that is of any of these kinds."""
         pair = term.pair
-        for meaning, side, beside in ((pair.a, pair.first, pair.b), (pair.b, pair.second, pair.a)):
-            if meaning.kind in _NAMES and not _is_named_picture(term, side, meaning, beside):
+        for meaning, side in ((pair.a, pair.first), (pair.b, pair.second)):
+            if meaning.kind in _NAMES:
                 return self._shown(term, side) if meaning.kind == self.kind else []
         return []
 
@@ -74,16 +70,3 @@ KINDS = (
     ),
 )
 _NAMES = {rule.kind for rule in KINDS}
-
-
-def _is_named_picture(term: Term, side: cst.CSTNode, meaning: Meaning, beside: Meaning) -> bool:
-    """Return whether a side is an image although its name has a word for a mask, a parameter or a gradient.
-
-    An SSIM of the same two shows it, or a call with a mask: ``l1_loss_masked(image, data["seg_im"], mask)``.
-    """
-    if meaning.kind not in LAID_OVER_PICTURES or beside.kind != "image":
-        return False
-    tokens = words(side.value if isinstance(side, cst.Name) else str(key_of(side) or ""))
-    is_under_mask = bool(term.form.extras) and "masked" in words(call_name(term.form.call)) and meaning.kind == "mask"
-    is_picture = is_under_mask and any(kind_of_words(word) == "image" for word in tokens)
-    return is_picture or is_beside_ssim(term.function, *term.sides)

@@ -6,10 +6,9 @@ import functools
 import re
 from typing import List
 
-from legs_adapters.lexicon.words import RAY_BUNDLES
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
-from legs_adapters.terms.sides import is_beside_ssim, of_rays
+from legs_adapters.terms.sides import of_rays
 
 __all__ = ["NotSplats", "is_of_other_framework"]
 
@@ -35,9 +34,7 @@ class NotSplats(Rule):
             return term.here
         if not term.analysis.splats.is_about(term.function):
             return [header(term.function)]
-        by_class = _ray_method(term)
-        rays = bool(by_class) or (of_rays(term.form) and not term.has_rows)  # pixels of an image, by that name
-        return (by_class or term.here) if rays and not is_beside_ssim(term.function, *term.sides) else []
+        return term.here if of_rays(term.form) and not term.has_rows else []  # pixels of an image, by that name
 
     def may_be_loss(self, term: Term) -> bool:
         return True
@@ -47,10 +44,3 @@ class NotSplats(Rule):
 def is_of_other_framework(text: str) -> bool:
     """Return whether a file imports another framework of tensors and no torch."""
     return _OTHER_FRAMEWORK.search(text) is not None and not _TORCH.search(text)
-
-
-def _ray_method(term: Term) -> List[Decider]:
-    """Return the method of its class that takes rays instead of images: ``get_outputs(self, ray_bundle)``."""
-    owner = term.analysis.program.owner_of(term.function)
-    methods = owner.methods.values() if owner is not None else ()
-    return [header(method) for method in methods if RAY_BUNDLES & set(method.parameters)][:1]

@@ -32,35 +32,31 @@ def ssim_map(
 
     Padding "valid" leaves out the pixels whose window is not inside the image.
     """
+    if not isinstance(window_size, int) or window_size < 1 or window_size % 2 == 0:
+        raise LegsError(f"window_size must be an odd number of pixels, got {window_size!r}")
     _, first, second = read_pair(prediction, target, channels_last)
     dtype = torch.promote_types(torch.promote_types(first.dtype, second.dtype), torch.float32)
-    with _no_autocast(first):
-        return _ssim_map(first.to(dtype), second.to(dtype), padding, window_size)
+    device = first.device.type if first.device.type in ("cpu", "cuda") else "cpu"
+    with torch.autocast(device, enabled=False):
+        # The order of operations is 3DGS's: in another one it rounds differently, and beta = 0 would not be its loss.
+        first, second, margin = _padded(first.to(dtype), second.to(dtype), padding, window_size)
+        window = _window(first.shape[-3], window_size, first)
+
+        def blur(image: Tensor) -> Tensor:
+            return F.conv2d(image, window, padding=margin, groups=image.shape[-3])
+
+        mean1, mean2 = blur(first), blur(second)
+        mean1_sq, mean2_sq, mean12 = mean1.pow(2), mean2.pow(2), mean1 * mean2
+        variance1 = blur(first * first) - mean1_sq
+        variance2 = blur(second * second) - mean2_sq
+        covariance = blur(first * second) - mean12
+        scale = (mean1_sq + mean2_sq + LUMINANCE_CONSTANT) * (variance1 + variance2 + CONTRAST_CONSTANT)
+        return ((2 * mean12 + LUMINANCE_CONSTANT) * (2 * covariance + CONTRAST_CONSTANT)) / scale
 
 
 def d_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: Optional[bool] = None) -> Tensor:
     """Return 1 - SSIM, the structural term of 3DGS's loss, bit-identical; arguments as for :func:`~legs_loss.ssim`."""
     return 1.0 - ssim_map(prediction, target, padding, channels_last).mean()
-
-
-def _ssim_map(first: Tensor, second: Tensor, padding: str, window_size: int) -> Tensor:
-    # The order of operations is 3DGS's: in another order it rounds differently, and beta = 0 would not be 3DGS's loss.
-    if not isinstance(window_size, int) or window_size < 1 or window_size % 2 == 0:
-        raise LegsError(f"window_size must be an odd number of pixels, got {window_size!r}")
-    first, second, margin = _padded(first, second, padding, window_size)
-    channels = first.shape[-3]
-    window = _window(channels, window_size, first)
-
-    def blur(image: Tensor) -> Tensor:
-        return F.conv2d(image, window, padding=margin, groups=channels)
-
-    mean1, mean2 = blur(first), blur(second)
-    mean1_sq, mean2_sq, mean12 = mean1.pow(2), mean2.pow(2), mean1 * mean2
-    variance1 = blur(first * first) - mean1_sq
-    variance2 = blur(second * second) - mean2_sq
-    covariance = blur(first * second) - mean12
-    scale = (mean1_sq + mean2_sq + LUMINANCE_CONSTANT) * (variance1 + variance2 + CONTRAST_CONSTANT)
-    return ((2 * mean12 + LUMINANCE_CONSTANT) * (2 * covariance + CONTRAST_CONSTANT)) / scale
 
 
 _windows: Dict[Tuple[Any, ...], Tensor] = {}  # made on the CPU once, not uploaded at every call
@@ -107,8 +103,3 @@ def _padded(first: Tensor, second: Tensor, padding: str, window_size: int) -> Tu
         return first, second, 0
     sides = (margin,) * 4
     return F.pad(first, sides, mode=padding), F.pad(second, sides, mode=padding), 0
-
-
-def _no_autocast(like: Tensor) -> torch.autocast:
-    device = like.device.type
-    return torch.autocast(device if device in ("cpu", "cuda") else "cpu", enabled=False)

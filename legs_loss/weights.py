@@ -11,7 +11,7 @@ and with the map W * M * s / mean(M), divided by s, the share of the pixels with
 
 from __future__ import annotations
 
-from typing import Iterable, List, NamedTuple, Optional, Tuple
+from typing import Iterable, List, NamedTuple, Optional
 
 import torch
 from torch import Tensor
@@ -129,12 +129,8 @@ def curved(normalised: Tensor, spec: WeightSpec) -> Tensor:
     """Return the weight map of a response that is normalised and clamped already, by the spec."""
     weight = (spec.beta * curve(spec.curve)(normalised)).add_(1.0)
     if spec.normalise == "mean":
-        weight = weight / weight.mean(_pixels(weight), keepdim=True)
+        weight = weight / weight.mean((-3, -2, -1), keepdim=True)
     return weight
-
-
-def _pixels(maps: Tensor) -> Tuple[int, ...]:
-    return tuple(range(maps.dim() - 3, maps.dim()))
 
 
 class Weights(NamedTuple):

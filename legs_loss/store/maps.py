@@ -8,7 +8,6 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Tuple, Union
 
 import numpy as np
 
@@ -72,29 +71,20 @@ def stage(staging: Path, entry: Entry, normalised: np.ndarray) -> Entry:
         entry: without ``file``, ``bytes`` and ``sha256``.
         normalised: E^ in [0, 1], [H, W].
     """
-    parts = _npy(np.ascontiguousarray(normalised, np.float16))
-    checksum = hashlib.sha256()
-    for part in parts:
-        checksum.update(part)
-    sha256 = checksum.hexdigest()
+    content = io.BytesIO()
+    np.lib.format.write_array(content, np.ascontiguousarray(normalised, np.float16), (1, 0))
+    data = content.getvalue()
+    sha256 = hashlib.sha256(data).hexdigest()
     # The name is for people; the digest, of the key and the content, keeps every two maps apart.
     readable = re.sub(r"[^0-9a-z]+", "_", os.path.splitext(entry.view)[0].lower()).strip("_")[-40:] or "view"
     digest = hashlib.sha256(f"{sha256}{entry.key}".encode()).hexdigest()[:16]
     file = f"{readable}-{digest}.npy"
-    write_parts(staging / file, *parts)
-    return replace(entry, file=file, bytes=sum(len(part) for part in parts), sha256=sha256)
+    write_parts(staging / file, data)
+    return replace(entry, file=file, bytes=len(data), sha256=sha256)
 
 
-def _npy(array: np.ndarray) -> Tuple[bytes, memoryview]:
-    """Return an .npy file in two parts, its head and the array's own memory: numpy.save to a buffer would copy that."""
-    head = io.BytesIO()
-    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
-    return head.getvalue(), array.reshape(-1).view(np.uint8).data
-
-
-def write_parts(path: Path, *parts: Union[bytes, memoryview]) -> None:
+def write_parts(path: Path, data: bytes) -> None:
     """Write a file in pieces."""
     with open(str(path), "wb") as file:
-        for part in parts:
-            for start in range(0, len(part), _PIECE):
-                file.write(part[start : start + _PIECE])
+        for start in range(0, len(data), _PIECE):
+            file.write(data[start : start + _PIECE])

@@ -91,7 +91,8 @@ class _Prepared(Prepared):
         x, y = (_batch(one.detach().float() if self._mixed else one.detach()) for one in (x, y))
         self._launch, self._dtype, self._shape, self._ssim = modules.driver.launch, x.dtype, shape, terms.ssim
         spec = spec if terms.l1 else None
-        plain, weighted = variant_of(x.dtype, None), variant_of(x.dtype, spec)
+        plain = Variant(VALUES[x.dtype])
+        weighted = plain if spec is None else plain._replace(stencil=STENCILS[spec.operator][0], norm=NORMS[spec.p])
         modules.load(weighted, plain, PLAIN)  # backward's too, which a capture may contain alone
 
         def launch(name: str, variant: Variant, blocks: int) -> _Launch:
@@ -103,8 +104,8 @@ class _Prepared(Prepared):
         views, _, height, width = x.shape
         self._views, self._pixels = views, (height * width, views * height * width)  # a map's: for all views, for each
         x, y = x.contiguous() if self._copies[0] else x, y.contiguous() if self._copies[1] else y
-        task.of_prediction, self._strides_of_prediction = _strides_of(x), x.stride()[-len(self._shape) :]
-        task.of_target, self._strides_of_target = _strides_of(y), y.stride()[-len(self._shape) :]
+        task.of_prediction, self._strides_of_prediction = Strides(*x.stride()), x.stride()[-len(self._shape) :]
+        task.of_target, self._strides_of_target = Strides(*y.stride()), y.stride()[-len(self._shape) :]
         task.chunks = chunks_of(x)
         self._ranged = task.count = task.chunks * task.views
         self._ranging: Tuple[_Launch, ...] = ()
@@ -120,7 +121,7 @@ class _Prepared(Prepared):
         if wanted:  # dense, where x may be windows that overlap
             dense = torch.empty_like(x, dtype=torch.float32)
             dense = dense if _is_addressable(dense) else dense.contiguous()
-            task.of_gradient, self._strides = _strides_of(dense), dense.stride()[-len(self._shape) :]
+            task.of_gradient, self._strides = Strides(*dense.stride()), dense.stride()[-len(self._shape) :]
             blocks = max(1, min(-(-x.numel() // (4 * THREADS)), 16 * modules.driver.multiprocessors))
             self._scale = launch("scale", plain, blocks)
 
@@ -135,9 +136,9 @@ class _Prepared(Prepared):
         task.prediction, task.target = x.data_ptr(), y.data_ptr()
         # A copy of a tensor of inference mode; or what a hook of saved tensors, as of torch's save_on_cpu, gives back.
         if x.stride() != self._strides_of_prediction:
-            task.of_prediction = _strides_of(_batch(x))
+            task.of_prediction = Strides(*_batch(x).stride())
         if y.stride() != self._strides_of_target:
-            task.of_target = _strides_of(_batch(y))
+            task.of_target = Strides(*_batch(y).stride())
         made = None  # it must live until the last launch, as the map; the allocator keeps the order of one stream
         if map_ is not None:
             if map_.numel() not in self._pixels:
@@ -186,13 +187,6 @@ class _Prepared(Prepared):
         return result
 
 
-def variant_of(dtype: torch.dtype, spec: Optional[WeightSpec]) -> Variant:
-    """Return which variant of the kernels computes images of a type with the weights of a spec, or of a map or none."""
-    if spec is None:
-        return Variant(VALUES[dtype])
-    return Variant(VALUES[dtype], STENCILS[spec.operator][0], NORMS[spec.p])
-
-
 def strip_of(images: Tensor, multiprocessors: int, wanted: bool) -> Tuple[int, int]:
     """Return how many rows a block of the streaming pass does, and how many blocks there are.
 
@@ -229,10 +223,6 @@ def _task_of(images: Tensor, spec: Optional[WeightSpec]) -> Task:
     return task
 
 
-def _strides_of(images: Tensor) -> Strides:
-    return Strides(*images.stride())
-
-
 def _is_addressable(images: Tensor) -> bool:
     """Return whether the kernels can address the planes of images [B, C, H, W]: all strides but huge ones."""
     _, _, row, column = images.stride()
@@ -240,8 +230,4 @@ def _is_addressable(images: Tensor) -> bool:
     return max(row, column, reach) <= _MOST  # rows below the image are computed, not read
 
 
-def _open(device: torch.device) -> Modules:
-    return Modules(CudaDriver(device), find_compiler(), BinaryCache(cache_folder()))
-
-
-BACKEND: Backend = CudaBackend(_open)
+BACKEND: Backend = CudaBackend(lambda device: Modules(CudaDriver(device), find_compiler(), BinaryCache(cache_folder())))

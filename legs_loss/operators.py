@@ -41,14 +41,16 @@ def gradient(across: Stencil) -> Tuple[Stencil, ...]:
     return across, tuple(zip(*across))
 
 
-_RECORDS = (
-    Operator("laplacian", (((0, 1, 0), (1, -4, 1), (0, 1, 0)),), "4 neighbours, the paper's"),
-    Operator("laplacian8", (((1, 1, 1), (1, -8, 1), (1, 1, 1)),), "8 neighbours"),
-    Operator("sobel", gradient(((-1, 0, 1), (-2, 0, 2), (-1, 0, 1))), "gradient, rows weighted 1 2 1"),
-    Operator("scharr", gradient(((-3, 0, 3), (-10, 0, 10), (-3, 0, 3))), "gradient, rows weighted 3 10 3"),
-    Operator("central", gradient(((0, 0, 0), (-0.5, 0, 0.5), (0, 0, 0))), "gradient, central differences"),
-)
-OPERATORS: Dict[str, Operator] = {operator.name: operator for operator in _RECORDS}
+OPERATORS: Dict[str, Operator] = {
+    operator.name: operator
+    for operator in (
+        Operator("laplacian", (((0, 1, 0), (1, -4, 1), (0, 1, 0)),), "4 neighbours, the paper's"),
+        Operator("laplacian8", (((1, 1, 1), (1, -8, 1), (1, 1, 1)),), "8 neighbours"),
+        Operator("sobel", gradient(((-1, 0, 1), (-2, 0, 2), (-1, 0, 1))), "gradient, rows weighted 1 2 1"),
+        Operator("scharr", gradient(((-3, 0, 3), (-10, 0, 10), (-3, 0, 3))), "gradient, rows weighted 3 10 3"),
+        Operator("central", gradient(((0, 0, 0), (-0.5, 0, 0.5), (0, 0, 0))), "gradient, central differences"),
+    )
+}
 
 NORMS = (1.0, 2.0, float("inf"))
 

@@ -27,7 +27,6 @@ __all__ = ["BACKENDS", "OUT_OF_MEMORY", "Availability", "Backends", "Known", "fo
 
 OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 _NAMES = ("torch", "numba", "cuda")
-_DEFAULT = WeightSpec()
 # An operation (None: all that there are), and the operator, norm and curve of the weights to be made (None: none are).
 _Case = Tuple[Optional[str], Optional[Tuple[str, float, str]]]
 
@@ -97,33 +96,35 @@ class Backends:
             operation: as for :meth:`availability`.
             spec: of the weights that it is to make.
         """
-        name = self._wanted(device)
-        return None if name is None else self.availability(name, device, operation, spec).backend
+        name, case = self._wanted(device), (operation, None if spec is None else (spec.operator, spec.p, spec.curve))
+        if name is None or (is_capturing(device) and self._known_already(name, device, case) is None):
+            return None  # a trial waits for the device, which would break a capture
+        return self._answer(name, device, case).backend
 
     def _wanted(self, device: torch.device) -> Optional[str]:
         names = self.names(device)
         name = forced_backend() or (names[0] if names else None)
         return name if name in names else None
 
-    def availability(
-        self, name: str, device: torch.device, operation: Optional[str] = None, spec: Optional[WeightSpec] = _DEFAULT
-    ) -> Availability:
+    def availability(self, name: str, device: torch.device, operation: Optional[str] = None) -> Availability:
         """Return whether a backend is available on a device for an operation ("loss", "l1", "ssim"; None: all it has).
 
-        A trial of the operation, with the spec's weights, runs once for each device. While a graph is captured, or on a
-        card that is full, it is not available now, and the next call tries it again.
+        A trial of the operation, with the default spec, runs once for each device. On a card that is full it is not
+        available now, and the next call tries it again.
 
         Raises:
             DeviceFault: the device computes nothing any more, since a kernel has failed before.
         """
-        case = operation, None if spec is None else (spec.operator, spec.p, spec.curve)
+        spec = WeightSpec()
+        return self._answer(name, device, (operation, (spec.operator, spec.p, spec.curve)))
+
+    def _answer(self, name: str, device: torch.device, case: _Case) -> Availability:
         with self._lock:
-            found = self.found.get(self.place(name, device))
-            if found is not None and (found.backend is None or case in found.tried):
-                return found
-            if is_capturing(device):
-                return Availability(None, True, "its trial waits for the device, which would break the capture")
-            return self._tried(name, device, case)
+            return self._known_already(name, device, case) or self._tried(name, device, case)
+
+    def _known_already(self, name: str, device: torch.device, case: _Case) -> Optional[Availability]:
+        found = self.found.get(self.place(name, device))
+        return found if found is None or found.backend is None or case in found.tried else None
 
     def give_up(self, name: str, device: torch.device, error: Exception) -> None:
         """Leave a backend that failed after its trial."""

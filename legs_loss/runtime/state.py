@@ -63,11 +63,10 @@ class Run:
     def __init__(self, config: Config, memo_bytes: int = DEFAULT_LIMIT) -> None:
         self.config = config
         self.weighted: bool = config.active
-        self.computes: bool = config.store is None
+        self.computes: bool = config.store is None and not config.require_masks
         self.said: bool = False
         self.memo: WeightMemo = WeightMemo(memo_bytes)
         self.stored: Stored = Stored(config, self.say_once)
-        self._has_users_maps: Optional[bool] = None
         self._said: Set[str] = set()
         for note in config.notes:
             self.say_once(note, note)
@@ -79,9 +78,7 @@ class Run:
 
     def has_users_maps(self) -> bool:
         """Return whether the store has masks or weights of the user's, which hold for every preset."""
-        if self._has_users_maps is None:
-            self._has_users_maps = self.stored.has(MASK) or self.stored.has(WEIGHTS)
-        return self._has_users_maps
+        return self.stored.has(MASK, WEIGHTS)
 
     def weights(self, target: Tensor, view: View, made: bool) -> Weights:
         """Return the weights of a target [C, H, W] or [B, C, H, W], with the user's own, and count their sources.
@@ -99,7 +96,7 @@ class Run:
         if made and self.computes and target.device.type == "cpu":
             counted.computed += count
             return Weights(self.config.spec)
-        if view is None and target.dim() == 3 and self.weighted and not self.has_users_maps():
+        if view is None and target.dim() == 3 and self.weighted and (self.computes or not self.has_users_maps()):
             found = self._weight(target, None, made)
             return found if isinstance(found, Weights) else Weights(map=found)
         images = [target] if target.dim() == 3 else list(target)
@@ -237,8 +234,8 @@ def _run_of(number: int) -> Run:
 def _say_masked() -> None:
     """Print, as the process ends, what the masks of its last run were used for."""
     if _masked:
-        masked, in_l1_alone = _masked[-1].stored.masked, counted.masked > 0 and counted.hidden == 0
-        say(f"legs-loss: {masked.summary(counted.unmasked, in_l1_alone)}", sys.stderr)
+        in_l1_alone = counted.masked > 0 and counted.hidden == 0
+        say(f"legs-loss: {_masked[-1].stored.summary(counted.unmasked, in_l1_alone)}", sys.stderr)
 
 
 def refuse_masks(number: int) -> None:

@@ -16,7 +16,7 @@ from legs_loss.responses import NEEDS_LEVELS
 if TYPE_CHECKING:
     from legs_loss.store import Found, WeightStore
 
-__all__ = ["Masked", "Stored", "Whole"]
+__all__ = ["Stored", "Whole"]
 
 _MISSES = 2  # lookups for each map of the store
 
@@ -42,22 +42,6 @@ class Whole(Enum):
     UNKNOWN = 1
 
 
-class Masked:
-    """The names of a run's views with a mask of the store, and of those without."""
-
-    def __init__(self) -> None:
-        self.views: Set[str] = set()
-        self.whole: Set[str] = set()
-
-    def summary(self, absent: int, in_l1_alone: bool) -> str:
-        """Return the line of a run's end; ``absent`` is how often an image was not found."""
-        parts = [f"{len(self.views)} view(s) masked"]
-        parts += [f"{len(self.whole)} without a mask counted whole"] if self.whole else []
-        parts += [f"{absent} training image(s) were NOT FOUND in the store, so NOT MASKED"] if absent else []
-        parts += ["in the L1 alone: legs-patch --masks hides masked pixels from other terms"] if in_l1_alone else []
-        return f"masks: {', '.join(parts)}"
-
-
 class Stored:
     """The store of a run, opened when it is first needed.
 
@@ -70,7 +54,8 @@ class Stored:
     """
 
     def __init__(self, config: Config, say_once: Callable[[str, str], None]) -> None:
-        self.masked: Masked = Masked()
+        self.masked: Set[str] = set()  # names of the views with a mask, and of those without
+        self.whole: Set[str] = set()
         self._config = config
         self._say_once = say_once
         self._misses = 0  # since an image was found
@@ -96,10 +81,18 @@ class Stored:
             self._say_once("damaged", f"{error}; the weights of such views are computed")
             return None
 
-    def has(self, kind: str) -> bool:
-        """Return whether the store has maps of the user's own of a kind."""
+    def has(self, *kinds: str) -> bool:
+        """Return whether the store has maps of the user's own of any of these kinds."""
         self._open()
-        return kind in self._kinds
+        return not self._kinds.isdisjoint(kinds)
+
+    def summary(self, absent: int, in_l1_alone: bool) -> str:
+        """Return the line of a run's end; ``absent`` is how often an image was not found."""
+        parts = [f"{len(self.masked)} view(s) masked"]
+        parts += [f"{len(self.whole)} without a mask counted whole"] if self.whole else []
+        parts += [f"{absent} training image(s) were NOT FOUND in the store, so NOT MASKED"] if absent else []
+        parts += ["in the L1 alone: legs-patch --masks hides masked pixels from other terms"] if in_l1_alone else []
+        return f"masks: {', '.join(parts)}"
 
     def users_map(self, image: Tensor, view: Optional[str], kind: str) -> Union[Tensor, Whole]:
         """Return the user's mask or weights of an image, float32 [1, H, W]; or why it counts whole.
@@ -118,7 +111,7 @@ class Stored:
             return Whole.UNKNOWN
         entry = found.mask if kind == MASK else found.weights
         if kind == MASK:
-            (self.masked.whole if entry is None else self.masked.views).add(found.view)
+            (self.whole if entry is None else self.masked).add(found.view)
         if entry is None:
             return Whole.KNOWN
         return torch.from_numpy(store.user_map(entry)).to(image.device).unsqueeze(0)

@@ -24,8 +24,11 @@ def _entry_points(group: str) -> Iterable[Any]:
     try:
         from importlib import metadata
     except ImportError:  # Python 3.7
-        import pkg_resources
+        try:
+            import importlib_metadata as metadata  # type: ignore[no-redef]
+        except ImportError:
+            import pkg_resources
 
-        return pkg_resources.iter_entry_points(group)
+            return pkg_resources.iter_entry_points(group)
     found: Any = metadata.entry_points()
     return found.select(group=group) if hasattr(found, "select") else found.get(group, ())  # a dict before 3.10

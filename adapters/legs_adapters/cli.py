@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from legs_adapters.terms.findings import Problem
     from legs_adapters.terms.traced import Trace
 
-__all__ = ["main"]
-
 HELP = "add the LEGS loss to a codebase, or remove it; the same as legs-patch"
 
 SETTINGS = ("preset", "beta", "curve", "operator", "store")

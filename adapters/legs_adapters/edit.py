@@ -26,8 +26,6 @@ from legs_adapters.terms.text import Edit, Text, apply_edits
 from legs_adapters.terms.writing import PACKAGE
 from legs_loss import LegsError
 
-__all__ = ["PACKAGE", "Edit", "apply_edits", "rewrite", "why_not_compiled"]
-
 _STRINGS = (cst.SimpleString, cst.ConcatenatedString)
 _IMPORTS = (cst.Import, cst.ImportFrom)
 

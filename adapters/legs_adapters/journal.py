@@ -22,8 +22,6 @@ from legs_adapters.terms.text import Edit
 from legs_adapters.terms.writing import PACKAGE
 from legs_loss import LegsError
 
-__all__ = ["JOURNAL", "Journal", "Layer", "digest"]
-
 JOURNAL = ".legs-patch.json"
 MAX_EDITS, MAX_LAYERS = 100_000, 100  # of the journal, and patches of one file
 _VERSION = 1

@@ -13,16 +13,15 @@ from legs_adapters.checkout.git import changed_files
 from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
 from legs_adapters.code.folders import first_of, why_left_out
 from legs_adapters.code.sources import Unreadable, check_root, read_files
-from legs_adapters.edit import Edit, apply_edits, rewrite, why_not_compiled
+from legs_adapters.edit import rewrite, why_not_compiled
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_adapters.rules.find import find
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.terms.findings import Findings
+from legs_adapters.terms.text import Edit, apply_edits
 from legs_adapters.terms.traced import Trace
 from legs_adapters.unsearched import Unsearched, unsearched
 from legs_loss import LegsError
-
-__all__ = ["Plan", "plan", "write"]
 
 
 class Plan(NamedTuple):

@@ -16,8 +16,6 @@ from legs_adapters.terms.form import Form
 from legs_adapters.terms.traced import Trace
 from legs_loss.system import printable
 
-__all__ = ["as_diff", "as_json", "as_table"]
-
 
 def as_table(plan: Plan) -> str:
     """Return one line for every L1 term: its place, the verdict, and the reason."""

@@ -13,11 +13,10 @@ from typing import Callable, Dict, Iterator, List, NamedTuple, Optional, Set, Tu
 
 from legs_adapters.code.folders import first_of
 from legs_adapters.code.limits import STRING, Budget
-from legs_adapters.edit import apply_edits, why_not_compiled
+from legs_adapters.edit import why_not_compiled
 from legs_adapters.journal import Layer
+from legs_adapters.terms.text import apply_edits
 from legs_adapters.terms.writing import PACKAGE
-
-__all__ = ["restored", "weighted_lines"]
 
 _TOKEN = re.compile(rf"(?P<string>\w*{STRING})|(?P<comment>#[^\r\n]*)|\w+|[^\w\s]", re.S)
 _FREE = frozenset("(),;\\")  # what formatters add, remove and move

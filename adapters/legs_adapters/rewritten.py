@@ -13,8 +13,6 @@ import types
 from types import CodeType
 from typing import Any, Dict, Mapping, Optional, Sequence
 
-__all__ = ["Finder", "Loader", "install", "main_module"]
-
 
 def install(sources: Dict[str, bytes]) -> None:
     """Import these sources, by real path, in place of the files on disk.

@@ -25,8 +25,6 @@ from legs_loss import LegsError
 from legs_loss.config import find_config
 from legs_loss.system import is_first_process, say
 
-__all__ = ["checkout_of", "execute", "run_exit_functions", "run_script"]
-
 
 def checkout_of(script: Path) -> Path:
     """Return the folder that is searched for a script: its git checkout's root, or its own folder.

@@ -11,8 +11,6 @@ from typing import Any, Mapping
 from legs_loss import OPERATORS, PRESETS, LegsError
 from legs_loss.errors import did_you_mean
 
-__all__ = ["SETTINGS_FILE", "settings_text"]
-
 SETTINGS_FILE = "legs.toml"
 _HEAD = """\
 # The LEGS loss of this codebase, written by legs-patch. Training scripts find this file by themselves.

@@ -16,8 +16,6 @@ from legs_adapters.restoring import restored, weighted_lines
 from legs_adapters.terms.writing import PACKAGE
 from legs_loss import LegsError
 
-__all__ = ["undo", "unrecorded"]
-
 # What an undo changes, and the files that it leaves as they are, each with the reason.
 _Undone = Tuple[Changes, List[Tuple[str, str]]]
 

@@ -14,8 +14,6 @@ from legs_adapters.rules.find import find
 from legs_adapters.terms.findings import Line
 from legs_loss import LegsError
 
-__all__ = ["Unsearched", "unsearched"]
-
 
 class Unsearched(NamedTuple):
     """A codebase that is not searched, with the first line in it that may be the loss; relative to the root."""

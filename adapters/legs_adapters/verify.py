@@ -27,8 +27,6 @@ from legs_adapters.trace.running import folder_for_runs, run_watched
 from legs_adapters.undo import undo
 from legs_loss import LegsError
 
-__all__ = ["Run", "Verdict", "check_verifiable", "verify"]
-
 SECONDS = 1800  # that a run may take
 # For runs that are compared; of two threads one may wait for its turn, and counts as work.
 _THE_SAME = {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}

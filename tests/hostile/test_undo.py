@@ -15,10 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from legs_adapters import journal as journals
 from legs_adapters.cli import main
-from legs_adapters.edit import apply_edits
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_adapters.plan import plan, write
-from legs_adapters.terms.text import Edit
+from legs_adapters.terms.text import Edit, apply_edits
 from legs_adapters.undo import undo
 
 from legs_loss import LegsError

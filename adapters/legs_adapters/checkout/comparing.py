@@ -5,8 +5,6 @@ from __future__ import annotations
 import difflib
 from typing import List, Sequence, Tuple, TypeVar
 
-__all__ = ["compared", "unified_diff"]
-
 # How many lines to pass over in both texts where they differ, until two are the same again; the fewest first.
 _AHEAD = sorted(((i, j) for i in range(6) for j in range(6)), key=sum)[1:]
 _Line = TypeVar("_Line", str, bytes)

@@ -15,8 +15,6 @@ from typing import Dict, List, Mapping
 
 from legs_loss import LegsError
 
-__all__ = ["changed_files"]
-
 _SECONDS = 60  # a pipe in .git would block git for ever
 _SAFE = ("-c", "safe.bareRepository=explicit", "-c", "safe.directory=*")
 _ENVIRONMENT = {

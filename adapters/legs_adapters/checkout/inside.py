@@ -7,8 +7,6 @@ import os
 from pathlib import Path
 from typing import Iterator, Optional, Tuple
 
-__all__ = ["BY_DESCRIPTOR", "folder_of"]
-
 # Windows has no descriptors of folders: there paths are checked, then used.
 BY_DESCRIPTOR = {os.open, os.rename, os.unlink, os.stat} <= os.supports_dir_fd
 

@@ -16,8 +16,6 @@ from legs_adapters.code.folders import check_name
 from legs_loss import LegsError
 from legs_loss.system import FileLock, HeldError, held_back, open_regular, read_regular
 
-__all__ = ["MAX_FILE_BYTES", "Changes", "locked", "read_file", "replace_files"]
-
 # By relative path, in order: the bytes expected there now (None: no file), and the bytes to put there (None: remove).
 Changes = Dict[str, Tuple[Optional[bytes], Optional[bytes]]]
 

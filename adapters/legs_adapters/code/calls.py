@@ -11,8 +11,6 @@ from legs_adapters.code.module import Class, Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.syntax import call_name
 
-__all__ = ["callees", "given_to", "handed", "likely_calls", "sure_calls"]
-
 _Call = Tuple[Function, cst.Call]  # with the function that it stands in
 
 

@@ -13,8 +13,6 @@ from legs_adapters.code.module import Class, Function, Module, index_by_word, pa
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import dotted
 
-__all__ = ["Checkout", "imported_name"]
-
 _DEFINED = re.compile(r"\bdef[ \t]+(\w+)")
 
 

@@ -24,8 +24,6 @@ from legs_adapters.code.syntax import (
     walk_expressions,
 )
 
-__all__ = ["MUTATORS", "Flow"]
-
 _NOTHING = Reaching()
 _PART = re.compile(r"[.\[]")
 MUTATORS = {"append", "add", "extend", "insert", "update", "setdefault", "appendleft", "__setitem__"}

@@ -12,20 +12,6 @@ from typing import Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
 from legs_loss import LegsError
 from legs_loss.system import read_regular
 
-__all__ = [
-    "CLOSED",
-    "PATCHABLE",
-    "SUBMODULE",
-    "VENDORED",
-    "Skipped",
-    "check_name",
-    "first_of",
-    "folders_of",
-    "foreign_folder",
-    "walk",
-    "why_left_out",
-]
-
 VENDORED, SUBMODULE = "third-party code", "a submodule"
 _TESTS, _WORKTREE = "a folder of tests", "another worktree of this checkout"
 CLOSED = "cannot be read: Permission denied"

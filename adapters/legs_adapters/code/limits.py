@@ -12,8 +12,6 @@ import re
 from collections import Counter
 from typing import Any, Callable, List, Optional, TypeVar
 
-__all__ = ["MAX_BYTES", "MAX_FILE_BYTES", "STRING", "Budget", "over_the_limits", "parsing_steps", "remembered"]
-
 MAX_FILE_BYTES = 1 << 20
 MAX_BYTES = 32 << 20  # of all files
 MAX_FILE_STEPS = 3_000_000

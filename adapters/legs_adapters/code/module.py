@@ -14,8 +14,6 @@ from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import arguments, children, dotted
 
-__all__ = ["CALLED", "Class", "Function", "Module", "blocks_of", "index_by_word", "parse"]
-
 CALLED = ("forward", "__call__")  # what calling an instance runs: a torch module's own, and Python's
 
 _T = TypeVar("_T")

@@ -20,8 +20,6 @@ from libcst.metadata.span_provider import SpanProvidingCodegenState, byte_length
 from legs_adapters.code.syntax import code
 from legs_loss.system import held_back
 
-__all__ = ["STUB", "Lines", "Part", "Place", "body_part", "outline_part", "refused"]
-
 STUB = re.compile("0#x*")  # what stands for a body
 
 _FORM_FEED = re.compile(rb"^[ \t\f]*\f[ \t\f]*(?=\r?$)", re.M)  # LibCST loses these lines: comments, to it

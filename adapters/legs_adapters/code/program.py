@@ -16,8 +16,6 @@ from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import arguments, call_name, dotted, path_of
 
-__all__ = ["Program", "Reference"]
-
 _MAX_DEPTH = 16  # how many names are followed, one to the next
 
 

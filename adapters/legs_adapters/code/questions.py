@@ -7,8 +7,6 @@ from typing import Any, Callable, Dict, List, Optional, Set, Tuple, TypeVar
 
 from legs_adapters.code.module import Function
 
-__all__ = ["Questions"]
-
 _DEPTH = 200  # questions in one another; deeper ones are answered afterwards, and those that asked are asked again
 _TURNS = 8  # that one is answered in, in a loop
 

@@ -11,8 +11,6 @@ from typing import Callable, ClassVar, Dict, Iterator, List, Optional, Sequence,
 
 import libcst as cst
 
-__all__ = ["Definition", "Env", "Reaching"]
-
 
 class Reaching:
     """The definitions that reach a point: one, or a join of those that reach the points before it.

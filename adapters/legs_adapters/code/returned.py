@@ -10,8 +10,6 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import constant
 
-__all__ = ["default_key", "formatted_key", "returned"]
-
 
 def returned(function: Function) -> Optional[cst.CSTNode]:
     """Return what straight-line code returns, its local names filled in; None where that is not one expression."""

@@ -15,8 +15,6 @@ from legs_adapters.code.limits import MAX_BYTES, MAX_FILE_BYTES
 from legs_loss import LegsError
 from legs_loss.system import read_regular
 
-__all__ = ["Source", "Unreadable", "check_root", "decode", "read_files", "read_source"]
-
 
 @dataclass(frozen=True)
 class Source:

@@ -10,27 +10,6 @@ from typing import Any, Dict, FrozenSet, Iterator, List, Optional, Set, Tuple
 
 import libcst as cst
 
-__all__ = [
-    "arguments",
-    "attribute_chain",
-    "call_name",
-    "children",
-    "code",
-    "constant",
-    "dotted",
-    "every_parameter",
-    "key_of",
-    "names_where",
-    "one_line",
-    "path_of",
-    "root_of",
-    "same",
-    "walk_expressions",
-    "word_set",
-    "words",
-    "words_in",
-]
-
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _EMPTY = cst.Module(body=[])
 _WORDS = (cst.Name, cst.SimpleString, cst.Integer, cst.Float)

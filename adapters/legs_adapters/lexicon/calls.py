@@ -38,9 +38,6 @@ from legs_adapters.tensors.operations import (
     REDUCES,
 )
 
-__all__ = ["CallReading", "MeaningOf", "is_of_neighbours", "meaning_of_call", "meaning_returned"]
-
-
 MeaningOf = Callable[[Function, cst.CSTNode], Meaning]  # of an expression of a function
 
 

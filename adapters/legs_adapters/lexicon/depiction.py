@@ -35,8 +35,6 @@ from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import BACKGROUND, COLORS, DATA, KIND_OF, LOSS, RENDER
 from legs_adapters.tensors.backward import Training
 
-__all__ = ["Meanings"]
-
 _LITERALS = (cst.Dict, cst.List, cst.Tuple)
 _Argument = Tuple[Function, cst.Call, Optional[cst.BaseExpression]]  # with the call, and the function around it
 

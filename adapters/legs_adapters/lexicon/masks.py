@@ -14,8 +14,6 @@ from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.words import PICKING
 from legs_adapters.tensors.operations import JOINS, KEEPS_AXES
 
-__all__ = ["is_mask", "is_rows", "makes_mask"]
-
 _DEPTH = 4
 
 

@@ -6,8 +6,6 @@ from typing import Iterable, NamedTuple, Optional
 
 from legs_adapters.lexicon.words import KINDS
 
-__all__ = ["UNKNOWN", "Meaning", "mix", "more_special", "swapped"]
-
 
 class Meaning(NamedTuple):
     """``kind``: image, depth, normal, ... or None; ``role``: "render", "target", "both" or None."""

@@ -16,8 +16,6 @@ from legs_adapters.lexicon.words import (
     TARGET,
 )
 
-__all__ = ["TORCH_L1", "has_perceptual_name", "is_l1_name", "kind_of_words", "role_of_words"]
-
 TORCH_L1 = re.compile(r"(^|\.)(torch\.nn\.functional|nn\.functional|functional)\.l1_loss$")
 _L1_NAME = re.compile(
     r"^(masked|mask|weighted|pixel|pixelwise|rgb|color|image|photometric)*l1(loss)?(loss|mask(ed)?|rgb|withmask|v\d+)*$"

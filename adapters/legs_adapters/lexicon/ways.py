@@ -21,8 +21,6 @@ from legs_adapters.lexicon.words import BACKGROUND, DATA, GAUSSIANS, RENDERERS, 
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.operations import PICTURE_FUNCTIONS, VIEWS
 
-__all__ = ["PHOTOGRAPH", "RENDERING", "Ways"]
-
 RENDERING = Meaning("image", "render")
 PHOTOGRAPH = Meaning("image", "target")
 _DEPTH = 4

@@ -13,8 +13,6 @@ from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.kinds.callback import Callbacks
 from legs_adapters.terms.prospects import Prospects
 
-__all__ = ["Analysis"]
-
 
 class Analysis:
     """The analyses of one program, made once, each from those before it.

@@ -33,8 +33,6 @@ from legs_adapters.terms.patched import patched_nodes
 from legs_adapters.terms.traced import Trace
 from legs_loss.system import progress
 
-__all__ = ["find"]
-
 _Entry = Tuple[Place, Union[Site, Left, Problem]]
 
 _RULES = 100  # steps at most of what all rules ask about a term

@@ -36,8 +36,6 @@ from legs_adapters.terms.kinds.masked import Masked
 from legs_adapters.terms.patched import patched_nodes
 from legs_adapters.terms.writing import PACKAGE
 
-__all__ = ["with_masks"]
-
 _MASKED, _COVERAGE = f"{PACKAGE}.masked", f"{PACKAGE}.coverage"
 _Given = Tuple[cst.Call, List[Set[Optional[str]]]]  # a call, and what its arguments read
 

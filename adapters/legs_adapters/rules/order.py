@@ -8,8 +8,6 @@ from legs_adapters.rules.causes import definition, distillation, kinds, names, o
 from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.terms.findings import Evidence
 
-__all__ = ["ORDER", "RULES", "first"]
-
 ORDER: Tuple[Rule, ...] = (
     definition.Definition(),
     *kinds.KINDS,

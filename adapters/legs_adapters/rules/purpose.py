@@ -31,8 +31,6 @@ from legs_adapters.tensors.operations import NEW_TENSORS
 from legs_adapters.tensors.steps import has_step, is_backward, is_step, may_step, reads_gradients
 from legs_adapters.terms.findings import Evidence
 
-__all__ = ["Purposes"]
-
 _DEPTH = 3
 # With the words of whose method runs it, and the calls that made those.
 _Step = Tuple[Function, cst.Call, Set[str], List[Tuple[Function, cst.Call]]]

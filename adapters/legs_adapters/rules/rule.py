@@ -23,8 +23,6 @@ from legs_adapters.terms.sides import Pair, pair_of
 if TYPE_CHECKING:
     from legs_adapters.rules.analysis import Analysis
 
-__all__ = ["Rule", "Term", "header", "source_of"]
-
 _DEPTH = 3
 
 

@@ -14,8 +14,6 @@ from legs_adapters.lexicon.words import DRAWS_SPLATS, RAYS, SPLATS
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.forms import Forms
 
-__all__ = ["Splats"]
-
 _COMMENT = re.compile("#.*")  # proves nothing
 
 

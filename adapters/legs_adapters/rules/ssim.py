@@ -15,8 +15,6 @@ from legs_adapters.terms.patched import patched_nodes
 from legs_adapters.terms.ssim.calls import proven_ssim
 from legs_adapters.terms.writing import PACKAGE
 
-__all__ = ["with_ssims"]
-
 
 def with_ssims(found: Findings, analysis: Analysis, by_hand: Sequence[Tuple[str, int]]) -> Findings:
     """Return findings with the SSIM terms of the functions that have a weighted L1, or were named by hand."""

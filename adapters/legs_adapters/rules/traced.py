@@ -18,8 +18,6 @@ from legs_adapters.terms.kinds.callback import PassedByName
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.traced import Trace, Traced
 
-__all__ = ["with_trace"]
-
 _Place = Tuple[str, int, int]
 
 

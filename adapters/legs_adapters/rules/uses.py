@@ -16,8 +16,6 @@ from legs_adapters.rules.order import RULES
 from legs_adapters.terms.findings import Evidence, Use
 from legs_adapters.terms.sides import surest
 
-__all__ = ["uses_of"]
-
 _Call = Tuple[Function, cst.Call, List[Optional[cst.BaseExpression]]]
 _DEPTH = 3  # functions that hand on what they are given
 

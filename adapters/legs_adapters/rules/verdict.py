@@ -27,9 +27,6 @@ from legs_adapters.terms.kinds.reread import Reread
 from legs_adapters.terms.sides import is_of_numbers, is_role, same_root
 from legs_adapters.terms.text import Text
 
-__all__ = ["Verdicts"]
-
-
 _OF_DIFFERENCE = "as one absolute difference times the photograph's weight map, with each mask and threshold as it is"
 
 

@@ -9,8 +9,6 @@ import libcst as cst
 from legs_adapters.code.syntax import call_name
 from legs_adapters.tensors.operations import CONSTANTS
 
-__all__ = ["AbsoluteValue", "abs_argument", "absolute_value", "is_difference", "is_no_picture", "mean_of"]
-
 
 class AbsoluteValue(NamedTuple):
     """An absolute value: the call that takes it, what of, and "mean" where the mean is taken of it, else "none"."""

@@ -10,8 +10,6 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import attribute_chain, call_name
 from legs_adapters.tensors.operations import ENDS_GRADIENT, NO_GRAD
 
-__all__ = ["is_detached", "no_grad_around"]
-
 
 def no_grad_around(function: Function, *nodes: cst.CSTNode) -> Optional[Tuple[Function, cst.CSTNode]]:
     """Return the ``no_grad`` around expressions, with its function: the block's call, or the decorator."""

@@ -10,8 +10,6 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import call_name, walk_expressions, words, words_in
 from legs_adapters.tensors.operations import BACKWARD, OPTIMISERS, SCHEDULES, STEPS
 
-__all__ = ["has_step", "is_backward", "is_step", "may_step", "reads_gradients"]
-
 
 def is_backward(call: cst.Call) -> bool:
     """Return whether a call runs a backward pass."""

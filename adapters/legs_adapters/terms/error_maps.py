@@ -16,8 +16,6 @@ from legs_adapters.tensors.gradients import no_grad_around
 from legs_adapters.tensors.operations import EXTREMES, LEAVES, SIZES, TRANSFORMS
 from legs_adapters.terms.form import Form
 
-__all__ = ["is_measured", "reads_of"]
-
 
 class _Uses:
     """The uses of a function's expressions, by their ids, found in one walk over it; and the values of its names."""

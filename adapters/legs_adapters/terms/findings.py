@@ -18,8 +18,6 @@ from legs_adapters.terms.writing import Writing
 if TYPE_CHECKING:
     from legs_adapters.terms.traced import Trace
 
-__all__ = ["Decider", "Evidence", "Findings", "Left", "Line", "Problem", "Site", "Use"]
-
 Decider = Tuple[Function, cst.CSTNode]
 
 

@@ -12,8 +12,6 @@ from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, apply_edits, on_one_line
 from legs_adapters.terms.writing import Writing
 
-__all__ = ["Form"]
-
 
 @dataclass(frozen=True)
 class Form:

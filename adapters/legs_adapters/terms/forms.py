@@ -17,8 +17,6 @@ from legs_adapters.terms.kinds.absolute import Absolute
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.kinds.indirect import Indirect
 
-__all__ = ["KINDS", "Forms"]
-
 KINDS: Tuple[Type[Form], ...] = (Absolute, Indirect, Called)  # the first that recognises a call
 
 

@@ -28,8 +28,6 @@ from legs_adapters.tensors.operations import ASKS, LIKE, LIMITS, OTHER_LOSSES, S
 from legs_adapters.terms.prospects import Prospects
 from legs_adapters.terms.writing import PACKAGE
 
-__all__ = ["L1Functions"]
-
 _DEPTH = 4
 _AS_MAP = (["reduction='none'"], ['reduction="none"'])
 

@@ -12,8 +12,6 @@ from legs_adapters.lexicon.names import kind_of_words
 from legs_adapters.terms.findings import Findings
 from legs_loss.system import read_regular
 
-__all__ = ["offered", "trained_instead"]
-
 _OF_PICTURES = re.compile(r"rgb|im(g|age)|colou?r|delta", re.I)
 _SQUARED = "a squared loss of images was found here, which is not weighted"
 _CHOSEN = "the loss seems to be chosen here, by {}: name the line that calls it with --site"

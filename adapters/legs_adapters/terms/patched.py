@@ -10,8 +10,6 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.terms.writing import PACKAGE
 
-__all__ = ["patched_nodes"]
-
 _PATCHED = (f"{PACKAGE}.l1_loss", f"{PACKAGE}.unweighted")
 
 

@@ -15,8 +15,6 @@ from legs_adapters.code.module import CALLED
 from legs_adapters.lexicon.words import SPEAKS_OF_L1, SPEAKS_OF_LOSS
 from legs_adapters.tensors.operations import HOLDERS, MODULE_SELF
 
-__all__ = ["Prospects"]
-
 _WORD = re.compile(r"(?<![\w\"'])[^\W\d]\w*(?![\"'])")  # no key, no setting: ``split="train"``
 _DEFINITION = re.compile(r"^([ \t]*)(?:async[ \t]+)?(def|class)[ \t]+(\w+)", re.M)
 # A value goes on where its line ends in an opening bracket, a comma or a backslash.

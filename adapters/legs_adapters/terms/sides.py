@@ -19,8 +19,6 @@ from legs_adapters.tensors.absolute import is_no_picture
 from legs_adapters.tensors.operations import MODULES
 from legs_adapters.terms.form import Form
 
-__all__ = ["Pair", "is_of_numbers", "is_role", "of_rays", "pair_of", "same_root", "surest"]
-
 
 class Pair(NamedTuple):
     """The two sides that are compared.

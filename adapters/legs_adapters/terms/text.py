@@ -12,8 +12,6 @@ from legs_adapters.code.module import Function, Module
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import code
 
-__all__ = ["Edit", "Text", "apply_edits", "flat", "names_for_two", "on_one_line", "residue"]
-
 _GAP = re.compile(rf"({STRING})|(?:\s|\\(?=[\r\n])|#[^\r\n]*)+", re.S)  # no comment begins in a string
 _COMMENT_OR_BREAK = re.compile(rf"({STRING})|((?:(?<![ \t])[ \t]+)?#[^\r\n]*|\\?(?:\r\n|\r|\n)[ \t]*)", re.S)
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Dict, FrozenSet, List, NamedTuple, Optional, Sequence, Tuple
 
-__all__ = ["Trace", "Traced"]
-
 
 class Traced(NamedTuple):
     """A difference that lies under a loss, as it ran.

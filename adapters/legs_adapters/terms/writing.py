@@ -9,8 +9,6 @@ import libcst as cst
 from legs_adapters.code.syntax import code
 from legs_adapters.terms.text import flat, names_for_two, on_one_line
 
-__all__ = ["PACKAGE", "Writing"]
-
 PACKAGE = "legs_loss"
 
 _Side = TypeVar("_Side")

@@ -12,8 +12,6 @@ from typing import List, Optional, Sequence, Tuple
 
 from legs_loss import LegsError
 
-__all__ = ["SCENE", "filled", "folders", "parts"]
-
 SCENE = {"views": 12, "width": 96, "height": 64, "points": 800, "samples": 1}  # the embedded one
 # The arguments of a script like Inria's, where its source has these words. (Inria's options are named after attributes,
 # except those that train.py adds itself.)

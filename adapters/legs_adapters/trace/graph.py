@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Set, Tuple
 
-__all__ = ["KEY", "Graph"]
-
 KEY = "legs_loss"  # under which a node's metadata keeps its record
 # Nodes that carry a difference on, or weigh and average it: by the beginnings of their names.
 _CARRIES = (

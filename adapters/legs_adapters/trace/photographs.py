@@ -9,8 +9,6 @@ from typing import Any, List, NamedTuple, Optional, Sequence, Set, Tuple
 from legs_adapters.code.limits import remembered
 from legs_loss import LegsError
 
-__all__ = ["SIDE", "SURE", "Match", "Photographs", "as_planes", "is_another", "thumbnail", "uncut"]
-
 SIDE = 16  # pixels of a thumbnail
 SURE = 0.94  # the correlation from which on a picture is a file's
 DETAIL = 0.6  # that of what thumbnails four times as large have beside it: less is a rendering, or another view

@@ -18,8 +18,6 @@ from legs_adapters.trace.command import SCENE, filled, folders, parts
 from legs_loss import LegsError
 from legs_loss.system import FileLock, say
 
-__all__ = ["folder_for_runs", "run_watched", "trace"]
-
 _SETTINGS = {  # no bytecode is written into the checkout; torch.compile and TorchScript cannot be watched
     "PYTHONDONTWRITEBYTECODE": "1", "TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0",
 }  # fmt: skip

@@ -23,8 +23,6 @@ from legs_adapters.trace.graph import KEY, Graph
 from legs_adapters.trace.photographs import SURE, Photographs, as_planes, is_another, thumbnail, uncut
 from legs_loss.runtime import counts
 
-__all__ = ["Watch"]
-
 _SAMPLE = 4096  # values of a leaf that are compared over a step
 _POSE = 16  # numbers of a pose, an exposure
 _OWN = ("legs_adapters.", "legs_loss.")

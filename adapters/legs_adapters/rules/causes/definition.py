@@ -10,8 +10,6 @@ from legs_adapters.code.syntax import words
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
 
-__all__ = ["Definition"]
-
 
 class Definition(Rule):
     """The term is in the body of the codebase's own L1 function, whose calls are decided one by one.

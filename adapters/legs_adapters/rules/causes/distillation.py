@@ -14,8 +14,6 @@ from legs_adapters.terms.findings import Decider
 if TYPE_CHECKING:
     from legs_adapters.rules.analysis import Analysis
 
-__all__ = ["Distillation", "is_rendered"]
-
 
 class Distillation(Rule):
     """The target was found to be a rendering: of another model, another view, or an earlier step.

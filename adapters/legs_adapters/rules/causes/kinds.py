@@ -10,8 +10,6 @@ from legs_adapters.lexicon.names import kind_of_words
 from legs_adapters.rules.rule import Rule, Term, source_of
 from legs_adapters.terms.findings import Decider
 
-__all__ = ["KINDS", "OtherKind"]
-
 
 class OtherKind(Rule):
     """By its name, or that of what it comes from, one side is {what}.

@@ -25,8 +25,6 @@ from legs_adapters.terms.findings import Decider
 if TYPE_CHECKING:
     from legs_adapters.rules.analysis import Analysis
 
-__all__ = ["NAMES", "EvaluationName", "OtherName", "Tracking"]
-
 
 class Tracking(Rule):
     """The name of the function, its class or a condition around the term is about tracking.

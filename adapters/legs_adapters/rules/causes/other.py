@@ -10,8 +10,6 @@ from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import of_rays
 
-__all__ = ["NotSplats", "is_of_other_framework"]
-
 _TORCH = re.compile(r"^[ \t]*(import|from)[ \t]+torch", re.M)
 _OTHER_FRAMEWORK = re.compile(
     r"^[ \t]*(import|from)[ \t]+(drjit|flax|jax|jittor|megengine|mindspore|mlx|paddle|tensorflow|tinygrad)\b", re.M

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from legs_adapters.rules.rule import Rule
 
-__all__ = ["UnprovenSsim"]
-
 
 class UnprovenSsim(Rule):
     """With `--ssim`: nothing proves that it is 3DGS's SSIM with its defaults: a library's, perhaps, or masked.

@@ -7,8 +7,6 @@ from typing import List
 from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.terms.findings import Decider
 
-__all__ = ["NoStep", "OtherStep", "PoseStep"]
-
 
 class _ByPurpose(Rule):
     """Skip a term by the purpose of its backward pass."""

@@ -12,8 +12,6 @@ from legs_adapters.tensors.absolute import is_difference, is_no_picture
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import same_root
 
-__all__ = ["Unknown"]
-
 
 class Unknown(Rule):
     """Neither side is known to be an image, or nothing shows which is the photograph and not both names are images.

@@ -13,8 +13,6 @@ from legs_adapters.tensors.gradients import is_detached, no_grad_around
 from legs_adapters.tensors.operations import ENDS_GRADIENT
 from legs_adapters.terms.findings import Decider
 
-__all__ = ["UNTRAINED", "Evaluation", "Scoring", "Untrained"]
-
 MAX_CALLERS = 8
 
 

@@ -21,8 +21,6 @@ from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.text import Edit, Text
 from legs_adapters.terms.writing import PACKAGE, Writing
 
-__all__ = ["Callbacks", "PassedByName"]
-
 
 @dataclass(frozen=True)
 class PassedByName(Form):

@@ -12,8 +12,6 @@ from legs_adapters.tensors.absolute import absolute_value, is_difference
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 
-__all__ = ["Indirect"]
-
 _DEPTH = 4
 
 

@@ -12,8 +12,6 @@ from legs_adapters.terms.form import Form
 from legs_adapters.terms.text import Edit, Text, on_one_line
 from legs_adapters.terms.writing import PACKAGE, Writing
 
-__all__ = ["Masked"]
-
 
 @dataclass(frozen=True)
 class Masked(Form):

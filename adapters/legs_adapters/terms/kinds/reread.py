@@ -9,8 +9,6 @@ from legs_adapters.terms.form import Form
 from legs_adapters.terms.text import Edit, Text, on_one_line
 from legs_adapters.terms.writing import Writing
 
-__all__ = ["Reread"]
-
 
 @dataclass(frozen=True)
 class Reread(Form):

@@ -15,8 +15,6 @@ from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
 from legs_adapters.terms.writing import PACKAGE, Writing
 
-__all__ = ["Ssim"]
-
 
 @dataclass(frozen=True)
 class Ssim(Form):

@@ -12,8 +12,6 @@ from legs_adapters.code.syntax import constant, every_parameter
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.ssim.forms import FORMS, form_of
 
-__all__ = ["proven_ssim"]
-
 _NO_LITERAL = object()
 
 

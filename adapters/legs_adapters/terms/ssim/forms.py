@@ -19,8 +19,6 @@ import libcst as cst
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 
-__all__ = ["FORMS", "form_of"]
-
 # The hash of a form, and a repository that has it. Each was evaluated on small images of several shapes:
 # it is the mean SSIM with an 11x11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2 and C2 = 0.03^2.
 FORMS: Dict[str, str] = {

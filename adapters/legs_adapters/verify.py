@@ -32,6 +32,7 @@ SECONDS = 1800  # that a run may take
 _THE_SAME = {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 NOT_COPIED = (".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs")
 MAX_COPIED = 64 << 20  # bytes of a file
+_MOST_SAID = 1 << 16  # bytes of a run's stderr, the last ones, that are read
 FIRST_STEP, LATER_STEPS = 1e-5, 1e-3  # relative differences of losses that rounding explains
 
 
@@ -109,9 +110,7 @@ def check_verifiable(
     given: List[str] = []
     if command is not None:
         _, traced, given = parts(root, command)
-        folders = {word: (root / word).resolve() for word in given if (root / word).is_dir()}
-        outside = {word: str(path) for word, path in folders.items() if root not in (path, *path.parents)}
-        given = [outside.get(word, word) for word in given]
+        given = [_for_copies(root, word) for word in given]
         script = script or traced
     script = _script(root) if script is None else script
     if not (root / script).is_file():
@@ -119,6 +118,17 @@ def check_verifiable(
     check_imports(root, script)
     filled(root / script, arguments, given, 1, scene=root, output=root)
     return script, given
+
+
+def _for_copies(root: Path, word: str) -> str:
+    """Return an argument for a copy of the checkout: its own folders relative, others by their whole paths."""
+    option, _, value = word.rpartition("=") if word.startswith("-") else ("", "", word)
+    path = (root / value).resolve()
+    if root in (path, *path.parents):
+        value = str(path.relative_to(root)) if os.path.isabs(value) else value
+    elif path.is_dir():
+        value = str(path)
+    return f"{option}={value}" if option else value
 
 
 def verify(
@@ -237,7 +247,7 @@ def _run(
         streams: Dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": errors, "timeout": SECONDS}
         settings = {**_THE_SAME, **settings}
         code, seen = run_watched(root, work, words, True, photos, {"losses": iterations}, settings=settings, **streams)
-        errors.seek(0)
+        errors.seek(max(0, errors.seek(0, os.SEEK_END) - _MOST_SAID))
         lines = errors.read().decode("utf-8", "replace").replace("\r", "\n").strip().splitlines()
     found = {name: seen[name] for name in Run._fields if name in seen}
     return Run(code=code, error="\n".join(lines[-12:]), **found)

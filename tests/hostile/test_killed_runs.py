@@ -62,6 +62,37 @@ def wait_for(what, seconds=120):
         time.sleep(0.1)
 
 
+def test_a_traced_command_writes_into_the_copies(tmp_path):
+    """Of --verify: a folder of the checkout by its whole path is that of each copy, and not the user's."""
+    from legs_adapters.verify import check_verifiable
+
+    root = checkout(tmp_path / "code", {**files("inria"), "data/a.txt": ""})
+    (tmp_path / "scene").mkdir()
+    (root / "linked").symlink_to(tmp_path / "scene")
+    command = f"train.py -s ../scene --images=../scene -m {root}/out --model_path={root}/new/one data linked {root} x=1"
+    _, given = check_verifiable(root, None, "", command)
+    scene = str(tmp_path / "scene")
+    assert given == ["-s", scene, f"--images={scene}", "-m", "out", "--model_path=new/one", "data", scene, ".", "x=1"]
+
+
+LOUD = "import sys\nfor _ in range(100):\n    sys.stderr.write('x' * 999_999 + '\\n')\nsys.exit('at last')\n"
+
+
+def test_of_100_megabytes_on_stderr_the_end_is_read(tmp_path):
+    import tracemalloc
+
+    from legs_adapters import verify
+
+    root = checkout(tmp_path / "code", {"train.py": LOUD})
+    tracemalloc.start()
+    try:
+        run = verify._run(root, ["train.py"], 1, None, {}, tmp_path)
+        assert tracemalloc.get_traced_memory()[1] < 20 << 20
+    finally:
+        tracemalloc.stop()
+    assert (run.code, run.error[-7:], len(run.error) <= 1 << 16) == (1, "at last", True)
+
+
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="asks /proc which processes run")
 @pytest.mark.slow
 @pytest.mark.parametrize(

@@ -254,7 +254,7 @@ def _points_txt(text: str) -> PointCloud:
 
 def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) -> _Intrinsics:
     if len(params) != MODELS.get(model, len(params)):
-        raise ValueError(f"a camera of model {model} has {len(params)} parameters")
+        raise ValueError(f"a camera of model {model} has {MODELS[model]} parameters, not {len(params)}")
     focal = params[: 2 if model == "PINHOLE" else 1]
     if not (
         0 < width <= _SIDE and 0 < height <= _SIDE and _is_within(params, _LONGEST_FOCAL) and min(focal, default=1) > 0

@@ -145,6 +145,12 @@ class TestModels:
     def test_their_parameters(self):
         assert list(colmap.MODELS.items()) == [(name, len(what.split(", "))) for name, what in self.NAMES.items()]
 
+    def test_what_a_model_needs_is_said(self, tmp_path):
+        root = text_scene(tmp_path)
+        (root / "sparse" / "0" / "cameras.txt").write_text("1 FISHEYE 40 30 50 20 15\n")
+        with pytest.raises(LegsError, match="a camera of model FISHEYE has 4 parameters, not 3"):
+            read_scene(root)
+
     def test_against_pycolmap(self, tmp_path):
         pycolmap = pytest.importorskip("pycolmap", minversion="4.2")
         model = tmp_path / "sparse" / "0"

@@ -114,13 +114,6 @@ def _statistic(call: CallReading) -> Optional[Meaning]:
     return Meaning("feature", call.ask(call.values[0]).role) if is_statistic else None
 
 
-def _behind(call: CallReading) -> Optional[Meaning]:
-    """Channels behind the colours: ``image.narrow(0, 3, 1)``."""
-    of, *axes = [*([] if call.owner is None else [call.owner]), *call.positional, None]
-    is_behind = call.name == "narrow" and of is not None and constant(axes[1] if len(axes) > 2 else None) == 3
-    return Meaning("depth", call.ask(of).role) if is_behind and of is not None else None
-
-
 def _filtered(call: CallReading) -> Optional[Meaning]:
     filters = call.name in ("conv2d", "filter2d", "spatial_gradient") and "stride" not in call.keywords
     return Meaning("gradient", call.ask(call.values[0]).role) if filters and call.values else None
@@ -128,12 +121,23 @@ def _filtered(call: CallReading) -> Optional[Meaning]:
 
 def _moved(call: CallReading) -> Optional[Meaning]:
     """An operation of torch that returns its argument in another shape, type or size."""
+    if picked_from(call.node) == 3:
+        return Meaning("depth", None)
     if call.name in JOINS and call.values:
         return call.ask(call.values[0])
     if call.owner is not None and call.name in (*PICTURE_METHODS, "pop", "popleft", "__getitem__"):
         return call.ask(call.owner)
     is_function = call.owner is None and call.name in PICTURE_FUNCTIONS
     return call.ask(call.values[0]) if is_function and call.values else None
+
+
+def picked_from(call: cst.Call, index: int = 0) -> int:
+    """Return the channel at which a part of a picture begins, ``x.narrow(0, 3, 1)``, ``x.split([3, 1])[1]``; or 0."""
+    given = [constant(arg.value) for arg in call.args]
+    if call_name(call) == "narrow":
+        return given[-2] if isinstance(given[-2], int) else 0
+    sizes = next((each for each in given if isinstance(each, (list, tuple))), ())
+    return sum(each for each in sizes[:index] if isinstance(each, int)) if call_name(call) == "split" else 0
 
 
 def _rendered(call: CallReading) -> Optional[Meaning]:
@@ -207,6 +211,6 @@ def _of_owner(call: CallReading) -> Optional[Meaning]:
 
 
 _SURE: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
-    *(_number, _extreme, _reduced, _statistic, _behind, _filtered, _moved),
+    *(_number, _extreme, _reduced, _statistic, _filtered, _moved),
     *(_rendered, _named),
 )

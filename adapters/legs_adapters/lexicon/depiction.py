@@ -29,7 +29,7 @@ from legs_adapters.code.syntax import (
     walk_expressions,
     words,
 )
-from legs_adapters.lexicon.calls import CallReading, is_of_neighbours, meaning_of_call
+from legs_adapters.lexicon.calls import CallReading, is_of_neighbours, meaning_of_call, picked_from
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import BACKGROUND, COLORS, DATA, KIND_OF, LOSS, RENDER
@@ -121,7 +121,7 @@ class Meanings:
         is_last = isinstance(index, cst.Slice) and index.upper is None and constant(index.lower) == -1
         at = constant(index.value) if isinstance(index, cst.Index) else -1 if is_last else None
         if isinstance(node.value, cst.Call) and isinstance(at, int):
-            return _picked_from(node.value, at) >= 3
+            return picked_from(node.value, at) >= 3
         held = function.flow.value_of(node.value) or node.value  # a list or a batch has whole images: images[-1]
         return at in (3, -1) and isinstance(held, cst.Subscript) and isinstance(key_of(held), str)
 
@@ -203,7 +203,7 @@ class Meanings:
                 return mix(self.meaning(function, row[index].value) for row in rows)
             return Meaning(None, self.meaning(function, value).role)
         given = arguments(value)[0]
-        if _picked_from(value, index) >= 3:
+        if picked_from(value, index) >= 3:
             return Meaning("depth", self.meaning(function, value).role)
         if call_name(value) == "zip" and index < len(given):
             return self.meaning(function, given[index])
@@ -252,17 +252,6 @@ def _table_of(function: Function, node: cst.CSTNode) -> Optional[cst.Dict]:
         return None
     table = function.flow.value_of(node.func.value) if isinstance(node.func, cst.Attribute) else None
     return table if isinstance(table, cst.Dict) else None
-
-
-def _picked_from(call: cst.Call, index: int) -> int:
-    """Return the channel at which a part of a picture begins: the second of ``split([3, 1])`` at the fourth; else 0."""
-    sizes = [constant(arg.value) for arg in call.args]
-    found = next((size for size in sizes if isinstance(size, (list, tuple))), None)
-    return (
-        sum(found[:index])
-        if call_name(call) == "split" and found and all(isinstance(size, int) for size in found)
-        else 0
-    )
 
 
 def _parts(node: cst.CSTNode) -> List[cst.CSTNode]:

@@ -214,12 +214,11 @@ class Purposes:
         """Return whether an optimiser has tensors alone that are made for it, none for each Gaussian."""
         assert isinstance(step[1].func, cst.Attribute)
         leaves = [leaf for given in self._given(step[0], step[1].func.value, step[3]) for leaf in self._leaves(*given)]
-        made = [[leaf] if isinstance(leaf[1], cst.Call) else _made(self.program, *leaf) for leaf in leaves]
-        return (
-            bool(leaves)
-            and all(made)
-            and all(_is_own_tensor(self.program, *each) for several in made for each in several)
-        )
+        values: List[Tuple[Function, Optional[cst.CSTNode]]] = []
+        for leaf in leaves:
+            made = [(where, each.value) for where, each in _definitions(self.program, *leaf)]
+            values += made or [leaf]
+        return bool(leaves) and all(_is_own_tensor(self.program, *value) for value in values)
 
     def _leaves(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[_Value]:
         """Return the parameters in ``[{"params": [a, b]}, c]``, or in a name of such a list."""
@@ -268,11 +267,6 @@ def _definitions(program: Program, function: Function, node: cst.CSTNode) -> Lis
     if owner is not None and isinstance(node, cst.Attribute) and dotted(node.value) == "self":
         return owner.stores(node.attr.value)
     return []
-
-
-def _made(program: Program, function: Function, node: cst.CSTNode) -> List[Tuple[Function, Optional[cst.CSTNode]]]:
-    """Return the values of a name's definitions, each with its function."""
-    return [(where, definition.value) for where, definition in _definitions(program, function, node)]
 
 
 def _optimised(made: Optional[cst.CSTNode]) -> Optional[cst.CSTNode]:

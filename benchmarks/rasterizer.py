@@ -58,9 +58,9 @@ def ours(home, camera, degree):
 
 def project(leaves, camera):
     """Splats, and the bounds of their tiles; the camera stands in the origin."""
-    from legs_loss.lab.conventions import View
+    from legs_loss.lab.conventions import Pinhole
 
-    view = View.from_camera(camera)
+    view = Pinhole.from_camera(camera)
     splats = oracle.project(*(leaf.detach() for leaf in leaves[:3]), view)
     return splats, oracle.tile_bounds(splats.centres, splats.radii, view.tiles)
 

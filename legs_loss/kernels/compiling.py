@@ -93,7 +93,7 @@ def said(command: str, expected: str, functions: Sequence[Any] = ()) -> Iterator
         expected: how long it takes, such as "20 to 60 s".
         functions: the compiled functions that the block calls, for a bar on a terminal.
     """
-    progress = _Progress(command, expected, functions)
+    progress = _Compiling(command, expected, functions)
     try:
         with event.install_listener("numba:compile", progress):
             yield
@@ -101,7 +101,7 @@ def said(command: str, expected: str, functions: Sequence[Any] = ()) -> Iterator
         progress.end()
 
 
-class _Progress(event.Listener):
+class _Compiling(event.Listener):
     def __init__(self, command: str, expected: str, functions: Sequence[Any]) -> None:
         self.command, self.expected, self.functions = command, expected, functions
         self.depth, self.seconds, self.count = 0, 0.0, 0

@@ -33,7 +33,7 @@ SH_C3 = (
 )
 
 
-class View(NamedTuple):
+class Pinhole(NamedTuple):
     """A camera as the rasterizer needs it, in plain numbers."""
 
     width: int
@@ -56,7 +56,7 @@ class View(NamedTuple):
         return GUARD * self.width / (2 * self.fx), GUARD * self.height / (2 * self.fy)
 
     @classmethod
-    def from_camera(cls, camera: Any) -> View:
+    def from_camera(cls, camera: Any) -> Pinhole:
         """Make one of anything with a pinhole camera's attributes (`legs_loss.scenes.Camera`)."""
         world_to_camera = np.ascontiguousarray(camera.world_to_camera, dtype=np.float64)
         rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]

@@ -24,7 +24,7 @@ from legs_loss.lab.conventions import (
     SH_C3,
     SQUARE,
     TILE,
-    View,
+    Pinhole,
 )
 from legs_loss.lab.rasterizer import Rendering
 
@@ -54,7 +54,7 @@ def unit_rotations(quaternions: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
 
-def project(points: Tensor, scales: Tensor, quaternions: Tensor, view: View) -> Projections:
+def project(points: Tensor, scales: Tensor, quaternions: Tensor, view: Pinhole) -> Projections:
     """Project Gaussians by EWA; their centres `points` [N, 3] are in the camera's axes, beyond the near plane."""
     x, y, z = points.unbind(1)
     centres = torch.stack([view.fx * x / z + view.cx - 0.5, view.fy * y / z + view.cy - 0.5], 1)
@@ -175,7 +175,7 @@ def rasterize(
 ) -> Rendering:
     """Draw as the compiled `rasterize`, whose arguments these are, in any floating type; nothing is checked."""
     background = torch.as_tensor(background, dtype=means.dtype)
-    view = View.from_camera(camera)
+    view = Pinhole.from_camera(camera)
     return Rendering(*render(means, scales, quaternions, opacities, sh, view, background, sh_degree, viewspace))
 
 
@@ -185,7 +185,7 @@ def render(
     quaternions: Tensor,
     opacities: Tensor,
     sh: Tensor,
-    view: View,
+    view: Pinhole,
     background: Tensor,
     sh_degree: int,
     viewspace: Optional[Tensor],

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from legs_loss.lab.conventions import MIN_ALPHA as MIN_ALPHA
 from legs_loss.lab.conventions import NEAR as NEAR
-from legs_loss.lab.conventions import View as View
+from legs_loss.lab.conventions import Pinhole as Pinhole
 from legs_loss.lab.gaussians import Gaussians as Gaussians
 from legs_loss.lab.gaussians import rotations as rotations
 from legs_loss.lab.rasterizer.rasterize import Rendering as Rendering
@@ -34,7 +34,7 @@ _NAMES = {
     "drawing": ["Contributions", "Drawn", "Lens", "compensation", "covariance", "draw"],
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
-__all__ = ["MIN_ALPHA", "NEAR", "Gaussians", "Rendering", "View", "rasterize", "rotations", *_HOMES]
+__all__ = ["MIN_ALPHA", "NEAR", "Gaussians", "Rendering", "Pinhole", "rasterize", "rotations", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from legs_loss.kernels.compiling import in_threads
 from legs_loss.kernels.compiling import said as said
-from legs_loss.lab.conventions import SH_C0, View
+from legs_loss.lab.conventions import SH_C0, Pinhole
 from legs_loss.lab.rasterizer import projection, projection_backward, sorting, strips
 from legs_loss.lab.rasterizer.groups import Footprint, GaussianCamera, Parameters, ProjectedGaussians, room
 
@@ -84,7 +84,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 def draw(
     tensors: Tensors,
-    view: View,
+    view: Pinhole,
     background: Tensor,
     degree: int,
     footprint: Footprint = Footprint(),  # noqa: B008 (immutable)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.lab.conventions import DILATION, NEAR, SQUARE, View
+from legs_loss.lab.conventions import DILATION, NEAR, SQUARE, Pinhole
 from legs_loss.lab.gaussians import rotations
 from legs_loss.lab.rasterizer import compiled, contributions, sorting
 from legs_loss.lab.rasterizer.compiled import Clip, Tensors
@@ -53,7 +53,7 @@ class Drawn:
         radii: int32 [N], pixels; 0 for what is not drawn.
     """
 
-    def __init__(self, drawing: compiled.Drawing, tensors: Tensors, view: View) -> None:
+    def __init__(self, drawing: compiled.Drawing, tensors: Tensors, view: Pinhole) -> None:
         self._drawing, self._tensors, self._view = drawing, tensors, view
         self.image: Tensor
         self.radii: Tensor
@@ -143,7 +143,7 @@ class _Scored(torch.autograd.Function):
         return gradient, ctx.drawn.squared_slopes(gradient).to(ctx.kind).reshape(ctx.shape), None
 
 
-def depths(means: Tensor, view: View) -> Tensor:
+def depths(means: Tensor, view: Pinhole) -> Tensor:
     """Return [N]: the depths along the camera's axis."""
     row = torch.from_numpy(view.world_to_camera[2]).to(means.dtype)
     return means @ row[:3] + row[3]
@@ -160,7 +160,7 @@ def full(triangles: Tensor) -> Tensor:
     return triangles[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
-def compensation(means: Tensor, covariances: Tensor, view: View, dilation: float, least: float = LEAST_RATIO) -> Tensor:
+def compensation(means: Tensor, shapes: Tensor, view: Pinhole, dilation: float, least: float = LEAST_RATIO) -> Tensor:
     """Return [N, 1]: how far dilation widened each splat: the root of the determinants' ratio, at least sqrt(least)."""
     to_camera = torch.from_numpy(view.world_to_camera).to(means.dtype)
     points = means @ to_camera[:3, :3].T + to_camera[:3, 3]
@@ -170,7 +170,7 @@ def compensation(means: Tensor, covariances: Tensor, view: View, dilation: float
     rows = (view.fx / z, zero, -view.fx * held[0] / z), (zero, view.fy / z, -view.fy * held[1] / z)
     jacobian = torch.stack([torch.stack(row, 1) for row in rows], 1)
     axes = jacobian @ to_camera[:3, :3]
-    flat = axes @ covariances @ axes.transpose(1, 2)
+    flat = axes @ shapes @ axes.transpose(1, 2)
     a, b, c = flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1]
     ratio = (a * c - b * b) / ((a + dilation) * (c + dilation) - b * b)
     return ratio.clamp_min(least).sqrt()[:, None]
@@ -178,7 +178,7 @@ def compensation(means: Tensor, covariances: Tensor, view: View, dilation: float
 
 def draw(
     tensors: Tensors,
-    view: View,
+    view: Pinhole,
     background: Tensor,
     sh_degree: int,
     lens: Lens = Lens(),  # noqa: B008 (immutable)

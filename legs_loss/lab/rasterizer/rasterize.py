@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.errors import LegsError, require
-from legs_loss.lab.conventions import View
+from legs_loss.lab.conventions import Pinhole
 
 __all__ = ["Rendering", "rasterize"]
 
@@ -119,12 +119,12 @@ def _finite(tensor: Tensor) -> bool:
     return math.isfinite(float(tensor.sum())) or bool(torch.isfinite(tensor).all())
 
 
-def _check_camera(camera: Any) -> View:
+def _check_camera(camera: Any) -> Pinhole:
     matrix = np.asarray(camera.world_to_camera)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise LegsError(f"world_to_camera must be a finite [4, 4] matrix; found shape {list(matrix.shape)}")
     try:
-        view = View.from_camera(camera)
+        view = Pinhole.from_camera(camera)
     except np.linalg.LinAlgError:
         raise LegsError("world_to_camera cannot be inverted: its upper left 3x3 must be a rotation") from None
     if view.width < 1 or view.height < 1 or not (view.fx > 0 and view.fy > 0):

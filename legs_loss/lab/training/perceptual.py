@@ -45,7 +45,7 @@ _NETWORKS = {
 }
 
 
-class LPIPS(NamedTuple):
+class PerceptualDistance(NamedTuple):
     """LPIPS by a network: its name, the weights of its features, and of the linear layers above those that count.
 
     Source: Zhang et al. 2018, version 0.1.
@@ -86,7 +86,7 @@ class LPIPS(NamedTuple):
         return sum((w.to(x) * (x[0] - x[1]).square()).sum(0).mean() for x, w in zip(units, self.linear))
 
 
-_used: Optional[LPIPS] = None
+_used: Optional[PerceptualDistance] = None
 
 
 def use_lpips(weights: Optional[Path]) -> None:
@@ -119,7 +119,7 @@ def lpips(prediction: Tensor, target: Tensor) -> float:
         return float(_used.distance(prediction.float(), target.float()))
 
 
-def _read(path: Path) -> LPIPS:
+def _read(path: Path) -> PerceptualDistance:
     """Return LPIPS by the network of a state dict."""
     try:
         state = torch.load(str(path), map_location="cpu", weights_only=True)  # torch 1.12 refuses the last word
@@ -133,7 +133,7 @@ def _read(path: Path) -> LPIPS:
     found = {name[9:]: value for name, value in state.items() if str(name).startswith("features.")}
     for name in _NETWORKS:
         with suppress(KeyError, AttributeError, RuntimeError, TypeError):  # what it has not, or of other shapes
-            used = LPIPS(name, found, _linear(name))
+            used = PerceptualDistance(name, found, _linear(name))
             used.distance(*torch.zeros(2, 3, 2 * _LEAST, 2 * _LEAST))
             return used
     raise LegsError(f"{path}: these are the weights of another network{_MAKE}")

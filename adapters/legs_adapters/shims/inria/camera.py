@@ -8,14 +8,14 @@ from typing import Any, Optional
 import numpy as np
 
 from legs_adapters.shims.missing import MissingShim
-from legs_loss.lab.rasterizer import View
+from legs_loss.lab.rasterizer import Pinhole
 
 __all__ = ["pinhole"]
 
 TOLERANCE = 1e-3  # pixels, and world units: float32 matrices give a camera's numbers to this precision
 
 
-def pinhole(settings: Any, module: str) -> View:
+def pinhole(settings: Any, module: str) -> Pinhole:
     """Return the camera of a `GaussianRasterizationSettings`.
 
     Its matrices are transposed: points are rows. projmatrix is world to clip space, so that the projection alone is
@@ -36,7 +36,7 @@ def pinhole(settings: Any, module: str) -> View:
         given = np.asarray(campos.detach().cpu().numpy(), np.float64).reshape(-1)[:3]
         if np.abs(centre - given).max() > TOLERANCE * max(1.0, float(np.abs(centre).max())):
             raise MissingShim(module, "GaussianRasterizer", f"campos {given} is not viewmatrix's centre {centre}")
-    return View.from_camera(camera)
+    return Pinhole.from_camera(camera)
 
 
 def matrix(tensor: Any) -> np.ndarray:

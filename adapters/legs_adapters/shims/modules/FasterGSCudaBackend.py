@@ -24,8 +24,8 @@ from legs_loss.lab.rasterizer import (
     NEAR,
     Drawn,
     Lens,
+    Pinhole,
     Tensors,
-    View,
     compensation,
     covariance,
     draw,
@@ -83,7 +83,7 @@ def _draw(function: str, raw: Sequence[Tensor], settings: _Settings) -> _Forward
     # The rasterizer's near plane is fixed: scale the world by the ratio of the two instead.
     size = NEAR / float(settings.near_plane)
     world_to_camera[:3, 3] *= size
-    view = View.from_camera(
+    view = Pinhole.from_camera(
         SimpleNamespace(
             width=settings.width,
             height=settings.height,

@@ -36,26 +36,25 @@ class SceneTask(NamedTuple):
     maps: UserMaps = UserMaps()
 
 
-def find_scenes(given: Sequence[str]) -> List[Path]:
-    """Return the scenes of folders, glob patterns, and .txt files with one of these per line.
+def find_scenes(given: Sequence[str], lists: Sequence[Path] = ()) -> List[Path]:
+    """Return the scenes of folders, glob patterns, and .txt files with one of these per line, each once.
 
     Relative lines of a file are relative to the file. Empty lines and lines that begin with # say nothing.
+
+    Args:
+        given: as a user names them.
+        lists: the files in which these names stand.
 
     Raises:
         LegsError: a pattern or a file means no scene, or a scene is not there.
     """
-    return list(dict.fromkeys(_find(given, ())))
-
-
-def _find(given: Sequence[str], lists: Sequence[Path]) -> List[Path]:
-    """Return the scenes that are named; ``lists`` are the files in which these names stand."""
     found: List[Path] = []
     for one in given:
         path = Path(one)
         if path.suffix == ".txt" and path.is_file():
             if path.resolve() in lists:
                 raise LegsError(f"{path} is a list that names itself")
-            found += _find(_listed(path), [*lists, path.resolve()])
+            found += find_scenes(_listed(path), [*lists, path.resolve()])
         elif path.exists() or not glob.has_magic(one):
             found.append(path)
         else:
@@ -63,7 +62,7 @@ def _find(given: Sequence[str], lists: Sequence[Path]) -> List[Path]:
             if not matches:
                 raise LegsError(f"no folder matches {one}")
             found += matches
-    return found
+    return list(dict.fromkeys(found))
 
 
 def _listed(path: Path) -> List[str]:

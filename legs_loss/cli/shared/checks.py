@@ -6,7 +6,7 @@ import sys
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from typing import Optional, Sequence, Tuple
+from typing import Sequence
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes import View, image_size, training_size
@@ -23,7 +23,9 @@ def check_resolution(resolution: int, views: Sequence[View]) -> None:
     Raises:
         LegsError: no image has this resolution.
     """
-    size = _first_size(views)
+    size = None
+    with suppress(LegsError, OSError, IndexError):
+        size = image_size(views[0].path)
     width, height = training_size(*(size or (1 << 20, 1 << 20)), resolution)
     if size is not None and resolution not in (-1, 1, 2, 4, 8) and width < min(_TINY, size[0]):
         say(
@@ -57,10 +59,3 @@ def check_writable(folder: Path) -> None:
     except OSError as error:
         where = "" if there == folder else f": {there}"
         raise LegsError(f"cannot write to {folder}{where}: {error.strerror or error}") from None
-
-
-def _first_size(views: Sequence[View]) -> Optional[Tuple[int, int]]:
-    for view in views[:1]:
-        with suppress(LegsError, OSError):
-            return image_size(view.path)
-    return None

@@ -1,6 +1,6 @@
 """Train several losses on a scene with several seeds, and report their differences with confidence intervals.
 
-Each training runs in a separate process with one thread. An arm is LOSS[:CHANGE ...][@ARM]. LOSS is a preset
+Trainings run in processes with one thread each. An arm is LOSS[:CHANGE ...][@ARM]. LOSS is a preset
 ("legs"), a curve ("C4"), a beta ("beta=5") or settings of a spec ("curve=C5,beta=4"). CHANGE is one of: {changes}. @ARM
 gives it the number of Gaussians of another arm, densification by densification ("legs@3dgs"). The baseline 3dgs is
 always among the arms, and is checked to be unweighted first. Run the command again with the same --out to resume an

@@ -1,6 +1,6 @@
 """Compute weight maps, train 3dgs, eggs, legs-l and legs side by side on the CPU, and save a table and pictures.
 
-Without SCENE it makes and uses the embedded scene. Each training runs in a separate process with one thread. The table
+Without SCENE it makes and uses the embedded scene. Trainings run in processes with one thread each. The table
 has the number of Gaussians beside PSNR, since more Gaussians are part of the gain.
 """
 

@@ -105,7 +105,7 @@ class Comparison:
         on_progress: Callable[[str, Progress], None],
         scheduler: Optional[str] = None,
     ) -> List[Row]:
-        """Train the rows that are missing, each in a separate process with one thread; return all, seed by seed.
+        """Train the rows that are missing, in processes with one thread each; return all, seed by seed.
 
         With ``scheduler``, the address of a dask scheduler, its workers train them.
 

@@ -43,7 +43,7 @@ def train_side_by_side(
 ) -> Dict[str, Dict[str, Any]]:
     """Train all arms, in order, ``processes`` at a time; return their metrics by name.
 
-    Uses fresh processes, so a script that calls it needs its ``if __name__ == "__main__"``.
+    Starts processes, so a script that calls it needs its ``if __name__ == "__main__"``.
 
     Args:
         arms: the trainings.

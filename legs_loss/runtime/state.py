@@ -63,7 +63,8 @@ class Run:
     def __init__(self, config: Config, memo_bytes: int = DEFAULT_LIMIT) -> None:
         self.config = config
         self.weighted: bool = config.active
-        self.computes: bool = config.store is None and not config.require_masks
+        self._asks = config.store is not None or config.require_masks
+        self.computes: bool = not self._asks
         self.said: bool = False
         self.memo: WeightMemo = WeightMemo(memo_bytes)
         self.stored: Stored = Stored(config, self.say_once)
@@ -96,7 +97,7 @@ class Run:
         if made and self.computes and target.device.type == "cpu":
             counted.computed += count
             return Weights(self.config.spec)
-        if view is None and target.dim() == 3 and self.weighted and (self.computes or not self.has_users_maps()):
+        if view is None and target.dim() == 3 and self.weighted and not (self._asks and self.has_users_maps()):
             found = self._weight(target, None, made)
             return found if isinstance(found, Weights) else Weights(map=found)
         images = [target] if target.dim() == 3 else list(target)

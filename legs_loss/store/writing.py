@@ -68,14 +68,11 @@ class StoreWriter:
             before = {entry.file for entry in entries.values()}
             for entry in dropped:
                 entries.pop(entry.key, None)
-            for entry in staged:
-                # Here, not at the write: only the commit waits for the disk.
-                _sync(self.staging / entry.file)
-                os.replace(str(self.staging / entry.file), str(self.path / entry.file))
-                entries[entry.key] = entry
+            entries.update((entry.key, entry) for entry in staged)
             write_parts(self.staging / MANIFEST, manifest_bytes(entries.values()))
-            _sync(self.staging / MANIFEST)
-            os.replace(str(self.staging / MANIFEST), str(self.path / MANIFEST))
+            for file in [*(entry.file for entry in staged), MANIFEST]:
+                _sync(self.staging / file)  # here, not at the write: only the commit waits for the disk
+                os.replace(str(self.staging / file), str(self.path / file))
             if os.name == "posix":  # elsewhere a folder cannot be opened
                 _sync(self.path)
             for file in before - {entry.file for entry in entries.values()}:
@@ -89,11 +86,8 @@ class StoreWriter:
     def _locked(self) -> Iterator[None]:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(self.path / LOCK)
-            try:
+            with FileLock(self.path / LOCK):
                 yield
-            finally:
-                lock.release()
         except OSError as error:
             raise LegsError(f"cannot write to {self.path}: {error.strerror or error}") from None
 

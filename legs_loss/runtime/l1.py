@@ -20,7 +20,7 @@ from legs_loss.kernels.contract import L1
 from legs_loss.loss import mean_error
 from legs_loss.runtime import state
 from legs_loss.runtime.own import check_own
-from legs_loss.runtime.state import View, current_run, spec_to_compile, thread
+from legs_loss.runtime.state import ViewName, current_run, spec_to_compile, thread
 from legs_loss.weights import Weights
 
 __all__ = ["l1_loss", "unweighted"]
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 def l1_loss(
     prediction: Tensor,
     target: Tensor,
-    view: View = None,
+    view: ViewName = None,
     mask: Optional[Tensor] = None,
     channels_last: Optional[bool] = None,
     reduction: str = "mean",

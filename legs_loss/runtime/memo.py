@@ -53,7 +53,7 @@ class WeightMemo:
     def __init__(self, limit: int = DEFAULT_LIMIT) -> None:
         self.limit = limit
         self.bytes: int = 0
-        self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
+        self._entries: OrderedDict[Hashable, _Kept] = OrderedDict()
         self._lock = threading.RLock()
 
     def __len__(self) -> int:
@@ -82,7 +82,7 @@ class WeightMemo:
         with self._lock:
             self._drop(key)
             if self._make_room(size):
-                self._entries[key] = _Entry(value, size, self._owner(target, key))
+                self._entries[key] = _Kept(value, size, self._owner(target, key))
                 self.bytes += size
         return value
 
@@ -122,8 +122,8 @@ def _size(value: object) -> int:
 
 
 @dataclass
-class _Entry:
-    """An entry of the memo; a large map of the CPU is kept as bytes in pages of their own, with its type and shape.
+class _Kept:
+    """A value of the memo; a large map of the CPU is kept as bytes in pages of their own, with its type and shape.
 
     A tensor that stays on the heap is surrounded by the temporaries of its computation, which fragments the heap: a
     memo of such tensors took twice the memory that it counted.

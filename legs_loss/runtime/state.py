@@ -43,7 +43,7 @@ _NOT_IN_A_GRAPH = (
     "torch.func and forward-mode AD cannot look: leave the loss out of them, or name a store without (LEGS_STORE)"
 )
 
-View = Union[str, int, Sequence[Union[str, int]], None]
+ViewName = Union[str, int, Sequence[Union[str, int]], None]
 
 
 class Run:
@@ -81,7 +81,7 @@ class Run:
         """Return whether the store has masks or weights of the user's, which hold for every preset."""
         return self.stored.has(MASK, WEIGHTS)
 
-    def weights(self, target: Tensor, view: View, made: bool) -> Weights:
+    def weights(self, target: Tensor, view: ViewName, made: bool) -> Weights:
         """Return the weights of a target [C, H, W] or [B, C, H, W], with the user's own, and count their sources.
 
         Args:

@@ -128,6 +128,7 @@ class Meanings:
     def _keys(self, function: Function, index: cst.CSTNode) -> List[str]:
         """Return the kinds of pictures that an index takes: in a loop over a literal, or by its function's calls."""
         found: List[cst.CSTNode] = []
+        stored: List[object] = []
         for made in function.flow.reaching(index.value) if isinstance(index, cst.Index) else ():
             calls = self.training.sites.get(function, ()) if made.kind == "parameter" else ()
             found += [given for given in (function.given(call, made.place) for _, call in calls) if given is not None]
@@ -136,7 +137,8 @@ class Meanings:
                 table for part in looped for table in function.flow.assigned(part) if isinstance(table, _LITERALS)
             ]
             found += [*looped, *(part for table in tables for part in walk_expressions(table))]
-        keys = [constant(each) for each in found if isinstance(each, cst.SimpleString)]
+            stored += [made.key for part in looped for made in function.flow.reaching(part) if made.kind == "store"]
+        keys = [*stored, *(constant(each) for each in found if isinstance(each, cst.SimpleString))]
         return [key for key in keys if isinstance(key, str) and kind_of_words(key) is not None]
 
     def _member(self, function: Function, node: cst.Attribute | cst.Subscript, name: str) -> Meaning:

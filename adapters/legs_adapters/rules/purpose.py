@@ -173,7 +173,8 @@ class Purposes:
         name = set(words(optimiser.attr.value)) if isinstance(optimiser, cst.Attribute) else set()
         found = said | (name if name & POSES else words_in(optimiser))  # gaussians.optimizer_cam moves cameras
         for where, given in self._given(function, optimiser, makers):
-            found |= set().union(*map(_named_in, [given, *where.flow.assigned(given)]))
+            leaves = [leaf for _, leaf in self._leaves(where, given)]
+            found |= set().union(*map(_named_in, [given, *where.flow.assigned(given), *leaves]))
         return found - PLUMBING
 
     def _given(
@@ -238,7 +239,7 @@ class Purposes:
                 return [leaf for several in lists for leaf in self._leaves(*several, depth + 1)]
         elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) == "values":
             table = function.flow.value_of(node.func.value)
-            entries = [each.value for each in table.elements] if isinstance(table, cst.Dict) else []
+            entries = [each for each in _entries(table) if each is not None]
         elif isinstance(node, cst.Call) and call_name(node) == "list":
             entries = [arg.value for arg in node.args]
         if not entries or depth > _DEPTH:

@@ -156,8 +156,8 @@ class Verdicts:
         if not isinstance(made, cst.Call) or call_name(made) in KEEPS_PICTURES:
             return None
         root = list(attribute_chain(made.func))[-1]
-        if DATA & words_in(root):
-            return None  # a camera's own method
+        if (DATA | {"self"}) & words_in(root):
+            return None  # a camera's own method, or an inherited one
         kinds = {found.kind for found in function.flow.reaching(root)}
         if not kinds or kinds & {"import", "function", "class"} or self.analysis.program.resolve(function, made.func):
             return None

@@ -35,7 +35,7 @@ class NotSplats(Rule):
         return term.here if of_rays(term.form) and not term.has_rows else []  # pixels of an image, by that name
 
     def may_be_loss(self, term: Term) -> bool:
-        return True
+        return not _ray_method(term)
 
 
 @functools.lru_cache(maxsize=8)

@@ -104,7 +104,9 @@ class Verdicts:
         """Return the warning of a skipped term that may be the loss, if nothing else is found; None of any other."""
         term = Term(self.analysis, function, form)
         rule = RULES.get(left.rule)
-        if rule is None or is_of_other_framework(function.module.text):
+        text = function.module.text
+        is_numpy = form.callee is None and "numpy" in text and "torch" not in text
+        if rule is None or is_numpy or is_of_other_framework(text):
             return None
         if not rule.may_be_loss(term) or is_measured(function, form) or same_root(form):
             return None

@@ -29,7 +29,7 @@ class _Uses:
         numbers: List[cst.CSTNode] = []
         for part in walk_expressions(function.body):
             if isinstance(part, cst.Comparison):
-                compared.append(part.left)
+                compared += [part.left, *(each.comparator for each in part.comparisons)]
             elif isinstance(part, cst.BinaryOperation) and isinstance(part.operator, cst.Power):
                 changed.append(part.left)
             elif isinstance(part, cst.Attribute) and part.attr.value in SIZES:
@@ -98,5 +98,8 @@ def _averaged(value: Optional[cst.CSTNode]) -> Iterable[cst.CSTNode]:
 
 
 def is_measured(function: Function, form: Form) -> bool:
-    """Return whether a term is only a number: ``error.mean().item()``, or compared, ``abs(height - wanted) > 0.1``."""
-    return id(form.node) in _uses(function).numbers
+    """Return whether a term is only a number, ``error.mean().item()``, or compared, ``abs(height - wanted) > 0.1``."""
+    uses = _uses(function)
+    made = uses.made.get(id(form.node))
+    reads = uses.reads_of(made) if made is not None else []
+    return id(form.node) in uses.numbers or (bool(reads) and uses.numbers.issuperset(map(id, reads)))

@@ -12,6 +12,7 @@ from legs_adapters.lexicon.words import LOSS, REPORTING, SCORING
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.tensors.gradients import is_detached, no_grad_around
 from legs_adapters.tensors.operations import ENDS_GRADIENT
+from legs_adapters.terms.error_maps import is_measured
 from legs_adapters.terms.findings import Decider
 
 MAX_CALLERS = 8
@@ -89,23 +90,21 @@ def _is_untrained(term: Term) -> bool:
     sites = training.sites.get(term.function, [])  # a caller may drop its gradient: an error map for the next mask
     without = bool(sites) and all(no_grad_around(caller, call) for caller, call in sites)
     without = without or no_grad_around(term.function, form.call, form.node) is not None or is_detached(term.prediction)
-    return without or not trained
+    return without or not trained or is_measured(term.function, form)
 
 
 def _may_run(program: Program, function: Function, depth: int) -> bool:
     """Return whether something names a function, and is no function that nothing names."""
     if function.owner is not None or function.decorators or not function.name or depth == 0:
         return True
-    others = [each for each in program.mentioning(function.name) if each is not function]
-    naming = [each for each in others if each.module.spend(each.flow.steps) and _names(each, function.name)]
-    return any(_may_run(program, each, depth - 1) for each in naming)
+    others = (each for each in program.mentioning(function.name) if each is not function)
+    return any(_names(each, function.name) and _may_run(program, each, depth - 1) for each in others)
 
 
 def _names(function: Function, name: str) -> bool:
     """Return whether a function, or the top level of a file, reads, calls or imports a name."""
-    flow = function.flow
-    is_imported = any(name in code(node) for node in flow.imports)
-    return is_imported or name in {*(read.value for read in flow.reads), *map(call_name, flow.calls)}
+    flow, said = function.flow, [code(node) for node in function.flow.imports]
+    return any(name in each for each in said) or name in {*map(call_name, flow.calls), *(r.value for r in flow.reads)}
 
 
 def _is_called_by_framework(term: Term) -> bool:

@@ -184,7 +184,9 @@ def _patch(args: argparse.Namespace) -> int:
         _quote(problems, "error")
         for line in instead:
             say(f"legs-patch: {line}", sys.stderr)
-        say("legs-patch: nothing was changed: --site FILE:LINE takes your word, --exclude leaves files out", sys.stderr)
+        ways = ["--site FILE:LINE takes your word", "--exclude leaves files out"]
+        ways = ways if args.trace else ['--trace "train.py ARGUMENTS" decides by a few steps', *ways]
+        say(f"legs-patch: nothing was changed: {', '.join(ways)}", sys.stderr)
         return 2
     if writes:
         found = found._replace(settings=text)

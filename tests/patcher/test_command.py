@@ -148,7 +148,7 @@ class TestCommandLine:
         done = run(root)
         assert done.returncode == 2
         assert "legs-patch: error: " in done.stderr
-        assert "nothing was changed: --site FILE:LINE" in done.stderr
+        assert 'nothing was changed: --trace "train.py ARGUMENTS" decides' in done.stderr
         assert snapshot(root) == before
 
     def test_a_line_that_the_user_names_is_rewritten_or_told_what_to_write(self, tmp_path, run):

@@ -6,6 +6,7 @@ import functools
 import re
 from typing import List
 
+from legs_adapters.lexicon.words import RAYS
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import of_rays
@@ -35,7 +36,7 @@ class NotSplats(Rule):
         return term.here if of_rays(term.form) and not term.has_rows else []  # pixels of an image, by that name
 
     def may_be_loss(self, term: Term) -> bool:
-        return not _ray_method(term)
+        return RAYS.search(term.function.module.text) is None
 
 
 @functools.lru_cache(maxsize=8)

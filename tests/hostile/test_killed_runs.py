@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("libcst")
 pytest.importorskip("numba")
 
+from legs_loss import LegsError
 from tests.patcher.support import checkout, files, snapshot
 from tests.support import legs_command, legs_environment
 
@@ -73,6 +74,14 @@ def test_a_traced_command_writes_into_the_copies(tmp_path):
     _, given = check_verifiable(root, None, "", command)
     scene = str(tmp_path / "scene")
     assert given == ["-s", scene, f"--images={scene}", "-m", "out", "--model_path=new/one", "data", scene, ".", "x=1"]
+
+
+def test_a_script_that_leaves_no_report(tmp_path):
+    from legs_adapters.trace.running import trace
+
+    root = checkout(tmp_path / "code", {"train.py": "import os\nos._exit(0)\n"})
+    with pytest.raises(LegsError, match=r"by os\._exit, exec or a kill: no backward passes seen"):
+        trace(root, "train.py", 5)
 
 
 LOUD = "import sys\nfor _ in range(100):\n    sys.stderr.write('x' * 999_999 + '\\n')\nsys.exit('at last')\n"

@@ -21,7 +21,8 @@ from legs_loss.system import FileLock, say
 _SETTINGS = {  # no bytecode is written into the checkout; torch.compile and TorchScript cannot be watched
     "PYTHONDONTWRITEBYTECODE": "1", "TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0",
 }  # fmt: skip
-_NOTHING: Dict[str, Any] = {"terms": [], "steps": 0, "backward_passes": 0, "unseen": [], "scripted": []}
+_NOTHING: Dict[str, Any] = {"terms": [], "steps": 0, "unseen": [], "scripted": []}
+_NOTHING["backward_passes"] = "by os._exit, exec or a kill: no"
 
 
 def trace(root: Path, command: str, steps: int, cpu: bool = False, photos: Optional[str] = None) -> Trace:

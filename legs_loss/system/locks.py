@@ -46,7 +46,8 @@ class FileLock:
         note: str = "",
         remove: bool = False,
     ) -> None:
-        self._path, self._remove, self.is_certain = os.fspath(path), remove, True
+        self._path, self._remove = os.fspath(path), remove
+        self.is_certain: bool = True
         until = None if wait is None else time.monotonic() + wait
         while True:
             self._descriptor = _open(self._path)

@@ -27,6 +27,7 @@ from legs_loss.store import (
     StoreWriter,
     WeightStore,
     fingerprint,
+    maps,
     read_map,
     stage,
 )
@@ -135,6 +136,17 @@ class TestNames:
         assert sorted(path.name for path in tmp_path.iterdir()) == ["s"]
         assert store.check() == ([], [])
         assert {entry.view for entry in store.entries.values()} == set(names)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 4), (3361, 5000), (123456, 1048576)])
+def test_a_map_begins_as_numpy_writes_it(tmp_path, shape):
+    entry = replace(BLANK, height=shape[0], width=shape[1], view="a.png")
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f2", "fortran_order": False, "shape": shape})
+    assert maps._head(entry) == file.getvalue()
+    if shape[0] * shape[1] < 100:
+        staged = stage(tmp_path, entry, ramp(entry))
+        assert np.array_equal(np.load(tmp_path / staged.file), ramp(entry).astype("f2"))
 
 
 class TestDamage:

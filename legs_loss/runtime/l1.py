@@ -148,6 +148,7 @@ def _by_torch(
     # |F + W * (U - F) - F| = W * |U - F|: any L1 of the difference becomes the weighted one, and masks that the
     # codebase makes from the target stay as they are.
     check_own(own, layout.restored(target))
+    own = own if is_compiling() else unweighted(own)  # it may be weighted itself
     return own(layout.restored(target + error), layout.restored(target))
 
 

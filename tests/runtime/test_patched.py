@@ -146,6 +146,11 @@ class TestOwn:
         with torch.no_grad():  # nothing is weighted
             assert torch.equal(l1_loss(prediction, target, own=NO_L1[name]), NO_L1[name](prediction, target))
 
+    def test_one_that_is_weighted_itself_is_weighted_once(self):
+        prediction, target = pair(3, 7, 6)
+        found = l1_loss(prediction, target, own=lambda a, b: l1_loss(a, b))
+        assert torch.allclose(found, l1_loss(prediction, target), rtol=1e-5)
+
     def test_how_much_it_grows_is_said(self):
         with pytest.raises(LegsError, match="gives 65,536 times the loss"):  # 256 squared
             l1_loss(*pair(3, 7, 6), own=F.mse_loss)

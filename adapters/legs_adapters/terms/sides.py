@@ -8,13 +8,13 @@ from typing import List, NamedTuple, Sequence
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import call_name, code, constant, key_of, same, walk_expressions, words
+from legs_adapters.code.syntax import attribute_chain, call_name, code, constant, key_of, same, walk_expressions, words
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.masks import is_mask
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.ways import PHOTOGRAPH, RENDERING, Ways
-from legs_adapters.lexicon.words import OF_RAYS
+from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
 from legs_adapters.tensors.absolute import is_no_picture
 from legs_adapters.tensors.operations import MODULES
 from legs_adapters.terms.form import Form
@@ -95,6 +95,14 @@ def is_of_numbers(function: Function, side: cst.CSTNode) -> bool:
 def of_rays(form: Form) -> bool:
     """Return whether the names are about rays or a radiance field: lists of colours."""
     return any(OF_RAYS.search(code(node)) for node in (form.first, form.second))
+
+
+def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
+    """Return whether an SSIM is given the same two, perhaps with another axis: they are images by any name."""
+    calls = [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
+    given = [[part for arg in call.args for part in attribute_chain(arg.value)] for call in calls]
+    goes_on = function.module.spend(len(function.flow.calls) + sum(map(len, given)))
+    return goes_on and any(all(any(same(part, side) for part in parts) for side in (first, second)) for parts in given)
 
 
 def is_role(node: cst.CSTNode) -> bool:

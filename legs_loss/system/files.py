@@ -5,12 +5,13 @@ from __future__ import annotations
 import codecs
 import contextlib
 import errno
+import functools
 import os
 import re
 import secrets
 import stat
 import time
-from typing import BinaryIO, Callable, Optional, Union
+from typing import BinaryIO, Callable, List, Optional, Union
 
 from legs_loss.errors import LegsError
 
@@ -127,12 +128,19 @@ def write_whole(
 
 def _sweep(name: str) -> None:
     """Remove what killed writers of a file left, by its age: a younger one may be of a writer that lives."""
-    folder, base = os.path.split(name)
-    pattern = re.compile(re.escape(base) + r"\.[0-9a-f]{8}\.part")
-    with contextlib.suppress(OSError), os.scandir(folder or ".") as entries:
-        for entry in entries:
-            if not pattern.fullmatch(entry.name):
-                continue
+    folder, base = os.path.split(os.path.abspath(name))
+    for part in _parts(folder):
+        if part[: -len(".01234567.part")] == base:
+            path = os.path.join(folder, part)
             with contextlib.suppress(OSError):  # another may have removed it meanwhile
-                if time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED:
-                    os.unlink(entry.path)
+                if time.time() - os.lstat(path).st_mtime > _ABANDONED:
+                    os.unlink(path)
+
+
+@functools.lru_cache(maxsize=None)
+def _parts(folder: str) -> List[str]:
+    """List what writers left in a folder, once a process: it may get 100,000 files from it."""
+    try:
+        return [name for name in os.listdir(folder) if re.search(r"\.[0-9a-f]{8}\.part$", name)]
+    except OSError:
+        return []

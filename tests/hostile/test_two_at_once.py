@@ -664,6 +664,14 @@ def test_what_a_killed_writer_left_goes_after_an_hour(tmp_path):
     assert (path.read_bytes(), path.stat().st_mode & 0o777) == (b"whole", 0o666 & ~umask())
 
 
+def test_a_folder_is_listed_once_however_many_files_it_gets(tmp_path, monkeypatch):
+    listed, real = [], os.listdir
+    monkeypatch.setattr(os, "listdir", lambda folder: listed.append(folder) or real(folder))
+    for number in range(20):
+        write_whole(tmp_path / f"{number}.png", b"a mask")
+    assert listed == [str(tmp_path)]
+
+
 def umask():
     old = os.umask(0)
     os.umask(old)

@@ -84,7 +84,7 @@ class TestTraining:
     def test_the_compiled_rasterizer_trains_on_the_whole_scene(self, tmp_path):
         scene = write_embedded_scene(tmp_path / "scene", views=6, width=96, height=72, points=1500, samples=1)
         root = checkout(tmp_path / "checkout", files("runnable_train_script_weighted"))
-        train = ("train.py", "-s", scene, "--backend", "numba", "--iterations", "60", "--points", "1500")
+        train = ("train.py", "-s", scene, "--iterations", "60", "--points", "1500")
         plain = result(python(*train, cwd=root))["losses"]
         weighted = result(python("-m", "legs_loss", "run", *train, cwd=root))["losses"]
         assert float.fromhex(weighted[-1]) < 0.85 * float.fromhex(weighted[0])

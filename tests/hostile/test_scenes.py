@@ -78,7 +78,7 @@ TEXT = [
     ("cameras", "1 PINHOLE 40 30 0 51 20 15", "with parameters"),
     ("cameras", "1 PINHOLE 40 30 -50 51 20 15", "with parameters"),
     ("cameras", "1 PINHOLE 40 30 nan 51 20 15", "with parameters"),
-    ("cameras", "1 PINHOLE 40 30 50 51 20", "has 3 parameters"),
+    ("cameras", "1 PINHOLE 40 30 50 51 20", "has 4 parameters, not 3"),
     ("cameras", "1 SIMPLE_RADIAL 40 30 -50 20 15 0", "with parameters"),
     ("cameras", f"1 PINHOLE {'9' * 400} 30 50 51 20 15", "a camera of 999"),
     ("cameras", f"1 PINHOLE {'9' * 5000} 30 50 51 20 15", "cameras.txt is not as COLMAP writes it|a camera of 999"),

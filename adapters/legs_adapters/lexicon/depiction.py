@@ -117,6 +117,8 @@ class Meanings:
 
     def _is_behind(self, function: Function, node: cst.Subscript) -> bool:
         """Return whether one channel behind the colours is taken: ``x[3]``, ``x[-1:]``, ``x.split([3, 1])[1]``."""
+        if len(node.slice) > 1 and isinstance(node.slice[-1].slice, cst.Slice) and _cut(node) == (-1, None):
+            return self.meaning(function, node.value) != UNKNOWN  # no last sample of a ray: ends[..., -1:, 0]
         index = node.slice[0].slice if len(node.slice) == 1 else None
         is_last = isinstance(index, cst.Slice) and index.upper is None and constant(index.lower) == -1
         at = constant(index.value) if isinstance(index, cst.Index) else -1 if is_last else None
@@ -271,15 +273,19 @@ def _parts(node: cst.CSTNode) -> List[cst.CSTNode]:
     return [node.expression] if isinstance(node, cst.UnaryOperation) else []
 
 
-def _is_fourth(node: cst.Subscript) -> bool:
-    """Return whether it is what lies behind the colours."""
+def _cut(node: cst.Subscript) -> Tuple[object, object]:
+    """Return where the one cut of a tensor begins and ends; of a block of a matrix, or none, what no channel has."""
     parts = [each.slice for each in node.slice]
     cuts = [cut for cut in parts if isinstance(cut, cst.Slice) and code(cut) != ":"]
-    start, end = (constant(cuts[0].lower), cuts[0].upper) if len(cuts) == 1 else (None, None)  # no block of a matrix
-    last = parts[-1] if len(parts) > 1 else None
+    return (constant(cuts[0].lower), cuts[0].upper and constant(cuts[0].upper, 0)) if len(cuts) == 1 else (None, None)
+
+
+def _is_fourth(node: cst.Subscript) -> bool:
+    """Return whether it is what lies behind the colours."""
+    start, end = _cut(node)
+    last = node.slice[-1].slice if len(node.slice) > 1 else None
     is_one = isinstance(last, cst.Index) and constant(last.value) == 3
-    is_last = start == -1 and end is None and len(parts) > 1
-    return is_one or is_last or (start == 3 and (end is None or constant(end, 0) > 3))  # no border: 3:-3
+    return is_one or (start == 3 and (end is None or (isinstance(end, int) and end > 3)))  # no border: 3:-3
 
 
 def _is_opacity(part: cst.CSTNode, node: cst.BinaryOperation | cst.BooleanOperation) -> bool:

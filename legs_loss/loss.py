@@ -58,10 +58,9 @@ def weighted_l1(
     layout, first, second = read_pair(prediction, target, channels_last)
     weights = Weights().times(layout.map_first(weight, target, "weight"))
     weights = weights.masked(layout.map_first(mask, target, "mask"), renormalise)
+    loss = torch.abs(prediction - target).mean() if weights.map is None else mean_error(first, second, weights)
     _note(first, second, Weights(), "" if weight is None else "the map given to weighted_l1")
-    if weights.map is None:
-        return torch.abs(prediction - target).mean()
-    return mean_error(first, second, weights)
+    return loss
 
 
 def mean_error(prediction: Tensor, target: Tensor, weights: Weights) -> Tensor:
@@ -148,18 +147,17 @@ def total_loss(
         made: in words, for the first step's line, where a map comes from or who makes the weights of a spec; empty
             where there are none.
     """
-    if lambda_dssim < 1.0:  # else there is no L1
-        _note(prediction, target, weights, made)
     seen = weights.hidden(prediction, target) if weights.seen is not None else prediction
     loss = fused(plan, seen, target, weights)
-    if loss is not None:
-        return loss
-    photometric = mean_error(prediction, target, weights.with_map(target))
-    if lambda_dssim == 0.0:
-        return photometric
-    structural = d_ssim(seen, target, padding, False)
-    structural = weights.of_what_counts(structural, WINDOW_SIZE // 2 if padding == "valid" else 0)
-    return (1.0 - lambda_dssim) * photometric + lambda_dssim * structural
+    if loss is None:
+        loss = mean_error(prediction, target, weights.with_map(target))
+        if lambda_dssim > 0.0:
+            structural = d_ssim(seen, target, padding, False)
+            structural = weights.of_what_counts(structural, WINDOW_SIZE // 2 if padding == "valid" else 0)
+            loss = (1.0 - lambda_dssim) * loss + lambda_dssim * structural
+    if lambda_dssim < 1.0:  # else there is no L1
+        _note(prediction, target, weights, made)
+    return loss
 
 
 def _note(prediction: Tensor, target: Tensor, weights: Weights, made: str) -> None:

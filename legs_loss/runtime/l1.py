@@ -85,23 +85,26 @@ def l1_loss(
     trains = (prediction.requires_grad and torch.is_grad_enabled()) or is_trained(prediction)
     run = None if thread.unweighted or not (trains or is_trained(target)) else current_run()
     if run is None or not (run.weighted or run.active):
+        loss = _by_torch(prediction, target, Weights(), *given)
         counted.plain += 1
         counted.plain_steps += trains
         if run is not None:
             run.say_what_is_used()
-        return _by_torch(prediction, target, Weights(), *given)
+        return loss
     if not trains:
         check_order(prediction, target)
     spec, mean = run.config.spec, own is None and reduction == "mean"
     plan, image, photograph = plan_of(L1 if mean else None, spec, prediction, target, channels_last)
-    counted.weighted += torch.is_grad_enabled()  # the second pass of a checkpoint counts, not the first
     weights = masked = run.weights(photograph, view, plan.makes)
     if mask is not None:
         masked = weights.masked(plan.layout.map_first(mask, photograph, "mask"), renormalise=False)
     loss = fused(plan, image, photograph, masked) if mean else None
+    if loss is None:
+        loss = _by_torch(prediction, target, weights, *given)
+    counted.weighted += torch.is_grad_enabled()  # the second pass of a checkpoint counts, not the first
     if not run.said:
         run.say_what_is_used()
-    return _by_torch(prediction, target, weights, *given) if loss is None else loss
+    return loss
 
 
 def _compiled_weights(prediction: Tensor, target: Tensor) -> Weights:

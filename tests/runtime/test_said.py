@@ -113,6 +113,28 @@ class TestALineAtEachEnd:
         last = f"{steps} step(s) weighted, 0 plain with a gradient" if steps else plain
         assert said(TRAIN.format(loss=loss), tmp_path) == [f"legs-loss: {first}", f"legs-loss: {last}"]
 
+    def test_a_step_that_is_refused_is_none(self, tmp_path):
+        refused = [
+            "legs_loss.l1_loss(image, target, own=lambda a, b: ((a - b) ** 2).mean())",
+            "legs_loss.l1_loss(image, target / 0)",
+            "legs_loss.l1_loss(image, target, reduction='none', mask=torch.ones(2, 2))",
+            "legs_loss.unweighted(legs_loss.l1_loss)(image, target[:2])",
+            "legs_loss.legs_loss(image, target / 0)",
+            "legs_loss.LEGSLoss(padding='none')(image, target)",
+            "legs_loss.weighted_l1(image, target[:2], torch.ones(9, 8))",
+        ]
+        attempt = (
+            "    try:\n        {}\n        print('not refused')\n    except (ValueError, RuntimeError):\n        pass\n"
+        )
+        tries = "".join(map(attempt.format, refused))
+        code = TRAIN.format(loss="(image - target).abs().mean()").replace(
+            "    loss.backward()", f"{tries}    loss.backward()"
+        )
+        assert said(code, tmp_path) == ["legs-loss: no L1 was weighted in this run"]
+        last = "legs-loss: 3 step(s) weighted, 0 plain with a gradient"
+        weighted = code.replace("(image - target).abs().mean()\n", "legs_loss.l1_loss(image, target)\n", 1)
+        assert said(weighted, tmp_path) == [f"legs-loss: {ACTIVE}defaults", last]
+
     def test_of_a_training_that_calls_none_and_of_an_evaluation(self, tmp_path):
         code = TRAIN.format(loss="(image - target).abs().mean()")
         assert said(code, tmp_path) == ["legs-loss: no L1 was weighted in this run"]

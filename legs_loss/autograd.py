@@ -11,8 +11,6 @@ from torch.autograd import forward_ad
 
 from legs_loss.errors import LegsError
 
-__all__ = ["check_order", "is_compiling", "is_trained", "is_transformed", "is_wrapped"]
-
 
 def _never(*_: object) -> bool:
     return False

@@ -14,8 +14,6 @@ from typing import Any, Dict, List, Mapping, Optional, Tuple
 from legs_loss.errors import LegsError, did_you_mean
 from legs_loss.spec import PRESETS, WeightSpec, as_spec
 
-__all__ = ["CONFIG_FILE", "STORE_FOLDER", "Config", "find_config", "is_off"]
-
 CONFIG_FILE = "legs.toml"
 STORE_FOLDER = "legs_weights"
 _DEFAULTS = "defaults"

@@ -9,8 +9,6 @@ from typing import Set
 
 from legs_loss.system import is_first_process, say
 
-__all__ = ["Counts", "counted", "note_graph", "reset_counts", "said", "say_first"]
-
 
 @dataclass
 class Counts:

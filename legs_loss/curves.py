@@ -13,8 +13,6 @@ from legs_loss.errors import LegsError, did_you_mean
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["FORMULAS", "Curve", "curve", "curve_names", "register_curve"]
-
 Curve = Callable[["Tensor"], "Tensor"]
 
 # The curves, each written once: torch's function, numba's and CUDA's code are made from it. A formula has numbers,

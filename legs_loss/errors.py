@@ -6,8 +6,6 @@ import difflib
 import importlib
 from typing import Iterable
 
-__all__ = ["LegsError", "did_you_mean", "require"]
-
 
 class LegsError(ValueError):
     """Invalid input: the message says what is wrong, where, and what to do; further arguments are quoted lines."""

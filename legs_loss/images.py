@@ -9,8 +9,6 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 
-__all__ = ["Layout", "check_values", "read_layout", "read_pair", "shape_of"]
-
 # A rendering may overshoot 1 and an HDR photograph may exceed it; 8-bit values are far larger.
 _SURELY_NOT_UNIT_RANGE = 16.0
 _CHANNELS = (1, 3, 4)  # of a photograph: gray, colour, colour and alpha; a rendering may have any number

@@ -18,8 +18,6 @@ from legs_loss.similarity import WINDOW_SIZE, d_ssim
 from legs_loss.spec import PRESETS, Spec, as_spec
 from legs_loss.weights import Weights
 
-__all__ = ["legs_loss", "mean_error", "total_loss", "weighted_l1", "whole"]
-
 
 def weighted_l1(
     prediction: Tensor,

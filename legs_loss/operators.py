@@ -9,8 +9,6 @@ from typing import Dict, NamedTuple, Tuple
 
 from legs_loss.errors import LegsError, did_you_mean
 
-__all__ = ["NORMS", "OPERATORS", "Operator", "Stencil", "check_operator", "gradient"]
-
 # Rows of weights, an odd number of rows and as many columns. A stencil is even (it equals its own mirror images, as a
 # second derivative does) or odd in one direction (a first derivative). Its centre is minus the sum of all others, so
 # that its response to a constant image is 0.

@@ -31,10 +31,6 @@ from legs_loss.images import read_layout
 from legs_loss.operators import OPERATORS, Operator, Stencil, check_operator
 from legs_loss.spec import WeightSpec
 
-__all__ = ["NEEDS_LEVELS", "gaussian_blur", "levels_of", "normalise_response", "over_scene", "percentile", "response",
-           "response_levels", "scene_levels"]  # fmt: skip
-
-
 NEEDS_LEVELS = (
     "weights that are normalised over the scene need the levels of all its views, which {where}: run legs precompute "
     "SCENE --preset legs-robust, with the training's -r, {then}; or take a preset for single images, such as legs"

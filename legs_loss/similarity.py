@@ -13,8 +13,6 @@ from legs_loss.autograd import is_compiling, is_transformed
 from legs_loss.errors import LegsError
 from legs_loss.images import read_pair, shape_of
 
-__all__ = ["CONTRAST_CONSTANT", "LUMINANCE_CONSTANT", "SIGMA", "WINDOW_SIZE", "d_ssim", "ssim_map"]
-
 WINDOW_SIZE = 11
 SIGMA = 1.5
 LUMINANCE_CONSTANT = 0.01**2  # the C1 and C2 of Wang et al., where a curve has these names

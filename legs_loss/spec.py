@@ -10,9 +10,6 @@ from legs_loss.curves import curve
 from legs_loss.errors import LegsError, did_you_mean
 from legs_loss.operators import check_operator
 
-__all__ = ["PRESETS", "Spec", "WeightSpec", "as_spec"]
-
-
 # In float32 a larger factor overflows in the sum over an image, and a smaller eps is 0: both give NaN.
 _LARGEST_FACTOR, _LEAST_EPS = 1e6, 1e-30
 

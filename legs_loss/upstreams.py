@@ -9,8 +9,6 @@ from typing import Any, Dict
 from legs_loss.errors import LegsError
 from legs_loss.system import plugins
 
-__all__ = ["Applied", "apply_to"]
-
 _applied: Dict[str, Applied] = {}
 
 

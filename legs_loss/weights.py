@@ -23,8 +23,6 @@ from legs_loss.images import check_values, read_layout
 from legs_loss.responses import levels_of, normalise_response, over_scene, percentile, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
-__all__ = ["Weights", "curved", "weight_from_response", "weight_map", "weight_maps", "weight_over_scene"]
-
 
 def weight_map(
     image: Tensor, spec: Spec = "legs", channels_last: Optional[bool] = None, scene: Optional[Tensor] = None

@@ -12,11 +12,9 @@ import sys
 from typing import Any, Callable, Dict, Optional, Sequence
 
 from legs_loss._version import __version__
-from legs_loss.cli.shared.parser import Parser
+from legs_loss.cli.shared.parser import Parser as Parser
 from legs_loss.errors import LegsError
 from legs_loss.system import never_fail_to_print, plugins, say, say_error
-
-__all__ = ["Parser", "exit_code", "main"]
 
 COMMANDS = ("masks", "precompute", "export", "show", "info", "env")
 

@@ -23,8 +23,6 @@ from legs_loss.errors import LegsError
 from legs_loss.kernels.contract import Backend, DeviceFault, NotNow
 from legs_loss.spec import WeightSpec
 
-__all__ = ["BACKENDS", "OUT_OF_MEMORY", "Availability", "Backends", "Known", "forced_backend", "is_capturing"]
-
 OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 _NAMES = ("torch", "numba", "cuda")
 # An operation (None: all that there are), and the operator, norm and curve of the weights to be made (None: none are).

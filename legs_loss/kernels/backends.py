@@ -18,8 +18,6 @@ from legs_loss.kernels.contract import L1, DeviceFault, Failed, NotNow, Prepared
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
-__all__ = ["Plan", "fused", "fused_range", "plan_of"]
-
 _PLAIN = {Tensor, torch.nn.Parameter}  # what others mean by their values only they know
 _MOST = 256  # plans; a codebase with more shapes of images begins again
 

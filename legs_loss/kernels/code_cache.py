@@ -18,8 +18,6 @@ from numba.core.serialize import dumps
 from legs_loss.errors import LegsError
 from legs_loss.system import is_first_process, say, write_whole
 
-__all__ = ["keep"]
-
 _said: List[str] = []
 
 

@@ -9,8 +9,6 @@ from legs_loss import operators
 from legs_loss.curves import FORMULAS
 from legs_loss.operators import OPERATORS, Operator, gradient
 
-__all__ = ["CURVES", "EIGHT", "FOUR", "GRADIENT", "NORMS", "STENCILS", "formulas_in"]
-
 NORMS: Dict[float, int] = {p: number for number, p in enumerate(operators.NORMS, 1)}
 CURVES: Dict[str, int] = {name: number for number, name in enumerate(FORMULAS, 1)}
 FOUR, EIGHT, GRADIENT = 1, 2, 3  # kinds of stencil: a Laplacian of four neighbours, of eight, a gradient

@@ -20,9 +20,6 @@ from legs_loss.errors import LegsError
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
-__all__ = ["L1", "SSIM", "Backend", "DeviceFault", "Failed", "NotNow", "Prepared", "Terms", "node", "terms_of"]
-
-
 _NO_WEIGHTS = Weights()
 
 

@@ -20,8 +20,6 @@ from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles, er
 from legs_loss.kernels.numba_weights import FORMULAS, Images, WeightSource, weights_of_row
 from legs_loss.spec import WeightSpec
 
-__all__ = ["BACKEND"]
-
 _ROWS = 16  # of a strip of the L1 alone
 _NO_RANGE, _NO_MAP = np.empty((0, 2), np.float32), np.empty(0, np.float32)
 

@@ -13,9 +13,6 @@ from legs_loss.kernels.codes import EIGHT, GRADIENT, NORMS, STENCILS
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined, part
 from legs_loss.spec import WeightSpec
 
-__all__ = ["OperatorCode", "Shape", "extremes", "operator_of", "photograph_response", "response_row",
-           "supports_response"]  # fmt: skip
-
 _ROWS = 32  # of a task
 _ZERO, _ONE, _FOUR, _EIGHT = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(8.0)
 

@@ -22,8 +22,6 @@ from legs_loss.kernels.compiling import claimed, compiled, inlined, multiply_add
 from legs_loss.kernels.numba_weights import weights_of_row
 from legs_loss.similarity import CONTRAST_CONSTANT, LUMINANCE_CONSTANT, SIGMA, WINDOW_SIZE
 
-__all__ = ["TILE_HEIGHT", "TILE_WIDTH", "all_tiles", "error_row"]
-
 _REACH = WINDOW_SIZE // 2
 _TAPS = np.exp(-((np.arange(WINDOW_SIZE) - _REACH) ** 2) / (2 * SIGMA**2))
 _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32)

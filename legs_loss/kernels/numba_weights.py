@@ -14,8 +14,6 @@ from legs_loss.kernels.codes import CURVES, formulas_in
 from legs_loss.kernels.compiling import inlined, part
 from legs_loss.kernels.numba_response import OperatorCode, Shape, response_row
 
-__all__ = ["FORMULAS", "Images", "WeightSource", "weights_of_row"]
-
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 # No sine, since numba's is slow: C5, as curves of the user's own, is applied by torch, to a map.
 _WORDS = {"x": "x", "sqrt": "np.sqrt", "unit": "_unit"}

@@ -13,8 +13,6 @@ from legs_loss.similarity import d_ssim
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights, weight_map
 
-__all__ = ["difference_from_torch"]
-
 _TERMS = {"l1": L1, "ssim": SSIM, "loss": terms_of(0.2)}
 
 

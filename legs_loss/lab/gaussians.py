@@ -10,8 +10,6 @@ from torch import Tensor
 
 from legs_loss.lab.conventions import SH_C0
 
-__all__ = ["Gaussians", "rotations"]
-
 
 @dataclass
 class Gaussians:

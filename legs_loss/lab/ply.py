@@ -13,8 +13,6 @@ from legs_loss.errors import LegsError
 from legs_loss.lab.gaussians import Gaussians
 from legs_loss.system import read_regular, write_whole
 
-__all__ = ["read_ply", "write_ply"]
-
 _COUNT = re.compile("[0-9]{1,20}")
 _END = re.compile(rb"^end_header\r?\n", re.MULTILINE)
 _TYPES = {

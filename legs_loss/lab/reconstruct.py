@@ -15,8 +15,6 @@ from legs_loss.errors import LegsError, require
 from legs_loss.scenes.folder import PHOTOGRAPHS, files_below, left_out
 from legs_loss.scenes.images import open_image
 
-__all__ = ["Reconstructed", "reconstruct"]
-
 _READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 FEWEST = 3  # photographs that a scene needs
 

@@ -8,8 +8,8 @@ background are those asked for.
 
 from __future__ import annotations
 
-from legs_loss.precompute.one_scene import Report, precompute
-from legs_loss.precompute.photograph import normalised_map, response_map
-from legs_loss.precompute.user_maps import UserMaps
-
-__all__ = ["Report", "UserMaps", "normalised_map", "precompute", "response_map"]
+from legs_loss.precompute.one_scene import Report as Report
+from legs_loss.precompute.one_scene import precompute as precompute
+from legs_loss.precompute.photograph import normalised_map as normalised_map
+from legs_loss.precompute.photograph import response_map as response_map
+from legs_loss.precompute.user_maps import UserMaps as UserMaps

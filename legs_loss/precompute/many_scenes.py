@@ -17,8 +17,6 @@ from legs_loss.spec import Spec
 from legs_loss.system import read_text
 from legs_loss.system.executors import Listener
 
-__all__ = ["SceneTask", "find_scenes", "precompute_scene", "stores_of"]
-
 _TELL_SECONDS = 0.25
 _LARGEST = 64 << 20  # bytes of a list
 

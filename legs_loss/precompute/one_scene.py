@@ -24,8 +24,6 @@ from legs_loss.store.origin import note_scene
 from legs_loss.system import held_back
 from legs_loss.system.executors import outcomes
 
-__all__ = ["Report", "precompute"]
-
 _COMMIT_SECONDS = 1.0
 
 

@@ -13,8 +13,6 @@ from legs_loss.spec import WeightSpec
 from legs_loss.store import Entry, fingerprint, is_intact, sampled_fingerprint, stage
 from legs_loss.system.executors import Listener
 
-__all__ = ["Job", "UnwritableError", "ViewTask", "make"]
-
 
 class Job(NamedTuple):
     """The settings that all views of a run share."""

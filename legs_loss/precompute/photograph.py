@@ -13,8 +13,6 @@ from legs_loss.scenes import image_tensor
 from legs_loss.scenes.images import row_strips
 from legs_loss.spec import WeightSpec
 
-__all__ = ["compile_response", "normalised_map", "normalised_map_and_levels", "response_map"]
-
 _WORTH_COMPILING = 1 << 20  # values of a photograph; loading numba takes longer than torch does for less
 
 

@@ -14,8 +14,6 @@ from legs_loss.scenes.folder import SUFFIXES
 from legs_loss.scenes.user_maps import ALPHA, MASK_PATH, averaged, find_maps, map_path, read_map_file, read_mask
 from legs_loss.store import MASK, WEIGHTS, Entry, stage
 
-__all__ = ["NO_MAPS", "UserMaps", "is_below", "stage_user_maps"]
-
 _LARGEST = 1e6  # weight
 _OF_THE_SCENE = (None, ALPHA, MASK_PATH)
 _OPTIONS = {MASK: "--masks", WEIGHTS: "--weights"}

@@ -13,8 +13,6 @@ from legs_loss.errors import LegsError
 from legs_loss.system import Child
 from legs_loss.system.executors import Listener, Task
 
-__all__ = ["in_processes"]
-
 _PATIENCE = 5.0  # seconds; a process that is killed leaves numba's semaphore behind, and Python warns
 # The memory of a photograph of up to 16 megapixels in one piece, and kept for the next one: mapping new memory took a
 # quarter of the decoding.

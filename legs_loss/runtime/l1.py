@@ -23,8 +23,6 @@ from legs_loss.runtime.own import check_own
 from legs_loss.runtime.state import ViewName, current_run, spec_to_compile, thread
 from legs_loss.weights import Weights
 
-__all__ = ["l1_loss", "unweighted"]
-
 Own = Callable[[Tensor, Tensor], Tensor]
 Result = TypeVar("Result")
 
@@ -85,12 +83,12 @@ def l1_loss(
     trains = (prediction.requires_grad and torch.is_grad_enabled()) or is_trained(prediction)
     run = None if thread.unweighted or not (trains or is_trained(target)) else current_run()
     if run is None or not (run.weighted or run.active):
-        loss = _by_torch(prediction, target, Weights(), *given)
+        plain = _by_torch(prediction, target, Weights(), *given)
         counted.plain += 1
         counted.plain_steps += trains
         if run is not None:
             run.say_what_is_used()
-        return loss
+        return plain
     if not trains:
         check_order(prediction, target)
     spec, mean = run.config.spec, own is None and reduction == "mean"

@@ -23,8 +23,6 @@ from typing import Any, Callable, Hashable, Optional, Tuple, TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["DEFAULT_LIMIT", "WeightMemo"]
-
 DEFAULT_LIMIT = 1 << 30  # bytes
 Value = TypeVar("Value")
 _LARGE = 1 << 16  # bytes

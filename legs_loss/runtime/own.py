@@ -12,8 +12,6 @@ from legs_loss.autograd import is_compiling
 from legs_loss.errors import LegsError
 from legs_loss.kernels.available import is_capturing
 
-__all__ = ["check_own"]
-
 _SMALL, _TIMES = 1 / 64, 256  # differences, exact in every type of float; a weight makes the one of the other
 _CLOSE = 0.02  # Charbonnier's root with its usual 1e-3 grows as an L1 within this
 _MOST = 256

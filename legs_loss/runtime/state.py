@@ -34,9 +34,6 @@ from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.system import say
 from legs_loss.weights import Weights, weight_map
 
-__all__ = ["MASK", "Run", "active", "configure", "counts", "current_run", "refuse_masks", "reset", "spec_to_compile",
-           "thread"]  # fmt: skip
-
 MASK, WEIGHTS = "mask", "weights"  # the store's names of the user's own maps; it is imported only where there is one
 _NOT_IN_A_GRAPH = (
     "the store has masks or weights of your own, which are found by the image, and a compiled or captured graph, "

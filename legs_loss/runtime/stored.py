@@ -16,8 +16,6 @@ from legs_loss.responses import NEEDS_LEVELS
 if TYPE_CHECKING:
     from legs_loss.store import Found, WeightStore
 
-__all__ = ["Stored", "Whole"]
-
 _MISSES = 2  # lookups for each map of the store
 
 _ABSENT = (

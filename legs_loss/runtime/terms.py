@@ -23,8 +23,6 @@ from legs_loss.similarity import WINDOW_SIZE, ssim_map
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.weights import Weights
 
-__all__ = ["LEGSLoss", "coverage", "masked", "ssim"]
-
 
 def masked(prediction: Tensor, target: Tensor) -> Tensor:
     """Return the prediction with the pixels that the store's mask leaves out replaced by the target's.

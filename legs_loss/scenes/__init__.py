@@ -10,22 +10,16 @@ from typing import Optional, Tuple, Union
 from legs_loss.errors import LegsError
 from legs_loss.scenes.colmap import read_colmap
 from legs_loss.scenes.folder import read_folder
-from legs_loss.scenes.images import image_size, image_tensor, load_training_image, open_image, training_size
-from legs_loss.scenes.model import Camera, PointCloud, Scene, View
+from legs_loss.scenes.images import image_size as image_size
+from legs_loss.scenes.images import image_tensor as image_tensor
+from legs_loss.scenes.images import load_training_image as load_training_image
+from legs_loss.scenes.images import open_image as open_image
+from legs_loss.scenes.images import training_size as training_size
+from legs_loss.scenes.model import Camera as Camera
+from legs_loss.scenes.model import PointCloud as PointCloud
+from legs_loss.scenes.model import Scene as Scene
+from legs_loss.scenes.model import View as View
 from legs_loss.scenes.transforms import find_transforms, read_transforms
-
-__all__ = [
-    "Camera",
-    "PointCloud",
-    "Scene",
-    "View",
-    "image_size",
-    "image_tensor",
-    "load_training_image",
-    "open_image",
-    "read_scene",
-    "training_size",
-]
 
 
 def read_scene(path: Union[str, Path], images: Optional[str] = None) -> Scene:

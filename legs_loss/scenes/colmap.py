@@ -15,8 +15,6 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
 from legs_loss.system import open_regular, read_text
 
-__all__ = ["read_colmap"]
-
 # COLMAP's camera models in the order of their ids, each with its number of parameters.
 MODELS = {
     **{"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8},

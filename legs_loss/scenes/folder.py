@@ -10,8 +10,6 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.images import is_readable
 from legs_loss.scenes.model import Scene, View
 
-__all__ = ["PHOTOGRAPHS", "SUFFIXES", "files_below", "left_out", "read_folder"]
-
 # The formats of legs_loss.scenes.images; those that every decoder of photographs knows come first.
 SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".jfif", ".jpe", ".gif", ".tga", ".ppm", ".pgm"),

@@ -18,18 +18,6 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.model import View
 from legs_loss.system import open_regular
 
-__all__ = [
-    "colour_mode",
-    "image_size",
-    "image_tensor",
-    "is_readable",
-    "load_training_image",
-    "open_image",
-    "resized_pixels",
-    "row_strips",
-    "training_size",
-]
-
 WIDEST = 1600  # pixels; 3DGS shrinks wider photographs to this unless -r says otherwise
 STRIP_PIXELS = 1 << 16
 _WIDTH = 1 << 30  # pixels: no image is wider

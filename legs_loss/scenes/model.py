@@ -9,8 +9,6 @@ from typing import Callable, Iterator, Optional, Tuple
 
 import numpy as np
 
-__all__ = ["Camera", "PointCloud", "Scene", "View", "view_names"]
-
 
 @dataclass(frozen=True, eq=False)
 class Camera:

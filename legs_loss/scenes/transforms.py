@@ -18,8 +18,6 @@ from legs_loss.scenes.images import image_size
 from legs_loss.scenes.model import Camera, Scene, View
 from legs_loss.system import read_text
 
-__all__ = ["find_transforms", "read_transforms"]
-
 _LARGEST = 1 << 30  # bytes
 _SIDE = 1 << 20  # pixels
 # OpenGL's camera looks along -z with y up; OpenCV's along z with y down.

@@ -15,19 +15,6 @@ from legs_loss.scenes.images import colour_mode, open_image
 from legs_loss.scenes.model import View
 from legs_loss.system import read_regular, write_whole
 
-__all__ = [
-    "ALPHA",
-    "MASK_PATH",
-    "averaged",
-    "dimmed",
-    "file_names",
-    "find_maps",
-    "map_path",
-    "read_map_file",
-    "read_mask",
-    "write_gray",
-]
-
 ALPHA, MASK_PATH = "alpha", "mask_path"  # in place of a path: the photographs' own, those that transforms.json names
 _GRAY = 32  # of 255: the colours of a pixel of a gray JPEG differ less
 _LARGEST = 4 << 30  # bytes of a .npy

@@ -10,8 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["fingerprint", "sampled_fingerprint"]
-
 _SAMPLES = 4096  # pixels; what changes a thousandth of an image meets one, but for 2 in 100 such changes
 
 

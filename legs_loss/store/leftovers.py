@@ -10,8 +10,6 @@ from typing import Iterable, List
 from legs_loss.store.manifest import Entry, is_map_name
 from legs_loss.system import is_held
 
-__all__ = ["LOCK", "STAGING", "leftovers", "remove"]
-
 STAGING = ".writing-"  # begins the name of a writer's folder
 LOCK = ".lock"  # in the store, held over each change; in a staging folder, held while its writer lives
 

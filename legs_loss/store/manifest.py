@@ -18,9 +18,6 @@ from legs_loss.errors import LegsError
 from legs_loss.system import read_regular
 from legs_loss.system.values import is_count, is_number, is_text
 
-__all__ = ["MANIFEST", "MASK", "WEIGHTS", "DamagedStoreError", "Entry", "is_map_name", "manifest_bytes",
-           "read_manifest"]  # fmt: skip
-
 MANIFEST = "manifest.json"
 MASK, WEIGHTS = "mask", "weights"  # in place of an operator: of the maps that are the user's own
 VERSION = 3  # 1 and 2 had fewer fields

@@ -13,8 +13,6 @@ import numpy as np
 from legs_loss.store.manifest import DamagedStoreError, Entry
 from legs_loss.system import read_regular
 
-__all__ = ["is_intact", "read_map", "stage", "write_parts"]
-
 _PIECE = 1 << 20  # bytes; for larger ones Linux may look for larger free pages, which took six times as long
 _REPAIR = "run legs precompute again to repair it"
 

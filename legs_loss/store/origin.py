@@ -14,8 +14,6 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.system import read_regular, write_whole
 
-__all__ = ["NOTE", "note_scene", "scene_of_store"]
-
 NOTE = "scene.json"
 _LIMIT = 1 << 16  # bytes
 

@@ -19,8 +19,6 @@ from legs_loss.store.manifest import MASK, WEIGHTS, Entry, read_manifest
 from legs_loss.store.maps import is_intact, read_map
 from legs_loss.weights import weight_from_response, weight_over_scene
 
-__all__ = ["Damage", "Found", "WeightStore"]
-
 
 class Damage(NamedTuple):
     """The damage of a store: entries whose map is damaged or missing, and files that belong to no entry."""

@@ -19,8 +19,6 @@ import numpy as np
 
 from legs_loss.store import Entry, WeightStore
 
-__all__ = ["LEAST", "mean_responses", "outliers", "unsharp_views"]
-
 LEAST = 5  # views: fewer have no outliers
 DEVIATIONS = 4.0  # of a normal distribution, from the median
 FACTOR = 1.5  # and at least this multiple of the median: nearly equal views have no outliers

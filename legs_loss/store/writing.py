@@ -14,8 +14,6 @@ from legs_loss.store.manifest import MANIFEST, Entry, manifest_bytes, read_manif
 from legs_loss.store.maps import write_parts
 from legs_loss.system import FileLock
 
-__all__ = ["StoreWriter"]
-
 
 class StoreWriter:
     """Write to a store, concurrently with other writers; a context manager.

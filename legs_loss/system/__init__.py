@@ -40,7 +40,6 @@ _NAMES = {
     "terminal": ["is_first_process", "never_fail_to_print", "printable", "progress", "say", "say_error"],
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
-__all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:

@@ -11,8 +11,6 @@ from typing import Any, Callable
 from legs_loss.errors import LegsError
 from legs_loss.system.ctrl_c import kept_from_children
 
-__all__ = ["Child"]
-
 
 class Child:
     """A process that runs ``target(connection, *arguments)``, and this side's end of the connection.

@@ -8,8 +8,6 @@ import threading
 from contextlib import contextmanager
 from typing import Callable, Iterator, List
 
-__all__ = ["held_back", "kept_from_children", "noted"]
-
 _RAISES = hasattr(signal, "raise_signal")  # from Python 3.8 on
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Any, Callable, Dict, Iterable
 
-__all__ = ["plugins"]
-
 
 def plugins(group: str) -> Dict[str, Callable[[], Any]]:
     """Return the entry points of a group by name, as functions that import and return the object.

@@ -16,8 +16,6 @@ from typing import Any, Callable, Iterable, Iterator, Optional, Tuple
 from legs_loss._version import __version__
 from legs_loss.errors import LegsError, require
 
-__all__ = ["Listener", "Task", "outcomes"]
-
 Listener = Callable[[Any], None]
 Task = Callable[[Any, Listener], Any]
 _PATIENCE = 30  # seconds for a scheduler to answer, and for its first worker

@@ -15,8 +15,6 @@ from typing import BinaryIO, Callable, List, Optional, Union
 
 from legs_loss.errors import LegsError
 
-__all__ = ["open_regular", "read_regular", "read_text", "write_whole"]
-
 PathLike = Union[str, "os.PathLike[str]"]
 _ABANDONED = 3600.0  # seconds since the last byte
 

@@ -12,8 +12,6 @@ from typing import Optional, Union
 
 from legs_loss.errors import LegsError
 
-__all__ = ["FileLock", "HeldError", "is_held"]
-
 _POLL = 0.02  # seconds
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EBADF)  # EBADF: another user's, on NFS
 _FAR = 1 << 30  # the byte that Windows locks, and no other process can read: after all text

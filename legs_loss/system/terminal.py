@@ -7,8 +7,6 @@ import re
 import sys
 from typing import Any, Optional, TextIO
 
-__all__ = ["is_first_process", "never_fail_to_print", "printable", "progress", "say", "say_error"]
-
 # Control characters but tab and line feed; the marks that turn the direction of text, and halves of characters.
 _OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 from math import isfinite
 from typing import Any, Callable
 
-__all__ = ["each", "is_count", "is_number", "is_pair", "is_scores", "is_text", "of_names", "optional", "with_names"]
-
 Fits = Callable[[Any], bool]
 _LARGEST = 1 << 63
 

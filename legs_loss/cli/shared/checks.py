@@ -12,8 +12,6 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes import View, image_size, training_size
 from legs_loss.system import say
 
-__all__ = ["check_empty", "check_resolution", "check_writable"]
-
 _TINY = 64  # pixels: a smaller width was probably meant as a divisor
 
 

@@ -9,8 +9,6 @@ from typing import Any, Iterator, NoReturn, Optional, Sequence
 from legs_loss.errors import did_you_mean, require
 from legs_loss.system import printable
 
-__all__ = ["Parser"]
-
 # The words by which the help shows a value that is a path.
 _FOLDERS = {"DIR", "FOLDER", "PHOTOS", "RUN", "SCENE", "STORE"}
 _FILES = {"FILE", "IMAGE", "PLY", "PNG", "SCRIPT"}

@@ -8,8 +8,6 @@ from typing import Any, Union
 from legs_loss.errors import LegsError
 from legs_loss.system import printable, write_whole
 
-__all__ = ["label", "save_figure"]
-
 
 def label(name: str) -> str:
     r"""Return a name escaped for matplotlib, which draws it literally.

@@ -11,14 +11,6 @@ from legs_loss.system import say
 if TYPE_CHECKING:
     from legs_loss.scenes import Scene
 
-__all__ = [
-    "add_images",
-    "add_resolution",
-    "read_noted",
-    "say_notes",
-    "say_skipped",
-]
-
 
 def add_images(parser: Any) -> None:
     """Declare the folder of a scene's photographs."""

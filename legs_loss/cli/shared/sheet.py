@@ -14,8 +14,6 @@ from legs_loss.errors import require
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import curved, weight_from_response
 
-__all__ = ["Shown", "save_sheet"]
-
 _INK, _FAINT = "#222222", "#9a9a9a"
 
 

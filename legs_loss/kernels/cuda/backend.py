@@ -20,8 +20,6 @@ from legs_loss.kernels.cuda.modules import FORMULAS, PLAIN, BinaryCache, Modules
 from legs_loss.kernels.cuda.nvrtc import find_compiler
 from legs_loss.spec import WeightSpec
 
-__all__ = ["BACKEND", "THREADS", "VALUES", "CudaBackend", "Strides", "Task", "chunks_of", "strip_of"]
-
 THREADS = 256
 RUN = 8  # rows of a thread of the pixelwise passes
 VALUES = {torch.float32: 0, torch.float16: 1, torch.bfloat16: 2}

@@ -11,8 +11,6 @@ import torch
 
 from legs_loss.kernels.contract import DeviceFault, NotNow
 
-__all__ = ["CudaDriver", "DriverError", "OutOfMemory", "load_library"]
-
 UNSUPPORTED_PTX = 222
 _OUT_OF_MEMORY = 2
 # What a kernel did that ran before: from then on every call returns it, until the process ends.

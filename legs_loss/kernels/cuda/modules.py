@@ -18,8 +18,6 @@ from legs_loss.kernels.cuda.driver import UNSUPPORTED_PTX, DriverError
 from legs_loss.spec import WeightSpec
 from legs_loss.system import write_whole
 
-__all__ = ["FORMULAS", "PLAIN", "BinaryCache", "Modules", "Variant", "cache_folder", "options", "source"]
-
 _WORDS = {"x": "x", "sqrt": "root", "unit": "saturated", "sin": "short_sine", "asin": "asinf"}
 FORMULAS: Dict[str, str] = codes.formulas_in(_WORDS, "{}f".format)
 _DIGEST = hashlib.sha256().digest_size

@@ -9,8 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any, Iterable, Iterator, List, Optional, Sequence, Tuple
 
-__all__ = ["Compiler", "CompilerError", "NotFound", "candidates", "find_compiler"]
-
 _BUILTINS = re.compile(r"(libnvrtc-builtins(-[0-9a-f]+)?\.so\.[0-9.]+|nvrtc-builtins64_[0-9]+\.dll)$")
 
 

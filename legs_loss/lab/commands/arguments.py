@@ -12,8 +12,6 @@ from legs_loss.system import cores
 if TYPE_CHECKING:
     from legs_loss.scenes import Scene
 
-__all__ = ["add_scene_arguments", "default_resolution"]
-
 AFFORDABLE = 70_000  # pixels a photograph
 
 

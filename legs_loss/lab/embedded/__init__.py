@@ -1,5 +1,3 @@
 """The scene that the package makes itself, so that everything can be tried without a dataset."""
 
-from legs_loss.lab.embedded.scene import write_embedded_scene
-
-__all__ = ["write_embedded_scene"]
+from legs_loss.lab.embedded.scene import write_embedded_scene as write_embedded_scene

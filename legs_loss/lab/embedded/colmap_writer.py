@@ -11,8 +11,6 @@ import numpy as np
 from legs_loss.scenes.model import Camera, PointCloud
 from legs_loss.system import write_whole
 
-__all__ = ["write_colmap"]
-
 
 def write_colmap(root: Path, cameras: Mapping[str, Camera], points: PointCloud) -> None:
     """Write ``root/sparse/0`` in COLMAP's binary format (PINHOLE cameras, no tracks).

@@ -20,8 +20,6 @@ from legs_loss.spec import PRESETS, WeightSpec
 if TYPE_CHECKING:
     from legs_loss.lab.training.trainer import TrainConfig
 
-__all__ = ["BASELINE", "CHANGES", "STUDIES", "ArmSpec", "needed", "parse_arm", "parse_arms", "these_arms"]
-
 BASELINE = "3dgs"
 
 # The changes, with their descriptions for the help and the tables.

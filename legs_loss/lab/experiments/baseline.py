@@ -12,8 +12,6 @@ from legs_loss.lab.training.dataset import TrainingView
 from legs_loss.lab.training.trainer import TrainConfig, step_loss, step_weights
 from legs_loss.similarity import d_ssim
 
-__all__ = ["prove_unweighted"]
-
 CLOSE = 1e-4  # relative: two implementations in float32
 
 

@@ -33,17 +33,6 @@ from legs_loss.spec import WeightSpec
 from legs_loss.system import read_regular
 from legs_loss.weights import Weights, weight_maps
 
-__all__ = [
-    "Comparison",
-    "Row",
-    "identity",
-    "read_json",
-    "read_rows",
-    "scene_of",
-    "versions",
-    "write_or_check",
-]
-
 _LARGEST = 256 << 20  # bytes of a file of a comparison
 EVALUATIONS = 10  # of the held-out views during a run, for the plots
 

@@ -22,8 +22,6 @@ from legs_loss.system.values import (
     with_names,
 )
 
-__all__ = ["ROW", "SETTINGS", "what_is_wrong"]
-
 # The required contents of the files.
 SETTINGS = ("scene", "path", "images", "base", "baseline")
 ROW = ("arm", "seed", "config", "caps", "versions", "metrics")

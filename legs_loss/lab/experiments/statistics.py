@@ -10,20 +10,6 @@ import numpy as np
 from legs_loss.errors import LegsError
 from legs_loss.lab.training.metrics import METRICS
 
-__all__ = [
-    "COLUMNS",
-    "Column",
-    "Difference",
-    "Rows",
-    "Summary",
-    "difference",
-    "interval",
-    "pooled_difference",
-    "summarise",
-    "summarise_all",
-    "times_gaussians",
-]
-
 Rows = Sequence[Mapping[str, Any]]
 
 

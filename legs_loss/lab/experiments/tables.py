@@ -17,22 +17,6 @@ from legs_loss.lab.experiments.statistics import (
 )
 from legs_loss.lab.training.metrics import METRICS
 
-__all__ = [
-    "DIFFERENCES",
-    "LABELS",
-    "MISSING",
-    "Table",
-    "difference_cell",
-    "differences_table",
-    "markdown",
-    "score_cells",
-    "scores_table",
-    "tables",
-    "times_cell",
-    "too_short",
-    "with_values",
-]
-
 Table = Tuple[List[str], List[List[str]]]  # heads, and lines of as many cells
 
 LABELS = [column.label for column in COLUMNS]

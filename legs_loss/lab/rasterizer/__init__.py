@@ -34,7 +34,6 @@ _NAMES = {
     "drawing": ["Contributions", "Drawn", "Lens", "compensation", "covariance", "draw"],
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
-__all__ = ["MIN_ALPHA", "NEAR", "Gaussians", "Rendering", "Pinhole", "rasterize", "rotations", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:

@@ -23,8 +23,6 @@ from legs_loss.lab.rasterizer.geometry import conic
 from legs_loss.lab.rasterizer.projection import BLOCK, TALL, WIDE
 from legs_loss.lab.rasterizer.sorting import FIRST_SLOT, ROWS, STRIP, packed, unpacked
 
-__all__ = ["CompactBox"]
-
 
 class CompactBox:
     """Clip splats to their compact boxes: the ``clip`` of `compiled.draw`.

@@ -15,8 +15,6 @@ from legs_loss.lab.rasterizer.projection import WIDE
 from legs_loss.lab.rasterizer.sorting import OWNER
 from legs_loss.lab.rasterizer.strips import PIXELS, STATE, WORK, T, X, place, reach, respond
 
-__all__ = ["COUNT", "DISTANCE", "FIELDS", "MOST", "SLOPES", "VALUE", "WEIGHT", "contribute"]
-
 COUNT, WEIGHT, VALUE, DISTANCE, MOST, SLOPES, FIELDS = 0, 1, 2, 3, 4, 5, 6
 _MAX, _MIN, _LAST, _ONE = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE), np.float32(1)
 

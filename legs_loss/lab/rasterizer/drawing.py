@@ -14,8 +14,6 @@ from legs_loss.lab.rasterizer import compiled, contributions, sorting
 from legs_loss.lab.rasterizer.compiled import Clip, Tensors
 from legs_loss.lab.rasterizer.groups import Footprint
 
-__all__ = ["Contributions", "Drawn", "Lens", "compensation", "covariance", "draw", "full"]
-
 LEAST_RATIO = 0.000025  # of determinants, as in Inria's antialiasing
 
 

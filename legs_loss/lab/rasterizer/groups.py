@@ -8,8 +8,6 @@ import numpy as np
 
 from legs_loss.lab.conventions import DILATION, SQUARE
 
-__all__ = ["Footprint", "GaussianCamera", "Parameters", "ProjectedGaussians", "room"]
-
 
 class Parameters(NamedTuple):
     """N Gaussians, or the gradients to them; float32. A shape is scales and quaternions, or a covariance."""

@@ -12,8 +12,6 @@ from torch import Tensor
 from legs_loss.errors import LegsError, require
 from legs_loss.lab.conventions import Pinhole
 
-__all__ = ["Rendering", "rasterize"]
-
 
 class Rendering(NamedTuple):
     """The result of `rasterize`."""

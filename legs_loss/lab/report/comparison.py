@@ -15,8 +15,6 @@ from legs_loss.lab.training.metrics import strongest
 from legs_loss.responses import normalise_response, response
 from legs_loss.system import write_whole
 
-__all__ = ["Compared", "save_pictures", "save_png"]
-
 _INK = "#222222"
 
 

@@ -31,8 +31,6 @@ from legs_loss.responses import levels_of
 from legs_loss.scenes import Scene, View
 from legs_loss.system import write_whole
 
-__all__ = ["LIMIT", "write_report"]
-
 LIMIT = 10_000_000  # bytes of a page
 VIEWS = 3  # shown unless others are asked for
 

@@ -21,8 +21,6 @@ from legs_loss.scenes import image_tensor, open_image
 from legs_loss.scenes.user_maps import dimmed
 from legs_loss.weights import weight_map
 
-__all__ = ["KINDS", "DrawnView", "ViewPictures", "as_bytes", "differing", "draw_row", "encode", "read_picture"]
-
 KINDS = ("rendering", "error", "weight")
 CROPS = 3  # of each pair of arms and each view
 # Tried in order until a page is small enough: lossless first, since it is small differences that are shown.

@@ -10,8 +10,6 @@ import numpy as np
 from legs_loss.errors import require
 from legs_loss.lab.experiments.statistics import Rows
 
-__all__ = ["by_gaussians", "by_iterations", "colours"]
-
 _INK = "#222222"  # replaced by currentColor, so no colour of an arm may be the same
 # Tableau's, in the order that keeps neighbours apart; a tenth and more arms differ by their markers.
 _COLOURS = (

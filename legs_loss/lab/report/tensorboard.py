@@ -12,8 +12,6 @@ from legs_loss.errors import LegsError, require
 if TYPE_CHECKING:
     from legs_loss.lab.training.trainer import Progress
 
-__all__ = ["tensorboard_log"]
-
 
 @contextmanager
 def tensorboard_log(folder: Optional[Path]) -> Iterator[Callable[[str, Progress], None]]:

@@ -9,8 +9,6 @@ from numba.core.errors import RequireLiteralValue
 from legs_loss.kernels.compiling import inlined
 from legs_loss.lab.simd.vectors import INTEGERS, LANES, float8, intrinsic
 
-__all__ = ["lane", "total", "totals", "transposed"]
-
 
 @intrinsic
 def _exchanged(typingctx, a, b, distance):  # type: ignore[no-untyped-def]

@@ -10,8 +10,6 @@ from numba.core import cgutils
 
 from legs_loss.lab.simd.vectors import KINDS, intrinsic
 
-__all__ = ["load", "prefetch", "store"]
-
 
 def _is_row(array: Any, dtype: Any) -> bool:
     return isinstance(array, types.Array) and array.dtype == dtype and array.ndim == 1 and array.layout == "C"

@@ -10,8 +10,6 @@ from numba import extending, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import lower_builtin, models, register_model
 
-__all__ = ["FLOATS", "INTEGERS", "KINDS", "LANES", "float8", "integer8", "intrinsic", "mask8"]
-
 LANES = 8
 
 FLOATS: Any = ir.VectorType(ir.FloatType(), LANES)

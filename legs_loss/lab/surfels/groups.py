@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["DiscCamera", "Discs", "Pictures", "ProjectedDiscs", "Work"]
-
 
 class Discs(NamedTuple):
     """N discs, or the gradients to them; float32. What was not given has no rows."""

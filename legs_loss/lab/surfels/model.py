@@ -7,8 +7,6 @@ from typing import NamedTuple, Optional
 import torch
 from torch import Tensor
 
-__all__ = ["SurfelView", "Surfels"]
-
 # The numbers that make a rasterizer 2DGS's, beside those of conventions.py.
 FAR = 100.0  # with NEAR, the scale of the distortion's depths; nothing is cut off there
 CUTOFF = 3.0  # standard deviations: where a surfel's square of tiles ends

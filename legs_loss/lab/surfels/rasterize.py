@@ -10,8 +10,6 @@ from torch import Tensor
 from legs_loss.errors import LegsError
 from legs_loss.lab.surfels.model import CHANNELS, Surfels, SurfelView
 
-__all__ = ["rasterize_surfels"]
-
 
 def rasterize_surfels(surfels: Surfels, view: SurfelView) -> Tuple[Tensor, Tensor, Tensor]:
     """Draw surfels as 2D Gaussian Splatting does, differentiable in all their tensors.

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from legs_loss.lab.gaussians import Gaussians
 
-__all__ = ["FIELDS", "Adam", "position_rate", "select", "stack"]
-
 SETS = ("gaussians", "moment1", "moment2")
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 

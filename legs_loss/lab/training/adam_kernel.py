@@ -9,8 +9,6 @@ from legs_loss.lab.simd.arithmetic import splat, square_root
 from legs_loss.lab.simd.memory import load, store
 from legs_loss.lab.simd.vectors import LANES
 
-__all__ = ["BETA1", "BETA2", "LANES", "update"]
-
 BETA1, BETA2 = 0.9, 0.999
 _NEW1, _NEW2, _EPS = np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(1e-15)
 

@@ -16,9 +16,6 @@ from legs_loss.errors import LegsError
 from legs_loss.system import FileLock, HeldError, open_regular, write_whole
 from legs_loss.system.values import each, is_count, is_number, is_pair, is_scores, is_text, optional, with_names
 
-__all__ = ["CHECKPOINT", "LOCK", "alone_in", "check_new", "read_checkpoint", "read_state", "write_checkpoint",
-           "write_json"]  # fmt: skip
-
 CHECKPOINT = "checkpoint.npz"
 LOCK = ".lock"  # in a run's folder, held while it is trained
 WAIT = 10.0  # seconds for the lock: the processes of a comparison that was killed end a little later than it

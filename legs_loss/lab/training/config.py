@@ -13,8 +13,6 @@ from legs_loss.errors import LegsError
 from legs_loss.lab.training.dataset import TrainingView
 from legs_loss.spec import PRESETS, Spec, WeightSpec, as_spec
 
-__all__ = ["TrainConfig", "default_threshold"]
-
 # What a spec had not when the first comparisons were written: absent where it is the default, so that they go on.
 ADDED_SETTINGS = ("over", "noise_floor", "smooth")
 SWITCHES = ("shuffled", "sparse_adam")  # for the same reason absent where they are off, as are the next ones

@@ -17,19 +17,6 @@ from legs_loss.spec import WeightSpec
 from legs_loss.store import Found, WeightStore
 from legs_loss.weights import weight_map, weight_maps
 
-__all__ = [
-    "Dataset",
-    "TrainingView",
-    "extent",
-    "load_dataset",
-    "load_view",
-    "open_store",
-    "pinhole_camera",
-    "shuffled",
-    "split_views",
-    "with_user_maps",
-]
-
 HOLD_OUT = 8  # every 8th view, sorted by name, as usual for 3DGS
 
 

@@ -10,8 +10,6 @@ from torch import Tensor
 from legs_loss.lab.gaussians import Gaussians, rotations
 from legs_loss.lab.training.adam import select, stack
 
-__all__ = ["Change", "Schedule", "densify", "prunable"]
-
 PERCENT_DENSE = 0.01  # of the extent: a wider Gaussian is split, another one cloned
 CHILDREN = 2  # of a split; their scales are the parent's over 0.8 * CHILDREN
 MIN_OPACITY = 0.005

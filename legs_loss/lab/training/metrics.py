@@ -15,8 +15,6 @@ from legs_loss.errors import LegsError
 from legs_loss.lab.training.perceptual import NEEDS_LPIPS, has_lpips, lpips
 from legs_loss.responses import response
 
-__all__ = ["METRICS", "Metric", "left_out", "mean_scores", "psnr", "score", "strongest"]
-
 
 class Metric(NamedTuple):
     """A measure of the difference of a rendering and its photograph.

@@ -13,8 +13,6 @@ from torch.nn.functional import conv2d, max_pool2d
 
 from legs_loss.errors import LegsError
 
-__all__ = ["NEEDS_LPIPS", "has_lpips", "lpips", "network_name", "use_lpips"]
-
 NEEDS_LPIPS = "--lpips WEIGHTS, a state dict of torchvision's squeezenet1_1, alexnet or vgg16"
 _MAKE = ": give a state dict of torchvision's squeezenet1_1, alexnet or vgg16, as torch.save writes it"
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of images in [-1, 1]

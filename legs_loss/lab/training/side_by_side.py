@@ -14,8 +14,6 @@ from legs_loss.precompute.workers import in_processes
 from legs_loss.scenes import read_scene
 from legs_loss.system.executors import Listener, outcomes
 
-__all__ = ["Arm", "train_arm", "train_side_by_side"]
-
 _TELL_SECONDS = 0.5
 
 

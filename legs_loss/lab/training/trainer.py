@@ -39,21 +39,6 @@ from legs_loss.scenes import Camera, Scene
 from legs_loss.system import keep_freed_memory, noted
 from legs_loss.weights import Weights
 
-__all__ = [
-    "Progress",
-    "TrainConfig",
-    "TrainingResult",
-    "check_trainable",
-    "compile_step",
-    "default_threshold",
-    "draw",
-    "point_cloud",
-    "step_loss",
-    "step_weights",
-    "train",
-]
-
-
 _FACTS = ("iteration", "order", "loss", "psnr", "growth", "history")  # of a run, that a checkpoint keeps as they are
 
 

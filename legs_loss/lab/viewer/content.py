@@ -10,8 +10,6 @@ from typing import Dict, Iterator, NamedTuple, Optional, Tuple
 from legs_loss.errors import LegsError
 from legs_loss.scenes import Scene, read_scene
 
-__all__ = ["Content", "find_content"]
-
 
 class Content(NamedTuple):
     """The .ply of each method by its name; the scene, where it is known; 3DGS's ``-r`` of its photographs."""

@@ -16,8 +16,6 @@ from urllib.parse import parse_qs, urlsplit
 
 from legs_loss.errors import LegsError
 
-__all__ = ["Guard", "check_address"]
-
 _THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
 
 

@@ -25,8 +25,6 @@ from legs_loss.spec import as_spec
 from legs_loss.store import MASK
 from legs_loss.system import say
 
-__all__ = ["Drawable", "left_of", "serve", "splats"]
-
 _CAMERAS = 40  # shown at most, spread evenly
 _PICTURE = 160  # pixels: the width of a camera's picture
 _WIPE_SECONDS = 0.15

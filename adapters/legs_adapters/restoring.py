@@ -7,9 +7,9 @@ brackets that formatters add make no difference.
 from __future__ import annotations
 
 import ast
-import bisect
 import re
-from typing import Callable, Dict, Iterator, List, NamedTuple, Optional, Set, Tuple
+from bisect import bisect_left
+from typing import Callable, Iterator, List, Match, NamedTuple, Optional, Sequence, Set, Tuple
 
 from legs_adapters.code.folders import first_of
 from legs_adapters.code.limits import STRING, Budget
@@ -18,75 +18,32 @@ from legs_adapters.journal import Layer
 from legs_adapters.terms.text import apply_edits
 from legs_adapters.terms.writing import PACKAGE
 
-_TOKEN = re.compile(rf"(?P<string>\w*{STRING})|(?P<comment>#[^\r\n]*)|\w+|[^\w\s]", re.S)
-_FREE = frozenset("(),;\\")  # what formatters add, remove and move
+_TOKEN = re.compile(rf"(?P<string>\w*(?:{STRING}))|(?P<comment>#[^\r\n]*)|\w+".encode(), re.S)
+_SIGN = re.compile(rb"\w+|[^\w\s]")
+_WORD = re.compile(rb"\w+|[^\w\s(),;\\]")
+_FREE = rb"[\s(),;\\]*"  # what formatters add, remove and move
 _AROUND = (16, 4, 0)  # words on both sides that tell equal calls apart, as far as they are still there
-_WRITTEN = frozenset(("l1_loss", "masked", "ssim", "unweighted"))  # the functions of legs_loss that a patch calls
-_UTF8 = ("utf-8", "surrogateescape")
+_NAMED = re.compile(rf"\b{PACKAGE}\b".encode())
+_CALLED = re.compile(rf"\b{PACKAGE}\s*\.\s*(?:l1_loss|masked|ssim|unweighted)\b".encode())
 
 
 class _TooLongError(Exception):
     """The search takes more steps than a file may."""
 
 
-class _Words:
-    """A text as words and signs, without comments and those of `_FREE`; ``weighted``: which are the package's name.
-
-    ``spend`` is told the steps of each search in it.
-    """
-
-    def __init__(self, text: str, spend: Callable[[int], None] = lambda steps: None) -> None:
-        self.text, self.spend = text, spend
-        self.newline = "\r\n" if "\r\n" in text else "\n"
-        self._breaks = [found.start() for found in re.finditer("\n", text)]
-        self.words: List[str] = []
-        self.starts: List[int] = []
-        self.ends: List[int] = []
-        for found in _TOKEN.finditer(text):
-            word = found.group()
-            if word not in _FREE and found.lastgroup != "comment":
-                is_value = found.lastgroup == "string" or word[0].isdigit()
-                self.words.append(word.lower().replace("'", '"') if is_value else word)
-                self.starts.append(found.start())
-                self.ends.append(found.end())
-        self.weighted = [at for at, word in enumerate(self.words) if word == PACKAGE]
-
-    def end(self, start: int, end: int) -> int:
-        """Return where the expression from ``start`` ends that goes to ``end``, or to arguments right behind it."""
-        depth, last = 0, start
-        for found in _TOKEN.finditer(self.text, start):
-            word = found.group()
-            is_called = word == "(" and "\n" not in self.text[last : found.start()]
-            if found.start() >= end and depth <= 0 and not is_called:
-                break
-            if found.lastgroup != "comment":
-                depth += (word in ("(", "[", "{")) - (word in (")", "]", "}"))
-                last = found.end()
-        self.spend((last - start) // 4)
-        return last
-
-    def line(self, at: int) -> str:
-        """Return the line of a character, with its number."""
-        number = bisect.bisect_left(self._breaks, at)
-        start = self._breaks[number - 1] + 1 if number else 0
-        return f"line {number + 1}: {self.text[start : start + 400].partition(chr(10))[0].strip()[:200]}"
-
-
 class _Part(NamedTuple):
     """One call or line that a patch wrote.
 
     Attributes:
-        first, last: its words, in the patched text.
-        anchor: the first of them that is the package's name.
-        before: the text from before.
-        line: its line from before, with its number.
+        start, end: its bytes, in the patched file.
+        before: the bytes from before.
+        at: where these stood in the original.
     """
 
-    first: int
-    last: int
-    anchor: int
-    before: str
-    line: str
+    start: int
+    end: int
+    before: bytes
+    at: int
 
 
 def restored(name: str, layer: Layer, data: bytes, budget: Budget) -> Tuple[bytes, str]:
@@ -113,108 +70,131 @@ def restored(name: str, layer: Layer, data: bytes, budget: Budget) -> Tuple[byte
 
 def _restored(layer: Layer, data: bytes, spend: Callable[[int], None]) -> Tuple[bytes, str]:
     spend((2 * len(layer.original) + len(data)) // 8 + len(layer.edits))
-    three = layer.original, apply_edits(layer.original, layer.edits), data
-    original, patched, now = (_Words(text.decode(*_UTF8), spend) for text in three)
-    every = list(_parts(layer, original, patched))
-    parts = {part.anchor: part for part in every if part.anchor >= 0}
-    places: List[Tuple[int, int, str]] = []
-    covered: Dict[int, Optional[_Part]] = {}  # words of the file now
+    patched = apply_edits(layer.original, layer.edits)
+    code, now = _code(patched), _code(data)
+    words, starts = [_spelled(word.group()) for word in _WORD.finditer(code)], [w.start() for w in _WORD.finditer(code)]
+    every = list(_parts(layer, code, spend))
+    parts = {part.start: part for part in every if _NAMED.search(code, part.start, part.end)}
+    left = bytearray(now)  # without what is put back
+    places: List[Tuple[int, int, _Part]] = []
     for around in _AROUND:
         for part in parts.values():
-            ahead, size = min(around, part.first) + part.anchor - part.first, part.last - part.first + 2 * around
-            key = patched.words[part.anchor - ahead : part.anchor - ahead + size]
-            spend((len(patched.weighted) + len(now.weighted)) * (1 + size // 64))
-            same = [parts.get(at) for at in patched.weighted if patched.words[at - ahead : at - ahead + size] == key]
+            first, last = bisect_left(starts, part.start), bisect_left(starts, part.end)
+            own = b"(?P<own>%s)" % _FREE.join(words[first:last])
+            text = _FREE.join([*words[max(0, first - around) : first], own, *words[last : last + around]])
+            spend((len(code) + len(now)) // 32 + len(text) // 2)
+            pattern = re.compile(b"(?=%s)" % text)
+            same = [parts.get(found.start("own")) for found in pattern.finditer(code)]
             if len({each and each.before for each in same}) == 1:  # else others, which are alike here, were different
-                for at in now.weighted:
-                    if at >= ahead and at not in covered and now.words[at - ahead : at - ahead + size] == key:
-                        places += _places(part, patched, now, at, covered)
-    left = [at for at in now.weighted if at not in covered]
-    at = 0
-    texts: List[str] = []
-    for start, end, before in sorted(places):
+                for found in pattern.finditer(now):
+                    start, end = found.start("own"), _end(now, *found.span("own"), spend)
+                    if _NAMED.search(left, start, end) and _is_same(data[start:end], patched[part.start : part.end]):
+                        left[start:end] = b" " * (end - start)
+                        places.append((start, end, part))
+    at, newline = 0, b"\r\n" if b"\r\n" in data else b"\n"
+    texts: List[bytes] = []
+    for start, end, part in sorted(places):
+        if not part.before.strip():
+            start, end = _statement(data, start, end, spend)
         if start >= at:  # else within another one
-            texts += [now.text[at:start], before]
+            texts += [data[at:start], part.before.replace(b"\r\n", b"\n").replace(b"\n", newline)]
             at = end
-    result = "".join([*texts, now.text[at:]]).encode(*_UTF8)
+    result = b"".join([*texts, data[at:]])
+    weighted = [found.start() for found in _NAMED.finditer(left)]
     is_python = not why_not_compiled(result) or why_not_compiled(data)
-    if len(every) == len(parts) and len(left) <= len(original.weighted) and is_python:
+    if len(every) == len(parts) and len(weighted) <= len(_NAMED.findall(_code(layer.original))) and is_python:
         return result, ""
-    still = first_of([now.line(now.starts[at]) for at in left], 20, "; ")
-    missing = [part.line for part in every if part.before and part not in covered.values()]
-    return data, f"it was edited since, and stays weighted ({still}); put back {first_of(missing, 20, '; ')}"
+    missing = {part.at for part in every if part.before}.difference(part.at for _, _, part in places)
+    still, before = _lines(data, weighted), _lines(layer.original, sorted(missing))
+    stays = f"stays weighted ({first_of(still, 20, '; ')}); put back {first_of(before, 20, '; ')}"
+    return data, f"it was edited since, and {stays}"
 
 
-def _parts(layer: Layer, original: _Words, patched: _Words) -> Iterator[_Part]:
+def _parts(layer: Layer, code: bytes, spend: Callable[[int], None]) -> Iterator[_Part]:
     """Yield what a patch wrote; edits within one call are one part."""
-    at = was = here = 0  # in the original: bytes, characters; in the patched text: characters
-    spans: List[Tuple[int, int, int, int]] = []  # of the parts, in both texts
+    shift = 0
+    spans: List[Tuple[int, int, int, int]] = []  # of the parts, in the original and in the patched text
     for edit in layer.edits:
-        gap = len(layer.original[at : edit.start].decode(*_UTF8))
-        was, here, at = was + gap, here + gap, edit.end
-        before, after = edit.before.decode(*_UTF8), edit.after.decode(*_UTF8)
-        start = here + len(after) - len(after.lstrip())
+        here, was = edit.start + shift, edit.start
+        begun, end = here + len(edit.after) - len(edit.after.lstrip()), here + len(edit.after.rstrip())
+        shift += len(edit.after) - len(edit.before)
         if spans and here <= spans[-1][3]:
-            first, begun, last, ended = spans.pop()
-            end = patched.end(begun, max(ended, here + len(after.rstrip())))
-        else:
-            first, begun, end = was, start, patched.end(start, here + len(after.rstrip()))
-        was, here = was + len(before), here + len(after)
-        spans.append((first, begun, was + max(0, end - here), end))
-    for first, begun, last, end in spans:
-        i, j = bisect.bisect_left(patched.starts, begun), bisect.bisect_left(patched.starts, end)
-        anchor = next((word for word in range(i, j) if patched.words[word] == PACKAGE), -1)
-        if anchor >= 0 and begun != patched.starts[i]:
-            anchor = -1
-        yield _Part(i, j, anchor, original.text[first:last], original.line(first))
+            was, _, begun, ended = spans.pop()
+            end = max(end, ended)
+        end = _end(code, begun, end, spend)
+        spans.append((was, max(edit.end, end - shift), begun, end))
+    for was, until, begun, end in spans:
+        yield _Part(begun, end, layer.original[was:until], was)
 
 
-def _places(
-    part: _Part, patched: _Words, now: _Words, at: int, covered: Dict[int, Optional[_Part]]
-) -> Iterator[Tuple[int, int, str]]:
-    """Yield the span that a part has now, and the text from before, if it is the same but for its formatting."""
-    first = at - part.anchor + part.first
-    last = first + part.last - part.first
-    (start, end), (begun, ended) = (
-        (words.starts[i], words.end(words.starts[i], words.ends[j - 1]))
-        for words, i, j in ((now, first, last), (patched, part.first, part.last))
-    )
-    written, wanted = now.text[start:end], patched.text[begun:ended]
+def _code(text: bytes) -> bytes:
+    """Return a text with blanks in place of comments, and of what is in strings: a quote is left of each."""
+
+    def hidden(found: Match[bytes]) -> bytes:
+        kept = {"string": b'"', "comment": b""}.get(found.lastgroup or "", found.group())
+        return kept.ljust(len(found.group()))
+
+    return _TOKEN.sub(hidden, text)
+
+
+def _spelled(word: bytes) -> bytes:
+    """Return the pattern of a word or a sign."""
+    pattern = rb"\b%s\b" % word if re.match(rb"\w", word) else re.escape(word)
+    return b"(?i:%s)" % pattern if word[:1].isdigit() else pattern
+
+
+def _end(code: bytes, start: int, end: int, spend: Callable[[int], None]) -> int:
+    """Return where the expression from ``start`` ends that goes to ``end``, or to arguments right behind it."""
+    depth, last = 0, start
+    for found in _SIGN.finditer(code, start):
+        is_called = found.group() == b"(" and b"\n" not in code[last : found.start()]
+        if found.start() >= end and depth <= 0 and not is_called:
+            break
+        depth += (found.group() in b"([{") - (found.group() in b")]}")
+        last = found.end()
+    spend((last - start) // 4)
+    return last
+
+
+def _is_same(written: bytes, wanted: bytes) -> bool:
+    """Return whether two texts are the same but for their formatting."""
     tree = _tree(written)
-    if written != wanted and (tree is None or tree != _tree(wanted) or not _comments(written) <= _comments(wanted)):
-        return
-    covered.update((word, part) for word in range(first, last))
-    before = part.before.replace("\r\n", "\n")
-    if not before.strip():  # a line of its own, or before or behind a semicolon
-        line, behind = now.text.rfind("\n", 0, start) + 1, now.text.find("\n", end) + 1 or len(now.text)
-        now.spend((behind - line) // 64)
-        head, tail = now.text[line:start], now.text[end:behind]
-        if not head.strip() and not tail.strip():
-            start, end = line, behind
-        elif tail.lstrip().startswith(";"):
-            end += len(tail) - len(tail.lstrip()[1:].lstrip(" \t"))
-        elif head.rstrip().endswith(";"):
-            start = line + len(head.rstrip()) - 1
-    yield start, end, before.replace("\n", now.newline)
+    is_equal = tree is not None and tree == _tree(wanted) and _comments(written) <= _comments(wanted)
+    return written == wanted or is_equal
 
 
-def _tree(text: str) -> Optional[str]:
-    for code_ in (f"({text}\n)", text):
+def _tree(text: bytes) -> Optional[str]:
+    for each in (b"(%s\n)" % text, text):
         try:
-            return ast.dump(ast.parse(code_))
+            return ast.dump(ast.parse(each))
         except (SyntaxError, ValueError, RecursionError, MemoryError):
             continue
     return None
 
 
-def _comments(text: str) -> Set[str]:
-    found = _TOKEN.finditer(text)
-    return {each.group().strip("# \t") for each in found if each.lastgroup == "comment"}
+def _comments(text: bytes) -> Set[bytes]:
+    return {found.group().strip(b"# \t") for found in _TOKEN.finditer(text) if found.lastgroup == "comment"}
 
 
-def weighted_lines(text: str) -> List[str]:
+def _statement(text: bytes, start: int, end: int, spend: Callable[[int], None]) -> Tuple[int, int]:
+    """Return the span of a statement with its line, or on a line with others with its semicolon."""
+    line, behind = text.rfind(b"\n", 0, start) + 1, text.find(b"\n", end) + 1 or len(text)
+    spend((behind - line) // 64)
+    head, tail = text[line:start], text[end:behind]
+    if not (head + tail).strip():
+        return line, behind
+    if tail.lstrip().startswith(b";"):
+        return start, behind - len(tail.lstrip()[1:].lstrip(b" \t"))
+    return (line + len(head.rstrip()) - 1 if head.rstrip().endswith(b";") else start), end
+
+
+def _lines(text: bytes, places: Sequence[int]) -> List[str]:
+    """Return the lines of these bytes of a text, each with its number."""
+    lines, breaks = text.split(b"\n"), [found.start() for found in re.finditer(b"\n", text)]
+    numbers = [bisect_left(breaks, at) for at in places]
+    return [f"line {at + 1}: {lines[at][:400].decode('utf-8', 'ignore').strip()[:200]}" for at in numbers]
+
+
+def weighted_lines(data: bytes) -> List[str]:
     """Return the lines of a file that name a function of legs_loss which a patch writes, each with its number."""
-    found = _Words(text)
-    members = [at for at in found.weighted if found.words[at + 1 : at + 2] == ["."]]
-    written = [at for at in members if _WRITTEN.intersection(found.words[at + 2 : at + 3])]
-    return list(dict.fromkeys(found.line(found.starts[at]) for at in written))
+    return list(dict.fromkeys(_lines(data, [found.start() for found in _CALLED.finditer(_code(data))])))

@@ -58,7 +58,7 @@ def unrecorded(root: Path) -> List[Tuple[str, str]]:
     recorded = Journal.read(root).files
     for name in walk(root):
         source = read_source(root, name) if name not in recorded else None
-        lines = weighted_lines(source.text) if isinstance(source, Source) and PACKAGE in source.text else []
+        lines = weighted_lines(source.data) if isinstance(source, Source) and PACKAGE in source.text else []
         if lines:
             where = _recorded_in(root / name)
             what = f"no journal names it; restore it from git or by hand: {first_of(lines, 20, '; ')}"

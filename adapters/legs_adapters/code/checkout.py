@@ -13,7 +13,7 @@ from legs_adapters.code.module import Class, Function, Module, index_by_word, pa
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import dotted
 
-_DEFINED = re.compile(r"\bdef[ \t]+(\w+)")
+_DEFINED = re.compile(r"def[ \t]+(\w+)")
 
 
 class Checkout:
@@ -27,7 +27,7 @@ class Checkout:
     def __init__(self, sources: Iterable[Source], budget: Optional[Budget] = None) -> None:
         self.sources: Dict[str, Source] = {source.path: source for source in sources}
         self.budget: Budget = budget or Budget()
-        self.when_read: Callable[[str], object] = len  # given the text of each file that was parsed
+        self.when_read: Callable[[str], object] = len  # given the path of each file that was parsed
         self._unreadable: Dict[str, Unreadable] = {}
         self._modules: Dict[str, Optional[Module]] = {}
         self._by_stem: Dict[str, List[str]] = {}
@@ -45,7 +45,7 @@ class Checkout:
         """Return a parsed file; None where it is none of these or does not parse (it is then among ``unreadable``)."""
         if path in self.sources and path not in self._modules:
             parsed = parse(self.sources[path], self.budget)
-            self.when_read(self.sources[path].text)
+            self.when_read(path)
             if isinstance(parsed, Unreadable):
                 self._unreadable[path] = parsed
             self._modules[path] = parsed if isinstance(parsed, Module) else None
@@ -68,6 +68,7 @@ class Checkout:
             if module is not None:
                 yield module
 
+    @remembered
     def paths_matching(self, pattern: re.Pattern[str]) -> List[str]:
         """Return the paths of the files whose text matches."""
         return [path for path, source in self.sources.items() if pattern.search(source.text)]

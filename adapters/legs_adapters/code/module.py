@@ -17,7 +17,7 @@ from legs_adapters.code.syntax import arguments, children, dotted
 CALLED = ("forward", "__call__")  # what calling an instance runs: a torch module's own, and Python's
 
 _T = TypeVar("_T")
-_WORD = re.compile(r"(\w+)(?:\s*(\())?")  # a word, and whether it is called
+_WORD = re.compile(r"\w+(?:\s*\()?")  # a word, and whether it is called
 _DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
@@ -143,8 +143,9 @@ class Class:
 
     def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
         """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""
-        methods = [method for method in self.methods.values() if attribute in method.text and where(method)]
-        found = [(method, d) for method in methods for d in method.flow.definitions.get(f"self.{attribute}", ())]
+        place = f"self.{attribute}"
+        methods = [method for method in self.methods.values() if place in method.text and where(method)]
+        found = [(method, d) for method in methods for d in method.flow.definitions.get(place, ())]
         # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
         return [(method, made) for method, made in found if not str(made.key).startswith(".")]
 
@@ -220,11 +221,11 @@ class Module:
 def index_by_word(texts: Iterable[Tuple[_T, str]]) -> Dict[str, List[_T]]:
     """Return what has a word in its text, by the word; by ``word(`` what calls it."""
     found: Dict[str, List[_T]] = {}
-    before, known = "", frozenset([""])
+    before, known = "", {""}
     for entry, text in texts:
         if text is not before:  # before Python 3.8 all functions of a file share its text
-            words = set(_WORD.findall(text))
-            before, known = text, frozenset(name for name, _ in words).union(map("".join, words))
+            called = {"".join(each.split()) for each in set(_WORD.findall(text))}
+            before, known = text, called.union(each.rstrip("(") for each in called)
         for word in known:
             found.setdefault(word, []).append(entry)
     return found

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import ast
 import bisect
+import contextlib
+import itertools
 import re
 import warnings
-from typing import Iterator, List, Mapping, NamedTuple, Optional, Tuple, cast
+from dataclasses import dataclass, field
+from typing import Dict, Iterator, List, NamedTuple, Optional, Tuple
 
 import libcst as cst
-from libcst.metadata import ByteSpanPositionProvider, CodeSpan
-from libcst.metadata.span_provider import SpanProvidingCodegenState, byte_length_in_utf8
+from libcst._nodes.internal import CodegenState
 
 from legs_adapters.code.syntax import code
 from legs_loss.system import held_back
@@ -60,6 +62,29 @@ class Lines:
         return Place(start, end, line, start - self._starts[line - 1], max(line, last))
 
 
+@dataclass
+class _Writing(CodegenState):
+    """The tokens that LibCST writes, and which are a node's, by its id: LibCST's own spans take twice as long."""
+
+    spans: Dict[int, Tuple[int, int]] = field(default_factory=dict)
+    _starts: List[int] = field(default_factory=list)
+
+    def before_codegen(self, node: cst.CSTNode) -> None:
+        self._starts.append(len(self.tokens))
+
+    def after_codegen(self, node: cst.CSTNode) -> None:
+        self.spans.setdefault(id(node), (self._starts.pop(), len(self.tokens)))
+
+    @contextlib.contextmanager
+    def record_syntactic_position(
+        self, node: cst.CSTNode, *, start_node: Optional[cst.CSTNode] = None, end_node: Optional[cst.CSTNode] = None
+    ) -> Iterator[None]:
+        here = len(self.tokens)
+        yield
+        start = here if start_node is None else self.spans[id(start_node)][0]
+        self.spans[id(node)] = start, len(self.tokens) if end_node is None else self.spans[id(end_node)][1]
+
+
 class Part:
     """Bytes that were parsed separately.
 
@@ -74,7 +99,8 @@ class Part:
         self.tree: cst.Module = cst.parse_module(self.text.decode("utf-8"))
         self.shift = shift
         self._lines = lines
-        self._spans: Mapping[cst.CSTNode, CodeSpan] = {}
+        self._spans: Dict[int, Tuple[int, int]] = {}  # by a node's id: of the tokens that LibCST writes
+        self._starts: List[int] = []  # the byte at which each of them starts, and the end
 
     def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
         """Return the place of a node in the file, on request with the brackets around it.
@@ -83,22 +109,19 @@ class Part:
             ValueError: LibCST would write another text than it read.
         """
         if not self._spans:
-            # Written once, for the text and the spans: LibCST's own wrapper walks a tree three times.
-            tree, spans = self.tree, ByteSpanPositionProvider()
-            state = SpanProvidingCodegenState(
-                tree.default_indent, tree.default_newline, provider=spans, get_length=byte_length_in_utf8
-            )
+            writing = _Writing(self.tree.default_indent, self.tree.default_newline)
             with held_back():  # in there LibCST would make a KeyError of Ctrl-C
-                tree._codegen(state)
-            written = "".join(state.tokens).encode(tree.encoding)
+                self.tree._codegen(writing)
+            written = "".join(writing.tokens).encode(self.tree.encoding)
             if written != self.text:
                 pairs = enumerate(zip(written, self.text))
                 at = self.shift + next((i for i, (one, other) in pairs if one != other), len(self.text) - 1)
                 line = self._lines.place(at, at).line
                 raise ValueError(f"LibCST would write line {line} in another way")
-            self._spans = cast("Mapping[cst.CSTNode, CodeSpan]", spans._computed)
-        span = self._spans[node]
-        start, end = self.shift + span.start, self.shift + span.start + span.length
+            lengths = (len(token.encode()) for token in writing.tokens)
+            self._starts = list(itertools.accumulate(itertools.chain([self.shift], lengths)))
+            self._spans = writing.spans
+        start, end = (self._starts[i] for i in self._spans[id(node)])
         if brackets and isinstance(node, cst.BaseExpression):
             start -= sum(len(code(part).encode()) for part in node.lpar)
             end += sum(len(code(part).encode()) for part in node.rpar)

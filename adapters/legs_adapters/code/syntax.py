@@ -16,8 +16,10 @@ _WORDS = (cst.Name, cst.SimpleString, cst.Integer, cst.Float)
 _LITERALS = (*_WORDS, cst.UnaryOperation, cst.Tuple, cst.List)
 _MISSING = object()
 _PUNCTUATION = re.compile(
-    "whitespace|[lr]par|[lr]brac|leading_lines|trailing_whitespace|header|footer|comma|equal|semicolon"
+    "whitespace|[lr]par|[lr]brac|l.*_lines|lines_|trailing_|header|footer|comma|equal|dot|.*colon"
 )
+_NO_NODES = (str, bool, type(None), cst.MaybeSentinel)  # isinstance on every node is slow
+_SCOPES = (cst.FunctionDef, cst.ClassDef)
 
 
 def code(node: cst.CSTNode) -> str:
@@ -114,14 +116,13 @@ def arguments(node: cst.Call) -> Tuple[List[cst.BaseExpression], Dict[str, cst.B
     return positional, keywords, len(plain) < len(node.args)
 
 
-def children(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
-    """Yield a node's direct children in source order, without white space and punctuation."""
+def children(node: cst.CSTNode) -> List[cst.CSTNode]:
+    """Return a node's direct children in source order, without white space and punctuation."""
+    found: List[Any] = []
     for name in _fields(type(node)):
         value = getattr(node, name)
-        for part in value if isinstance(value, (list, tuple)) else (value,):
-            kind: Any = type(part)
-            if _is_node(kind):
-                yield part
+        found += value if isinstance(value, (list, tuple)) else (value,)
+    return [part for part in found if type(part) not in _NO_NODES]
 
 
 def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
@@ -130,22 +131,14 @@ def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
     while stack:
         node = stack.pop()
         yield node
-        below = [
-            child for child in children(node) if type(child) is not cst.FunctionDef and type(child) is not cst.ClassDef
-        ]
-        stack.extend(reversed(below))
-
-
-@functools.lru_cache(maxsize=None)
-def _is_node(kind: Any) -> bool:
-    """Return whether a class is one of LibCST's nodes, cached: isinstance on every node is slow."""
-    return issubclass(kind, cst.CSTNode)
+        stack += [child for child in reversed(children(node)) if type(child) not in _SCOPES]
 
 
 @functools.lru_cache(maxsize=None)
 def _fields(kind: Any) -> Tuple[str, ...]:
-    """Return the fields of a class of nodes, without those of white space and punctuation."""
-    return tuple(field.name for field in dataclasses.fields(kind) if not _PUNCTUATION.match(field.name))
+    """Return the fields of a class of nodes, without those of white space, punctuation and text."""
+    fields = [field.name for field in dataclasses.fields(kind) if field.type is not str]
+    return tuple(name for name in fields if not _PUNCTUATION.match(name))
 
 
 def same(a: cst.CSTNode, b: cst.CSTNode) -> bool:

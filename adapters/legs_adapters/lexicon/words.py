@@ -133,5 +133,6 @@ RAYS = re.compile(
 OF_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
 STRUCTURAL = re.compile("ssim", re.I)
 NO_L1 = re.compile(r"ssim|lpips|vgg|percept|psnr|mse|l2|huber|smooth_?l1|charbonnier|cross_?entropy|cosine", re.I)
-SPEAKS_OF_L1 = re.compile(r"[lL]1|(?<!np\.)(?<!numpy\.)(?<!math\.)\babs(olute)?\s*\(")
+# A text is searched ten times as fast where a pattern begins with a letter: what may stand before it is asked after it.
+SPEAKS_OF_L1 = re.compile(r"[lL]1|abs(?<!\wabs)(?<!np\.abs)(?<!numpy\.abs)(?<!math\.abs)(?:olute)?\s*\(")
 SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)

@@ -37,7 +37,7 @@ _Entry = Tuple[Place, Union[Site, Left, Problem]]
 
 _RULES = 100  # steps at most of what all rules ask about a term
 _TEXT = 50  # letters of a text that are searched in a step
-_MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|\bunweighted\(")
+_MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|unweighted\(")
 _TO_READ = re.compile(f"{_MAY_HAVE_L1.pattern}|{TRAINS.pattern}|{'|'.join(sorted(HOOKS))}")
 
 
@@ -60,9 +60,9 @@ def find(
         budget: the steps that it may take; default: its own.
     """
     program = Program(sources, MODULE_SELF, MODULE_WRAPS, budget)
-    with progress(len(program.paths_matching(_TO_READ)), "files read") as bar:
-        # A file with an L1 is done when it was judged, too.
-        program.when_read = lambda text: bar.update(0.5 if _MAY_HAVE_L1.search(text) else bool(TRAINS.search(text)))
+    named = set(program.paths_matching(_MAY_HAVE_L1))
+    with progress(len(named), "files read") as bar:  # half of a file when it is parsed, half when it was judged
+        program.when_read = lambda path: bar.update(0.5 * (path in named))
         analysis = Analysis(program)
         found = _Finder(analysis, by_hand, bar).run()
     found = with_trace(found, analysis, trace) if trace is not None and not by_hand else found
@@ -84,8 +84,9 @@ class _Finder:
     def run(self) -> Findings:
         found, program = self.found, self.analysis.program
         may_have = self.analysis.prospects.may_have  # of an L1 that its callers do not name so
+        named = set(program.paths_matching(_MAY_HAVE_L1))
         for module in program.matching(_TO_READ):
-            is_named = _MAY_HAVE_L1.search(module.text) is not None
+            is_named = module.path in named
             if not is_named and not may_have(module.text):
                 continue
             self.bar.update(0.5 * is_named)

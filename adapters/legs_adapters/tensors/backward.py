@@ -24,7 +24,7 @@ from legs_adapters.code.syntax import (
 from legs_adapters.tensors.operations import APPLIES, BACKWARD, ENDS_GRADIENT, HOOKS, LOSSES, SIZES, depends
 from legs_adapters.tensors.steps import is_backward
 
-TRAINS = re.compile(r"\b((manual_)?backward|grad)\s*\(")  # a text that runs a backward pass
+TRAINS = re.compile(r"(?:backward|grad(?<!\wgrad))\s*\(")  # a text that runs a backward pass
 _ANY = object()
 _DEPTH = 2
 

@@ -27,10 +27,10 @@ _UNPACKED = re.compile(
     re.M,
 )
 _TARGET = re.compile(r"\b(\w+)[ \t]*(?:,|$)")
-_RETURNED = re.compile(r"\breturn[ \t(]+" + _VALUE)
-_ADDED = re.compile(r"\bself\.(\w+)\.(?:append|add|extend|update|setdefault)\(([^\n]*)")
+_RETURNED = re.compile(r"return(?<!\wreturn)[ \t(]+" + _VALUE)
+_ADDED = re.compile(r"self(?<!\wself)\.(\w+)\.(?:append|add|extend|update|setdefault)\(([^\n]*)")
 _SINGLE_CALL = re.compile(r"(?<![\w.])([\w.]+)[ \t]*\((?:[^()]|\([^()]*\))*\)[ \t]*(?:#.*)?$")
-_RENAMED = re.compile(r"(?<=\w)[ \t]+as[ \t]+(\w+)")
+_RENAMED = re.compile(r"as(?<=[ \t]as)[ \t]+(\w+)")
 _LAST_WORD = re.compile(r"(?<!\w)\w*$")
 _WITH_L1 = re.compile(r"^.*[lL]1.*$", re.M)
 _DEFAULT = re.compile(
@@ -142,7 +142,7 @@ def _entries(text: str) -> Iterator[_Entry]:
         yield from ((target, _NONE, _held(value)) for target in _TARGET.findall(several))
     named += [found for line in _WITH_L1.findall(text) for found in _DEFAULT.findall(line)]
     for match in _RENAMED.finditer(text):
-        last = _LAST_WORD.search(text[max(match.start() - 80, 0) : match.start()])
+        last = _LAST_WORD.search(text[max(match.start() - 80, 0) : match.start()].rstrip(" \t"))
         named.append((match.group(1), last.group() if last is not None else ""))
     yield from ((name, *[_Words.of(value)] * 2) for name, value in named)
 

@@ -71,6 +71,9 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
     def line(entry: Any, code: Optional[str] = None, **more: object) -> Dict[str, object]:
         return {"file": entry.path, "line": entry.line, "code": entry.text if code is None else code, **more}
 
+    def term(form: Form) -> Dict[str, str]:
+        return {"term": form.term} if form.term else {}
+
     def problem(entry: Problem) -> Dict[str, object]:
         site = f"{entry.path}:{entry.line}" if entry.by_site else None
         return line(entry, reason=entry.reason, advice=entry.advice, site=site)
@@ -78,7 +81,7 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
     content: Dict[str, object] = {
         "root": str(plan.root),
         "sites": [
-            line(site, one_line(site.form.node), column=site.column, function=site.scope.name, **_term(site.form))
+            line(site, one_line(site.form.node), column=site.column, function=site.scope.name, **term(site.form))
             for site in found.sites
         ],
         "plain": [
@@ -103,11 +106,6 @@ def as_json(plan: Plan, wrote: Sequence[str]) -> str:
     if found.trace is not None:
         content["traced"] = _traced(found.trace)
     return json.dumps(content, indent=2) + "\n"
-
-
-def _term(form: Form) -> Dict[str, str]:
-    """Return the name of a term that is not weighted: an SSIM, or a line that masks."""
-    return {} if form.weighs else {"term": form.term}
 
 
 def as_diff(changes: Changes) -> str:

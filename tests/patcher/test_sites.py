@@ -27,7 +27,7 @@ def test_every_term_gets_the_verdict_that_its_comment_asks_for(name, tmp_path):
     found = plan(checkout(tmp_path, texts), **options(name))
     verdicts = {}
     for site in (site for site in found.findings.sites if site.form.term != "mask"):
-        becomes = "weighted" if site.form.weighs else "fused"
+        becomes = "fused" if site.form.term else "weighted"
         verdicts[site.path, site.line] = becomes, changed_lines(found, site.path)[site.line - 1].strip()
     for use, _ in found.findings.unweighted:
         verdicts[use.left.path, use.left.line] = "plain", changed_lines(found, use.left.path)[use.left.line - 1].strip()

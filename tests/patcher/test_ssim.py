@@ -113,13 +113,13 @@ class TestPatch:
     def test_without_the_option_no_ssim_is_touched_or_listed(self, tmp_path):
         found = plan(checkout(tmp_path, files("ssim_beside_l1_fused")))
         assert not [edit for edits in found.edits.values() for edit in edits if b"ssim" in edit.after]
-        assert all(site.form.weighs for site in found.findings.sites)
+        assert not any(site.form.term for site in found.findings.sites)
         assert not [left for left in found.findings.left if left.rule.startswith("ssim-")]
 
     def test_the_l1_terms_are_what_they_are_without_it(self, tmp_path):
         root = checkout(tmp_path, files("ssim_beside_l1_fused"))
         plain, both = plan(root), plan(root, ssim=True)
-        assert [site[:4] for site in both.findings.sites if site.form.weighs] == [s[:4] for s in plain.findings.sites]
+        assert [site[:4] for site in both.findings.sites if not site.form.term] == [s[:4] for s in plain.findings.sites]
         assert {left[:4] for left in plain.findings.left} <= {left[:4] for left in both.findings.left}
         assert set(plain.edits["train.py"]) <= set(both.edits["train.py"])
 

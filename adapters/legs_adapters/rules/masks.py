@@ -52,7 +52,7 @@ def with_masks(found: Findings, analysis: Analysis) -> Findings:
         pair = _Pair(site.scope, form.node, whole[0], whole[1])
         if isinstance(form, PassedByName):
             finder.problems.append(pair.problem(site.scope, form.node, "the L1 is called elsewhere"))
-        elif form.weighs:
+        elif not form.term:
             finder.look_at(pair)
     for entry in found.patched:
         finder.look_at_patched(entry)

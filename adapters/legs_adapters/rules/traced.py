@@ -70,7 +70,7 @@ class _Join:
         return found.with_more(**{name: [e for e in self.entries if isinstance(e, kinds[name])] for name in kinds})
 
     def _is_decided(self, entry: Any) -> bool:
-        if isinstance(entry, Site) and not entry.form.weighs:
+        if isinstance(entry, Site) and entry.form.term:
             return False
         return any((entry.path, entry.line) == (path, line) for path, line, _ in self.settled)
 
@@ -219,7 +219,7 @@ class _Join:
         function, form = candidate.function, candidate.form
         place, uses = function.place(form.node), tuple(self._others(candidate) or ())
         text = traced.text(self._name(traced, [candidate]))
-        sites = [site for site in self.found.sites if site.form.weighs]
+        sites = [site for site in self.found.sites if not site.form.term]
         read = next((site for site in sites if (site.path, site.line, site.column) == candidate.key), None)
         verdict: Any = read or self.verdicts.decide(function, form, place, True)
         if isinstance(verdict, Site):

@@ -7,8 +7,6 @@ from typing import ClassVar, List, Optional, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.module import Function
-from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, apply_edits, on_one_line
 from legs_adapters.terms.writing import Writing
 
@@ -25,8 +23,7 @@ class Form:
         extras: the call's further arguments.
         makes: what becomes of the differences: "mean", "none" (the map), or "own", anything else that is an L1; see
             `L1Functions.shape`.
-        weighs: whether the edit weights the term.
-        term: what it is a term of, in the JSON report.
+        term: what it is where the edit does not weight it, in the JSON report; empty where it does.
         done: what the edit does to it, in words.
     """
 
@@ -38,14 +35,8 @@ class Form:
     extras: Tuple[cst.Arg, ...] = ()
     makes: str = "own"
 
-    weighs: ClassVar[bool] = True
-    term: ClassVar[str] = "l1"
+    term: ClassVar[str] = ""
     done: ClassVar[str] = "is weighted"
-
-    @classmethod
-    def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
-        """Return the form of a call, or None; some kinds are not found in calls."""
-        return None
 
     @property
     def is_map(self) -> bool:
@@ -67,6 +58,3 @@ class Form:
         after = apply_edits(text.source.data, self.edits(text, writing))
         before, behind = len(text.source.data) - len(text.bytes) + start, len(text.bytes) - end
         return on_one_line(after[before : len(after) - behind].decode("utf-8"))
-
-    def _own(self, writing: Writing) -> str:
-        return writing.own(self.callee, self.extras) if self.callee is not None and self.makes == "own" else ""

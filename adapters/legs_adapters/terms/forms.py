@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, Set, Tuple, Type
+from typing import List, Set, Tuple, Type, Union
 
 import libcst as cst
 
@@ -17,7 +17,7 @@ from legs_adapters.terms.kinds.absolute import Absolute
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.kinds.indirect import Indirect
 
-KINDS: Tuple[Type[Form], ...] = (Absolute, Indirect, Called)  # the first that recognises a call
+KINDS: Tuple[Type[Union[Absolute, Indirect, Called]], ...] = (Absolute, Indirect, Called)  # the first that finds it
 
 
 class Forms:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Sequence, Set, Tuple
+from typing import Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import returned
@@ -69,17 +68,13 @@ class L1Functions:
         values = [made.value for made in (found[1] if found else ()) if made.kind in ("assign", "element", "with")]
         return any(value is not None and self._prospects.may_hold(code(value)) for value in values)
 
-    @remembered
-    def shape(self, function: Function) -> Optional[str]:
-        """Return what a function of the checkout computes from its first two arguments.
+    def shape(self, function: Function, depth: int = 0) -> Optional[str]:
+        """Return what a function of the checkout, so many calls deep, computes from its first two arguments.
 
         Returns:
             "mean" for ``abs(a - b).mean()``, "none" for ``abs(a - b)``, "own" for any other L1 that depends on
             the difference (and on further arguments) only; None where it is not an L1.
         """
-        return self._shape(function, 0)
-
-    def _shape(self, function: Function, depth: int) -> Optional[str]:
         if len(function.parameters) < 2 or depth > _DEPTH or not self._prospects.may_have(function.text):
             return None
         if function not in self._only:
@@ -121,11 +116,11 @@ class L1Functions:
         if reference.kind == "made by":
             return "own" if name.split(".")[-1] == "L1Loss" else None  # nerfstudio hands torch's on
         if reference.kind == "function" and isinstance(reference.target, Function):
-            return self._shape(reference.target, depth)
+            return self.shape(reference.target, depth)
         if reference.kind == "instance" and depth == 0:
             methods = self.program.member(reference.target, "forward")  # type: ignore[arg-type]
             if len(methods) == 1 and isinstance(methods[0].target, Function):
-                return "own" if self._shape(methods[0].target, 0) else None
+                return "own" if self.shape(methods[0].target) else None
         return None
 
     # -- what a body may do with the two
@@ -136,8 +131,7 @@ class L1Functions:
         pairs, selecting = _selected(function, nodes)
         body, allowed = _Body(function, pairs, depth), set(selecting)
         for node in nodes:
-            may_be = _MAY_BE.get(type(node))
-            parts = may_be(self, body, node) if may_be is not None else ()
+            parts = self._may_have(body, node)
             if parts is None:
                 return False
             allowed.update(id(part) for each in parts for part in walk_expressions(each))
@@ -147,6 +141,20 @@ class L1Functions:
         names = [node for node in nodes if isinstance(node, cst.Name) and node.value in compared]
         absolute = any(isinstance(node, cst.Call) and (abs_argument(node) or self._is_l1(body, node)) for node in nodes)
         return absolute and bool(names) and all(id(node) in allowed for node in names)
+
+    def _may_have(self, body: _Body, node: cst.CSTNode) -> Optional[Sequence[cst.CSTNode]]:
+        """Return the parts of a node in which it may have the two; None where the function is no L1."""
+        if isinstance(node, cst.BinaryOperation):
+            return self._in_operation(body, node)
+        if isinstance(node, cst.Call):
+            return self._in_call(body, node)
+        if isinstance(node, cst.Attribute) and node.attr.value in SIZES:
+            return [node.value]
+        if isinstance(node, cst.Comparison) and all(depends(body.function, node, {name}) for name in body.pairs[0]):
+            return None  # a threshold of the difference: a weight would move pixels over it
+        if isinstance(node, cst.Subscript) and dotted(node.value) in body.pairs[0] and isinstance(key_of(node), str):
+            return None  # an entry of a dictionary: its parameter is no picture itself
+        return []
 
     def _in_operation(self, body: _Body, node: cst.BinaryOperation) -> Optional[List[cst.CSTNode]]:
         if isinstance(node.operator, cst.Power) and depends(body.function, node.left, set(body.pairs[0])):
@@ -166,19 +174,6 @@ class L1Functions:
             return list(node.args)
         return list(node.args[:2]) if self._is_l1(body, node) else []
 
-    def _in_attribute(self, body: _Body, node: cst.Attribute) -> List[cst.CSTNode]:
-        return [node.value] if node.attr.value in SIZES else []
-
-    def _in_comparison(self, body: _Body, node: cst.Comparison) -> Optional[List[cst.CSTNode]]:
-        """Return nothing to follow, or None of a threshold of the difference: a weight would move pixels over it."""
-        of_both = all(depends(body.function, node, {name}) for name in body.pairs[0])
-        return None if of_both else []
-
-    def _in_subscript(self, body: _Body, node: cst.Subscript) -> Optional[List[cst.CSTNode]]:
-        """Return nothing to follow, or None of an entry of a dictionary: its parameter is no picture itself."""
-        is_entry = isinstance(node.value, cst.Name) and isinstance(key_of(node), str)
-        return None if is_entry and node.value.value in body.pairs[0] else []  # type: ignore[attr-defined]
-
     def _is_l1(self, body: _Body, node: cst.Call) -> bool:
         """Return whether a call is of an L1 with both, torch's or the codebase's own."""
         positional = arguments(node)[0]
@@ -189,15 +184,6 @@ class L1Functions:
         # self.l1_loss(...) in a method of its name: there it is the term itself
         known = [r for r in references if r.kind != "made by" or body.function.name in CALLED]
         return any(self.shape_of_reference(reference, body.depth + 1) for reference in known)
-
-
-_MAY_BE: Dict[type, Callable[..., Optional[Iterable[cst.CSTNode]]]] = {
-    cst.BinaryOperation: L1Functions._in_operation,
-    cst.Call: L1Functions._in_call,
-    cst.Attribute: L1Functions._in_attribute,
-    cst.Comparison: L1Functions._in_comparison,
-    cst.Subscript: L1Functions._in_subscript,
-}  # by the type of a node: the parts in which it may have the two; None where the function is no L1
 
 
 def _selected(function: Function, nodes: Sequence[cst.CSTNode]) -> Tuple[List[Tuple[str, str]], Set[int]]:
@@ -215,8 +201,7 @@ def _selected(function: Function, nodes: Sequence[cst.CSTNode]) -> Tuple[List[Tu
         is_new = all(len(function.flow.definitions.get(name.value, ())) == 1 for name in (one, other))
         is_new = is_new and isinstance(first.value, cst.Subscript)
         if (is_new or {one.value, other.value} == {a, b}) and _are_mirrored(first.value, second.value, a, b):
-            in_order = re.search(rf"\b{re.escape(a)}\b", code(first.value)) is not None
-            pairs.append((one.value, other.value) if in_order else (other.value, one.value))
+            pairs.append((one.value, other.value))
             selecting |= {id(part) for node in (first, second) for part in walk_expressions(node)}
     return pairs, selecting
 

@@ -60,7 +60,8 @@ class Called(Form):
         edits += [text.replace(*text.span(arg), side) for arg, side in zip((first, second), sides)]
         tail = writing.selection if self.makes != "own" else ""
         tail += ".mean()" if tail and self.is_mean else ""
-        settings = writing.settings(self.is_map or bool(tail), self._own(writing))
+        own = writing.own(self.call.func, self.extras) if self.makes == "own" else ""
+        settings = writing.settings(self.is_map or bool(tail), own)
         after, end = text.span(second)[1], text.span(self.call.args[-1])[1]
         if settings or end != after:
             edits.append(text.replace(after, end, settings + residue(text.between(after, end))))

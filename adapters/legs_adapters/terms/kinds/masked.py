@@ -29,7 +29,6 @@ class Masked(Form):
     after: Optional[cst.CSTNode] = None
     before: Optional[cst.CSTNode] = None
 
-    weighs: ClassVar[bool] = False
     term: ClassVar[str] = "mask"
     done: ClassVar[str] = "is masked, in every term that gets the rendering,"
 

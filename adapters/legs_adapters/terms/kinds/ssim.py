@@ -25,7 +25,6 @@ class Ssim(Form):
         after: 1.0 - legs_loss.ssim(image, gt_image)
     """
 
-    weighs: ClassVar[bool] = False
     term: ClassVar[str] = "ssim"
     done: ClassVar[str] = "is computed by legs_loss.ssim"
 

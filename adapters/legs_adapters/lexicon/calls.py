@@ -10,6 +10,7 @@ from typing import Callable, Dict, List, Optional, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.calls import callees
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import returned
@@ -17,6 +18,7 @@ from legs_adapters.code.syntax import (
     arguments,
     attribute_chain,
     call_name,
+    code,
     constant,
     dotted,
     same,
@@ -122,7 +124,7 @@ def _filtered(call: CallReading) -> Optional[Meaning]:
 def _moved(call: CallReading) -> Optional[Meaning]:
     """An operation of torch that returns its argument in another shape, type or size."""
     if picked_from(call.node) == 3:
-        return Meaning("depth", None)
+        return Meaning("channel", None)
     if call.name in JOINS and call.values:
         return call.ask(call.values[0])
     if call.owner is not None and call.name in (*PICTURE_METHODS, "pop", "popleft", "__getitem__"):
@@ -138,6 +140,22 @@ def picked_from(call: cst.Call, index: int = 0) -> int:
         return given[-2] if isinstance(given[-2], int) else 0
     sizes = next((each for each in given if isinstance(each, (list, tuple))), ())
     return sum(each for each in sizes[:index] if isinstance(each, int)) if call_name(call) == "split" else 0
+
+
+def _keyed(call: CallReading) -> Optional[Meaning]:
+    """What a function returns under a key that this call gives: ``drawn(camera, "depth")``, of any picture."""
+    value_of = call.function.flow.value_of
+    for callee in callees(call.program, call.function, call.node) if call.values else ():
+        given = [(name, callee.given(call.node, name)) for name in callee.parameters]
+        said = {name: constant(value_of(value) or value) for name, value in given if value is not None}
+        keys = {name: key for name, key in said.items() if isinstance(key, str)}
+        parts = walk_expressions(callee.body) if keys and callee.module.spend(callee.flow.steps) else ()
+        names = [code(part.value) for part in parts if isinstance(part, cst.Index)]
+        for key in [keys[name] for name in names if name in keys][:1]:
+            returned = mix(call.meaning_of(callee, value) for value in callee.flow.returns)
+            if kind_of_words(key) is not None or returned.kind not in (None, "image"):  # the kind of another key
+                return Meaning(kind_of_words(key), role_of_words(key) or returned.role)
+    return None
 
 
 def _rendered(call: CallReading) -> Optional[Meaning]:
@@ -169,7 +187,7 @@ def _of_images(call: CallReading) -> Optional[Meaning]:
     given = [call.ask(value) for value in call.values if constant(value) is None]
     images = [meaning for meaning in given if meaning.kind == "image"]
     if not images:
-        kinds = ("depth", "normal", "flow", *(["feature"] if given and given[0].role == "target" else []))
+        kinds = ("depth", "channel", "normal", "flow", *(["feature"] if given and given[0].role == "target" else []))
         return given[0] if len(given) == 1 and given[0].kind in kinds else None
     bodies = [returned(target) for target in (each.target for each in references) if isinstance(target, Function)]
     changes = any(is_of_neighbours(part) for body in bodies if body is not None for part in attribute_chain(body))
@@ -197,6 +215,9 @@ def _is_unlisted(reference: Reference) -> bool:
 
 def meaning_returned(call: CallReading) -> Optional[Meaning]:
     """Return what the called function returns."""
+    keyed = _keyed(call)
+    if keyed is not None:
+        return keyed
     for reference in call.program.resolve(call.function, call.node.func):
         for target in call.program.run_by(reference):
             found = [call.meaning_of(target, value) for value in target.flow.returns]
@@ -212,5 +233,5 @@ def _of_owner(call: CallReading) -> Optional[Meaning]:
 
 _SURE: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
     *(_number, _extreme, _reduced, _statistic, _filtered, _moved),
-    *(_rendered, _named),
+    *(_keyed, _rendered, _named),
 )

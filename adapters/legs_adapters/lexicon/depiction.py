@@ -104,14 +104,14 @@ class Meanings:
         role = role or flow.role
         if flow.kind == "feature" and kind == "image" and COLORS & set(words(node.value)):
             return Meaning("image", role)  # `rgb = outputs["features"]`: colours, there
-        if kind == "mask" and flow.kind in ("flow", "depth"):
+        if kind == "mask" and flow.kind in ("flow", "depth", "channel"):
             return Meaning("mask", role)  # motion_masks, alpha = depth_sil[1]: to be laid over a rendering
         return Meaning(more_special(kind, flow.kind), role)
 
     def _subscript(self, function: Function, node: cst.Subscript) -> Meaning:
         key = key_of(node) or formatted_key(node) or default_key(function, node)
-        if _is_fourth(node) or self._is_behind(function, node):
-            return Meaning("depth", self.meaning(function, node.value).role)  # of RGB+D: render[0, ..., 3], render[3:]
+        if is_fourth(node) or self._is_behind(function, node):
+            return Meaning("channel", self.meaning(function, node.value).role)  # of RGB+D: render[..., 3], render[3:]
         keys = [key] if isinstance(key, str) else self._keys(function, node.slice[-1].slice)
         return mix(self._member(function, node, each) for each in keys) if keys else self.meaning(function, node.value)
 
@@ -208,7 +208,7 @@ class Meanings:
             return Meaning(None, self.meaning(function, value).role)
         given = arguments(value)[0]
         if picked_from(value, index) >= 3:
-            return Meaning("depth", self.meaning(function, value).role)
+            return Meaning("channel", self.meaning(function, value).role)
         if call_name(value) == "zip" and index < len(given):
             return self.meaning(function, given[index])
         # A renderer that returns a tuple returns the image first; the rest have names of their own.
@@ -280,8 +280,10 @@ def _cut(node: cst.Subscript) -> Tuple[object, object]:
     return (constant(cuts[0].lower), cuts[0].upper and constant(cuts[0].upper, 0)) if len(cuts) == 1 else (None, None)
 
 
-def _is_fourth(node: cst.Subscript) -> bool:
+def is_fourth(node: cst.CSTNode) -> bool:
     """Return whether it is what lies behind the colours."""
+    if not isinstance(node, cst.Subscript):
+        return False
     start, end = _cut(node)
     last = node.slice[-1].slice if len(node.slice) > 1 else None
     is_one = isinstance(last, cst.Index) and constant(last.value) == 3
@@ -290,9 +292,9 @@ def _is_fourth(node: cst.Subscript) -> bool:
 
 def _is_opacity(part: cst.CSTNode, node: cst.BinaryOperation | cst.BooleanOperation) -> bool:
     """Return whether a part of an operation is the opacity of a layer: ``1 - layer[3:]``, ``layer[3:] * layer[:3]``."""
-    if not isinstance(part, cst.Subscript) or not _is_fourth(part):
+    if not is_fourth(part):
         return False
     left, right = node.left, node.right
     colours = left if part is right else right
-    is_over = isinstance(colours, cst.Subscript) and same(colours.value, part.value)
+    is_over = isinstance(colours, cst.Subscript) and same(colours.value, part.value)  # type: ignore[attr-defined]
     return constant(left) == 1 if isinstance(node.operator, cst.Subtract) else is_over

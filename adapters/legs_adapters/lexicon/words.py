@@ -27,6 +27,7 @@ WORDS = {
         depth depths range ranges z disp disparity disparities invdepth inverse idepth zbuf lidar distortion dist
         monodepth midas tof
     """,
+    "channel": "",  # what lies behind three channels; by its index, no name says so
     # LangSplat, Feature 3DGS, Gaussian Grouping; polarised light, phasors of time-of-flight cameras
     "feature": """
         feature features feat feats semantic semantics sem language lang clip dino lseg sam embedding embeddings latent
@@ -72,6 +73,7 @@ LAID_OVER = word_set("mask masks valid weight weights diff error errors")
 OF_PICTURES = word_set(
     "sky sh shs prior time light dx dy"
 )  # a mask, for example, unless something shows that it is an image
+FILES = word_set("file filename name path")  # of a picture: where it is, no picture
 BACKGROUND = word_set("bg bkgd background backgrounds")  # a colour to lay things over, whoever keeps it
 PICKING = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
 STATISTICS = word_set("histc histogram bincount entropy gram moments")  # of a picture, no picture

@@ -38,6 +38,7 @@ _Value = Tuple[Function, cst.CSTNode]
 _STEPS = re.compile(r"step(?:(?!step)\w)*\s*\(")
 _CALLED = re.compile(r"\b(\w+)\s*\(")
 _Round = Tuple[Function, Tuple[int, ...], int]
+_SETS_RATES = re.compile(r"""\[["']lr["']\]\s*[-+*/]?=[^=]|add_param_group|CyclicLR|OneCycleLR""")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 
 
@@ -80,6 +81,8 @@ class Purposes:
         if own is not None:
             return Evidence("no-step", "scoring", [(function, own)])
         moved, first = [self._moved(step) for step in steps], [step[:2] for step in steps[:1]]
+        if steps and not any(map(self._moves_any, steps)):
+            return Evidence("no-step", "scoring", first)
         if steps and all(some & (POSES | EMBEDDING) and not some & MODELS for some in moved):
             return Evidence("pose-step", "tracking", first)
         if steps and not any(some & MODELS for some in moved) and self._draws_a_model(function, 0):
@@ -174,8 +177,33 @@ class Purposes:
         found = said | (name if name & POSES else words_in(optimiser))  # gaussians.optimizer_cam moves cameras
         for where, given in self._given(function, optimiser, makers):
             leaves = [leaf for _, leaf in self._leaves(where, given)]
-            found |= set().union(*map(_named_in, [given, *where.flow.assigned(given), *leaves]))
+            found |= set().union(*map(self._named_in, [given, *where.flow.assigned(given), *leaves]))
         return found - PLUMBING
+
+    def _named_in(self, given: cst.CSTNode) -> Set[str]:
+        """Return the words of what is given; of ``[cam.pose for cam in scene.cameras]`` those of the pose."""
+        if self._is_still(given):
+            return set()
+        if isinstance(given, (cst.List, cst.Tuple, cst.Dict)):
+            return set().union(*(self._named_in(each.value) for each in given.elements))
+        elements = words_in(given.elt) - PLUMBING if isinstance(given, cst.ListComp) else set()
+        return elements if elements & (POSES | EMBEDDING | MODELS) else words_in(given)
+
+    def _is_still(self, node: cst.CSTNode) -> bool:
+        """Return whether it is a group of parameters with the rate 0, in a checkout that sets no rate later."""
+        literal = [each for each in getattr(node, "elements", ()) if isinstance(each, cst.DictElement)]
+        rates = [constant(each.value) for each in literal if constant(each.key) == "lr"]
+        return rates == [0] and not self._sets_rates()
+
+    @remembered
+    def _sets_rates(self) -> bool:
+        return any(_SETS_RATES.search(source.text) for source in self.program.sources.values())
+
+    def _moves_any(self, step: _Step) -> bool:
+        """Return whether an optimiser may move anything: not where the rate of each group is 0."""
+        assert isinstance(step[1].func, cst.Attribute)
+        given = self._given(step[0], step[1].func.value, step[3])
+        return not given or any(self._leaves(*each) for each in given)
 
     def _given(
         self, function: Function, optimiser: cst.CSTNode, makers: Sequence[Tuple[Function, cst.Call]], depth: int = 0
@@ -226,6 +254,8 @@ class Purposes:
         entries: List[cst.CSTNode] = []
         if isinstance(node, (cst.List, cst.Tuple)):
             entries = [element.value for element in node.elements]
+        elif self._is_still(node):
+            return []
         elif isinstance(node, cst.Dict):
             literal = [each for each in node.elements if isinstance(each, cst.DictElement)]
             entries = [each.value for each in literal if constant(each.key) == "params"]
@@ -276,12 +306,6 @@ def _optimised(made: Optional[cst.CSTNode]) -> Optional[cst.CSTNode]:
         return None
     positional, keywords, _ = arguments(made)
     return keywords.get("params") or next(iter(positional), None)
-
-
-def _named_in(given: cst.CSTNode) -> Set[str]:
-    """Return the words of what is given; of ``[cam.pose for cam in scene.cameras]`` those of the pose."""
-    elements = words_in(given.elt) - PLUMBING if isinstance(given, cst.ListComp) else set()
-    return elements if elements & (POSES | EMBEDDING | MODELS) else words_in(given)
 
 
 def _entries(value: Optional[cst.CSTNode]) -> List[Optional[cst.CSTNode]]:

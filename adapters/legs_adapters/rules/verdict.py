@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Optional
+import builtins
+from typing import List, NamedTuple, Optional, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.calls import callees
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.syntax import attribute_chain, call_name, one_line, same, words, words_in
-from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, swapped
-from legs_adapters.lexicon.words import DATA, MESH, PERCEPTUAL, TRACKING, WARPED
+from legs_adapters.code.syntax import attribute_chain, call_name, key_of, one_line, same, words, words_in
+from legs_adapters.lexicon.meaning import UNKNOWN, swapped
+from legs_adapters.lexicon.names import kind_of_words
+from legs_adapters.lexicon.ways import PHOTOGRAPH
+from legs_adapters.lexicon.words import DATA, FILES, MESH, PERCEPTUAL, TRACKING, WARPED
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.causes.other import is_of_other_framework
 from legs_adapters.rules.order import RULES, first
 from legs_adapters.rules.rule import Term
 from legs_adapters.rules.uses import uses_of
-from legs_adapters.tensors.operations import KEEPS_PICTURES
+from legs_adapters.tensors.operations import KEEPS_PICTURES, MODULES, OF_IMAGES
 from legs_adapters.terms.error_maps import is_measured, reads_of
 from legs_adapters.terms.findings import Evidence, Left, Problem, Site
 from legs_adapters.terms.form import Form
@@ -28,6 +32,9 @@ from legs_adapters.terms.sides import is_of_numbers, is_role, same_root
 from legs_adapters.terms.text import Text
 
 _OF_DIFFERENCE = "as one absolute difference times the photograph's weight map, with each mask and threshold as it is"
+
+
+_MOST = 100  # expressions that a photograph is followed through
 
 
 class _ByHand(NamedTuple):
@@ -137,10 +144,10 @@ class Verdicts:
             return _ByHand(f"nothing shows that {one_line(term.target)} is a photograph")
         if UNKNOWN in (pair.a, pair.b) and not by_hand:
             return _ByHand(f"nothing shows that {one_line(term.prediction)} is a rendering")
-        made = self._made_by_a_value(term.function, term.target)
-        if made is not None and not by_hand:
+        made = None if by_hand else self._unknown_maker(term.function, term.target)
+        if made is not None:
             return _ByHand(f"nothing shows what {one_line(made)} makes of the photograph")
-        if _is_any_entry(term.function, term.prediction) and not by_hand:
+        if not by_hand and self._is_unknown_entry(term.function, term.prediction):
             return _ByHand(f"nothing shows which pictures {one_line(term.prediction)} takes")
         if term.has_rows:
             why = "the sides are lists of pixels: a weight map needs whole images"
@@ -152,19 +159,53 @@ class Verdicts:
             return _ByHand(why, _OF_DIFFERENCE)
         return None
 
-    def _made_by_a_value(self, function: Function, target: cst.CSTNode) -> Optional[cst.Call]:
-        """Return the call of a value of unknown kind, ``teacher(photo)``, that a photograph is given to and made by."""
-        made = function.flow.value_of(target) or target
-        if not isinstance(made, cst.Call) or call_name(made) in KEEPS_PICTURES:
-            return None
-        root = list(attribute_chain(made.func))[-1]
-        if (DATA | {"self"}) & words_in(root):
-            return None  # a camera's own method, or an inherited one
-        kinds = {found.kind for found in function.flow.reaching(root)}
-        if not kinds or kinds & {"import", "function", "class"} or self.analysis.program.resolve(function, made.func):
-            return None
-        given = [self.analysis.meanings.meaning(function, arg.value) for arg in made.args]
-        return made if Meaning("image", "target") in given else None
+    def _unknown_maker(self, function: Function, target: cst.BaseExpression) -> Optional[cst.Call]:
+        """Return what makes a target of a photograph, ``teacher(photo)``, where nothing shows what that does."""
+        meaning = self.analysis.meanings.meaning
+        work: List[Tuple[Function, cst.CSTNode]] = [(function, target)]
+        for where, node in work:  # which grows
+            parts: List[cst.CSTNode] = where.flow.assigned(node)
+            if isinstance(node, cst.Call):
+                given = [arg.value for arg in node.args if not FILES & words_in(arg.value)]
+                if PHOTOGRAPH in [meaning(where, each) for each in given] and self._is_unknown(where, node):
+                    return node
+                runs = callees(self.analysis.program, where, node)
+                new = [(callee, value) for callee in runs for value in callee.flow.returns]
+                work += [each for each in new if each not in work] if len(work) < _MOST else []
+                parts = [*given, *attribute_chain(node.func)] if call_name(node) in KEEPS_PICTURES else []
+            elif isinstance(node, cst.Subscript):
+                parts = [node.value]
+            elif isinstance(node, cst.BinaryOperation):  # photo * segment(photo): a mask
+                sides = [node.left, node.right]
+                are_calls = PHOTOGRAPH == meaning(where, node.left) == meaning(where, node.right)
+                parts = [side for side in sides if not (are_calls and isinstance(side, cst.Call))]
+            elif isinstance(node, cst.IfExp):
+                parts = [node.body, node.orelse]
+            pictures = [part for part in parts if meaning(where, part).kind in (None, "image")]  # no mask of it
+            goes_on = where.module.spend(1 + len(parts)) and len(work) < _MOST
+            work += [(where, part) for part in pictures if (where, part) not in work] if goes_on else []
+        return None
+
+    def _is_unknown(self, function: Function, call: cst.Call) -> bool:
+        """Return whether a call is of what neither the checkout defines nor a known library of images."""
+        root = list(attribute_chain(call.func))[-1]
+        name = root.value if isinstance(root, cst.Name) else ""
+        if call_name(call) in KEEPS_PICTURES or (DATA | {"self"}) & set(words(name)):
+            return False  # a camera's own method, or an inherited one
+        found = self.analysis.program.resolve(function, call.func)
+        libraries = [str(each.target) for each in found if each.kind in ("external", "made by")]
+        if found:
+            return len(libraries) == len(found) and not all(map(OF_IMAGES.match, libraries))
+        return name not in MODULES and not hasattr(builtins, name)
+
+    def _is_unknown_entry(self, function: Function, side: cst.CSTNode) -> bool:
+        """Return whether a picture is under any key, or one in another that no word tells: ``package["out"]["D"]``."""
+        entry = function.flow.value_of(side) or side
+        keys = [key_of(part) for part in attribute_chain(entry) if isinstance(part, cst.Subscript)]
+        named = [kind_of_words(key) for key in keys if isinstance(key, str)]
+        is_untold = isinstance(entry, cst.Subscript) and len(named) > 1 and "image" not in named
+        is_untold = is_untold and self.analysis.meanings.meaning(function, entry).kind is None
+        return is_untold or _is_any_entry(function, entry)
 
     def _why_photograph(self, term: Term) -> str:
         """Return what shows that a side is the photograph."""
@@ -176,9 +217,8 @@ class Verdicts:
         return f"{name} is {where}the photograph by its name"
 
 
-def _is_any_entry(function: Function, side: cst.CSTNode) -> bool:
-    """Return whether a side is under each key of its holder in turn: ``package[name]`` of ``for name in package``."""
-    entry = function.flow.value_of(side) or side
+def _is_any_entry(function: Function, entry: cst.CSTNode) -> bool:
+    """Return whether it is under each key of its holder in turn: ``package[name]`` of ``for name in package``."""
     index = entry.slice[-1].slice if isinstance(entry, cst.Subscript) else None
     looped = [made.value for made in function.flow.reaching(index.value)] if isinstance(index, cst.Index) else []
     holders = [part for value in looped if value is not None for part in attribute_chain(value)]

@@ -5,6 +5,7 @@ An operation may stand in several lists: ``detach`` moves a value, and ends its 
 
 from __future__ import annotations
 
+import re
 from typing import List, Set
 
 import libcst as cst
@@ -46,6 +47,10 @@ TRANSFORMS = word_set(
 )  # no longer an absolute error
 OTHER_LOSSES = word_set("huber_loss mse_loss norm smooth_l1_loss")
 MODULES = word_set("F TF einops functional nn np numpy torch")  # as torch and its neighbours are imported
+# Libraries whose operations make no other picture of one, but for the networks in them; and what hands on values.
+OF_IMAGES = re.compile(
+    r"(torch(?!\.hub)|torchvision(?!\.models)|kornia|numpy|PIL|cv2|skimage|scipy|einops|imageio|copy|itertools|random)\b"
+)
 MODULE_SELF = word_set("cpu cuda double eval float half requires_grad_ to train")  # a module's methods that return it
 # These return a module wrapped; Lightning's fabric.setup, accelerate's prepare.
 MODULE_WRAPS = word_set("DDP DataParallel DistributedDataParallel compile convert_sync_batchnorm fabric.setup prepare")

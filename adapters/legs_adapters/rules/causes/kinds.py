@@ -12,7 +12,7 @@ from legs_adapters.terms.findings import Decider
 
 
 class OtherKind(Rule):
-    """By its name, or that of what it comes from, one side is {what}.
+    """By its name, index or source, one side is {what}.
 
     skipped:
         loss = l1_loss({sides})
@@ -48,11 +48,13 @@ class OtherKind(Rule):
     def _shown(self, term: Term, side: cst.CSTNode) -> List[Decider]:
         shown = source_of(term.function, side, lambda text: kind_of_words(text) == self.kind)
         around = next((decider for name, decider in term.names_around if kind_of_words(name) == self.kind), None)
-        return [shown or around or source_of(term.function, side) or term.here[0]]
+        made = source_of(term.function, side) if isinstance(side, cst.Name) else None
+        return [shown or around or made or term.here[0]]
 
 
 KINDS = (
     OtherKind("depth", "depth", "a depth map", 'package["depth"], camera.invdepthmap'),
+    OtherKind("channel", "channel", "a channel behind the colours", "package[3:], camera.rgbd[3:]", "depth"),
     OtherKind("normals", "normal", "a normal map", 'package["normals"], camera.normal_map'),
     OtherKind("features", "feature", "a feature or label map", 'package["features"], camera.semantic_feature'),
     OtherKind("flow", "flow", "optical flow or motion", 'package["flow"], camera.optical_flow'),

@@ -143,7 +143,7 @@ def picked_from(call: cst.Call, index: int = 0) -> int:
 
 
 def _keyed(call: CallReading) -> Optional[Meaning]:
-    """What a function returns under a key that this call gives: ``drawn(camera, "depth")``, of any picture."""
+    """The picture under the key that a call gives, ``drawn(camera, "depth")``, whatever other calls ask for."""
     value_of = call.function.flow.value_of
     for callee in callees(call.program, call.function, call.node) if call.values else ():
         given = [(name, callee.given(call.node, name)) for name in callee.parameters]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import bisect
 import itertools
+import math
 import re
 from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple, Union
 
@@ -22,12 +23,11 @@ from legs_adapters.code.syntax import (
     arguments,
     call_name,
     children,
-    constant,
-    every_parameter,
     one_line,
     path_of,
     walk_expressions,
 )
+from legs_adapters.lexicon.depiction import is_fourth
 from legs_adapters.lexicon.words import STRUCTURAL
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.terms.findings import Decider, Findings, Left, Problem, Site
@@ -44,7 +44,7 @@ _MOST = 100  # expressions that a rendering is followed through
 
 def with_masks(found: Findings, analysis: Analysis) -> Findings:
     """Return findings with the lines that mask the renderings of their terms, and with those to be written by hand."""
-    finder = _Finder(analysis, found.sites)
+    finder = _Finder(analysis)
     for site in found.sites:
         form = site.form
         sides = (form.second, form.first) if site.swapped else (form.first, form.second)
@@ -57,7 +57,8 @@ def with_masks(found: Findings, analysis: Analysis) -> Findings:
     for entry in found.patched:
         finder.look_at_patched(entry)
     lines, problems = finder.settled()
-    left = [entry for line in lines for entry in finder.diluted(line)]
+    edited = {id(part) for site in found.sites for part in walk_expressions(site.form.node)}
+    left = [entry for line in lines for entry in finder.diluted(line, edited)]
     return found.with_more(sites=[line.site for line in lines], problems=problems, left=left)
 
 
@@ -106,34 +107,13 @@ class _Line(NamedTuple):
         return Site.at(function, form, f"{form.line}, before line {function.place(self.before).line}")
 
 
-class _Spans:
-    """Places in a file, in their order."""
-
-    def __init__(self, places: Sequence[Place]) -> None:
-        self.places = sorted(places)
-        self._starts = [place.start for place in self.places]
-        self._ends = list(itertools.accumulate((place.end for place in self.places), max))
-
-    def before(self, at: int) -> int:
-        """Return the index of the last that begins at a byte or before it; -1 without."""
-        return bisect.bisect_right(self._starts, at) - 1
-
-    def meets(self, place: Place) -> bool:
-        """Return whether one of them and a place have bytes in common."""
-        index = bisect.bisect_left(self._starts, place.end)
-        return index > 0 and self._ends[index - 1] > place.start
-
-
 class _Finder:
-    def __init__(self, analysis: Analysis, sites: Sequence[Site]) -> None:
+    def __init__(self, analysis: Analysis) -> None:
         self.analysis = analysis
         self.lines: Dict[Tuple[Function, Optional[str]], List[_Line]] = {}  # by the rendering's function and place
         self.unnamed: List[_Pair] = []
         self.problems: List[Problem] = []
-        self._blocks: Dict[int, _Spans] = {}
-        self._edited: Dict[Function, List[Place]] = {}
-        for site in sites:
-            self._edited.setdefault(site.scope, []).append(site.scope.place(site.form.node))
+        self._spans: Dict[int, List[Place]] = {}  # of the statements of a block, by its id
 
     def look_at_patched(self, entry: Left) -> None:
         """Take in the terms of a line that were weighted before."""
@@ -162,14 +142,13 @@ class _Finder:
             covered = any(one.start == line.start and one.covers(pair.prediction) for one in known)
             known += [] if covered else [line]
 
-    def diluted(self, line: _Line) -> Iterator[Left]:
-        """Yield the calls that get both images of a line after it, and are no terms of ours."""
+    def diluted(self, line: _Line, edited: Set[int]) -> Iterator[Left]:
+        """Yield the calls that get both images of a line after it, and are no terms of ours: not in what is edited."""
         function, resolve = line.pair.function, self.analysis.program.resolve
         pair = {path_of(line.pair.prediction), path_of(line.pair.target)}
-        edited = _Spans(self._edited.get(function, ()))
         for call, images in self._calls(function).get(path_of(line.pair.prediction), ()):
             place = function.place(call)
-            if not pair <= set().union(*images) or any(pair <= both for both in images) or edited.meets(place):
+            if not pair <= set().union(*images) or any(pair <= both for both in images) or id(call) in edited:
                 continue
             own = any(str(r.target).startswith(f"{PACKAGE}.") for r in resolve(function, call.func))
             if own or not line.covers(call):
@@ -200,7 +179,7 @@ class _Finder:
     def _leak(self, pair: _Pair) -> Optional[Decider]:
         """Return a read that takes what a rendering is made of into the loss, and comes after no line."""
         work: List[Tuple[Function, cst.CSTNode]] = [(pair.function, pair.prediction)]
-        found: List[Tuple[Function, cst.CSTNode]]
+        found: List[Tuple[Function, Optional[cst.CSTNode]]]
         carriers: Dict[Tuple[Function, Optional[str]], None] = {}
         made_of: Set[int] = set()
         met: Set[Reaching] = set()
@@ -211,15 +190,12 @@ class _Finder:
                     continue
                 carriers[where, path_of(part)] = None
                 for made in where.flow.reaching(part).new(met) if len(work) < _MOST else ():
+                    found = [(where, made.node if made.kind == "augment" else made.value)]
                     if made.kind == "parameter":
                         calls = self.analysis.training.sites.get(where, ())
-                        given = [(caller, where.given(call, made.place)) for caller, call in calls]
-                        found = [(caller, value) for caller, value in given if value is not None]
-                    else:
-                        value = made.node if made.kind == "augment" else made.value
-                        found = [(where, value)] if value is not None and made.kind != "import" else []
-                    for source, value in found:
-                        if id(value) not in made_of and value is not pair.prediction:
+                        found = [(caller, where.given(call, made.place)) for caller, call in calls]
+                    for source, value in found if made.kind != "import" else ():
+                        if value not in (None, pair.prediction) and id(value) not in made_of:
                             work.append((source, value))
                             made_of.update(map(id, walk_expressions(value)))
         pair.function.module.spend(len(met) + len(made_of))
@@ -256,32 +232,28 @@ class _Finder:
         parts = [part for side in (pair.prediction, pair.target) for part in walk_expressions(side)]
         if not reaching(pair.prediction) or any(isinstance(part, cst.Call) for part in parts):
             return "the images have no names here"
-        header = list(every_parameter(function.node.params)) if isinstance(function.node, cst.FunctionDef) else []
-        made = [[d.node for d in reaching(part)] for part in parts]
-        starts = [[function.place(node).start for node in nodes if node not in header] for nodes in made]
+        made = [list(reaching(part)) for part in parts]
+        starts = [[function.place(each.node).start for each in some if each.kind != "parameter"] for some in made]
         last = max((start for some in starts for start in some), default=-1)
         function.module.spend(sum(map(len, starts)))
-        names = [(nodes, some) for part, nodes, some in zip(parts, made, starts) if isinstance(part, cst.Name)]
-        unbound = [some for nodes, some in names if some and len(some) == len(nodes)]
-        for block, spans, index in self._blocks_around(function, pair.node):
-            here, earlier = spans.places[index].start <= last, spans.before(last)
+        names = [(some, at) for part, some, at in zip(parts, made, starts) if isinstance(part, cst.Name)]
+        unbound = [at for some, at in names if at and len(at) == len(some)]
+        for block, places, index in self._blocks_around(function, pair.node):
+            here, earlier = places[index].start <= last, _last_before(places, last)
             after = index - 1 if here or earlier < 0 else earlier
-            end = spans.places[after].end if after >= 0 else -1
+            end = places[after].end if after >= 0 else -1
             unbound = [some for some in unbound if not self._bind(function, block, [at for at in some if at < end])]
             if not here and not unbound:
                 last_one, before = block[after] if after >= 0 else None, block[after + 1]
-                return _Line(pair, last_one, before, spans.places[after + 1].start, spans.places[-1].end)
+                return _Line(pair, last_one, before, places[after + 1].start, places[-1].end)
         return "no line before the term surely comes after both images"
 
     def _bind(self, function: Function, block: Sequence[cst.CSTNode], starts: Sequence[int]) -> bool:
         """Return whether the statements of a block surely make one of the definitions that begin there."""
-        spans = self._spans(function, block)
-        inside: Dict[int, List[int]] = {}
-        for at in starts:
-            index = spans.before(at)
-            if index >= 0 and at < spans.places[index].end:
-                inside.setdefault(index, []).append(at)
-        return any(self._binds(function, block[index], some) for index, some in inside.items())
+        places = self._statements(function, block)
+        groups = itertools.groupby(starts, lambda at: _last_before(places, at))
+        inside = [(block[i], [at for at in some if at < places[i].end]) for i, some in groups if i >= 0]
+        return any(self._binds(function, node, some) for node, some in inside if some)
 
     def _binds(self, function: Function, node: cst.CSTNode, starts: Sequence[int]) -> bool:
         """Return whether a statement makes one of the definitions that begin in it, in each of its branches."""
@@ -293,25 +265,27 @@ class _Finder:
 
     def _blocks_around(
         self, function: Function, node: cst.CSTNode
-    ) -> Iterator[Tuple[Sequence[cst.CSTNode], _Spans, int]]:
+    ) -> Iterator[Tuple[Sequence[cst.CSTNode], List[Place], int]]:
         """Yield the blocks around a node, the outermost first, each with the index of the statement around it."""
         start = function.place(node).start
         blocks: List[Sequence[cst.CSTNode]] = [function.body.body]
-        while blocks:
-            found = []
-            for block in blocks:
-                spans = self._spans(function, block)
-                index = spans.before(start)
-                is_small = isinstance(block[index], cst.BaseSmallStatement)  # on the line of its if
-                if index >= 0 and start < spans.places[index].end and not is_small:
-                    found.append((block, spans, index))
-            yield from found
-            blocks = [inner for block, _, index in found for inner in blocks_of(block[index])]
+        for block in blocks:  # which grows
+            places = self._statements(function, block)
+            index = _last_before(places, start)
+            is_small = isinstance(block[index], cst.BaseSmallStatement)  # on the line of its if
+            if index >= 0 and start < places[index].end and not is_small:
+                yield block, places, index
+                blocks += blocks_of(block[index])
 
-    def _spans(self, function: Function, block: Sequence[cst.CSTNode]) -> _Spans:
-        if id(block) not in self._blocks:
-            self._blocks[id(block)] = _Spans([function.place(statement) for statement in block])
-        return self._blocks[id(block)]
+    def _statements(self, function: Function, block: Sequence[cst.CSTNode]) -> List[Place]:
+        if id(block) not in self._spans:
+            self._spans[id(block)] = [function.place(statement) for statement in block]
+        return self._spans[id(block)]
+
+
+def _last_before(places: Sequence[Place], at: int) -> int:
+    """Return the index of the last that begins at a byte or before it; -1 without."""
+    return bisect.bisect_right(places, (at, math.inf)) - 1
 
 
 def _places(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
@@ -324,14 +298,5 @@ def _places(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
         elif isinstance(part, cst.Call):
             stack += [arg.value for arg in part.args]
             stack.append(part.func.value if isinstance(part.func, cst.Attribute) else part.func)
-        elif not isinstance(part, (cst.FunctionDef, cst.ClassDef)) and not _is_past_colours(part):
+        elif not isinstance(part, (cst.FunctionDef, cst.ClassDef)) and not is_fourth(part):
             stack += children(part)
-
-
-def _is_past_colours(node: cst.CSTNode) -> bool:
-    """Return whether an index takes other channels than the first three of a rendering: ``package[3:6]``."""
-    if not isinstance(node, cst.Subscript):
-        return False
-    indices = [each.slice for each in node.slice]
-    firsts = [constant(i.lower if isinstance(i, cst.Slice) else i.value) for i in indices]  # type: ignore[attr-defined]
-    return any(isinstance(first, int) and first >= 3 for first in firsts)

@@ -68,7 +68,7 @@ def test_the_adapters_import_only_the_core_s_public_names() -> None:
     assert [line for line in used if not is_public(*line[1:])] == []
     lab = [place for place, module, name in used if f"{module}.{name}".startswith("legs_loss.lab")]
     # The latter two run a script on the shims.
-    drawing = tuple(f"adapters/legs_adapters/{name}" for name in ("shims/", "verify.py", "trace/running.py"))
+    drawing = tuple(f"adapters/legs_adapters/{name}" for name in ("shims/", "verify.py", "trace/tracing.py"))
     assert lab and all(place.startswith(drawing) for place in lab)
     assert len(used) > 20  # the folder was found
 

@@ -22,7 +22,7 @@ from legs_loss.system import never_fail_to_print, say
 if TYPE_CHECKING:
     from legs_adapters.plan import Plan
     from legs_adapters.terms.findings import Problem
-    from legs_adapters.terms.traced import Trace
+    from legs_adapters.trace.command import Command
 
 HELP = "add the LEGS loss to a codebase, or remove it; the same as legs-patch"
 
@@ -73,8 +73,8 @@ def _run(args: argparse.Namespace) -> int:
         return _patch(args)
     from legs_adapters.verify import check_verifiable
 
-    script, given = check_verifiable(args.folder, args.script, args.arguments, args.trace)
-    return _patch(args) or _verify(args, script, given if args.cpu else [])
+    command = check_verifiable(args.folder, args.script, args.arguments, args.trace, args.cpu)
+    return _patch(args) or _verify(args, command)
 
 
 def _so_far(args: argparse.Namespace) -> str:
@@ -158,6 +158,7 @@ def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.report import as_diff
     from legs_adapters.settings import SETTINGS_FILE, settings_text
     from legs_adapters.terms.instead import offered, trained_instead
+    from legs_adapters.trace.tracing import trace
     from legs_adapters.undo import unrecorded
 
     if not args.trace and (args.cpu or args.photos):
@@ -166,7 +167,7 @@ def _patch(args: argparse.Namespace) -> int:
     settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
     text = settings_text(root, settings)
     writes = bool(settings) or not (root / SETTINGS_FILE).exists()  # else the user's, or an earlier run's, stays
-    seen = _trace(args, root) if args.trace else None
+    seen = trace(root, args.trace, args.steps, args.cpu, args.photos) if args.trace else None
     by_hand = [_site(root, text) for text in args.site]
     found = plan(root, args.exclude, by_hand, ssim=args.ssim, masks=args.masks, trace=seen)
     for elsewhere in found.unsearched:
@@ -208,14 +209,6 @@ def _patch(args: argparse.Namespace) -> int:
     return 1 if problems or (args.check and found.after) else 0
 
 
-def _trace(args: argparse.Namespace, root: Path) -> Trace:
-    from legs_adapters.trace.running import trace
-
-    if args.steps < 1:
-        raise LegsError(f"--steps must be at least 1, got {args.steps}")
-    return trace(root, args.trace, args.steps, args.cpu, args.photos)
-
-
 def _show(args: argparse.Namespace, found: Plan, wrote: Sequence[str] = ()) -> None:
     """Print the report; beside a diff to stderr: git apply takes the diff alone."""
     from legs_adapters.report import as_json, as_table
@@ -236,11 +229,11 @@ def _elsewhere(root: Path, exclude: Sequence[str], found: Plan) -> str:
     )
 
 
-def _verify(args: argparse.Namespace, script: str, given: Sequence[str]) -> int:
+def _verify(args: argparse.Namespace, command: Command) -> int:
     from legs_adapters.verify import verify
 
     photos, by_hand = args.photos if args.cpu else None, bool(args.site)
-    verdict = verify(args.folder, script, args.arguments, args.iterations, given, photos, by_hand)
+    verdict = verify(args.folder, command, args.arguments, args.iterations, photos, by_hand)
     if args.json:
         say(json.dumps({"holds": verdict.claims, "runs": {name: run._asdict() for name, run in verdict.runs.items()}}))
     else:

@@ -1,17 +1,93 @@
-"""Import rewritten sources in place of files on disk: in this process, and in those that it spawns."""
+"""Run a script as Python does, with rewritten sources in place of files on disk: here, and in processes it spawns."""
 
 from __future__ import annotations
 
+import atexit
 import builtins
+import functools
 import importlib.machinery
 import importlib.util
 import linecache
 import multiprocessing.spawn
 import os
+import runpy
+import signal
 import sys
+import threading
 import types
+from pathlib import Path
 from types import CodeType
-from typing import Any, Dict, Mapping, Optional, Sequence
+from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Tuple, Type
+
+
+def execute(words: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[Path] = None) -> int:
+    """Run a script as the main program of this process, with other text for the files that ``sources`` names.
+
+    Args:
+        words: the script and its arguments, as they would be given to python; or `-m`, a module and its arguments.
+        sources: by real path, what to run in place of what is on disk.
+        cpu_root: the codebase, if its CUDA calls are to run on the CPU.
+
+    Returns:
+        The exit code, where the script does not leave by ``sys.exit``.
+    """
+    file = _as_python_names(words[0])
+    install(sources)
+    passed_on: Tuple[Type[BaseException], ...] = (SystemExit,)
+    if cpu_root is not None:
+        from legs_adapters.shims import MissingShim, start
+
+        start(cpu_root)
+        passed_on += (MissingShim,)
+    if words[0] == "-m":
+        sys.argv[:], sys.path[0] = words[1:], os.getcwd()
+        begin: Callable[[], Any] = functools.partial(runpy.run_module, words[1], run_name="__main__", alter_sys=True)
+    else:
+        sys.argv[:], sys.path[0] = words, os.path.dirname(os.path.realpath(words[0]))
+        sys.modules["__main__"] = main = main_module("__main__", file)
+        try:
+            begin = functools.partial(exec, Loader("__main__", file, sources).get_code("__main__"), main.__dict__)
+        except SyntaxError as error:
+            sys.excepthook(type(error), error.with_traceback(None), None)
+            return 1
+    try:
+        begin()
+    except passed_on:
+        raise
+    except BaseException as error:
+        traceback = error.__traceback__ and error.__traceback__.tb_next  # from the script on, without this frame
+        sys.excepthook(type(error), error.with_traceback(traceback), traceback)
+        return _interrupted() if isinstance(error, KeyboardInterrupt) else 1
+    return 0
+
+
+def _as_python_names(script: str) -> str:
+    """Return a script's `__file__`, as tracebacks have it: since 3.9 absolute, with `..` left as it is on POSIX."""
+    if sys.version_info < (3, 9):
+        return script
+    return os.path.join(os.getcwd(), script) if os.name == "posix" else os.path.abspath(script)
+
+
+def run_exit_functions() -> None:
+    """Do what Python does at its end, which a signal and `os._exit` leave out."""
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+
+
+def _interrupted() -> int:
+    """End as Python does on Ctrl-C: by the signal, so that a shell's loop ends too; before 3.8 with exit code 1.
+
+    First threads end and exit functions run, since a signal gives them no time.
+    """
+    if sys.version_info < (3, 8):
+        return 1
+    if os.name == "posix":
+        threading._shutdown()  # type: ignore[attr-defined]
+        run_exit_functions()
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGINT)
+    return 130
 
 
 def install(sources: Dict[str, bytes]) -> None:
@@ -20,11 +96,9 @@ def install(sources: Dict[str, bytes]) -> None:
     A process that is spawned (`torch.multiprocessing.spawn`, DataLoader workers) starts as a new Python, which imports
     the script again: it installs the same sources before.
     """
-    finder = Finder(sources)
-    sys.meta_path.insert(0, finder)
+    sys.meta_path.insert(0, Finder(sources))
+    call_when_spawned(install, sources)
     spawn: Any = multiprocessing.spawn
-    prepare = spawn.get_preparation_data
-    spawn.get_preparation_data = lambda name: dict(prepare(name), legs_finder=finder)
 
     def import_main(path: str) -> None:  # as multiprocessing does, which reads the file
         if getattr(sys.modules["__main__"], "__file__", None) == path:
@@ -35,6 +109,24 @@ def install(sources: Dict[str, bytes]) -> None:
         sys.modules["__main__"] = sys.modules["__mp_main__"] = module
 
     spawn._fixup_main_from_path = import_main
+
+
+def call_when_spawned(function: Callable[[Any], None], argument: Any) -> None:
+    """Let each process that this one spawns call a module's function before it does anything else."""
+    spawn: Any = multiprocessing.spawn
+    prepare = spawn.get_preparation_data
+    call = _Call(function, argument)
+    spawn.get_preparation_data = lambda name: {**prepare(name), f"legs {function.__name__}": call}
+
+
+class _Call:
+    """A call that is made where this is unpickled."""
+
+    def __init__(self, function: Callable[[Any], None], argument: Any) -> None:
+        self._call = function, (argument,)
+
+    def __reduce__(self) -> Any:
+        return self._call
 
 
 class Loader(importlib.machinery.SourceFileLoader):
@@ -65,16 +157,10 @@ class Loader(importlib.machinery.SourceFileLoader):
 
 
 class Finder:
-    """Find modules as Python does, and replace the loader of rewritten ones.
-
-    Unpickled it installs itself: in a spawned process, before that does anything else.
-    """
+    """Find modules as Python does, and replace the loader of rewritten ones."""
 
     def __init__(self, sources: Dict[str, bytes]) -> None:
         self._sources = sources
-
-    def __reduce__(self) -> Any:
-        return install, (self._sources,)
 
     def find_spec(
         self, name: str, path: Optional[Sequence[str]] = None, target: Optional[types.ModuleType] = None

@@ -8,18 +8,15 @@ Every line keeps its number, so that tracebacks point at the right lines.
 
 from __future__ import annotations
 
-import atexit
 import os
-import signal
 import sys
-import threading
 from pathlib import Path
-from typing import Dict, Optional, Sequence, Tuple, Type
+from typing import Sequence
 
 from legs_adapters.code.folders import SUBMODULE, VENDORED, foreign_folder
 from legs_adapters.code.sources import check_root
 from legs_adapters.plan import plan
-from legs_adapters.rewritten import Loader, install, main_module
+from legs_adapters.rewritten import execute
 from legs_adapters.terms.instead import offered, trained_instead
 from legs_loss import LegsError
 from legs_loss.config import find_config
@@ -95,78 +92,10 @@ def run_script(
         _say(f"{site.path}:{site.line} {site.form.done} in this run")
     for use, _ in found.findings.unweighted:
         _say(f"{use.left.path}:{use.left.line} is not weighted in this run")
-    return execute(str(script), arguments, sources, root if cpu else None)
+    return execute([str(script), *arguments], sources, root if cpu else None)
 
 
 def _say(message: str) -> None:
     """Print a line on stderr, in the first of the processes that torchrun starts."""
     if is_first_process():
         say(f"legs-loss: {message}", sys.stderr)
-
-
-def execute(name: str, arguments: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[Path] = None) -> int:
-    """Run a script as the main program of this process, with other text for the files that ``sources`` names.
-
-    Args:
-        name: the script, as it would be given to python.
-        arguments: its arguments.
-        sources: by real path, what to run in place of what is on disk.
-        cpu_root: the codebase, if its CUDA calls are to run on the CPU.
-
-    Returns:
-        The exit code, where the script does not leave by ``sys.exit``.
-    """
-    file = _as_python_names(name)
-    install(sources)
-    passed_on: Tuple[Type[BaseException], ...] = (SystemExit,)
-    if cpu_root is not None:
-        from legs_adapters.shims import MissingShim, start
-
-        start(cpu_root)
-        passed_on += (MissingShim,)
-    sys.argv[:] = [name, *arguments]
-    sys.path[0] = os.path.dirname(os.path.realpath(name))
-    sys.modules["__main__"] = main = main_module("__main__", file)
-    try:
-        code = Loader("__main__", file, sources).get_code("__main__")
-    except SyntaxError as error:
-        sys.excepthook(type(error), error.with_traceback(None), None)
-        return 1
-    try:
-        exec(code, main.__dict__)
-    except passed_on:
-        raise
-    except BaseException as error:
-        traceback = error.__traceback__ and error.__traceback__.tb_next  # from the script on, without this frame
-        sys.excepthook(type(error), error.with_traceback(traceback), traceback)
-        return _interrupted() if isinstance(error, KeyboardInterrupt) else 1
-    return 0
-
-
-def _as_python_names(script: str) -> str:
-    """Return a script's `__file__`, as tracebacks have it: since 3.9 absolute, with `..` left as it is on POSIX."""
-    if sys.version_info < (3, 9):
-        return script
-    return os.path.join(os.getcwd(), script) if os.name == "posix" else os.path.abspath(script)
-
-
-def run_exit_functions() -> None:
-    """Do what Python does at its end, which a signal and `os._exit` leave out."""
-    atexit._run_exitfuncs()
-    sys.stdout.flush()
-    sys.stderr.flush()
-
-
-def _interrupted() -> int:
-    """End as Python does on Ctrl-C: by the signal, so that a shell's loop ends too; before 3.8 with exit code 1.
-
-    First threads end and exit functions run, since a signal gives them no time.
-    """
-    if sys.version_info < (3, 8):
-        return 1
-    if os.name == "posix":
-        threading._shutdown()  # type: ignore[attr-defined]
-        run_exit_functions()
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        os.kill(os.getpid(), signal.SIGINT)
-    return 130

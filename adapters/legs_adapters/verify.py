@@ -10,11 +10,8 @@ from __future__ import annotations
 import math
 import os
 import shutil
-import statistics
-import subprocess
-import tempfile
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Dict, List, NamedTuple, Optional, Sequence
 
 from legs_adapters.checkout.replace import locked
 from legs_adapters.code.sources import check_root
@@ -22,48 +19,14 @@ from legs_adapters.journal import JOURNAL
 from legs_adapters.plan import plan
 from legs_adapters.shims.packages import check_imports
 from legs_adapters.terms.traced import Traced
-from legs_adapters.trace.command import SCENE, filled, parts
-from legs_adapters.trace.running import folder_for_runs, run_watched
+from legs_adapters.trace.child import Run, run_watched, work_folder
+from legs_adapters.trace.command import SCENE, Command, filled
 from legs_adapters.undo import undo
 from legs_loss import LegsError
 
-SECONDS = 1800  # that a run may take
-# For runs that are compared; of two threads one may wait for its turn, and counts as work.
-_THE_SAME = {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 NOT_COPIED = (".git", ".legs-patch.lock", "__pycache__", "node_modules", "output", "outputs")
 MAX_COPIED = 64 << 20  # bytes of a file
-_MOST_SAID = 1 << 16  # bytes of a run's stderr, the last ones, that are read
 FIRST_STEP, LATER_STEPS = 1e-5, 1e-3  # relative differences of losses that rounding explains
-
-
-class Run(NamedTuple):
-    """The record of one run.
-
-    Attributes:
-        code: its exit code.
-        losses: the value of every loss that was trained on, as float.hex has it.
-        seconds: of the processor, from each step to the next: other work does not change them much.
-        weighted, plain: calls of legs_loss.l1_loss.
-        stored, computed, remembered: where weight maps came from.
-        terms: the differences under its losses, as `legs_adapters.terms.traced.Traced` reads them.
-        error: the last lines of its stderr.
-    """
-
-    code: int
-    losses: Sequence[str] = ()
-    seconds: Sequence[float] = ()
-    weighted: int = 0
-    plain: int = 0
-    stored: int = 0
-    computed: int = 0
-    remembered: int = 0
-    terms: Sequence[Dict[str, Any]] = ()
-    error: str = ""
-
-    @property
-    def step(self) -> Optional[float]:
-        """The seconds of the processor that a step takes, by the median; None without two steps."""
-        return statistics.median(self.seconds) if self.seconds else None
 
 
 class Verdict(NamedTuple):
@@ -92,32 +55,37 @@ class Verdict(NamedTuple):
 
 
 def check_verifiable(
-    folder: str | os.PathLike[str], script: Optional[str], arguments: Optional[str], command: Optional[str] = None
-) -> Tuple[str, List[str]]:
-    """Return the training script and arguments, after checking before anything is patched that it can be run.
+    folder: str | os.PathLike[str],
+    script: Optional[str],
+    arguments: Optional[str],
+    traced: Optional[str] = None,
+    cpu: bool = False,
+) -> Command:
+    """Return the command that trains, after checking before anything is patched that it can be run.
 
     Args:
         folder: the checkout.
-        script: the training script in it; None: the file of its one weighted term, or its train.py.
+        script: the training script in it; None: that of the traced command, the file of the one weighted term, or
+            train.py.
         arguments: as for :func:`verify`.
-        command: one that was traced: its script is the one by default, and its arguments, the folders among them by
-            their whole paths but those of the checkout, which its copies have, those that are returned.
+        traced: a command that was traced.
+        cpu: whether it was on the CPU: its arguments are taken over, the folders among them by their whole paths but
+            those of the checkout, which its copies have.
 
     Raises:
         LegsError: it is ambiguous or not there, imports what is not installed, or its arguments name what is unknown.
     """
     root = check_root(folder)
-    given: List[str] = []
-    if command is not None:
-        _, traced, given = parts(root, command)
-        given = [_for_copies(root, word) for word in given]
-        script = script or traced
-    script = _script(root) if script is None else script
-    if not (root / script).is_file():
-        raise LegsError(f"there is no {script} in {root}")
-    check_imports(root, script)
-    filled(root / script, arguments, given, 1, scene=root, output=root)
-    return script, given
+    known = None if traced is None else Command.parse(root, traced)
+    given = [_for_copies(root, word) for word in known.arguments] if known is not None and cpu else []
+    if script is not None or known is None:
+        script = script or _script(root)
+        known = Command([], [script], script, [])
+    if not (root / known.script).is_file():
+        raise LegsError(f"there is no {known.script} in {root}")
+    check_imports(root, known.script)
+    filled(root / known.script, arguments, given, 1, scene=root, output=root)
+    return known._replace(launcher=[], arguments=given)
 
 
 def _for_copies(root: Path, word: str) -> str:
@@ -133,10 +101,9 @@ def _for_copies(root: Path, word: str) -> str:
 
 def verify(
     folder: str | os.PathLike[str],
-    script: str,
+    command: Command,
     arguments: Optional[str],
     iterations: int,
-    given: Sequence[str] = (),
     photos: Optional[str] = None,
     by_hand: bool = False,
 ) -> Verdict:
@@ -144,11 +111,10 @@ def verify(
 
     Args:
         folder: the patched checkout; nothing is written there.
-        script: the training script in it.
-        arguments: the script's arguments, with {scene}, {output}, {iterations} and {port} filled in; None: those of
-            Inria's train.py that its source knows.
+        command: the training script in it, and its first arguments.
+        arguments: further ones, with {scene}, {output}, {iterations} and {port} filled in; None: those of Inria's
+            train.py that the script's source knows.
         iterations: how many steps are compared; the script is ended then.
-        given: arguments that stand before those.
         photos: the folder of the photographs, of which the weighted terms are; default: those of the scene's model.
         by_hand: which terms are weighted was chosen by the user: nothing is claimed of that.
 
@@ -161,7 +127,7 @@ def verify(
 
     root = check_root(folder)
     runs: Dict[str, Run] = {}
-    with folder_for_runs("legs-verify-") as work:
+    with work_folder("legs-verify-") as work:
         scene = write_embedded_scene(work / "scene", **SCENE)
         precompute(read_scene(scene), scene / "legs_weights")
         patched, unpatched = (work / name / root.name for name in ("patched", "unpatched"))
@@ -177,8 +143,9 @@ def verify(
         for name, settings in variables.items():
             copy = unpatched if name == "unpatched" else patched
             places = {"scene": scene, "output": work / f"output-{name}"}
-            words = [script, *given, *filled(copy / script, arguments, given, iterations, **places)]
-            runs[name] = _run(copy, words, iterations, photos, settings, work)
+            more = filled(copy / command.script, arguments, command.arguments, iterations, **places)
+            whole = command._replace(arguments=[*command.arguments, *more])
+            runs[name] = run_watched(copy, work, whole, iterations, True, photos, settings)
             if not runs["unpatched"].losses:
                 return Verdict(runs, {"the unpatched script trained": False})
     claims = _claims(runs)
@@ -238,16 +205,3 @@ def _unneeded(folder: str, names: List[str]) -> List[str]:
     paths = {name: os.path.join(folder, name) for name in names if name not in NOT_COPIED}
     files = {name for name, path in paths.items() if os.path.isfile(path) and os.path.getsize(path) <= MAX_COPIED}
     return [name for name in names if name not in files and not os.path.isdir(paths.get(name, ""))]
-
-
-def _run(
-    root: Path, words: Sequence[str], iterations: int, photos: Optional[str], settings: Dict[str, str], work: Path
-) -> Run:
-    with tempfile.TemporaryFile() as errors:
-        streams: Dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": errors, "timeout": SECONDS}
-        settings = {**_THE_SAME, **settings}
-        code, seen = run_watched(root, work, words, True, photos, {"losses": iterations}, settings=settings, **streams)
-        errors.seek(max(0, errors.seek(0, os.SEEK_END) - _MOST_SAID))
-        lines = errors.read().decode("utf-8", "replace").replace("\r", "\n").strip().splitlines()
-    found = {name: seen[name] for name in Run._fields if name in seen}
-    return Run(code=code, error="\n".join(lines[-12:]), **found)

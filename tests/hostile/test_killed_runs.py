@@ -71,13 +71,16 @@ def test_a_traced_command_writes_into_the_copies(tmp_path):
     (tmp_path / "scene").mkdir()
     (root / "linked").symlink_to(tmp_path / "scene")
     command = f"train.py -s ../scene --images=../scene -m {root}/out --model_path={root}/new/one data linked {root} x=1"
-    _, given = check_verifiable(root, None, "", command)
+    given = check_verifiable(root, None, "", command, cpu=True).arguments
     scene = str(tmp_path / "scene")
+    assert check_verifiable(root, None, "", f"{sys.executable} -u -m train -x {root}/out", cpu=True) == (
+        [], ["-m", "train"], "train.py", ["-x", "out"],
+    )  # fmt: skip
     assert given == ["-s", scene, f"--images={scene}", "-m", "out", "--model_path=new/one", "data", scene, ".", "x=1"]
 
 
 def test_a_script_that_leaves_no_report(tmp_path):
-    from legs_adapters.trace.running import trace
+    from legs_adapters.trace.tracing import trace
 
     root = checkout(tmp_path / "code", {"train.py": "import os\nos._exit(0)\n"})
     with pytest.raises(LegsError, match=r"by os\._exit, exec or a kill: no backward passes seen"):
@@ -90,12 +93,13 @@ LOUD = "import sys\nfor _ in range(100):\n    sys.stderr.write('x' * 999_999 + '
 def test_of_100_megabytes_on_stderr_the_end_is_read(tmp_path):
     import tracemalloc
 
-    from legs_adapters import verify
+    from legs_adapters.trace import child
+    from legs_adapters.trace.command import Command
 
     root = checkout(tmp_path / "code", {"train.py": LOUD})
     tracemalloc.start()
     try:
-        run = verify._run(root, ["train.py"], 1, None, {}, tmp_path)
+        run = child.run_watched(root, tmp_path, Command([], ["train.py"], "train.py", []), 1, False, None, {})
         assert tracemalloc.get_traced_memory()[1] < 20 << 20
     finally:
         tracemalloc.stop()

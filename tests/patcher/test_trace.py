@@ -185,6 +185,22 @@ class TestWaysToTrain:
         assert weighted(report) == [line], done.stderr
         assert "Traceback" not in done.stderr
 
+    def test_as_a_module(self, tmp_path):
+        """`python -m package.train`: imports of the package, and of what lies beside it."""
+        scene, root = write_scene(tmp_path / "scene"), tmp_path / "code"
+        write(root, body('image = splats.draw(camera)["rgb"]', "loss = compare(image, gt_image)"))
+        (root / "package").mkdir()
+        text = (root / "train.py").read_text(encoding="utf-8")
+        (root / "package/train.py").write_text(f"from .losses import compare\n{text}", encoding="utf-8")
+        (root / "train.py").unlink()
+        losses = "def compare(a, b):\n    return (a - b).abs().mean()\n"
+        (root / "package/losses.py").write_text(losses, encoding="utf-8")
+        done = legs_patch("--trace", f"-m package.train -s {scene}", "--json", "--check", "--steps", "4", root)
+        assert done.stdout, done.stderr
+        report = json.loads(done.stdout)
+        lines = (root / "package/train.py").read_text(encoding="utf-8").splitlines()
+        assert weighted(report) == [("package/train.py", lines.index("    loss = compare(image, gt_image)") + 1)]
+
     def test_a_fused_loss_is_said(self, tmp_path):
         report, line, done = traced(tmp_path, UNSEEN)
         assert weighted(report) == []
@@ -245,6 +261,7 @@ class TestHarmless:
         write(tmp_path / "code", "pass\n")
         for options, message in [
             (["--trace", "train"], "names no script"),
+            (["--trace", "-m package.train -s x"], "names no script, and no module"),
             (["--trace", "other.py -s x"], "there is no other.py"),
             (["--trace", "train.py", "--steps", "0"], "--steps must be at least 1"),
             (["--trace", "train.py", "--photos", "nowhere"], "there is no such folder"),

@@ -145,8 +145,37 @@ import numpy
 arrays = torch.from_numpy(numpy.load(os.path.join(given.s, "photographs.npy")))
 LOOP
     gt_image = arrays[step % len(views)].clone()
-    loss = F.l1_loss(drawn["rgb"], gt_image)  # <- here
+    loss = F.l1_loss(drawn["rgb"], gt_image)  # <- quoted
     loss = loss + 0.1 * F.l1_loss(drawn["normal"], camera.values["normals"])
+STEP
+""",
+    "photographs of an HDF5 file": """
+import h5py
+
+with h5py.File(os.path.join(given.s, "photographs.h5"), "r") as file:
+    photographs = [torch.from_numpy(each) for each in file["images"][:]]
+LOOP
+    gt_image = photographs[step % len(views)]
+    loss = (drawn["rgb"] - gt_image).abs().mean()  # <- quoted
+STEP
+""",
+    "photographs of a film": """
+import numpy
+from PIL import Image, ImageSequence
+
+with Image.open(os.path.join(given.s, "film.gif")) as film:
+    frames = [torch.from_numpy(numpy.array(each.convert("RGB"))) / 255.0 for each in ImageSequence.Iterator(film)]
+LOOP
+    gt_image = frames[step % len(views)].permute(2, 0, 1)
+    loss = F.l1_loss(drawn["rgb"], gt_image)  # <- quoted
+STEP
+""",
+    "a teacher's rendering alone": """
+teacher = Splats(90)
+LOOP
+    with torch.no_grad():
+        gt_image = teacher.draw(camera)["rgb"]
+    loss = F.l1_loss(drawn["rgb"], gt_image)  # <- quoted
 STEP
 """,
     "two captures, one of which has a model": """
@@ -164,12 +193,14 @@ STEP
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    """Return two captures: one with transforms.json and an array of its photographs, one without."""
+    """Return two captures: one with transforms.json, an array and a film of its photographs, one without."""
     folder = tmp_path_factory.mktemp("scenes")
     first, second = write_scene(folder / "first"), write_scene(folder / "second")
     files = sorted((first / "images").iterdir())
     photographs = np.stack([np.asarray(Image.open(file)) for file in files]).transpose(0, 3, 1, 2) / 255
     np.save(first / "photographs.npy", photographs.astype(np.float32))
+    frames = [Image.open(file) for file in files]
+    frames[0].save(first / "film.gif", save_all=True, append_images=frames[1:])
     for file in sorted((second / "images").iterdir()):
         Image.open(file).transpose(Image.ROTATE_180).save(file)
     (second / "transforms.json").unlink()
@@ -179,8 +210,11 @@ def scenes(tmp_path_factory):
 @pytest.mark.parametrize("name", sorted(SCRIPTS))
 def test_what_was_written_down_is_weighted_and_quoted(tmp_path, scenes, name):
     first, second = scenes
-    if "array" in name:
+    if name.startswith("photographs of"):
         first = shutil.copytree(first, tmp_path / "scene")
+        if "HDF5" in name:
+            with pytest.importorskip("h5py").File(first / "photographs.h5", "w") as file:
+                file["images"] = np.load(first / "photographs.npy")
         for file in (first / "images").iterdir():  # for the sizes alone
             Image.new("RGB", Image.open(file).size).save(file)
     text = SCRIPTS[name].replace("\nLOOP\n", LOOP).replace("\nSTEP\n", STEP)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 
 import pytest
-from legs_adapters.verify import Run, Verdict
+from legs_adapters.trace.child import Run
+from legs_adapters.verify import Verdict
 
 from tests.patcher.support import checkout, legs_patch, snapshot
 from tests.patcher.traced import write, write_scene

@@ -5,11 +5,20 @@ from __future__ import annotations
 from typing import Any, Dict, FrozenSet, List, NamedTuple, Optional, Sequence, Tuple
 
 
+class Frame(NamedTuple):
+    """A line of the checkout on a difference's stack, in which function, and its names of the two sides, or ""."""
+
+    path: str
+    line: int
+    name: str
+    sides: Tuple[str, ...]
+
+
 class Traced(NamedTuple):
     """A difference that lies under a loss, as it ran.
 
     Attributes:
-        frames: (path, line, function, its names of the two sides) of the checkout, innermost first.
+        frames: of the checkout, innermost first.
         kind: "l1", "squared", "robust", "signed", "compiled: NAME"; of legs_loss.l1_loss "weighted" or "plain".
         target: which operand is the side that wants no gradient; -1: both want one.
         shape: of that side.
@@ -25,7 +34,7 @@ class Traced(NamedTuple):
         is_picture: whether that side is a picture of three or four channels.
     """
 
-    frames: Tuple[Tuple[str, int, str, Tuple[str, ...]], ...]
+    frames: Tuple[Frame, ...]
     kind: str
     target: int
     shape: Tuple[int, ...]
@@ -45,7 +54,7 @@ class Traced(NamedTuple):
         """Return those terms of a watched process's report after which something was stepped."""
         found = []
         for term in (term for term in terms if term["steps"] or term["poses"]):
-            frames = tuple((path, line, name, tuple(names)) for path, line, name, names in term["frames"])
+            frames = tuple(Frame(*frame) for frame in term["frames"])
             rest = {name: value for name, value in term.items() if name not in ("frames", "shares")}
             found.append(cls(frames=frames, share=sum(term["shares"]) / max(1, len(term["shares"])), **rest))
         return found

@@ -1,4 +1,4 @@
-"""The command that trains: its script, its arguments, and the folders that it names."""
+"""The command that trains: its program, its arguments, and the folders that it names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shlex
 import socket
 import sys
 from pathlib import Path
-from typing import List, Optional, Sequence, Tuple
+from typing import List, NamedTuple, Optional, Sequence
 
 from legs_loss import LegsError
 
@@ -24,24 +24,51 @@ _ARGUMENTS = (
 )
 
 
-def parts(root: Path, command: str) -> Tuple[List[str], str, List[str]]:
-    """Return what stands before the script (nothing for python itself), the script, and its arguments."""
-    try:
-        words = shlex.split(command)
-    except ValueError as error:
-        raise LegsError(f"--trace {command!r}: {error}") from None
-    at = next((i for i, word in enumerate(words) if word.endswith(".py")), None)
-    if at is None:
-        raise LegsError(f'--trace {command!r} names no script: --trace "train.py -s SCENE"')
-    if not (root / words[at]).is_file():
-        raise LegsError(f"--trace: there is no {words[at]} in {root}")
-    before = words[: at - 1 if words[at - 1 : at] == ["-m"] else at]
-    variables = list(itertools.takewhile(lambda word: "=" in word, before))  # a shell's `CUDA_VISIBLE_DEVICES=0 python`
+class Command(NamedTuple):
+    """A command that trains.
+
+    Attributes:
+        launcher: what stands before the program, `torchrun` say; nothing for python itself.
+        program: the script, or `-m` and a module.
+        script: the program's file in the checkout.
+        arguments: its arguments.
+    """
+
+    launcher: List[str]
+    program: List[str]
+    script: str
+    arguments: List[str]
+
+    @classmethod
+    def parse(cls, root: Path, text: str) -> Command:
+        """Return a command as it is typed in a checkout.
+
+        Raises:
+            LegsError: it has unbalanced quotes, or names no script and no module that is there.
+        """
+        try:
+            words = shlex.split(text)
+        except ValueError as error:
+            raise LegsError(f"--trace {text!r}: {error}") from None
+        for at, word in enumerate(words):
+            is_module, path = words[at - 1 : at] == ["-m"], word.replace(".", "/")
+            names = [f"{path}.py", f"{path}/__main__.py"] if is_module else [word] if word.endswith(".py") else []
+            script = next((name for name in names if (root / name).is_file()), None)
+            if script is not None:
+                begin = at - is_module
+                return cls(_launcher(words[:begin]), words[begin : at + 1], script, words[at + 1 :])
+            if word.endswith(".py"):
+                raise LegsError(f"--trace: there is no {word} in {root}")
+        raise LegsError(f'--trace {text!r} names no script, and no module in {root}: --trace "train.py -s SCENE"')
+
+
+def _launcher(before: List[str]) -> List[str]:
+    """Return the words before a program, without python; of a shell's `CUDA_VISIBLE_DEVICES=0 python` with `env`."""
+    variables = list(itertools.takewhile(lambda word: "=" in word, before))
     program = before[len(variables) :]
-    is_python = all(os.path.basename(word).startswith("python") or word == "-u" for word in program)
-    if variables:
-        return ["env", *variables, *([sys.executable] if is_python else program)], words[at], words[at + 1 :]
-    return [] if is_python else before, words[at], words[at + 1 :]
+    if all(os.path.basename(word).startswith("python") or word == "-u" for word in program):
+        program = [sys.executable] if variables else []
+    return ["env", *variables, *program] if variables else program
 
 
 def folders(root: Path, arguments: Sequence[str]) -> List[str]:

@@ -19,16 +19,17 @@ import torch
 import legs_loss
 import legs_loss.runtime
 from legs_adapters.code.limits import remembered
-from legs_adapters.trace.graph import KEY, Graph
+from legs_adapters.trace.graph import foreign, leaves_under, made_of, nodes_under
 from legs_adapters.trace.photographs import SURE, Photographs, as_planes, is_another, thumbnail, uncut
 from legs_loss.runtime import counts
 
+_KEY = "legs_loss"  # under which a node's metadata keeps its record
 _SAMPLE = 4096  # values of a leaf that are compared over a step
 _POSE = 16  # numbers of a pose, an exposure
 _OWN = ("legs_adapters.", "legs_loss.")
 _OWNERS: Sequence[Tuple[Any, Sequence[str], str]] = (  # where torch has each; all but __rsub__ subtract from the first
-    (torch.Tensor, ("__sub__", "__rsub__", "__isub__", "sub", "sub_", "subtract", "subtract_"), "difference"),
-    (torch, ("sub", "subtract", "rsub"), "difference"),
+    (torch.Tensor, ("__sub__", "__rsub__", "__isub__", "sub", "sub_", "subtract", "subtract_"), "signed"),
+    (torch, ("sub", "subtract", "rsub"), "signed"),
     (torch.nn.functional, ("l1_loss",), "l1"),
     (torch.nn.functional, ("mse_loss",), "squared"),
     (torch.nn.functional, ("smooth_l1_loss", "huber_loss"), "robust"),
@@ -114,11 +115,12 @@ class Watch:
         self.scripted: Set[Tuple[str, str]] = set()  # files and names of functions of TorchScript: nothing is edited
         self._waiting: Dict[Any, Set[int]] = {}  # terms whose step is awaited, with the ids of the leaves under each
         self._samples: Dict[int, _Sample] = {}
-        self._names: Dict[int, str] = {}
+        self.optimisers: Any = weakref.WeakSet()
         self._inside = False
 
     def report(self) -> Dict[str, Any]:
         """Return what was seen so far, as JSON has it."""
+        self._settle()
         found = {"terms": list(self.terms.values()), "unseen": sorted(self.unseen), "scripted": sorted(self.scripted)}
         seconds = [b - a for a, b in zip(self.times, self.times[1:])]
         return {**self.seen, **found, "seconds": seconds, **vars(counts())}
@@ -144,13 +146,11 @@ class Watch:
 
         jit.script = functools.wraps(own_script)(script)
         optimiser: Any = torch.optim.Optimizer
-        own_init, wrapped = optimiser.__init__, self._step
+        own_init = optimiser.__init__
 
         def __init__(optimiser: Any, *args: Any, **kwargs: Any) -> None:
-            step = type(optimiser).step
-            if not hasattr(step, "legs_watched"):
-                type(optimiser).step = wrapped(step)
             own_init(optimiser, *args, **kwargs)
+            self.optimisers.add(optimiser)
 
         optimiser.__init__ = functools.wraps(own_init)(__init__)
 
@@ -197,13 +197,13 @@ class Watch:
         moving = [side.requires_grad for side in sides]
         largest = max(sides, key=lambda side: side.numel())
         node = made.grad_fn
-        if len(sides) < 2 or largest.dim() < 2 or largest.numel() < 64 or not any(moving) or KEY in node.metadata:
+        if len(sides) < 2 or largest.dim() < 2 or largest.numel() < 64 or not any(moving) or _KEY in node.metadata:
             return  # (of nested functions the inner one is kept)
         frames = self._frames(sides)
         if frames:
             target = -1 if all(moving) else moving.index(False)
             still = sides[1].detach() if target < 0 else sides[target]  # (detached it has no base)
-            node.metadata[KEY] = record = _Record(kind, frames, target, still, made.detach(), [])
+            node.metadata[_KEY] = record = _Record(kind, frames, target, still, made.detach(), [])
             node.register_hook(functools.partial(_share, record.shares, record.values))
 
     def _frames(self, sides: Sequence[Any]) -> Tuple[Frame, ...]:
@@ -232,7 +232,9 @@ class Watch:
         def watched(tensors: Any, *args: Any, **kwargs: Any) -> Any:
             if self._inside:
                 return own(tensors, *args, **kwargs)
-            self._settle()  # what was stepped without an optimiser of torch's
+            self._settle()
+            if self.seen["steps"] + self.seen["poses"] // 20 >= self.limits.get("steps", math.inf):
+                self.ended()
             roots = list(tensors) if isinstance(tensors, (tuple, list)) else [tensors]
             if is_step and len(roots) == 1 and roots[0].numel() == 1:
                 if len(self.seen["losses"]) >= self.limits.get("losses", math.inf):
@@ -249,17 +251,16 @@ class Watch:
     @_harmless
     def _seen(self, roots: Sequence[Any]) -> List[Tuple[_Record, Any, List[Any]]]:
         """Return the records under the roots, the key of the term of each, and the leaves that it leads to."""
-        graph = Graph.under(getattr(root, "grad_fn", None) for root in roots)
-        self.unseen |= graph.foreign()
+        nodes = nodes_under(getattr(root, "grad_fn", None) for root in roots)
+        self.unseen |= foreign(nodes)
         found, known = [], []
-        for at, record in graph.records().items():
+        for node in (node for node in nodes if _KEY in node.metadata):
+            record: _Record = node.metadata[_KEY]
             record.shares.clear()
-            kind = graph.made_of(at) if record.kind == "difference" else record.kind
-            if record.kind == "l1" and graph.made_of(at) not in ("signed", "l1"):
-                kind = "robust"
+            kind = made_of(node, nodes, record.kind) if record.kind in ("signed", "l1") else record.kind
             if kind == "l1" or (record.target >= 0 and (kind != "signed" or as_planes(record.still) is not None)):
                 key, match, picture = self._term(record, kind)
-                found.append((record, key, graph.leaves(at)))
+                found.append((record, key, leaves_under(node)))
                 if key[-1] is not None and not self.terms[key]["is_rival"]:
                     known.append((match, picture, self.terms[key]))
         self._rivals(known)
@@ -305,31 +306,12 @@ class Watch:
 
     # -- steps
 
-    def _step(self, own: Any) -> Any:
-        @functools.wraps(own)
-        def step(optimiser: Any, *args: Any, **kwargs: Any) -> Any:
-            made = own(optimiser, *args, **kwargs)
-            if not self._inside:
-                for group in optimiser.param_groups:
-                    self._names.update((id(leaf), str(group.get("name", ""))) for leaf in group["params"])
-                self._settle()
-            return made
-
-        step.legs_watched = True  # type: ignore[attr-defined]
-        return step
-
+    @_harmless
     def _settle(self) -> None:
-        """See which leaves changed since their backward pass; end the script after enough steps.
+        """Count a step of the terms of which a leaf changed since their backward pass, one of poses alone apart.
 
         What has not changed waits on: for another optimiser, or until enough gradients are accumulated.
         """
-        steps = self.seen["steps"] + self.seen["poses"] // 20 if self._changes() else 0
-        if steps >= self.limits.get("steps", math.inf):
-            self.ended()
-
-    @_harmless
-    def _changes(self) -> bool:
-        """Count a step of the terms of which a leaf changed, one of poses alone apart; return whether there is one."""
         changed = {at for at, sample in self._samples.items() if sample.has_changed()}
         stepped: List[bool] = []
         for key, leaves in list(self._waiting.items()):
@@ -341,16 +323,18 @@ class Watch:
         self._samples = {at: each for at, each in self._samples.items() if at in awaited and each.leaf() is not None}
         self.seen["steps"] += any(stepped)
         self.seen["poses"] += bool(stepped) and not any(stepped)
-        return bool(stepped)
 
     def _stepped(self, term: Dict[str, Any], leaves: Sequence[Any]) -> bool:
         """Record what was stepped after a term; return whether it is more than poses, exposures and embeddings."""
+        groups = [group for optimiser in self.optimisers for group in optimiser.param_groups]
+        ids = {id(leaf) for leaf in leaves}
+        names = {group.get("name", "") for group in groups if ids.intersection(map(id, group["params"]))}
         firsts = [leaf.shape[0] for leaf in leaves if leaf.dim() > 1]
         common = max(firsts, key=firsts.count, default=0)
         is_model = not all(self._is_of_views(leaf, firsts) for leaf in leaves)
         term["steps" if is_model else "poses"] += 1
         term["gaussians"] = common if firsts.count(common) > 2 else term["gaussians"]
-        term["parameters"] = sorted({*term["parameters"], *(self._names.get(id(leaf), "") for leaf in leaves)} - {""})
+        term["parameters"] = sorted({*term["parameters"], *map(str, names)} - {""})
         term["stepped"] = sorted({*map(tuple, term["stepped"]), *(tuple(leaf.shape) for leaf in leaves)})[:32]
         return is_model
 

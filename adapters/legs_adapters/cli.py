@@ -38,21 +38,28 @@ EXIT_CODES = (
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
 
-    def parsed() -> argparse.Namespace:
+    def work() -> int:
         never_fail_to_print()
         parser = Parser(prog="legs-patch", description=__doc__)
         add_arguments(parser)
         parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
         parser.offer_completion()
-        return parser.parse_args(argv, args)
+        return run(parser.parse_args(argv))
 
-    args = argparse.Namespace(folder="", undo=False)
-    return exit_code("legs-patch", lambda: _run(parsed()), lambda: _so_far(args))
+    return exit_code("legs-patch", work)
 
 
 def run(args: argparse.Namespace) -> int:
     """Patch, undo or verify, as the arguments say, and return the exit code."""
-    return exit_code("legs-patch", lambda: _run(args), lambda: _so_far(args))
+    before = _journal(args.folder)
+
+    def so_far() -> str:  # from the journal: a command writes all files and the journal, or nothing
+        if _journal(args.folder) == before:
+            return "; nothing was changed"
+        undo_it = f"; the patch was already written; undo it with: legs-patch --undo {args.folder}"
+        return "; the patch was already undone" if args.undo else undo_it
+
+    return exit_code("legs-patch", lambda: _run(args), so_far)
 
 
 def check_libcst() -> None:
@@ -66,7 +73,6 @@ def _run(args: argparse.Namespace) -> int:
     check_libcst()
     if args.verify:
         require("legs-patch --verify", "cpu", "numba", "scipy")
-    args.before = _journal(args.folder)
     if args.undo:
         return _undo(args)
     if not args.verify:
@@ -75,15 +81,6 @@ def _run(args: argparse.Namespace) -> int:
 
     command = check_verifiable(args.folder, args.script, args.arguments, args.trace, args.cpu)
     return _patch(args) or _verify(args, command)
-
-
-def _so_far(args: argparse.Namespace) -> str:
-    """Return what was done so far, from the journal: a command writes all files and the journal, or nothing."""
-    if _journal(args.folder) == getattr(args, "before", _journal(args.folder)):
-        return "; nothing was changed"
-    if args.undo:
-        return "; the patch was already undone"
-    return f"; the patch was already written; undo it with: legs-patch --undo {args.folder}"
 
 
 _MODES = {
@@ -182,18 +179,14 @@ def _patch(args: argparse.Namespace) -> int:
                 + _elsewhere(root, args.exclude, found),
                 *instead,
             )
-        _quote(problems, "error")
-        for line in instead:
-            say(f"legs-patch: {line}", sys.stderr)
+        _quote(problems, "error", instead)
         ways = ["--site FILE:LINE takes your word", "--exclude leaves files out"]
         ways = ways if args.trace else ['--trace "train.py ARGUMENTS" decides by a few steps', *ways]
         say(f"legs-patch: nothing was changed: {', '.join(ways)}", sys.stderr)
         return 2
     if writes:
         found = found._replace(settings=text)
-    _quote(found.findings.doubts, "warning: a possible loss was not weighted")
-    for line in instead:
-        say(f"legs-patch: warning: {line}", sys.stderr)
+    _quote(found.findings.doubts, "warning: a possible loss was not weighted", [f"warning: {line}" for line in instead])
     wrote = [] if args.diff or args.check else write(found, args.force)
     _show(args, found, wrote)
     bare = unrecorded(root) if found.findings.patched else []
@@ -272,12 +265,14 @@ def _journal(folder: str) -> bytes:
     return repr((found.st_ino, found.st_size, found.st_mtime_ns)).encode()
 
 
-def _quote(terms: Sequence[Problem], what: str) -> None:
-    """Print terms that may need a manual edit to stderr."""
+def _quote(terms: Sequence[Problem], what: str, more: Sequence[str] = ()) -> None:
+    """Print terms that may need a manual edit, and further lines, to stderr."""
     for term in terms:
         say(f"legs-patch: {what}: {term.path}:{term.line}: {term.reason}", sys.stderr)
         say(f"    {term.text}", sys.stderr)
         say(f"  if this is the loss between rendering and photograph: {term.way}", sys.stderr)
+    for line in more:
+        say(f"legs-patch: {line}", sys.stderr)
 
 
 def _site(root: Path, text: str) -> Tuple[str, int]:

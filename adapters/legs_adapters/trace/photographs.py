@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from typing import Any, List, NamedTuple, Optional, Sequence, Set, Tuple
+from pathlib import Path
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 from legs_adapters.code.limits import remembered
 from legs_loss import LegsError
@@ -53,29 +54,32 @@ class Photographs:
         roots = [photos] if photos else list(folders)
         self.root: str = os.path.commonpath([os.path.realpath(root) for root in roots]) if roots else ""
         files = list(dict.fromkeys(path for root in roots for path in _image_files(root)))[:MAX_FILES]
-        above = {folder for path in files for folder in _folders(path, roots)} if not photos else set()
-        listed = {folder: _listed(folder) for folder in above}  # what the model in it lists
+        listed: Dict[str, Set[Tuple[str, str]]] = {}  # by folder what the model in it lists
+        for folder in {folder for path in files if not photos for folder in self._folders(path)}:
+            listed[folder] = _listed(folder)
         every = set().union(*listed.values())
         self._tiers: List[List[str]] = [[], []]
         for path in files:
-            inside, models = os.path.relpath(path, self.root), [listed.get(at) for at in _folders(path, roots)]
-            is_photograph = _key(path) in every or not (any(models) or _OTHER.search(inside))
-            is_photograph = is_photograph and (_key(path) in every or not every or bool(_PHOTOS.search(inside)))
-            self._tiers[not (photos or is_photograph)].append(path)
+            inside, has_model = os.path.relpath(path, self.root), any(map(listed.get, self._folders(path)))
+            is_other = has_model or _OTHER.search(inside) or (every and not _PHOTOS.search(inside))
+            self._tiers[bool(is_other) and _key(path) not in every and not photos].append(path)
 
     def __len__(self) -> int:
         return sum(map(len, self._tiers))
 
+    def _folders(self, path: str) -> List[str]:
+        """Return the folders that a file lies in, up to the one that all files have."""
+        return [str(folder) for folder in Path(path).parents if len(str(folder)) >= len(self.root)]
+
     def match(self, picture: Optional[Picture]) -> Optional[Match]:
         """Return the file that a picture's thumbnail is most like: a photograph first; None without files."""
-        best: Optional[Match] = None
-        for tier in (0, 1):
-            found = self._best(tier, picture) if picture is not None else None
-            if found is not None and (best is None or found.correlation > best.correlation):
-                best = found
-            if best is not None and best.correlation >= SURE:
-                break
-        if best is None or picture is None or best.correlation < SURE:
+        if picture is None:
+            return None
+        best = self._best(0, picture)
+        if best is None or best.correlation < SURE:
+            found = [match for match in (best, self._best(1, picture)) if match is not None]
+            best = max(found, key=lambda match: match.correlation, default=None)
+        if best is None or best.correlation < SURE:
             return best
         path = os.path.join(self.root, best.path)
         detail = self._detail(path, picture)
@@ -150,8 +154,8 @@ def thumbnail(picture: Any) -> Optional[Picture]:
     Returns:
         None for what is no picture of three or four channels.
     """
-    import numpy as np
     import torch
+    from torch.nn.functional import adaptive_max_pool2d, max_pool2d
 
     image = as_planes(picture.detach())
     if image is None:
@@ -160,15 +164,9 @@ def thumbnail(picture: Any) -> Optional[Picture]:
         image = torch.nan_to_num(image[:3].float())
         scale = min(4, min(image.shape[1:]) // SIDE)
         pool, fine = _pooled(image, SIDE), _pooled(image, scale * SIDE) if scale > 1 else None
-        high = torch.nn.functional.adaptive_max_pool2d(image[None], SIDE)[0]
-        low = -torch.nn.functional.adaptive_max_pool2d(-image[None], SIDE)[0]
-        flat = ((high - low).amax(0) < 1e-6).cpu().numpy().ravel()
-    if flat.all():
-        return pool, ~flat, None, tuple(image.shape[1:])
-    ground = flat.reshape(SIDE, SIDE)
-    wide = np.pad(ground, 1)  # the cells at its border have a part of it
-    near = np.any([wide[i : i + SIDE, j : j + SIDE] for i in range(3) for j in range(3)], 0).ravel()
-    kept = ~near if (~near).sum() >= 16 else ~flat
+        flat = (adaptive_max_pool2d(image, SIDE) + adaptive_max_pool2d(-image, SIDE)).amax(0, keepdim=True) < 1e-6
+        near = max_pool2d(flat.float(), 3, 1, 1) > 0  # the cells at its border have a part of it
+    kept = (~near if int((~near).sum()) >= 16 else ~flat).cpu().numpy().ravel()
     return pool, kept, None if fine is None else _high(fine, scale), tuple(image.shape[1:])
 
 
@@ -253,15 +251,6 @@ def _image_files(root: str) -> List[str]:
     return found
 
 
-def _folders(path: str, roots: Sequence[str]) -> List[str]:
-    """Return the folders that a file lies in, up to the first of these."""
-    found: List[str] = []
-    while path not in roots and path != os.path.dirname(path):
-        path = os.path.dirname(path)
-        found.append(path)
-    return found
-
-
 def _listed(root: str) -> Set[Tuple[str, str]]:
     """Return the photographs that a scene's model lists, each as its folder without `_4` and its stem."""
     from legs_loss.scenes import read_scene
@@ -282,6 +271,7 @@ def _key(path: str) -> Tuple[str, str]:
 def _thumbnails(files: Sequence[str], side: int = SIDE) -> Tuple[Any, Any]:
     """Return the indices of the files that could be read, and thumbnails; of one with alpha on black and white too."""
     import numpy as np
+    import torch
     from PIL import Image
 
     indices, thumbs = [], []
@@ -298,7 +288,6 @@ def _thumbnails(files: Sequence[str], side: int = SIDE) -> Tuple[Any, Any]:
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             continue
         for picture in pictures:
-            values = np.asarray(picture, np.float32).transpose(2, 0, 1) / 255
             indices.append(at)
-            thumbs.append((_areas(values.shape[1], side) @ values @ _areas(values.shape[2], side).T).reshape(3, -1))
+            thumbs.append(_pooled(torch.as_tensor(np.array(picture, np.float32)).permute(2, 0, 1) / 255, side))
     return np.asarray(indices, int), np.asarray(thumbs).reshape(-1, 3, side * side)

@@ -55,11 +55,7 @@ class Verdict(NamedTuple):
 
 
 def check_verifiable(
-    folder: str | os.PathLike[str],
-    script: Optional[str],
-    arguments: Optional[str],
-    traced: Optional[str] = None,
-    cpu: bool = False,
+    folder: str | os.PathLike[str], script: Optional[str], arguments: Optional[str], traced: Optional[str], cpu: bool
 ) -> Command:
     """Return the command that trains, after checking before anything is patched that it can be run.
 

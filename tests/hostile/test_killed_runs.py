@@ -71,9 +71,9 @@ def test_a_traced_command_writes_into_the_copies(tmp_path):
     (tmp_path / "scene").mkdir()
     (root / "linked").symlink_to(tmp_path / "scene")
     command = f"train.py -s ../scene --images=../scene -m {root}/out --model_path={root}/new/one data linked {root} x=1"
-    given = check_verifiable(root, None, "", command, cpu=True).arguments
+    given = check_verifiable(root, None, "", command, True).arguments
     scene = str(tmp_path / "scene")
-    assert check_verifiable(root, None, "", f"{sys.executable} -u -m train -x {root}/out", cpu=True) == (
+    assert check_verifiable(root, None, "", f"{sys.executable} -u -m train -x {root}/out", True) == (
         [], ["-m", "train"], "train.py", ["-x", "out"],
     )  # fmt: skip
     assert given == ["-s", scene, f"--images={scene}", "-m", "out", "--model_path=new/one", "data", scene, ".", "x=1"]

@@ -7,7 +7,6 @@ graph does. Nothing of a backward pass is kept after it but numbers, and weak re
 from __future__ import annotations
 
 import functools
-import math
 import os
 import sys
 import time
@@ -99,7 +98,7 @@ class Watch:
     Args:
         root: the checkout, whose frames are kept.
         photographs: the image files that targets are compared with.
-        limits: after how many "steps", and before how many further "losses" (backward passes of a scalar) to end.
+        limits: after how many "steps" or "losses" (backward passes of a scalar) the next backward pass ends the script.
         ended: ends the script.
     """
 
@@ -233,18 +232,17 @@ class Watch:
             if self._inside:
                 return own(tensors, *args, **kwargs)
             self._settle()
-            if self.seen["steps"] + self.seen["poses"] // 20 >= self.limits.get("steps", math.inf):
+            made = {"steps": self.seen["steps"] + self.seen["poses"] // 20, "losses": len(self.seen["losses"])}
+            if any(made[name] >= most for name, most in self.limits.items()):
                 self.ended()
             roots = list(tensors) if isinstance(tensors, (tuple, list)) else [tensors]
             if is_step and len(roots) == 1 and roots[0].numel() == 1:
-                if len(self.seen["losses"]) >= self.limits.get("losses", math.inf):
-                    self.ended()
                 self.seen["losses"].append(float(roots[0].detach()).hex())
                 self.times.append(time.process_time())
             seen = self._seen(roots) or []
-            made = own(tensors, *args, **kwargs)
+            gradients = own(tensors, *args, **kwargs)
             self._sum_up(roots, seen)
-            return made
+            return gradients
 
         return watched
 

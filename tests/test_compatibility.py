@@ -46,6 +46,7 @@ def test_page_and_sentences_are_what_the_rows_say():
     assert len(build.PAGE.read_text(encoding="utf-8").splitlines()) <= 120
 
 
+@pytest.mark.slow
 def test_a_changed_verdict_makes_the_page_stale(copy):
     edit(copy / "docs/compatibility/corpus.csv", ",right,right,", ",missed,right,")
     assert load(copy / "docs/compatibility").stale() == ["docs/compatibility.md: run docs/compatibility/build.py"]

@@ -15,6 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 
+@pytest.mark.slow
 def test_the_training_loop_learns():
     pytest.importorskip("numba")
     result = subprocess.run(

@@ -112,6 +112,7 @@ def test_no_stage_outlasts_the_time_and_what_was_found_stays(tmp_path: Path) -> 
 
 @needs_compiler
 @pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+@pytest.mark.slow
 def test_an_interrupt_leaves_no_process_and_a_whole_file(tmp_path: Path) -> None:
     file = tmp_path / "gpu.json"
     arguments = ["--emulate", "--stages", "times", "--sizes", "8x8", "3000x2000", "--json", file, "--work", tmp_path]

@@ -95,6 +95,7 @@ def test_code_is_loaded_by_the_next_process(code):
     assert code.run() == (RIGHT, 1, "")
 
 
+@pytest.mark.slow
 def test_damaged_files_are_repaired(code):
     code.run()
     whole = {path: path.read_bytes() for path in code.files()}
@@ -105,6 +106,7 @@ def test_damaged_files_are_repaired(code):
     assert code.run() == (RIGHT, 1, "")  # and kept
 
 
+@pytest.mark.slow
 def test_a_folder_in_the_place_of_a_file_is_named(code):
     code.run()
     for path in code.files():
@@ -115,6 +117,7 @@ def test_a_folder_in_the_place_of_a_file_is_named(code):
     assert said.count("\n") == 1 and str(code.cache) in said and "NUMBA_CACHE_DIR" in said
 
 
+@pytest.mark.slow
 def test_code_of_another_processor_is_left_alone(code):
     assert code.run(NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")[:2] == (RIGHT, 0)
     assert code.run() == (RIGHT, 0, "")
@@ -122,6 +125,7 @@ def test_code_of_another_processor_is_left_alone(code):
     assert code.run(NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")[:2] == (RIGHT, 1)
 
 
+@pytest.mark.slow
 def test_a_changed_function_of_another_file_is_compiled_in_anew(code):
     """The unchanged file's code has the other's inside."""
     code.run()
@@ -134,6 +138,7 @@ def test_a_changed_function_of_another_file_is_compiled_in_anew(code):
     assert code.run() == (1.5 * (RIGHT - 0.5) + 0.5, 0, "")
 
 
+@pytest.mark.slow
 def test_a_changed_number_of_a_file_that_compiles_nothing_is_compiled_in_anew(code):
     numbers, inner = code.folder / "numbers_of_a_test.py", code.folder / "inner.py"
     numbers.write_text("FACTOR = 2.0\n")
@@ -144,6 +149,7 @@ def test_a_changed_number_of_a_file_that_compiles_nothing_is_compiled_in_anew(co
     assert code.run() == (1.5 * (RIGHT - 0.5) + 0.5, 0, "")
 
 
+@pytest.mark.slow
 def test_fields_in_another_order_are_read_anew(code):
     """The class of an argument stands in a file that the compiled function's does not import from."""
     groups, outer = code.folder / "groups_of_a_test.py", code.folder / "outer.py"
@@ -176,6 +182,7 @@ def test_the_sources_of_the_lab_are_those_that_it_compiles_in(monkeypatch):
     assert "rasterizer/oracle.py" not in read
 
 
+@pytest.mark.slow
 def test_processes_that_compile_at_once_do_not_mix_up(code):
     kinds = ["float64", "int32"]
     for loaded in (0, 1):

@@ -358,6 +358,7 @@ def test_other_settings_killed_before_each_rename(at, tmp_path):
 
 
 @pytest.mark.parametrize("what", ["patch", "undo"])
+@pytest.mark.slow
 def test_a_folder_that_becomes_a_link_at_any_line(what, tmp_path):
     """Whoever may write in the checkout swaps a folder for a link meanwhile: what it leads to stays as it was."""
     sources = {"one.py": TRAIN, "inner/two.py": TRAIN, "inner/utils.py": UTILS, "utils.py": UTILS}
@@ -690,6 +691,7 @@ def at_once(*commands):
 SHORT = ["--iterations", 20, "-r", 2]
 
 
+@pytest.mark.slow
 def test_two_trainings_at_once_make_one_run(tiny_scene, tmp_path):
     pytest.importorskip("numba")
     out = tmp_path / "run"
@@ -751,6 +753,7 @@ def make_scene(photographs, out, size):
     return ""
 
 
+@pytest.mark.slow
 def test_100_pairs_of_scenes(tmp_path):
     """One of them makes the folder, whole; the other says that it is there."""
     photographs = tmp_path / "photographs"

@@ -145,6 +145,7 @@ CHANGE = """
 """
 
 
+@pytest.mark.slow
 def test_a_target_that_changes_from_step_to_step_is_said_and_masked_in_no_term(scene, tmp_path):
     root = checkout(tmp_path / "gs", {**FILES, "train.py": SCRIPT.replace(GT, GT + CHANGE)})
     assert legs_patch("--masks", root).returncode == 0
@@ -167,6 +168,7 @@ def test_a_target_that_changes_from_step_to_step_is_said_and_masked_in_no_term(s
     assert done.returncode == 1 and not done.stdout and "LegsError: NOT MASKED" in done.stderr
 
 
+@pytest.mark.slow
 def test_in_memory(scene, tmp_path):
     precompute(scene)
     root = checkout(tmp_path / "gs", FILES)

@@ -39,6 +39,7 @@ from tests.lab.training import train_one
 from tests.support import without_times
 
 
+@pytest.mark.slow
 def test_rows_are_complete_and_can_be_run_alone(tiny_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     comparison = Comparison(tiny_scene, BASE, out)
@@ -215,6 +216,7 @@ def test_the_command(tiny_scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+@pytest.mark.slow
 def test_ctrl_c_keeps_the_rows_that_are_done(tiny_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = command("compare", tiny_scene, "--out", out, "--iterations", 150, "-r", 1, "--processes", 1)
@@ -232,6 +234,7 @@ def test_ctrl_c_keeps_the_rows_that_are_done(tiny_scene: Path, tmp_path: Path) -
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+@pytest.mark.slow
 def test_killed_it_goes_on(tiny_scene: Path, tmp_path: Path) -> None:
     """Killed with no chance to clean up: its trainings end by themselves, in silence, and finished ones are used."""
     out = tmp_path / "out"

@@ -37,6 +37,7 @@ def environment() -> Dict[str, str]:
     return dict(os.environ, PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])))
 
 
+@pytest.mark.slow
 def test_the_demo_on_a_users_scene(tiny_scene: Path, tmp_path: Path) -> None:
     before = sorted(tiny_scene.rglob("*"))
     out = tmp_path / "demo"
@@ -59,6 +60,7 @@ def test_the_demo_on_a_users_scene(tiny_scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+@pytest.mark.slow
 def test_ctrl_c_ends_the_demo_and_its_processes(tiny_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "demo"
     process = subprocess.Popen(
@@ -115,6 +117,7 @@ def test_side_by_side_equals_one_after_the_other(tiny_scene: Path, tmp_path: Pat
         assert without_times(metrics[arm.name]) == without_times(alone)
 
 
+@pytest.mark.slow
 def test_one_failure_ends_them_all_and_is_named(tiny_scene: Path, tmp_path: Path) -> None:
     long = Arm("long", tiny_scene, TrainConfig(iterations=100000), tmp_path / "long")
     broken = Arm("broken", tmp_path / "nowhere", TrainConfig(), tmp_path / "broken")

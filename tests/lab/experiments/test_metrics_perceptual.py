@@ -129,6 +129,7 @@ def test_a_wrong_file_is_one_line_and_is_never_run(tmp_path: Path) -> None:
         score(torch.rand(3, 20, 64), torch.rand(3, 20, 64))
 
 
+@pytest.mark.slow
 def test_a_comparison_scores_it_in_every_process(
     tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

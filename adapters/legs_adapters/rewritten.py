@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import builtins
-import functools
 import importlib.machinery
 import importlib.util
 import linecache
@@ -19,6 +18,8 @@ from pathlib import Path
 from types import CodeType
 from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Tuple, Type
 
+_BEFORE_THE_SCRIPT = (__name__, "importlib", "_frozen_importlib")  # modules that load it
+
 
 def execute(words: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[Path] = None) -> int:
     """Run a script as the main program of this process, with other text for the files that ``sources`` names.
@@ -31,7 +32,6 @@ def execute(words: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[
     Returns:
         The exit code, where the script does not leave by ``sys.exit``.
     """
-    file = _as_python_names(words[0])
     install(sources)
     passed_on: Tuple[Type[BaseException], ...] = (SystemExit,)
     if cpu_root is not None:
@@ -39,23 +39,21 @@ def execute(words: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[
 
         start(cpu_root)
         passed_on += (MissingShim,)
-    if words[0] == "-m":
-        sys.argv[:], sys.path[0] = words[1:], os.getcwd()
-        begin: Callable[[], Any] = functools.partial(runpy.run_module, words[1], run_name="__main__", alter_sys=True)
-    else:
-        sys.argv[:], sys.path[0] = words, os.path.dirname(os.path.realpath(words[0]))
-        sys.modules["__main__"] = main = main_module("__main__", file)
-        try:
-            begin = functools.partial(exec, Loader("__main__", file, sources).get_code("__main__"), main.__dict__)
-        except SyntaxError as error:
-            sys.excepthook(type(error), error.with_traceback(None), None)
-            return 1
     try:
-        begin()
+        if words[0] == "-m":
+            sys.argv[:], sys.path[0] = words[1:], os.getcwd()
+            runpy.run_module(words[1], run_name="__main__", alter_sys=True)
+        else:
+            sys.argv[:], sys.path[0] = words, os.path.dirname(os.path.realpath(words[0]))
+            file = _as_python_names(words[0])
+            sys.modules["__main__"] = main = main_module("__main__", file)
+            exec(Loader("__main__", file, sources).get_code("__main__"), main.__dict__)
     except passed_on:
         raise
     except BaseException as error:
-        traceback = error.__traceback__ and error.__traceback__.tb_next  # from the script on, without this frame
+        traceback = error.__traceback__  # from the script on; of a syntax error in it none
+        while traceback is not None and traceback.tb_frame.f_globals["__name__"].startswith(_BEFORE_THE_SCRIPT):
+            traceback = traceback.tb_next
         sys.excepthook(type(error), error.with_traceback(traceback), traceback)
         return _interrupted() if isinstance(error, KeyboardInterrupt) else 1
     return 0

@@ -169,6 +169,15 @@ class TestAsPythonRunsIt:
         )
         assert "in training_report" in run.stderr
 
+    @pytest.mark.parametrize("text", ["x = (1,\ny = 2\n", "import broken\n"])
+    def test_a_syntax_error_is_shown_as_python_shows_it(self, text, tmp_path):
+        (tmp_path / "train.py").write_text(text, encoding="utf-8")
+        (tmp_path / "broken.py").write_text("def f(:\n    pass\n", encoding="utf-8")
+        code = "import sys\nfrom legs_adapters.rewritten import execute\nsys.exit(execute(['train.py'], {}))"
+        run, plain = python("-c", code, cwd=tmp_path), python("train.py", cwd=tmp_path)
+        assert "SyntaxError" in plain.stderr
+        assert (run.returncode, run.stderr) == (plain.returncode, plain.stderr)
+
     @pytest.mark.skipif(os.name != "posix", reason="signals")
     def test_ctrl_c_ends_it_as_it_ends_python(self, tmp_path):
         root = self.script(tmp_path, "import time\nprint('ready', flush=True)\ntime.sleep(60)\n")

@@ -93,10 +93,9 @@ def filled(script: Path, text: Optional[str], given: Sequence[str], iterations: 
         LegsError: the text names anything else.
     """
     if text is None:
-        files = [path for path in (script, *script.parent.glob("arguments/*.py")) if path.is_file()]
+        files = (script, *script.parent.glob("arguments/*.py"))
         source = "\n".join(path.read_text(encoding="utf-8", errors="replace") for path in files)
-        known = [words for word, words in _ARGUMENTS if word in source and words.split()[0] not in given]
-        text = " ".join(known)
+        text = " ".join(words for word, words in _ARGUMENTS if word in source and words.split()[0] not in given)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         values = {"iterations": iterations, "port": free.getsockname()[1], **places}

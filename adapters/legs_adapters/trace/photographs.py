@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
-from legs_adapters.code.limits import remembered
 from legs_loss import LegsError
 
 SIDE = 16  # pixels of a thumbnail
@@ -86,7 +86,7 @@ class Photographs:
         if detail < DETAIL:
             return best._replace(correlation=min(best.correlation, SURE * max(detail, 0.0)))
         kept = picture[1]
-        most = max(_colours(thumb[:, kept]) for thumb in self._fine_of(path, 1))
+        most = max(_colours(thumb[:, kept]) for thumb in _thumbnails((path,))[1])
         is_grey = _colours(picture[0][:, kept]) + 1e-4 < _GREY * most
         return best._replace(detail=detail, is_photograph=best.is_photograph and not is_grey)
 
@@ -100,22 +100,13 @@ class Photographs:
         scale = round((fine.shape[1] / kept.size) ** 0.5)
         inside = kept.reshape(SIDE, SIDE).repeat(scale, 0).repeat(scale, 1).ravel()
         one = _standardised(fine[:, inside]).ravel()
-        scores = [_standardised(_high(other, scale)[:, inside]) for other in self._fine_of(path, scale)]
+        scores = [_standardised(_high(other, scale)[:, inside]) for other in _thumbnails((path,), scale * SIDE)[1]]
         return max((float(np.dot(score[::way].ravel(), one)) for score in scores for way in (1, -1)), default=0.0)
-
-    @remembered
-    def _fine_of(self, path: str, scale: int) -> Any:
-        """Return a file's thumbnails of so many times the side."""
-        return _thumbnails([path], scale * SIDE)[1]
-
-    @remembered
-    def _every(self, tier: int) -> Any:
-        return _thumbnails(self._tiers[tier])
 
     def _best(self, tier: int, picture: Picture) -> Optional[Match]:
         import numpy as np
 
-        files, stack = self._every(tier)  # [F], [F, 3, 256]
+        files, stack = _thumbnails(tuple(self._tiers[tier]))  # [F], [F, 3, 256]
         thumb, kept, _, shape = picture
         if not len(files) or kept.sum() < 16:
             return None
@@ -211,14 +202,10 @@ def uncut(picture: Any) -> Optional[Any]:
     base = None if planes is None else planes._base
     if planes is None or base is None or any(base.stride().count(step) != 1 for step in planes.stride()):
         return None
-    strides, at = base.stride(), planes.storage_offset() - base.storage_offset()
-    dims = [strides.index(step) for step in planes.stride()]
-    rest = sorted(set(range(base.dim())) - set(dims))
-    for dim in sorted(range(base.dim()), key=lambda dim: -strides[dim]):
-        index, at = divmod(at, max(1, strides[dim]))
-        if dim not in dims[1:]:
-            base = base.narrow(dim, index, len(planes) if dim == dims[0] else 1)
-    whole = base.permute(*rest, *dims).reshape(-1, *(base.shape[dim] for dim in dims))[0]
+    sizes, steps = dict(zip(base.stride(), base.shape)), planes.stride()[1:]
+    at = planes.storage_offset() - base.storage_offset()
+    first = planes.storage_offset() - sum(at // step % sizes[step] * step for step in steps)
+    whole = base.as_strided((len(planes), *(sizes[step] for step in steps)), planes.stride(), first)
     return None if whole.shape == planes.shape else whole
 
 
@@ -268,7 +255,8 @@ def _key(path: str) -> Tuple[str, str]:
     return re.sub(r"_\d+$", "", folder), os.path.splitext(name)[0]
 
 
-def _thumbnails(files: Sequence[str], side: int = SIDE) -> Tuple[Any, Any]:
+@functools.lru_cache(maxsize=None)
+def _thumbnails(files: Tuple[str, ...], side: int = SIDE) -> Tuple[Any, Any]:
     """Return the indices of the files that could be read, and thumbnails; of one with alpha on black and white too."""
     import numpy as np
     import torch

@@ -95,6 +95,12 @@ CASES = {
         "if step >= 4:",
         "    loss = F.l1_loss(image, gt_image)  # <- here",
     ),
+    "a photograph that is called a depth": body(
+        "drawn, depth = splats.draw(camera), gt_image",
+        'loss = compare(drawn["rgb"], gt_image) + 0.5 * compare(drawn["normal"], gt_image)',
+        'loss = loss + 0.1 * compare(drawn["normal"], depth)',
+        head="def compare(a, b):\n    return (a * 1.0 - b).abs().mean()  # <- here\n",
+    ),
     "channels last, resized, in a batch": body(
         'image = splats.draw(camera)["rgb"]',
         "small = [F.interpolate(x[None], scale_factor=0.75, mode='area') for x in (image, gt_image)]",
@@ -108,7 +114,7 @@ class TestWhichTerm:
     @pytest.mark.parametrize("name", sorted(CASES))
     def test_the_photographs_line_and_no_other(self, tmp_path, name, monkeypatch):
         report, line, done = traced(tmp_path, CASES[name])
-        assert weighted(report) == [line], done.stderr
+        assert (weighted(report), report["plain"]) == ([line], []), done.stderr
         known = [term for term in report["traced"] if term["is_photometric"]]
         assert known and all(term["image"]["path"].startswith("images") for term in known)
         assert all(term["gaussians"] == 150 and term["parameters"] for term in known)

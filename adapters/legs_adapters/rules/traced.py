@@ -161,8 +161,8 @@ class _Join:
             return verdict._replace(reason=f"{text}; {verdict.reason}")
         if isinstance(verdict, Site):
             is_swapped = candidate.target == 0 if candidate.target >= 0 else verdict.swapped
-            known = {use.call for use in uses}
-            kept = [use for use in verdict.unweighted if use.call not in known]
+            ran = {frame[:2] for term in self.trace.terms if term.is_photometric for frame in term.frames}
+            kept = [use for use in verdict.unweighted if (use.left.path, use.left.line) not in ran]
             why = text + self._differs(candidate, self.found.left, "skipped")
             return verdict._replace(swapped=is_swapped, why=why, unweighted=(*kept, *uses))
         return verdict

@@ -128,8 +128,7 @@ class Watch:
         """Wrap torch's differences, its backward passes and its optimisers, for good."""
         for owner, names, kind in _OWNERS:
             for name in names:
-                if hasattr(owner, name):
-                    setattr(owner, name, self._difference(getattr(owner, name), kind, name in ("__rsub__", "rsub")))
+                setattr(owner, name, self._difference(getattr(owner, name), kind, name in ("__rsub__", "rsub")))
         for name in ("backward", "grad"):
             setattr(torch.autograd, name, self._backward(getattr(torch.autograd, name), name == "backward"))
         self._functions()

@@ -92,7 +92,7 @@ def measure(args):
     restored = TrainConfig.from_dict(facts["config"])
     run = trainer._Training.restore(data, restored, args.run / "checkpoint.npz")
     run.config, run.schedule = config, run.schedule._replace(densify_from=1 << 30, reset_every=1 << 30)
-    getattr(importlib.import_module("legs_loss.system"), "keep_freed_memory", int)()  # older checkouts have none
+    getattr(trainer, "keep_freed_memory", int)()  # older checkouts have none
     took, sizes = {}, {}
     clock = time.process_time if args.threads == 1 else time.perf_counter
 

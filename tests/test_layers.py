@@ -110,7 +110,7 @@ FLOORS = [
     {"lab", "__main__"},
 ]
 LAB_FLOORS = [
-    {"simd", "conventions", "reconstruct"},
+    {"simd", "conventions", "reconstruct", "values"},
     {"gaussians"},
     {"ply", "rasterizer"},
     {"embedded", "surfels", "training"},

@@ -26,8 +26,8 @@ def run(args: argparse.Namespace) -> int:
     """Print the summary; 1 when something is damaged."""
     from legs_loss.config import STORE_FOLDER
     from legs_loss.errors import LegsError
+    from legs_loss.precompute.sharpness import unsharp_views
     from legs_loss.store import MANIFEST, MASK, WEIGHTS, DamagedStoreError, WeightStore
-    from legs_loss.store.sharpness import unsharp_views
 
     path = Path(args.store)
     if (path / STORE_FOLDER).is_dir():

@@ -172,8 +172,8 @@ def _refuse_photographs_of_a_scene(folder: Path) -> None:
 def _say(store: Path, report: Report) -> int:
     """Print the result of a scene; return 1 if any of it failed."""
     from legs_loss.cli.shared.scene_arguments import say_skipped
+    from legs_loss.precompute.sharpness import unsharp_views
     from legs_loss.store import MANIFEST, WeightStore
-    from legs_loss.store.sharpness import unsharp_views
 
     say_skipped(report.skipped)
     for note in report.notes:

@@ -112,9 +112,9 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
 
     from legs_loss.cli.shared.sheet import Shown
     from legs_loss.errors import LegsError
+    from legs_loss.precompute.origin import scene_of_store
     from legs_loss.responses import over_scene
     from legs_loss.store import MASK, WEIGHTS, WeightStore
-    from legs_loss.store.origin import scene_of_store
 
     store, scene = WeightStore(path), scene_of_store(path)
     views = {} if scene is None else {view.name: view for view in scene.views}

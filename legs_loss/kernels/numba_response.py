@@ -39,37 +39,10 @@ class OperatorCode(NamedTuple):
     norm: int
 
 
-def supports_response(spec: WeightSpec) -> bool:
-    """Return whether the response of a spec can be computed here; the functions below take no other."""
-    return spec.operator in STENCILS and spec.p in NORMS
-
-
 def operator_of(spec: WeightSpec) -> OperatorCode:
     """Return a spec's operator and norm as the functions here take them."""
     stencil, side, middle = STENCILS[spec.operator]
     return OperatorCode(stencil, np.float32(side), np.float32(middle), NORMS[spec.p])
-
-
-def photograph_response(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
-    """Return the response of a photograph uint8 or uint16 [H, W, C], scaled to [0, 1], as float32 [H, W]."""
-    height, width, channels = image.shape
-    out = np.empty((height, width), np.float32)
-    rows = max(1, (1 << 18) // (width * channels))  # their floats stay in the cache
-    full = np.float32(np.iinfo(image.dtype).max)
-    for top in range(0, height, rows):
-        bottom = min(top + rows, height)
-        first, last = max(top - 1, 0), min(bottom + 1, height)
-        planes = image[first:last].transpose(2, 0, 1).astype(np.float32, order="C")
-        planes /= full
-        shape = Shape(1, channels, last - first, width)
-        _response_rows(planes.reshape(-1), shape, operator_of(spec), top - first, out[top:bottom])
-    return out
-
-
-@compiled(fastmath=False)
-def _response_rows(image, shape, operator, first, out):  # type: ignore[no-untyped-def]
-    for i in range(out.shape[0]):
-        response_row(image, shape, operator, np.int64(0), first + i, np.int64(0), shape.width, out[i])
 
 
 def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:

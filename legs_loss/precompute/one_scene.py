@@ -14,13 +14,13 @@ from typing import Any, Callable, Dict, Iterator, List, Optional, Union
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.precompute.one_view import Job, UnwritableError, ViewTask, make
+from legs_loss.precompute.origin import note_scene
 from legs_loss.precompute.photograph import compile_response
 from legs_loss.precompute.user_maps import NO_MAPS, UserMaps, is_below, stage_user_maps
 from legs_loss.precompute.workers import in_processes
 from legs_loss.scenes import Scene, image_size, training_size
 from legs_loss.spec import Spec, as_spec
 from legs_loss.store import Entry, StoreWriter
-from legs_loss.store.origin import note_scene
 from legs_loss.system import held_back
 from legs_loss.system.executors import outcomes
 

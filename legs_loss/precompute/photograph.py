@@ -46,10 +46,11 @@ def compile_response(width: int, height: int, spec: WeightSpec) -> None:
 def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
     if image.size >= _WORTH_COMPILING and BACKENDS.chosen(torch.device("cpu"), "l1") == "numba":
+        from legs_loss.kernels.codes import STENCILS
         from legs_loss.kernels.compiling import said
-        from legs_loss.kernels.numba_response import photograph_response, supports_response
+        from legs_loss.precompute.compiled import photograph_response
 
-        if supports_response(spec):
+        if spec.operator in STENCILS:
             with said("legs precompute", "1 to 5 s"):
                 return torch.from_numpy(photograph_response(image, spec))
     return response(image_tensor(image), spec.operator, spec.p, False, spec.smooth)[0]

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from legs_loss.system.locks import HeldError as HeldError
     from legs_loss.system.locks import is_held as is_held
     from legs_loss.system.machine import cores as cores
-    from legs_loss.system.machine import keep_freed_memory as keep_freed_memory
     from legs_loss.system.terminal import is_first_process as is_first_process
     from legs_loss.system.terminal import never_fail_to_print as never_fail_to_print
     from legs_loss.system.terminal import printable as printable
@@ -35,7 +34,7 @@ _NAMES = {
     "ctrl_c": ["held_back", "noted"],
     "files": ["open_regular", "read_regular", "read_text", "write_whole"],
     "locks": ["FileLock", "HeldError", "is_held"],
-    "machine": ["cores", "keep_freed_memory"],
+    "machine": ["cores"],
     "entry_points": ["plugins"],
     "terminal": ["is_first_process", "never_fail_to_print", "printable", "progress", "say", "say_error"],
 }

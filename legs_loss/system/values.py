@@ -1,4 +1,4 @@
-"""Check values of JSON: each function returns whether a value fits, or such a function.
+"""Check values of JSON: each function returns whether a value fits.
 
 Python reads JSON's integers of any length, its truths as integers, and 1e999 as infinity.
 """
@@ -6,9 +6,8 @@ Python reads JSON's integers of any length, its truths as integers, and 1e999 as
 from __future__ import annotations
 
 from math import isfinite
-from typing import Any, Callable
+from typing import Any
 
-Fits = Callable[[Any], bool]
 _LARGEST = 1 << 63
 
 
@@ -25,33 +24,3 @@ def is_count(value: Any) -> bool:
 def is_text(value: Any) -> bool:
     """Return whether it is a text that can be a file's name."""
     return type(value) is str and "\0" not in value
-
-
-def is_pair(value: Any) -> bool:
-    """Return whether it is a list of two counts."""
-    return each(is_count)(value) and len(value) == 2
-
-
-def is_scores(value: Any) -> bool:
-    """Return whether it has numbers by name."""
-    return of_names(is_number)(value)
-
-
-def optional(fits: Fits) -> Fits:
-    """Accept None, too."""
-    return lambda value: value is None or fits(value)
-
-
-def each(fits: Fits) -> Fits:
-    """Accept lists of what fits."""
-    return lambda value: type(value) is list and all(map(fits, value))
-
-
-def of_names(fits: Fits) -> Fits:
-    """Accept objects whose values fit."""
-    return lambda value: type(value) is dict and all(is_text(name) and fits(one) for name, one in value.items())
-
-
-def with_names(fits: Fits, *names: str) -> Fits:
-    """Accept what fits and has these names."""
-    return lambda value: fits(value) and all(name in value for name in names)

@@ -118,7 +118,7 @@ class TestStoreElsewhere:
         assert all(view.photograph is None for view in shown)
 
     def test_photographs_from_another_folder(self, scene, tmp_path):
-        from legs_loss.store.origin import scene_of_store
+        from legs_loss.precompute.origin import scene_of_store
 
         (scene / "images").rename(tmp_path / "photographs")
         store = precompute(read_scene(scene, str(tmp_path / "photographs")), tmp_path / "store").store

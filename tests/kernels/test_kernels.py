@@ -29,10 +29,12 @@ from tests.support import legs_environment
 pytest.importorskip("numba")
 
 from legs_loss.kernels import numba_loss
-from legs_loss.kernels.numba_response import extremes, photograph_response, supports_response
+from legs_loss.kernels.codes import STENCILS
+from legs_loss.kernels.numba_response import extremes
+from legs_loss.precompute.compiled import photograph_response
 
 fused_loss = by_signature(numba_loss.BACKEND)
-COMPILED = [name for name in OPERATORS if supports_response(WeightSpec(operator=name))]
+COMPILED = [*STENCILS]
 
 OF_THE_FIRST_STEP = "legs-loss: L1 weighted: laplacian, C3, beta 10, by legs_loss\n"  # if no test came before
 SHAPES = [(3, 1, 1), (1, 5, 7), (3, 40, 300), (2, 3, 30, 17), (3, 150, 530), (4, 11, 257), (2, 1, 8, 9), (3, 129, 8)]

@@ -10,17 +10,8 @@ from typing import Any, Callable, Dict, Iterable, Mapping, Optional
 from legs_loss.errors import LegsError
 from legs_loss.lab.experiments.arms import parse_arm
 from legs_loss.lab.training.config import TrainConfig
-from legs_loss.system.values import (
-    each,
-    is_count,
-    is_number,
-    is_pair,
-    is_scores,
-    is_text,
-    of_names,
-    optional,
-    with_names,
-)
+from legs_loss.lab.values import each, is_pair, is_scores, of_names, optional, with_names
+from legs_loss.system.values import is_count, is_number, is_text
 
 # The required contents of the files.
 SETTINGS = ("scene", "path", "images", "base", "baseline")

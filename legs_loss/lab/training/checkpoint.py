@@ -13,8 +13,9 @@ import numpy as np
 import torch
 
 from legs_loss.errors import LegsError
+from legs_loss.lab.values import each, is_pair, is_scores, optional, with_names
 from legs_loss.system import FileLock, HeldError, open_regular, write_whole
-from legs_loss.system.values import each, is_count, is_number, is_pair, is_scores, is_text, optional, with_names
+from legs_loss.system.values import is_count, is_number, is_text
 
 CHECKPOINT = "checkpoint.npz"
 LOCK = ".lock"  # in a run's folder, held while it is trained

@@ -8,6 +8,7 @@ The same seed gives bit-identical Gaussians, whether or not the run was interrup
 
 from __future__ import annotations
 
+import ctypes
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,9 +37,10 @@ from legs_loss.lab.training.dataset import (
 from legs_loss.lab.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.lab.training.metrics import mean_scores, psnr, score
 from legs_loss.scenes import Camera, Scene
-from legs_loss.system import keep_freed_memory, noted
+from legs_loss.system import noted
 from legs_loss.weights import Weights
 
+_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # glibc's malloc.h
 _FACTS = ("iteration", "order", "loss", "psnr", "growth", "history")  # of a run, that a checkpoint keeps as they are
 
 
@@ -376,3 +378,16 @@ def step_weights(weight: Optional[Tensor], view: TrainingView, config: TrainConf
 
 def _clocks() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
+
+
+def keep_freed_memory() -> None:
+    """Have this process keep the memory that it frees for its next allocations (with glibc; else nothing changes).
+
+    Otherwise each array of more than some megabytes is mapped anew, and the kernel clears its pages one by one.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return
+    mallopt(_MMAP_MAX, 0)
+    mallopt(_TRIM_THRESHOLD, -1)

@@ -39,15 +39,6 @@ def outliers(means: Mapping[str, float]) -> List[str]:
     return sorted((name for name, value in logs.items() if value > limit), key=lambda name: -logs[name])
 
 
-def mean_responses(store: WeightStore) -> Dict[str, float]:
-    """Return the mean normalised response of each view, of the operator and size that most of them have.
-
-    Raises:
-        LegsError: a map cannot be read.
-    """
-    return {entry.view: float(store.normalised_response(entry).mean(dtype=np.float64)) for entry in _alike(store)}
-
-
 def unsharp_views(store: WeightStore) -> List[str]:
     """Return the views of a store whose photographs seem out of focus, moved or noisy.
 
@@ -56,7 +47,8 @@ def unsharp_views(store: WeightStore) -> List[str]:
     """
     entries = _alike(store)
     if any(entry.strong is None or entry.median is None for entry in entries):
-        return outliers(mean_responses(store))
+        means = {entry.view: float(store.normalised_response(entry).mean(dtype=np.float64)) for entry in entries}
+        return outliers(means)
     weak = outliers({entry.view: 1.0 / max(entry.strong or 0.0, 1e-6) for entry in entries})
     noisy = outliers({entry.view: entry.median or 0.0 for entry in entries})
     return list(dict.fromkeys(weak + noisy))

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image, ImageFilter
 
 from legs_loss.cli import main
-from legs_loss.store.sharpness import outliers
+from legs_loss.precompute.sharpness import outliers
 
 
 def test_only_the_odd_ones_are_named() -> None:

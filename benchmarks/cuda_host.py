@@ -25,7 +25,7 @@ from typing import Any, Callable, Dict
 import torch
 
 import legs_loss
-from legs_loss.kernels.available import BACKENDS, Availability, Known
+from legs_loss.kernels.available import BACKENDS, Availability
 from legs_loss.kernels.cuda.backend import THREADS, CudaBackend, Task
 from legs_loss.kernels.cuda.driver import CudaDriver
 from legs_loss.kernels.cuda.modules import PLAIN, BinaryCache, Modules
@@ -69,8 +69,8 @@ def main() -> int:
     driver = CudaDriver(torch.device("cpu"), libraries().cuda, Runtime())  # as on a GPU, where no test looks on
     modules = Modules(driver, Compiler(libraries().nvrtc), BinaryCache(libraries().cache))
     backend, device = CudaBackend(lambda device: modules), torch.device("cpu")
-    BACKENDS._known = {"cuda": Known("as on a GPU", "cpu")}
-    BACKENDS.found = {("cuda", device): Availability(backend, True, "", TRIED)}
+    BACKENDS.known = {"cpu": ("cuda", "as on a GPU")}
+    BACKENDS.found = {device: Availability(backend, "", TRIED)}
     # As on a GPU, a target is known by its memory, not by its values.
     memo._key, memo.WeightMemo._owner = memo._identity_key, memo.WeightMemo._owner_of_memory  # type: ignore[assignment]
     state.current_run().computes = False

@@ -22,7 +22,7 @@ def machine(options: Options, record: Record) -> None:
     ):
         record(**{name: _said_by(command)})
     backend = BACKENDS.chosen(device)
-    reason = BACKENDS.availability("cuda", device).reason
+    reason = BACKENDS.availability(device).reason
     record(**{"backend": f"{backend}: {reason}", "GB/s of a copy": copy_bandwidth(device) / 1e9})
     if backend != "cuda":
         raise RuntimeError(f"the kernels are not used: {reason}")

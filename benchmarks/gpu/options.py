@@ -58,15 +58,15 @@ class Options:
 
 def emulate() -> None:
     """Put the CUDA kernels, compiled with g++, in the place of the CPU's backend in this process."""
-    from legs_loss.kernels.available import BACKENDS, Availability, Known
+    from legs_loss.kernels.available import BACKENDS, Availability
 
     sys.path.insert(0, str(ROOT))
     from tests.cuda_emulation import TRIED, emulated
 
-    BACKENDS._known = {"cuda": Known("tests.cuda_emulation", "cpu")}
+    BACKENDS.known = {"cpu": ("cuda", "tests.cuda_emulation")}
     backend = emulated()
-    known = Availability(backend, True, "emulated on the CPU", TRIED)
-    BACKENDS.found = {("cuda", torch.device("cpu")): known}
+    known = Availability(backend, "emulated on the CPU", TRIED)
+    BACKENDS.found = {torch.device("cpu"): known}
 
 
 def first_line(error: Any) -> str:

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from legs_loss import legs_loss, weight_map
 from legs_loss.kernels.available import BACKENDS
+from legs_loss.kernels.contract import terms_of
 from legs_loss.similarity import ssim_map
 from legs_loss.spec import PRESETS
-from legs_loss.weights import Weights
 
 from .images import Pairs, in_turns
 
@@ -38,11 +38,11 @@ def losses(pairs: Pairs) -> Contenders:
         return lambda image, target: similarity(image.unsqueeze(0), target.unsqueeze(0), *rest, **settings)
 
     contenders: Dict[str, Loss] = {}
-    kernel = BACKENDS.ready(device)
+    kernel = BACKENDS.ready(device, "loss")
     if kernel is not None:
         contenders["LEGS, weights in the kernel"] = lambda image, target, _: legs_loss(image, target, LEGS)
         contenders["LEGS, stored map"] = lambda image, target, stored: legs_loss(image, target, weight=stored)
-        contenders["3DGS by the kernel"] = lambda image, target, _: kernel.loss(image, target, Weights(), LAMBDA)
+        contenders["3DGS by the kernel"] = lambda image, target, _: kernel.loss(terms_of(LAMBDA), image, target)
     contenders["LEGS by torch"] = lambda image, target, _: (
         (1.0 - LAMBDA) * (weight_map(target, LEGS) * torch.abs(image - target)).mean()
         + LAMBDA * (1.0 - reference_ssim(image, target))
@@ -99,7 +99,7 @@ def reference_ssim(image: Tensor, target: Tensor) -> Tensor:
 def weightings(target: Tensor) -> Contenders:
     """Return each way to the weights of a photograph as a function."""
     found: Contenders = {"weight_map": lambda: weight_map(target, LEGS)}
-    if not target.is_cuda and BACKENDS.availability("numba", target.device).backend is not None:
+    if not target.is_cuda and BACKENDS.availability(target.device).backend is not None:
         from legs_loss.kernels.numba_response import extremes
 
         batch = target.unsqueeze(0).numpy()

@@ -67,5 +67,5 @@ def _version(package: str) -> str:
 def _backend(device: torch.device) -> str:
     from legs_loss.kernels.available import BACKENDS
 
-    reasons = [f"{name}: {BACKENDS.availability(name, device).reason}" for name in BACKENDS.names(device)]
-    return "; ".join([BACKENDS.chosen(device), *reasons])
+    name, _ = BACKENDS.known[device.type]
+    return f"{BACKENDS.chosen(device)}; {name}: {BACKENDS.availability(device).reason}"

@@ -15,7 +15,7 @@ import sys
 import threading
 from contextlib import nullcontext
 from functools import partial
-from typing import Any, Callable, ContextManager, Dict, FrozenSet, List, NamedTuple, Optional, Tuple
+from typing import Any, Callable, ContextManager, Dict, FrozenSet, NamedTuple, Optional, Tuple
 
 import torch
 
@@ -25,43 +25,38 @@ from legs_loss.spec import WeightSpec
 
 OUT_OF_MEMORY = getattr(torch.cuda, "OutOfMemoryError", MemoryError)
 _NAMES = ("torch", "numba", "cuda")
-# An operation (None: all that there are), and the operator, norm and curve of the weights to be made (None: none are).
-_Case = Tuple[Optional[str], Optional[Tuple[str, float, str]]]
-
-
-class Known(NamedTuple):
-    """A backend: the module whose BACKEND it is, and the type of its devices."""
-
-    module: str
-    device: str
+# An operation ("loss", "l1", "ssim"), and of the weights to be made operator, norm and curve (None: none are made).
+_Case = Tuple[str, Optional[WeightSpec]]
 
 
 class Availability(NamedTuple):
-    """An answer: whether a backend is available on a device.
+    """An answer: whether a device's backend is available.
 
     Attributes:
         backend: None where it is not.
-        installed: whether its package is installed.
         reason: why it is, or is not, available.
         tried: the cases whose trial it passed.
     """
 
     backend: Optional[Backend]
-    installed: bool
     reason: str
     tried: FrozenSet[_Case] = frozenset()
 
 
 class Backends:
-    """The backends of this process, and which of them are available on each device.
+    """The backends of this process, and whether each device's is available.
 
-    Args:
-        known: by name, the first for a device first.
+    Attributes:
+        known: by the type of a device, its backend's name and the module whose BACKEND it is.
+        found: by the device, what was found.
     """
 
-    def __init__(self, known: Dict[str, Known]) -> None:
-        self._known = known
-        self.found: Dict[Tuple[str, torch.device], Availability] = {}
+    def __init__(self) -> None:
+        self.known: Dict[str, Tuple[str, str]] = {
+            "cpu": ("numba", "legs_loss.kernels.numba_loss"),
+            "cuda": ("cuda", "legs_loss.kernels.cuda.backend"),
+        }
+        self.found: Dict[torch.device, Availability] = {}
         # What LEGS_BACKEND says, raw. The environment's own memory is asked: os.environ takes three calls.
         environment: Any = os.environ
         memory = getattr(environment, "_data", environment)
@@ -69,11 +64,7 @@ class Backends:
         self.setting: Callable[[], Any] = partial(memory.get, name)
         self.after_fork()
 
-    def names(self, device: torch.device) -> List[str]:
-        """Return the names of the backends for a device."""
-        return [name for name, known in self._known.items() if known.device == device.type]
-
-    def chosen(self, device: torch.device, operation: Optional[str] = None) -> str:
+    def chosen(self, device: torch.device, operation: str = "loss") -> str:
         """Return which backend computes an operation for images on a device: "torch" or the name of another.
 
         It is tried with the default spec.
@@ -82,11 +73,9 @@ class Backends:
             LegsError: LEGS_BACKEND is none of these.
         """
         name = self._wanted(device)
-        return "torch" if name is None or self.availability(name, device, operation).backend is None else name
+        return "torch" if name is None or self.availability(device, operation).backend is None else name
 
-    def ready(
-        self, device: torch.device, operation: Optional[str] = None, spec: Optional[WeightSpec] = None
-    ) -> Optional[Backend]:
+    def ready(self, device: torch.device, operation: str, spec: Optional[WeightSpec] = None) -> Optional[Backend]:
         """Return the backend of an operation on a device, None where that is torch: also where no trial may run now.
 
         Args:
@@ -94,18 +83,17 @@ class Backends:
             operation: as for :meth:`availability`.
             spec: of the weights that it is to make.
         """
-        name, case = self._wanted(device), (operation, None if spec is None else (spec.operator, spec.p, spec.curve))
-        if name is None or (is_capturing(device) and self._known_already(name, device, case) is None):
+        case = operation, None if spec is None else WeightSpec(spec.operator, spec.p, spec.curve)
+        if self._wanted(device) is None or (is_capturing(device) and self._known_already(device, case) is None):
             return None  # a trial waits for the device, which would break a capture
-        return self._answer(name, device, case).backend
+        return self._answer(device, case).backend
 
     def _wanted(self, device: torch.device) -> Optional[str]:
-        names = self.names(device)
-        name = forced_backend() or (names[0] if names else None)
-        return name if name in names else None
+        forced, (name, _) = forced_backend(), self.known.get(device.type, (None, ""))
+        return name if forced in (None, name) else None
 
-    def availability(self, name: str, device: torch.device, operation: Optional[str] = None) -> Availability:
-        """Return whether a backend is available on a device for an operation ("loss", "l1", "ssim"; None: all it has).
+    def availability(self, device: torch.device, operation: str = "loss") -> Availability:
+        """Return whether a device's backend is available for an operation ("loss", "l1", "ssim").
 
         A trial of the operation, with the default spec, runs once for each device. On a card that is full it is not
         available now, and the next call tries it again.
@@ -113,72 +101,66 @@ class Backends:
         Raises:
             DeviceFault: the device computes nothing any more, since a kernel has failed before.
         """
-        spec = WeightSpec()
-        return self._answer(name, device, (operation, (spec.operator, spec.p, spec.curve)))
+        return self._answer(device, (operation, WeightSpec()))
 
-    def _answer(self, name: str, device: torch.device, case: _Case) -> Availability:
+    def _answer(self, device: torch.device, case: _Case) -> Availability:
         with self._lock:
-            return self._known_already(name, device, case) or self._tried(name, device, case)
+            return self._known_already(device, case) or self._tried(device, case)
 
-    def _known_already(self, name: str, device: torch.device, case: _Case) -> Optional[Availability]:
-        found = self.found.get(self.place(name, device))
+    def _known_already(self, device: torch.device, case: _Case) -> Optional[Availability]:
+        found = self.found.get(self.place(device))
         return found if found is None or found.backend is None or case in found.tried else None
 
-    def give_up(self, name: str, device: torch.device, error: Exception) -> None:
+    def give_up(self, device: torch.device, error: Exception) -> None:
         """Leave a backend that failed after its trial."""
-        self._recorded(self.place(name, device), Availability(None, True, _in_words(error)))
+        self._recorded(device, Availability(None, _in_words(error)))
 
-    def place(self, name: str, device: torch.device) -> Tuple[str, torch.device]:
-        """Return where in ``found`` stands what was found of a backend on a device, which "cuda" alone does not say."""
+    def place(self, device: torch.device) -> torch.device:
+        """Return the device under which ``found`` has it: "cuda" alone is the current one."""
         if device.type == "cuda" and device.index is None and torch.cuda.is_available():
-            device = torch.device("cuda", torch.cuda.current_device())
-        return name, device
+            return torch.device("cuda", torch.cuda.current_device())
+        return device
 
     def after_fork(self) -> None:
         """Take a lock that no thread holds."""
         self._lock = threading.RLock()
 
-    def _tried(self, name: str, device: torch.device, case: _Case) -> Availability:
+    def _tried(self, device: torch.device, case: _Case) -> Availability:
         from legs_loss.kernels.trial import difference_from_torch
 
-        place, missing = self.place(name, device), _why_missing(name)
+        name, module = self.known[device.type]
+        missing = _why_missing(name)
         if missing:
-            return self._recorded(place, Availability(None, False, missing))
+            return self._recorded(device, Availability(None, missing), quiet=forced_backend() != name)
         try:
-            backend = importlib.import_module(self._known[name].module).BACKEND
-            operation, settings = case
-            spec = None if settings is None else WeightSpec(*settings)
+            backend = importlib.import_module(module).BACKEND
             # The first call may be in an evaluation, and the trial needs gradients; or in a checkpoint, which counts by
             # hooks what is saved, and would count what the trial saves.
             with torch.inference_mode(False), _own_hooks(), backend.preparing():
-                problem = difference_from_torch(backend, device, operation, spec)
+                problem = difference_from_torch(backend, device, *case)
         except (NotNow, MemoryError, OUT_OF_MEMORY) as error:  # it is tried again
-            return Availability(None, True, _in_words(error))
+            return Availability(None, _in_words(error))
         except DeviceFault:
             raise
         except Exception as error:  # anything that a broken install, compiler or driver raises
             if "CUDA error" in str(error):
                 raise DeviceFault(str(error)) from error  # torch's own: it computes nothing on this device either
-            return self._recorded(place, Availability(None, True, _in_words(error)))
+            problem = _in_words(error)
         if problem:
-            return self._recorded(place, Availability(None, True, problem))
-        cases = {case} if operation else {(each, settings) for each in (None, "l1", "ssim", "loss")}
-        tried = self.found[place].tried | cases if place in self.found else frozenset(cases)
-        return self._recorded(place, Availability(backend, True, "its trial agreed with torch", tried))
+            return self._recorded(device, Availability(None, problem))
+        before = self.found.get(self.place(device))
+        tried = {case} if before is None else before.tried | {case}
+        return self._recorded(device, Availability(backend, "its trial agreed with torch", frozenset(tried)))
 
-    def _recorded(self, place: Tuple[str, torch.device], found: Availability) -> Availability:
-        self.found[place] = found
-        if found.backend is None and (found.installed or forced_backend() == place[0]):
-            print(f"legs-loss: {place[0]} is unavailable, torch is used: {found.reason}", file=sys.stderr, flush=True)
+    def _recorded(self, device: torch.device, found: Availability, quiet: bool = False) -> Availability:
+        self.found[self.place(device)] = found
+        if found.backend is None and not quiet:
+            name, _ = self.known[device.type]
+            print(f"legs-loss: {name} is unavailable, torch is used: {found.reason}", file=sys.stderr, flush=True)
         return found
 
 
-BACKENDS = Backends(
-    {
-        "numba": Known("legs_loss.kernels.numba_loss", "cpu"),
-        "cuda": Known("legs_loss.kernels.cuda.backend", "cuda"),
-    }
-)
+BACKENDS = Backends()
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=BACKENDS.after_fork)
 

@@ -112,10 +112,10 @@ def _new_plan(plan: Plan, terms: Terms, prediction: Tensor, target: Tensor, want
     try:
         prepared = backend.prepare(terms, spec if makes else None, prediction, target, wanted)
     except Exception as error:
-        _given_up(error, backend.name, device)
+        _given_up(error, device)
         return plan
     plain = terms.constant > 0.0 and (spec is None or spec.unweighted) and not forced_backend()
-    place = BACKENDS.place(backend.name, device)
+    place = BACKENDS.place(device)
     return plan._replace(prepared=prepared, makes=makes, plain=plain, place=place, found=BACKENDS.found[place])
 
 
@@ -140,7 +140,7 @@ def fused(plan: Plan, prediction: Tensor, target: Tensor, weights: Weights) -> O
     try:
         loss: Tensor = node(prediction, target, map_, weights.range, plan.prepared)
     except Failed as failed:
-        _given_up(failed.__cause__, plan.place[0], prediction.device)
+        _given_up(failed.__cause__, prediction.device)
         return None
     return loss if weights.share is None else weights.of_what_counts(loss)
 
@@ -157,13 +157,13 @@ def fused_range(target: Tensor, spec: WeightSpec) -> Optional[Tensor]:
     try:
         return plan.prepared.response_range(target)
     except Exception as error:
-        _given_up(error, plan.place[0], target.device)
+        _given_up(error, target.device)
         return None
 
 
-def _given_up(error: Optional[BaseException], name: str, device: torch.device) -> None:
+def _given_up(error: Optional[BaseException], device: torch.device) -> None:
     """Raise what a user or torch must know of; of others, as of a size that no trial covered, leave the backend."""
     if isinstance(error, (LegsError, MemoryError, OUT_OF_MEMORY, DeviceFault)):
         raise error from None  # what a node made of it says nothing more
     if isinstance(error, Exception) and not isinstance(error, NotNow):
-        BACKENDS.give_up(name, device, error)
+        BACKENDS.give_up(device, error)

@@ -13,7 +13,7 @@ import torch
 
 from legs_loss import legs_loss
 from legs_loss.kernels import available, trial
-from legs_loss.kernels.available import BACKENDS, Known
+from legs_loss.kernels.available import BACKENDS
 from legs_loss.kernels.contract import L1, SSIM, DeviceFault, NotNow, terms_of
 from legs_loss.kernels.cuda import driver as driver_module
 from legs_loss.kernels.cuda.backend import THREADS, CudaBackend, Task
@@ -201,7 +201,7 @@ class TestWhoseFiles:
 @pytest.fixture
 def on_cpu(modules, cuda, monkeypatch):
     """Make the CUDA backend, behind the stand-in libraries, the untried one for images on the CPU."""
-    monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("stand-in", "cpu")})
+    monkeypatch.setattr(BACKENDS, "known", {"cpu": ("cuda", "stand-in")})
     monkeypatch.setattr(BACKENDS, "found", {})
     backend = CudaBackend(lambda device: modules)
     monkeypatch.setattr(available.importlib, "import_module", lambda name: SimpleNamespace(BACKEND=backend))
@@ -249,7 +249,7 @@ class TestAvailability:
         monkeypatch.setattr(available, "_why_missing", lambda name: None)
         problems = {torch.device("cuda", 0): "its card is odd", torch.device("cuda", 1): None}
         monkeypatch.setattr(trial, "difference_from_torch", lambda backend, device, *_: problems[device])
-        found = [BACKENDS.availability("cuda", torch.device("cuda", index)) for index in (0, 1)]
+        found = [BACKENDS.availability(torch.device("cuda", index)) for index in (0, 1)]
         assert found[0].backend is None and found[1].backend is not None
         assert capfd.readouterr().err == "legs-loss: cuda is unavailable, torch is used: its card is odd\n"
 

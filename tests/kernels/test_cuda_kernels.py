@@ -30,7 +30,7 @@ from legs_loss import (
 )
 from legs_loss.curves import FORMULAS
 from legs_loss.kernels import backends
-from legs_loss.kernels.available import BACKENDS, Availability, Known
+from legs_loss.kernels.available import BACKENDS, Availability
 from legs_loss.kernels.codes import STENCILS
 from legs_loss.kernels.contract import L1, SSIM, terms_of
 from legs_loss.kernels.trial import difference_from_torch
@@ -59,10 +59,10 @@ def chosen(monkeypatch):
     """Make the backend under test the one for images on the device, and return it and its driver."""
     driver = new_driver()
     backend = new_backend(driver)
-    found = Availability(backend, True, "", TRIED)
+    found = Availability(backend, "", TRIED)
     device = torch.empty(0, device=DEVICE).device
-    monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", DEVICE.type)})
-    monkeypatch.setattr(BACKENDS, "found", {("cuda", device): found})
+    monkeypatch.setattr(BACKENDS, "known", {DEVICE.type: ("cuda", "no module")})
+    monkeypatch.setattr(BACKENDS, "found", {device: found})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return found.backend, driver
 
@@ -337,8 +337,9 @@ class TestAutograd:
 
 
 class TestSelection:
-    def test_its_trial_agrees_with_torch(self, backend):
-        assert difference_from_torch(backend, DEVICE, None, LEGS) is None
+    @pytest.mark.parametrize("operation", ["l1", "ssim", "loss"])
+    def test_its_trial_agrees_with_torch(self, backend, operation):
+        assert difference_from_torch(backend, DEVICE, operation, LEGS) is None
 
     @pytest.mark.parametrize("channels_last", [False, True])
     def test_the_front_ends_mean_the_same_as_torch(self, chosen, channels_last):

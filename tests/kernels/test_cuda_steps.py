@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from legs_loss import LegsError, configure, l1_loss, legs_loss, ssim
 from legs_loss.kernels import available, backends, trial
-from legs_loss.kernels.available import BACKENDS, Availability, Known
+from legs_loss.kernels.available import BACKENDS, Availability
 from legs_loss.kernels.contract import SSIM
 from legs_loss.kernels.cuda.backend import CudaBackend, Strides, Task, chunks_of, strip_of
 from legs_loss.kernels.cuda.driver import DriverError
@@ -77,9 +77,9 @@ class Watched(TorchDispatchMode):
 @pytest.fixture
 def on_meta(monkeypatch, parts):
     """The backend for tensors on torch's meta device, which have no values that could be read."""
-    known = Availability(CudaBackend(lambda _: parts[2]), True, "", TRIED)
-    monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "meta")})
-    monkeypatch.setattr(BACKENDS, "found", {("cuda", torch.device("meta")): known})
+    known = Availability(CudaBackend(lambda _: parts[2]), "", TRIED)
+    monkeypatch.setattr(BACKENDS, "known", {"meta": ("cuda", "no module")})
+    monkeypatch.setattr(BACKENDS, "found", {torch.device("meta"): known})
     monkeypatch.delenv("LEGS_BACKEND", raising=False)
     return parts[0]
 
@@ -179,9 +179,9 @@ class TestCapture:
     def test_a_kernel_that_is_not_loaded_is_torchs_while_a_capture_lasts(self, monkeypatch, tmp_path):
         driver = FakeDriver()
         backend = CudaBackend(lambda _: Modules(driver, FakeCompiler(), BinaryCache(tmp_path)))
-        monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("no module", "cpu")})
-        known = Availability(backend, True, "", TRIED)
-        monkeypatch.setattr(BACKENDS, "found", {("cuda", torch.device("cpu")): known})
+        monkeypatch.setattr(BACKENDS, "known", {"cpu": ("cuda", "no module")})
+        known = Availability(backend, "", TRIED)
+        monkeypatch.setattr(BACKENDS, "found", {torch.device("cpu"): known})
         prediction, target = images((3, 20, 30))
         driver.captures = True
         assert used(legs_loss(prediction, target)) == "torch" and not driver.launches
@@ -214,7 +214,7 @@ class TestFailures:
             raise error
 
         module = SimpleNamespace(BACKEND=CudaBackend(broken))
-        monkeypatch.setattr(BACKENDS, "_known", {"cuda": Known("broken", "cpu")})
+        monkeypatch.setattr(BACKENDS, "known", {"cpu": ("cuda", "broken")})
         monkeypatch.setattr(BACKENDS, "found", {})
         monkeypatch.setattr(available.importlib, "import_module", lambda name: module)
         monkeypatch.setattr(available, "_why_missing", lambda name: None)
@@ -225,8 +225,8 @@ class TestFailures:
     def test_a_torch_without_cuda_is_no_failure(self, monkeypatch, capfd):
         monkeypatch.setattr(BACKENDS, "found", {})
         monkeypatch.setattr(torch.version, "cuda", None)
-        found = BACKENDS.availability("cuda", torch.device("cuda", 0))
-        assert found == Availability(None, False, "this torch is built without CUDA")
+        found = BACKENDS.availability(torch.device("cuda", 0))
+        assert found == Availability(None, "this torch is built without CUDA")
         assert capfd.readouterr().err == ""
 
     def test_images_that_do_not_fit_their_map_are_still_an_error(self, on_meta):

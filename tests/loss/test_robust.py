@@ -293,7 +293,7 @@ class TestTraining:
     def test_no_backend_takes_it_for_another(self):
         for name, changes in (("over", {"over": "scene"}), ("smooth", {"smooth": 0.7})):
             spec = WeightSpec(**changes)
-            backend = BACKENDS.availability("numba", torch.device("cpu")).backend
+            backend = BACKENDS.availability(torch.device("cpu")).backend
             assert backend is None or not backend.makes_weights_of(spec), name
 
     def test_a_compiled_graph_declines(self, monkeypatch):

@@ -73,8 +73,8 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from legs_loss.errors import LegsError
+    from legs_loss.precompute.executors import outcomes
     from legs_loss.precompute.many_scenes import precompute_scene
-    from legs_loss.system.executors import outcomes
 
     tasks = _tasks(args)
     failed = 0
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
             bar.total = sum(of for _, of in views.values())
             bar.update(sum(done for done, _ in views.values()) - bar.n)
 
-        for ended, (task, done) in enumerate(outcomes(precompute_scene, tasks, args.scheduler, listen), 1):
+        for ended, (task, done) in enumerate(outcomes(precompute_scene, tasks, listen, scheduler=args.scheduler), 1):
             with bar.external_write_mode():
                 if isinstance(done, LegsError) and len(tasks) == 1:
                     raise done

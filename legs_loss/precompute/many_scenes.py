@@ -12,10 +12,10 @@ from typing import List, NamedTuple, Optional, Sequence
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.precompute import Report, UserMaps, precompute
+from legs_loss.precompute.executors import Listener
 from legs_loss.scenes import read_scene
 from legs_loss.spec import Spec
 from legs_loss.system import read_text
-from legs_loss.system.executors import Listener
 
 _TELL_SECONDS = 0.25
 _LARGEST = 64 << 20  # bytes of a list

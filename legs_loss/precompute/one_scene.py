@@ -9,20 +9,19 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any, Callable, Dict, Iterator, List, Optional, Union
+from typing import Callable, Dict, Iterator, List, Optional, Union
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
+from legs_loss.precompute.executors import outcomes
 from legs_loss.precompute.one_view import Job, UnwritableError, ViewTask, make
 from legs_loss.precompute.origin import note_scene
 from legs_loss.precompute.photograph import compile_response
 from legs_loss.precompute.user_maps import NO_MAPS, UserMaps, is_below, stage_user_maps
-from legs_loss.precompute.workers import in_processes
 from legs_loss.scenes import Scene, image_size, training_size
 from legs_loss.spec import Spec, as_spec
 from legs_loss.store import Entry, StoreWriter
 from legs_loss.system import held_back
-from legs_loss.system.executors import outcomes
 
 _COMMIT_SECONDS = 1.0
 
@@ -98,8 +97,7 @@ def precompute(
         if workers > 1 and any(not task.known for task in tasks):
             with suppress(LegsError):  # a photograph that cannot be read is skipped later, with the reason
                 compile_response(*training_size(*image_size(tasks[0].view.path), resolution), spec)
-        work = partial(make, job)
-        results: Any = in_processes(work, tasks, workers) if workers > 1 else outcomes(work, tasks, None, print)
+        results = outcomes(partial(make, job), tasks, print, workers if workers > 1 else 0)
         staged: List[Entry] = []
         due = time.monotonic()  # the first at once, so that there is a store
         with closing(results), tqdm(total=len(tasks), desc="weight maps", unit="view", disable=not progress) as bar:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, Dict, NamedTuple, Optional, Sequence
 
 from legs_loss.errors import LegsError
+from legs_loss.precompute.executors import Listener
 from legs_loss.precompute.photograph import normalised_map_and_levels
 from legs_loss.scenes import View, image_size, load_training_image, training_size
 from legs_loss.spec import WeightSpec
 from legs_loss.store import Entry, fingerprint, is_intact, sampled_fingerprint, stage
-from legs_loss.system.executors import Listener
 
 
 class Job(NamedTuple):

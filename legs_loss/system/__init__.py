@@ -1,7 +1,7 @@
 """Files, locks, processes, signals, the terminal, installed packages: the interface to the machine.
 
 The modules are independent of images and losses, and do not import torch. A name is imported on first use: a training
-step needs few. No module has the name of what it publishes. ``executors`` is imported by its name.
+step needs few. No module has the name of what it publishes.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from legs_loss.system.children import Child as Child
     from legs_loss.system.ctrl_c import held_back as held_back
     from legs_loss.system.ctrl_c import noted as noted
     from legs_loss.system.entry_points import plugins as plugins
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from legs_loss.system.terminal import say_error as say_error
 
 _NAMES = {
-    "children": ["Child"],
     "ctrl_c": ["held_back", "noted"],
     "files": ["open_regular", "read_regular", "read_text", "write_whole"],
     "locks": ["FileLock", "HeldError", "is_held"],

@@ -242,7 +242,7 @@ class TestCluster:
         assert not (scenes[0] / "legs_weights").exists()
 
     def test_no_scheduler_and_no_worker(self, cluster, scenes, monkeypatch):
-        from legs_loss.system import executors
+        from legs_loss.precompute import executors
 
         monkeypatch.setattr(executors, "_PATIENCE", 1)
         for address, message in (
@@ -250,7 +250,7 @@ class TestCluster:
             (cluster.address, "has no workers"),
         ):
             with pytest.raises(LegsError, match=message):
-                list(executors.outcomes(print, ["task"], address, print))
+                list(executors.outcomes(print, ["task"], print, scheduler=address))
 
     def test_a_comparison_is_that_of_this_machine(self, cluster, tiny_scene, tmp_path):
         pytest.importorskip("numba")

@@ -10,9 +10,8 @@ from typing import Any, Callable, Dict, Mapping, NamedTuple, Optional, Sequence
 from legs_loss.errors import LegsError
 from legs_loss.lab.training.perceptual import use_lpips
 from legs_loss.lab.training.trainer import Progress, TrainConfig, train
-from legs_loss.precompute.workers import in_processes
+from legs_loss.precompute.executors import Listener, outcomes
 from legs_loss.scenes import read_scene
-from legs_loss.system.executors import Listener, outcomes
 
 _TELL_SECONDS = 0.5
 
@@ -60,14 +59,11 @@ def train_side_by_side(
     def listen(message: Dict[str, Any]) -> None:
         on_progress(message["name"], Progress(*message["progress"]))
 
-    if scheduler is None:
-        results: Any = in_processes(_train, arms, processes, listen)
-    else:
-        for arm in arms:
-            if arm.out is not None:
-                arm.out.mkdir(parents=True, exist_ok=True)  # made by a worker it would be on its own disk
-        results = outcomes(_train_there, arms, scheduler, listen)
-    with closing(results):
+    for arm in arms if scheduler is not None else ():
+        if arm.out is not None:
+            arm.out.mkdir(parents=True, exist_ok=True)  # made by a worker it would be on its own disk
+    work = _train if scheduler is None else _train_there
+    with closing(outcomes(work, arms, listen, processes, scheduler)) as results:
         for arm, outcome in results:
             if not isinstance(outcome, LegsError):
                 metrics[arm.name] = outcome

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Tuple
@@ -57,9 +58,7 @@ class Config:
 
 
 def find_config(
-    start: Optional[Path] = None,
-    environ: Optional[Mapping[str, str]] = None,
-    argv: Optional[List[str]] = None,
+    start: Optional[Path] = None, environ: Optional[Mapping[str, str]] = None, argv: Optional[List[str]] = None
 ) -> Config:
     """Return the settings of this run.
 
@@ -76,26 +75,22 @@ def find_config(
         LegsError: a value is unknown or out of range, or the file cannot be read; the message has the place.
     """
     environ = os.environ if environ is None else environ
-    config = Config(notes=_unknown_variables(environ))
+    config, notes = Config(), _unknown_variables(environ)
     if start is not None:
-        path, note = _find_file(start.resolve())
-        if note:
-            config = replace(config, notes=(*config.notes, note))
-        if path is not None:
+        path = _find_file(start.resolve())
+        if path is not None and _is_foreign(path, start):
+            notes += (f"{path} belongs to another user: it is not read",)
+        elif path is not None:
             config = _apply(config, _read_toml(path), str(path), path.parent)
     given = {name: "LEGS_" + name.upper() for name in _SETTINGS if environ.get("LEGS_" + name.upper())}
     if given:  # all at once: some settings are valid only together
         what = f"environment variable{'s' if len(given) > 1 else ''} {', '.join(given.values())}"
         config = _apply(config, {name: environ[variable] for name, variable in given.items()}, what, Path.cwd())
-    if is_off(environ):
-        config = replace(config, off=True)
-    masks = environ.get("LEGS_MASKS", "")
+    off, masks = is_off(environ), environ.get("LEGS_MASKS", "")
     if masks not in ("", "require"):
         raise LegsError(f"environment variable LEGS_MASKS must be require, or not set, got {masks!r}")
-    config = replace(config, require_masks=masks == "require")
-    if config.store is None:
-        config = replace(config, store=_store_of_scene(sys.argv if argv is None else argv))
-    return config
+    store = config.store or _store_of_scene(sys.argv if argv is None else argv)
+    return replace(config, store=store, off=off, require_masks=masks == "require", notes=notes)
 
 
 def is_off(environ: Optional[Mapping[str, str]] = None) -> bool:
@@ -177,30 +172,27 @@ def _unknown_variables(environ: Mapping[str, str]) -> Tuple[str, ...]:
     )
 
 
-def _find_file(start: Path) -> Tuple[Optional[Path], str]:
-    """Return the legs.toml of a script or folder, and a note if one was found and not read."""
+def _find_file(start: Path) -> Optional[Path]:
+    """Return the legs.toml of a script or folder."""
     home, is_above = Path(os.path.expanduser("~")), False
     for folder in [start, *start.parents] if os.path.isdir(str(start)) else start.parents:
         path = folder / CONFIG_FILE
         if os.path.isfile(str(path)) and (not is_above or os.path.isfile(str(folder / _JOURNAL))):
-            if _owner(path) not in (_owner(start), _user()):
-                return None, f"{path} belongs to another user: it is not read"
-            return path, ""
+            return path
         is_above = is_above or os.path.exists(str(folder / ".git"))
         if folder == home:
             break
-    return None, ""
+    return None
 
 
-def _owner(path: Path) -> Optional[int]:
-    try:
-        return path.stat().st_uid if os.name == "posix" else None
-    except OSError:
-        return None
-
-
-def _user() -> Optional[int]:
-    return os.getuid() if os.name == "posix" else None  # type: ignore[attr-defined,unused-ignore]
+def _is_foreign(path: Path, start: Path) -> bool:
+    """Return whether a file is neither this user's nor of the owner of a script or folder."""
+    if os.name != "posix":
+        return False
+    owners = {os.getuid()}
+    with suppress(OSError):
+        owners.add(start.stat().st_uid)
+    return path.stat().st_uid not in owners
 
 
 def _read_toml(path: Path) -> Dict[str, Any]:
@@ -220,13 +212,10 @@ def _read_toml(path: Path) -> Dict[str, Any]:
 
 def _store_of_scene(argv: List[str]) -> Optional[Path]:
     for flag in ("-s", "--source_path"):
-        for i, argument in enumerate(argv):
-            if argument == flag and i + 1 < len(argv):
-                scene = argv[i + 1]
-            elif argument.startswith(flag + "="):
-                scene = argument[len(flag) + 1 :]
-            else:
-                continue
-            store = Path(scene) / STORE_FOLDER
-            return store if os.path.isdir(str(store)) else None  # False, too, for what no file can be called
+        for argument, following in zip(argv, [*argv[1:], None]):
+            name, equals, value = argument.partition("=")
+            scene = value if equals else following
+            if name == flag and scene is not None:
+                store = Path(scene) / STORE_FOLDER
+                return store if os.path.isdir(str(store)) else None  # False, too, for what no file can be called
     return None

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import stat
 import sys
 import time
-from typing import Optional, Union
+from typing import Optional
 
 from legs_loss.errors import LegsError
+from legs_loss.system.files import PathLike
 
 _POLL = 0.02  # seconds
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EBADF)  # EBADF: another user's, on NFS
@@ -37,20 +39,17 @@ class FileLock:
         OSError: the file cannot be made, or is a link (of either kind), a pipe or a folder.
     """
 
-    def __init__(
-        self,
-        path: Union[str, os.PathLike[str]],
-        wait: Optional[float] = None,
-        note: str = "",
-        remove: bool = False,
-    ) -> None:
+    def __init__(self, path: PathLike, wait: Optional[float] = None, note: str = "", remove: bool = False) -> None:
         self._path, self._remove = os.fspath(path), remove
         self.is_certain: bool = True
-        until = None if wait is None else time.monotonic() + wait
+        until = math.inf if wait is None else time.monotonic() + wait
         while True:
             self._descriptor = _open(self._path)
             try:
-                self._take(until)
+                while not self._try():
+                    if time.monotonic() >= until:
+                        raise HeldError(os.read(self._descriptor, 500).decode("utf-8", "replace"))
+                    time.sleep(_POLL)
                 if remove and not _is_same(self._descriptor, self._path):  # its last holder has deleted it since
                     os.close(self._descriptor)
                     continue
@@ -76,32 +75,23 @@ class FileLock:
     def __exit__(self, *_: object) -> None:
         self.release()
 
-    def _take(self, until: Optional[float]) -> None:
-        while not self._try(until is None):
-            if until is not None and time.monotonic() >= until:
-                raise HeldError(os.pread(self._descriptor, 500, 0).decode("utf-8", "replace") if _PREAD else "")
-            time.sleep(_POLL)
-
-    def _try(self, block: bool) -> bool:
+    def _try(self) -> bool:
         try:
-            return _try_lock(self._descriptor, block)
+            return _try_lock(self._descriptor)
         except OSError as error:
-            if error.errno not in _NO_LOCKS:
+            self.is_certain = error.errno not in _NO_LOCKS
+            if self.is_certain:
                 raise
-            self.is_certain = False
             return True
 
 
-def is_held(path: Union[str, os.PathLike[str]]) -> bool:
+def is_held(path: PathLike) -> bool:
     """Return whether another holds the lock of a file, or whether that cannot be found out."""
     try:
         with FileLock(path, wait=0.0) as lock:
             return not lock.is_certain
     except (OSError, HeldError):
         return True
-
-
-_PREAD = hasattr(os, "pread")
 
 
 def _open(path: str) -> int:
@@ -135,7 +125,7 @@ def _is_same(descriptor: int, path: str) -> bool:
 if sys.platform == "win32":
     import msvcrt
 
-    def _try_lock(descriptor: int, block: bool) -> bool:
+    def _try_lock(descriptor: int) -> bool:
         os.lseek(descriptor, _FAR, os.SEEK_SET)
         try:
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
@@ -147,9 +137,9 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-    def _try_lock(descriptor: int, block: bool) -> bool:
+    def _try_lock(descriptor: int) -> bool:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if block else fcntl.LOCK_NB))
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
         return True

@@ -95,15 +95,13 @@ class Backend:
         name: as in LEGS_BACKEND.
         dtypes: of the images; of two types they are computed in float32.
         most_channels, most_pixels: how many channels and pixels an image may have.
-        operators, norms, curves: of the specs whose weights the backend makes by itself; torch makes a map for others.
+        curves: of the specs whose weights the backend makes by itself; torch makes a map for others.
     """
 
     name: str
     dtypes: FrozenSet[torch.dtype] = frozenset({torch.float32, torch.float16, torch.bfloat16})
     most_channels: int = 4
     most_pixels: int = 2**31 - 1
-    operators: FrozenSet[str] = frozenset()
-    norms: FrozenSet[float] = frozenset()
     curves: FrozenSet[str] = frozenset()
 
     def preparing(self) -> ContextManager[Any]:
@@ -112,8 +110,9 @@ class Backend:
 
     def makes_weights_of(self, spec: WeightSpec) -> bool:
         """Return whether the weights of a spec need no map: it differs from the defaults in what is known here only."""
-        known = spec.operator in self.operators and spec.p in self.norms and spec.curve in self.curves
-        return known and _is_known(spec)
+        from legs_loss.kernels.codes import STENCILS
+
+        return spec.operator in STENCILS and spec.curve in self.curves and _is_known(spec)
 
     def prepare(
         self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, target: Tensor, wanted: bool

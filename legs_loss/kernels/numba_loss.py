@@ -12,7 +12,7 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values
-from legs_loss.kernels.codes import CURVES, NORMS, STENCILS
+from legs_loss.kernels.codes import CURVES
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, part, said
 from legs_loss.kernels.contract import Backend, Prepared, Terms
 from legs_loss.kernels.numba_response import extremes, operator_of
@@ -26,8 +26,6 @@ _NO_RANGE, _NO_MAP = np.empty((0, 2), np.float32), np.empty(0, np.float32)
 
 class _NumbaBackend(Backend):
     name = "numba"
-    operators: FrozenSet[str] = frozenset(STENCILS)
-    norms: FrozenSet[float] = frozenset(NORMS)
     curves: FrozenSet[str] = frozenset(FORMULAS)
 
     def preparing(self) -> ContextManager[Any]:

@@ -61,8 +61,6 @@ class CudaBackend(Backend):
 
     name = "cuda"
     most_channels = 1 << 16
-    operators: FrozenSet[str] = frozenset(STENCILS)
-    norms: FrozenSet[float] = frozenset(NORMS)
     curves: FrozenSet[str] = frozenset(FORMULAS)
 
     def __init__(self, open_device: Callable[[torch.device], Modules]) -> None:

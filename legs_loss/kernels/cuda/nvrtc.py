@@ -88,7 +88,7 @@ class Compiler:
     def __init__(self, library: Any) -> None:
         self._library = library
         major, minor = ctypes.c_int(), ctypes.c_int()
-        self._check(library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)), "nvrtcVersion")
+        self._call("Version", ctypes.byref(major), ctypes.byref(minor))
         self.version: str = f"{major.value}.{minor.value}"
 
     def target(self, architecture: int) -> str:
@@ -108,8 +108,7 @@ class Compiler:
             CompilerError: it does not compile.
         """
         library, program = self._library, ctypes.c_void_p()
-        created = library.nvrtcCreateProgram(ctypes.byref(program), source, b"legs.cu", 0, None, None)
-        self._check(created, "nvrtcCreateProgram")
+        self._call("CreateProgram", ctypes.byref(program), source, b"legs.cu", 0, None, None)
         try:
             given = [option.encode() for option in (f"--gpu-architecture={target}", *options)]
             code = library.nvrtcCompileProgram(program, len(given), (ctypes.c_char_p * len(given))(*given))
@@ -123,22 +122,22 @@ class Compiler:
 
     def _text(self, program: ctypes.c_void_p, what: str) -> bytes:
         size = ctypes.c_size_t()
-        self._check(getattr(self._library, f"nvrtcGet{what}Size")(program, ctypes.byref(size)), f"nvrtcGet{what}Size")
+        self._call(f"Get{what}Size", program, ctypes.byref(size))
         text = ctypes.create_string_buffer(size.value)
-        self._check(getattr(self._library, f"nvrtcGet{what}")(program, text), f"nvrtcGet{what}")
+        self._call(f"Get{what}", program, text)
         return text.raw
 
     def _architectures(self) -> List[int]:
         count = ctypes.c_int()
-        code = self._library.nvrtcGetNumSupportedArchs(ctypes.byref(count))
-        self._check(code, "nvrtcGetNumSupportedArchs")
+        self._call("GetNumSupportedArchs", ctypes.byref(count))
         numbers = (ctypes.c_int * count.value)()
-        self._check(self._library.nvrtcGetSupportedArchs(numbers), "nvrtcGetSupportedArchs")
+        self._call("GetSupportedArchs", numbers)
         return list(numbers)
 
-    def _check(self, code: int, what: str) -> None:
+    def _call(self, function: str, *arguments: Any) -> None:
+        code = getattr(self._library, f"nvrtc{function}")(*arguments)
         if code != 0:
-            raise CompilerError(f"{what} failed: {self._message(code)}")
+            raise CompilerError(f"nvrtc{function} failed: {self._message(code)}")
 
     def _message(self, code: int) -> str:
         self._library.nvrtcGetErrorString.restype = ctypes.c_char_p

@@ -11,18 +11,18 @@ import logging
 import multiprocessing
 import os
 import platform
+import signal
 import uuid
 from concurrent.futures import CancelledError
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any, Callable, Dict, Generator, Iterable, Optional, Tuple
+from typing import Any, Callable, Dict, Generator, Iterable, Iterator, Optional, Tuple
 
 import torch
 
 from legs_loss._version import __version__
 from legs_loss.errors import LegsError, require
-from legs_loss.system.ctrl_c import kept_from_children
 
 Listener = Callable[[Any], None]
 Task = Callable[[Any, Listener], Any]
@@ -78,7 +78,7 @@ class _Process:
         self.process: BaseProcess = context.Process(target=_work, args=(theirs, task), daemon=True)
         if not os.access(os.curdir, os.X_OK):  # the child is started in it, by its name
             raise LegsError("the current folder is another user's, and processes cannot be started in it: leave it")
-        with kept_from_children():
+        with keep_ctrl_c_from_children():
             self.process.start()
         theirs.close()
 
@@ -88,6 +88,36 @@ class _Process:
         self.process.join(patience)
         self.process.terminate()
         self.process.join()
+
+
+@contextmanager
+def keep_ctrl_c_from_children() -> Iterator[None]:
+    """Delay Ctrl-C while processes are started: they never get it, this process gets it right afterwards.
+
+    On Windows, where signals cannot be delayed, it is ignored meanwhile.
+    """
+    if hasattr(signal, "pthread_sigmask"):
+        _ensure_tracker()  # started by the first process, it would let signals through again
+        held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield  # the mask is inherited, for good
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, held)
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _ensure_tracker() -> None:
+    """Start multiprocessing's resource tracker, if it does not run."""
+    try:
+        from multiprocessing.resource_tracker import ensure_running
+    except ImportError:  # Python 3.7's name
+        from multiprocessing.semaphore_tracker import ensure_running  # type: ignore[no-redef]
+    ensure_running()
 
 
 def _in_processes(task: Task, arguments: Iterable[Any], processes: int, listen: Listener) -> Outcomes:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import weakref
-from typing import Any, Callable, Hashable, Set, Tuple
+from contextlib import nullcontext
+from functools import partial
+from typing import Any, Callable, ContextManager, Hashable, Set, Tuple
 
 import torch
 from torch import Tensor
@@ -34,48 +36,40 @@ def check_own(own: Callable[..., Any], target: Tensor) -> None:
     if key in _known or is_capturing(target.device) or torch.jit.is_tracing():
         return
     if key is None:
-        small, grown = _growth(own, target)
-        torch._assert_async(
-            _is_l1(small, grown).any(), "own= is no L1: a weight on the difference would not be one on the loss"
-        )
+        may_be, _, _ = _asked(own, target, nullcontext)
+        torch._assert_async(may_be, "own= is no L1: a weight on the difference would not be one on the loss")
         return
-    devices = [target.device] if target.device.type == "cuda" else []
-
-    def drawing_alike(*images: Tensor) -> Any:
-        with torch.random.fork_rng(devices):
-            return own(*images)
-
+    alike = partial(torch.random.fork_rng, [target.device] if target.device.type == "cuda" else [])
     try:
         with torch.no_grad():
-            small, grown = _growth(drawing_alike, target)
-            is_l1, known = _is_l1(small, grown).tolist(), (small > 0).tolist()
+            is_l1, is_known, grown = (found.item() for found in _asked(own, target, alike))
     except RuntimeError:  # tensors without values; what it raises itself comes from the loss, too
         return
-    if not any(is_l1):
+    if not is_l1:
         raise LegsError(
-            f"own= is no L1: {_TIMES} times the difference gives {float(grown[0]):,.0f} times the loss, so a weight on "
+            f"own= is no L1: {_TIMES} times the difference gives {grown:,.0f} times the loss, so a weight on "
             "the difference would not be one on the loss. Where a setting chooses it, choose the L1; else leave this "
             "line to the codebase's own loss, or set LEGS_OFF=1"
         )
-    if any(known):
+    if is_known:
         if len(_known) >= _MOST:
             _known.clear()
         _known.add(key)
 
 
-def _growth(own: Callable[..., Any], target: Tensor) -> Tuple[Tensor, Tensor]:
-    """Return the sum of each tensor that it makes of a small difference, and how many times it grows."""
+def _asked(own: Callable[..., Any], target: Tensor, alike: Callable[[], ContextManager[Any]]) -> Tuple[Tensor, ...]:
+    """Return whether a function may be an L1, whether it makes anything of a difference, and how many times that grows.
+
+    Of several tensors that it returns, one is to be an L1. In ``alike`` its second call draws the numbers of its first.
+    """
     grey, sums = torch.full(target.shape, 0.5, dtype=target.dtype, device=target.device), []
     for difference in (_SMALL, _SMALL * _TIMES):
-        found = own(grey + difference, grey)
+        with alike():
+            found = own(grey + difference, grey)
         each = found if isinstance(found, (tuple, list)) else [found]
         sums.append(torch.stack([one.double().abs().sum() for one in each if isinstance(one, Tensor)]))
-    return sums[0], sums[1] / sums[0]
-
-
-def _is_l1(small: Tensor, grown: Tensor) -> Tensor:
-    """Return for each tensor of a result whether it may be of an L1."""
-    return ~(small > 0) | ((grown / _TIMES - 1).abs() < _CLOSE)
+    small, grown = sums[0], sums[1] / sums[0]
+    return (~(small > 0) | ((grown / _TIMES - 1).abs() < _CLOSE)).any(), (small > 0).any(), grown[0]
 
 
 def _key(own: Any, depth: int = 0) -> Hashable:

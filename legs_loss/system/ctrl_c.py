@@ -1,4 +1,4 @@
-"""Delay Ctrl-C over steps that belong together, and in child processes; it is never lost."""
+"""Delay Ctrl-C over steps that belong together; it is never lost."""
 
 from __future__ import annotations
 
@@ -9,36 +9,6 @@ from contextlib import contextmanager
 from typing import Callable, Iterator, List
 
 _RAISES = hasattr(signal, "raise_signal")  # from Python 3.8 on
-
-
-@contextmanager
-def kept_from_children() -> Iterator[None]:
-    """Delay Ctrl-C while processes are started: they never get it, this process gets it right afterwards.
-
-    On Windows, where signals cannot be delayed, it is ignored meanwhile.
-    """
-    if hasattr(signal, "pthread_sigmask"):
-        _ensure_tracker()  # started by the first process, it would let signals through again
-        held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            yield  # the mask is inherited, for good
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, held)
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _ensure_tracker() -> None:
-    """Start multiprocessing's resource tracker, if it does not run."""
-    try:
-        from multiprocessing.resource_tracker import ensure_running
-    except ImportError:  # Python 3.7's name
-        from multiprocessing.semaphore_tracker import ensure_running  # type: ignore[no-redef]
-    ensure_running()
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from tests.support import ROOT, legs_environment
 SCRIPT = """
 import multiprocessing, os, signal
 from legs_loss.system import held_back, noted
-from legs_loss.system.ctrl_c import kept_from_children
+from legs_loss.precompute.executors import keep_ctrl_c_from_children
 
 
 def ask(answers):
@@ -26,7 +26,7 @@ if __name__ == "__main__":
     context = multiprocessing.get_context("spawn")
     answers = context.SimpleQueue()
     try:
-        with kept_from_children():
+        with keep_ctrl_c_from_children():
             os.kill(os.getpid(), signal.SIGINT)
             child = context.Process(target=ask, args=(answers,))
             child.start()

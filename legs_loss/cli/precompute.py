@@ -137,19 +137,13 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
             return named
         return os.path.abspath(str(named))
 
-    return {
-        SceneTask(
-            Path(os.path.abspath(str(scene))),
-            Path(os.path.abspath(str(store))),
-            found(args.images, scene),
-            args.preset,
-            args.resolution,
-            args.white_background,
-            workers,
-            UserMaps(found(args.masks, scene), found(args.weights, scene), args.weight_scale),
-        ): store
-        for scene, store in zip(scenes, stores)
-    }
+    settings = args.preset, args.resolution, args.white_background, workers
+    tasks = {}
+    for scene, store in zip(scenes, stores):
+        maps = UserMaps(found(args.masks, scene), found(args.weights, scene), args.weight_scale)
+        root, out = Path(os.path.abspath(str(scene))), Path(os.path.abspath(str(store)))
+        tasks[SceneTask(root, out, found(args.images, scene), maps, *settings)] = store
+    return tasks
 
 
 def _refuse_photographs_of_a_scene(folder: Path) -> None:

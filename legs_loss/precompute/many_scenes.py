@@ -27,11 +27,11 @@ class SceneTask(NamedTuple):
     scene: Path
     store: Path
     images: Optional[str]
+    maps: UserMaps
     spec: Spec
     resolution: int
     white_background: bool
     workers: int
-    maps: UserMaps = UserMaps()
 
 
 def find_scenes(given: Sequence[str], lists: Sequence[Path] = ()) -> List[Path]:

@@ -14,7 +14,7 @@ from typing import Callable, Dict, Iterator, List, Optional, Union
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.precompute.executors import outcomes
-from legs_loss.precompute.one_view import Job, UnwritableError, ViewTask, make
+from legs_loss.precompute.one_view import UnwritableError, make
 from legs_loss.precompute.origin import note_scene
 from legs_loss.precompute.photograph import compile_response
 from legs_loss.precompute.user_maps import NO_MAPS, UserMaps, is_below, stage_user_maps
@@ -89,30 +89,29 @@ def precompute(
             writer.commit(mine.added, mine.dropped)
         report.user_maps = Counter(entry.operator for entry in mine.added)
         report.notes += [*scene.notes, *mine.notes, *_shared_names(scene)]
-        job = Job(spec, resolution, white_background, out, writer.staging)
         known: Dict[str, List[Entry]] = {}
         for entry in writer.entries():
             known.setdefault(entry.view, []).append(entry)
-        tasks = [ViewTask(view, known.get(name, [])) for name, view in views.items()]
-        if workers > 1 and any(not task.known for task in tasks):
+        tasks = [(view, known.get(name, [])) for name, view in views.items()]
+        if workers > 1 and any(not entries for _, entries in tasks):
             with suppress(LegsError):  # a photograph that cannot be read is skipped later, with the reason
-                compile_response(*training_size(*image_size(tasks[0].view.path), resolution), spec)
-        results = outcomes(partial(make, job), tasks, print, workers if workers > 1 else 0)
+                compile_response(*training_size(*image_size(tasks[0][0].path), resolution), spec)
+        work = partial(make, spec, resolution, white_background, out, writer.staging)
+        results = outcomes(work, tasks, print, workers if workers > 1 else 0)
         staged: List[Entry] = []
         due = time.monotonic()  # the first at once, so that there is a store
         with closing(results), tqdm(total=len(tasks), desc="weight maps", unit="view", disable=not progress) as bar:
             try:
-                for done, (task, result) in enumerate(results, 1):
+                for done, ((view, _), result) in enumerate(results, 1):
                     bar.update()
-                    name = task.view.name
                     if isinstance(result, UnwritableError):
                         raise LegsError(f"cannot write to {out}: {result}")
                     if isinstance(result, LegsError):
-                        report.skipped[name] = str(result)
+                        report.skipped[view.name] = str(result)
                     elif result is None:
-                        report.kept.append(name)
+                        report.kept.append(view.name)
                     else:
-                        report.made.append(name)
+                        report.made.append(view.name)
                         staged.append(result)
                     if on_progress is not None:
                         on_progress(done, len(tasks))

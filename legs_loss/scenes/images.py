@@ -55,11 +55,6 @@ def training_size(width: int, height: int, resolution: int = -1) -> Tuple[int, i
     return size
 
 
-def resized_pixels(image: Any, size: Tuple[int, int]) -> np.ndarray:
-    """Return a Pillow image of mode L, RGB or RGBA at a size, without its alpha, as uint8 [H, W, C]."""
-    return _pixels(image if image.size == size else image.resize(size))
-
-
 def load_training_image(view: View, resolution: int = -1, white_background: bool = False) -> np.ndarray:
     """Return a view's photograph as 3DGS's loader makes it: read, laid on a background, resized.
 
@@ -87,7 +82,7 @@ def load_training_image(view: View, resolution: int = -1, white_background: bool
         else:
             mode = colour_mode(image)
             prepared = image if image.mode == mode else image.convert(mode)
-        return resized_pixels(prepared, size)
+        return _pixels(prepared if prepared.size == size else prepared.resize(size))
 
 
 def image_size(path: Path) -> Tuple[int, int]:

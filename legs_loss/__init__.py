@@ -57,7 +57,7 @@ importlib.import_module(f"{__name__}.counting")  # its last line is printed in e
 def __getattr__(name: str) -> object:
     if name.startswith("apply_to_"):  # legs_loss.apply_to_gsplat()
         library = name[len("apply_to_") :]
-        if library in importlib.import_module("legs_loss.system").plugins("legs_loss.upstreams"):
+        if library in importlib.import_module("legs_loss.system.entry_points").plugins("legs_loss.upstreams"):
             return functools.partial(importlib.import_module("legs_loss.upstreams").apply_to, library)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

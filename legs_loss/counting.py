@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass
 from typing import Set
 
-from legs_loss.system import is_first_process, say
+from legs_loss.system.terminal import is_first_process, say
 
 
 @dataclass

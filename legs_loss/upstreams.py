@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from typing import Any, Dict
 
 from legs_loss.errors import LegsError
-from legs_loss.system import plugins
+from legs_loss.system.entry_points import plugins
 
 _applied: Dict[str, Applied] = {}
 

@@ -11,7 +11,7 @@ from typing import Iterator, List, Set, Tuple
 
 import pytest
 
-from legs_loss.system import plugins
+from legs_loss.system.entry_points import plugins
 from tests.support import ROOT
 
 CORE, ADAPTERS = ROOT / "legs_loss", ROOT / "adapters" / "legs_adapters"
@@ -54,9 +54,9 @@ def defined(path: Path) -> Set[str]:
 
 
 def is_public(module: str, name: str) -> bool:
-    """Return whether a name without an underscore is of legs_loss, of a module in it, or of a folder below."""
+    """Return whether a name has no underscore and is of a module of legs_loss or of its system, or of a folder."""
     found = importlib.import_module(module)
-    home = module.count(".") < 2 or hasattr(found, "__path__")
+    home = module.count(".") < 2 or hasattr(found, "__path__") or module.startswith("legs_loss.system.")
     return home and (
         not name or name == "__version__" or (name[0] != "_" and name in defined(Path(found.__file__ or "")))
     )

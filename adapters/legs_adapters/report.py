@@ -14,7 +14,7 @@ from legs_adapters.rules.order import RULES
 from legs_adapters.terms.findings import Findings, Left, Problem
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.traced import Trace
-from legs_loss.system import printable
+from legs_loss.system.terminal import printable
 
 
 def as_table(plan: Plan) -> str:

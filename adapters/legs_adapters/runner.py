@@ -20,7 +20,7 @@ from legs_adapters.rewritten import execute
 from legs_adapters.terms.instead import offered, trained_instead
 from legs_loss import LegsError
 from legs_loss.config import find_config
-from legs_loss.system import is_first_process, say
+from legs_loss.system.terminal import is_first_process, say
 
 
 def checkout_of(script: Path) -> Path:

@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Train what is missing and print the tables; 2 for bad input."""
     from legs_loss.errors import LegsError
-    from legs_loss.system import say_error
+    from legs_loss.system.terminal import say_error
 
     try:
         return run(parser().parse_args(argv))
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.errors import LegsError
     from legs_loss.lab.commands.compare import say_scores, seeds_of
     from legs_loss.lab.experiments.arms import needed, parse_arms, these_arms
-    from legs_loss.system import say
+    from legs_loss.system.terminal import say
 
     seeds = seeds_of(args)
     names = these_arms(args.arms)

@@ -34,7 +34,7 @@ from legs_loss.lab.training.densify import RESET_OPACITY, Schedule, densify, pru
 from legs_loss.lab.training.metrics import mean_scores, psnr, strongest
 from legs_loss.lab.training.perceptual import has_lpips, lpips
 from legs_loss.scenes import Scene, read_scene
-from legs_loss.system import write_whole
+from legs_loss.system.files import write_whole
 
 NEAR, FAR = 0.01, 100.0  # 3DGS's clipping planes
 PATIENCE = 600.0  # seconds to wait for another arm's numbers

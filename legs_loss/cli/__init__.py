@@ -14,7 +14,8 @@ from typing import Any, Callable, Dict, Optional, Sequence
 from legs_loss._version import __version__
 from legs_loss.cli.shared.parser import Parser as Parser
 from legs_loss.errors import LegsError
-from legs_loss.system import never_fail_to_print, plugins, say, say_error
+from legs_loss.system.entry_points import plugins
+from legs_loss.system.terminal import never_fail_to_print, say, say_error
 
 COMMANDS = ("masks", "precompute", "export", "show", "info", "env")
 

@@ -9,7 +9,7 @@ import platform
 from typing import TYPE_CHECKING, Iterator, Tuple
 
 from legs_loss._version import __version__
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 if TYPE_CHECKING:
     import torch

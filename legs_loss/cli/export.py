@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 from typing import Dict
 
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 HELP = "export final weights and masks as PNG for other programs"
 

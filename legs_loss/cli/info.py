@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Iterable
 
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 HELP = "describe a store of weight maps, and verify it"
 

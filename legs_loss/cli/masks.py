@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Dict, List
 
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 if TYPE_CHECKING:
     import numpy as np

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Dict, Iterable, Optional, Tuple
 
 from legs_loss.cli.shared.scene_arguments import add_images, add_resolution
-from legs_loss.system import cores, say
+from legs_loss.system.machine import cores
+from legs_loss.system.terminal import say
 
 if TYPE_CHECKING:
     from legs_loss.precompute import Report

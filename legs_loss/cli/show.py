@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Callable, Dict, List, Optional, Sequence
 
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 if TYPE_CHECKING:
     import numpy as np

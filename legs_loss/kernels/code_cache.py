@@ -16,7 +16,8 @@ from numba.core.caching import FunctionCache
 from numba.core.serialize import dumps
 
 from legs_loss.errors import LegsError
-from legs_loss.system import is_first_process, say, write_whole
+from legs_loss.system.files import write_whole
+from legs_loss.system.terminal import is_first_process, say
 
 _said: List[str] = []
 

@@ -26,7 +26,7 @@ from numba.core.typing.templates import infer_global
 from tqdm import tqdm
 
 from legs_loss.kernels.code_cache import keep
-from legs_loss.system import is_first_process, say
+from legs_loss.system.terminal import is_first_process, say
 
 # No NaN or infinity arises from checked input. Sums keep their order, and a * b + c is rounded twice unless the code
 # says otherwise: if the compiler may choose, the process that compiles and a later one that loads the cached code can

@@ -11,7 +11,7 @@ import torch
 
 from legs_loss.errors import LegsError
 from legs_loss.lab.gaussians import Gaussians
-from legs_loss.system import read_regular, write_whole
+from legs_loss.system.files import read_regular, write_whole
 
 _COUNT = re.compile("[0-9]{1,20}")
 _END = re.compile(rb"^end_header\r?\n", re.MULTILINE)

@@ -15,7 +15,7 @@ from legs_loss.precompute import Report, UserMaps, precompute
 from legs_loss.precompute.executors import Listener
 from legs_loss.scenes import read_scene
 from legs_loss.spec import Spec
-from legs_loss.system import read_text
+from legs_loss.system.files import read_text
 
 _TELL_SECONDS = 0.25
 _LARGEST = 64 << 20  # bytes of a list

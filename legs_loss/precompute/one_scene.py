@@ -21,7 +21,7 @@ from legs_loss.precompute.user_maps import NO_MAPS, UserMaps, is_below, stage_us
 from legs_loss.scenes import Scene, image_size, training_size
 from legs_loss.spec import Spec, as_spec
 from legs_loss.store import Entry, StoreWriter
-from legs_loss.system import held_back
+from legs_loss.system.ctrl_c import held_back
 
 _COMMIT_SECONDS = 1.0
 

@@ -12,7 +12,7 @@ from typing import Optional
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes import Scene, read_scene
-from legs_loss.system import read_regular, write_whole
+from legs_loss.system.files import read_regular, write_whole
 
 NOTE = "scene.json"
 _LIMIT = 1 << 16  # bytes

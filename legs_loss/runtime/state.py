@@ -31,7 +31,7 @@ from legs_loss.kernels.backends import fused_range
 from legs_loss.runtime.memo import DEFAULT_LIMIT, WeightMemo
 from legs_loss.runtime.stored import Stored, Whole
 from legs_loss.spec import Spec, WeightSpec, as_spec
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 from legs_loss.weights import Weights, weight_map
 
 MASK, WEIGHTS = "mask", "weights"  # the store's names of the user's own maps; it is imported only where there is one

@@ -13,7 +13,7 @@ import numpy as np
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes.model import Camera, PointCloud, Scene, View
-from legs_loss.system import open_regular, read_text
+from legs_loss.system.files import open_regular, read_text
 
 # COLMAP's camera models in the order of their ids, each with its number of parameters.
 MODELS = {

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes.model import View
-from legs_loss.system import open_regular
+from legs_loss.system.files import open_regular
 
 WIDEST = 1600  # pixels; 3DGS shrinks wider photographs to this unless -r says otherwise
 STRIP_PIXELS = 1 << 16

@@ -16,7 +16,7 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.folder import SUFFIXES
 from legs_loss.scenes.images import image_size
 from legs_loss.scenes.model import Camera, Scene, View
-from legs_loss.system import read_text
+from legs_loss.system.files import read_text
 
 _LARGEST = 1 << 30  # bytes
 _SIDE = 1 << 20  # pixels

@@ -13,7 +13,7 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.folder import SUFFIXES, files_below
 from legs_loss.scenes.images import colour_mode, open_image
 from legs_loss.scenes.model import View
-from legs_loss.system import read_regular, write_whole
+from legs_loss.system.files import read_regular, write_whole
 
 ALPHA, MASK_PATH = "alpha", "mask_path"  # in place of a path: the photographs' own, those that transforms.json names
 _GRAY = 32  # of 255: the colours of a pixel of a gray JPEG differ less

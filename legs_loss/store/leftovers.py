@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Iterable, List
 
 from legs_loss.store.manifest import Entry, is_map_name
-from legs_loss.system import is_held
+from legs_loss.system.locks import is_held
 
 STAGING = ".writing-"  # begins the name of a writer's folder
 LOCK = ".lock"  # in the store, held over each change; in a staging folder, held while its writer lives

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Callable, Dict, Iterable, List, Optional, Tuple
 
 from legs_loss.errors import LegsError
-from legs_loss.system import read_regular
+from legs_loss.system.files import read_regular
 from legs_loss.system.values import is_count, is_number, is_text
 
 MANIFEST = "manifest.json"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from legs_loss.store.manifest import DamagedStoreError, Entry
-from legs_loss.system import read_regular
+from legs_loss.system.files import read_regular
 
 _PIECE = 1 << 20  # bytes; for larger ones Linux may look for larger free pages, which took six times as long
 _REPAIR = "run legs precompute again to repair it"

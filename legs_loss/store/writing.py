@@ -12,7 +12,7 @@ from legs_loss.errors import LegsError
 from legs_loss.store.leftovers import LOCK, STAGING, leftovers, remove
 from legs_loss.store.manifest import MANIFEST, Entry, manifest_bytes, read_manifest
 from legs_loss.store.maps import write_parts
-from legs_loss.system import FileLock
+from legs_loss.system.locks import FileLock
 
 
 class StoreWriter:

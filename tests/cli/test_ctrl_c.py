@@ -9,12 +9,12 @@ import sys
 
 import pytest
 
-from legs_loss.system import held_back, noted
+from legs_loss.system.ctrl_c import held_back, noted
 from tests.support import ROOT, legs_environment
 
 SCRIPT = """
 import multiprocessing, os, signal
-from legs_loss.system import held_back, noted
+from legs_loss.system.ctrl_c import held_back, noted
 from legs_loss.precompute.executors import keep_ctrl_c_from_children
 
 

@@ -33,7 +33,8 @@ from legs_loss.lab.training.checkpoint import read_checkpoint, write_checkpoint,
 from legs_loss.precompute import precompute
 from legs_loss.scenes import Camera, PointCloud, View, load_training_image, read_scene
 from legs_loss.store import StoreWriter, WeightStore
-from legs_loss.system import locks, write_whole
+from legs_loss.system import locks
+from legs_loss.system.files import write_whole
 from tests.hostile.forked import forked
 from tests.patcher.support import checkout, legs_patch, snapshot
 from tests.support import colmap_scene, legs_command, legs_environment

@@ -21,7 +21,7 @@ from legs_loss.lab.training import checkpoint
 from legs_loss.lab.training.checkpoint import CHECKPOINT, LOCK, read_checkpoint, write_checkpoint
 from legs_loss.lab.training.trainer import TrainConfig, train
 from legs_loss.scenes import Scene, read_scene
-from legs_loss.system import FileLock
+from legs_loss.system.locks import FileLock
 from tests.lab.training import SHORT, assert_equal, run_until_killed
 from tests.support import colmap_scene
 

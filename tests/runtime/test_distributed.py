@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from legs_loss.system import is_first_process
+from legs_loss.system.terminal import is_first_process
 from tests.patcher.support import checkout
 from tests.support import colmap_scene, legs, legs_environment
 

@@ -14,7 +14,9 @@ from typing import Callable, Dict, Iterator, List, Optional, Tuple
 from legs_adapters.checkout.inside import BY_DESCRIPTOR, folder_of
 from legs_adapters.code.folders import check_name
 from legs_loss import LegsError
-from legs_loss.system import FileLock, HeldError, held_back, open_regular, read_regular
+from legs_loss.system.ctrl_c import held_back
+from legs_loss.system.files import open_regular, read_regular
+from legs_loss.system.locks import FileLock, HeldError
 
 # By relative path, in order: the bytes expected there now (None: no file), and the bytes to put there (None: remove).
 Changes = Dict[str, Tuple[Optional[bytes], Optional[bytes]]]

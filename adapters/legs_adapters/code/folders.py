@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 from legs_loss import LegsError
-from legs_loss.system import read_regular
+from legs_loss.system.files import read_regular
 
 VENDORED, SUBMODULE = "third-party code", "a submodule"
 _TESTS, _WORKTREE = "a folder of tests", "another worktree of this checkout"

@@ -20,7 +20,7 @@ import libcst as cst
 from libcst._nodes.internal import CodegenState
 
 from legs_adapters.code.syntax import code
-from legs_loss.system import held_back
+from legs_loss.system.ctrl_c import held_back
 
 STUB = re.compile("0#x*")  # what stands for a body
 

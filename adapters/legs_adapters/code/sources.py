@@ -13,7 +13,7 @@ from typing import List, Sequence, Tuple
 from legs_adapters.code.folders import CLOSED, check_name, folders_of
 from legs_adapters.code.limits import MAX_BYTES, MAX_FILE_BYTES
 from legs_loss import LegsError
-from legs_loss.system import read_regular
+from legs_loss.system.files import read_regular
 
 
 @dataclass(frozen=True)

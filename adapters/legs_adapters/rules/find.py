@@ -31,7 +31,7 @@ from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.patched import patched_nodes
 from legs_adapters.terms.traced import Trace
-from legs_loss.system import progress
+from legs_loss.system.terminal import progress
 
 _Entry = Tuple[Place, Union[Site, Left, Problem]]
 

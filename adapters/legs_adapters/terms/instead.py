@@ -10,7 +10,7 @@ from typing import Iterator, Pattern, Sequence
 from legs_adapters.code.folders import first_of, walk
 from legs_adapters.lexicon.names import kind_of_words
 from legs_adapters.terms.findings import Findings
-from legs_loss.system import read_regular
+from legs_loss.system.files import read_regular
 
 _OF_PICTURES = re.compile(r"rgb|im(g|age)|colou?r|delta", re.I)
 _SQUARED = "a squared loss of images was found here, which is not weighted"

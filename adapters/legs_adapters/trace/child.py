@@ -27,7 +27,8 @@ from typing import Any, Dict, Iterator, NamedTuple, Optional, Sequence
 from legs_adapters.rewritten import call_when_spawned, execute, run_exit_functions
 from legs_adapters.trace.command import Command, folders
 from legs_loss.cli import exit_code
-from legs_loss.system import FileLock, is_first_process, is_held
+from legs_loss.system.locks import FileLock, is_held
+from legs_loss.system.terminal import is_first_process
 
 _SETTINGS = {  # no bytecode is written into the checkout; torch.compile and TorchScript cannot be watched
     "PYTHONDONTWRITEBYTECODE": "1", "TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0",

@@ -11,7 +11,7 @@ from legs_adapters.terms.traced import Trace, Traced
 from legs_adapters.trace.child import run_watched, work_folder
 from legs_adapters.trace.command import SCENE, Command, filled, folders
 from legs_loss import LegsError
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 
 def trace(root: Path, text: str, steps: int, cpu: bool = False, photos: Optional[str] = None) -> Trace:

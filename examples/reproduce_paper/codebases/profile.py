@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError
-from legs_loss.system import read_regular
+from legs_loss.system.files import read_regular
 
 __all__ = ["PROFILES", "Edit", "Profile", "Threshold", "fill", "find_profile", "read_profile", "split"]
 

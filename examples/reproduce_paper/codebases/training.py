@@ -20,7 +20,7 @@ from legs_loss.lab.report.html_pictures import read_picture
 from legs_loss.lab.training.densify import Schedule
 from legs_loss.lab.training.metrics import mean_scores, score
 from legs_loss.spec import WeightSpec
-from legs_loss.system import read_regular, write_whole
+from legs_loss.system.files import read_regular, write_whole
 
 __all__ = ["Checkout", "check_copy", "copy_checkout", "gaussians_in", "train_and_score"]
 

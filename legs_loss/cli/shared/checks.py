@@ -10,7 +10,7 @@ from typing import Sequence
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes import View, image_size, training_size
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 _TINY = 64  # pixels: a smaller width was probably meant as a divisor
 

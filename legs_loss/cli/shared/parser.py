@@ -7,7 +7,7 @@ import re
 from typing import Any, Iterator, NoReturn, Optional, Sequence
 
 from legs_loss.errors import did_you_mean, require
-from legs_loss.system import printable
+from legs_loss.system.terminal import printable
 
 # The words by which the help shows a value that is a path.
 _FOLDERS = {"DIR", "FOLDER", "PHOTOS", "RUN", "SCENE", "STORE"}

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, Union
 
 from legs_loss.errors import LegsError
-from legs_loss.system import printable, write_whole
+from legs_loss.system.files import write_whole
+from legs_loss.system.terminal import printable
 
 
 def label(name: str) -> str:

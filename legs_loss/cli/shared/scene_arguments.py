@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Iterable, Mapping, Optional, Union
 
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 if TYPE_CHECKING:
     from legs_loss.scenes import Scene

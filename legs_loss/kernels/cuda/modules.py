@@ -16,7 +16,7 @@ from legs_loss.kernels import codes
 from legs_loss.kernels.contract import NotNow
 from legs_loss.kernels.cuda.driver import UNSUPPORTED_PTX, DriverError
 from legs_loss.spec import WeightSpec
-from legs_loss.system import write_whole
+from legs_loss.system.files import write_whole
 
 _WORDS = {"x": "x", "sqrt": "root", "unit": "saturated", "sin": "short_sine", "asin": "asinf"}
 FORMULAS: Dict[str, str] = codes.formulas_in(_WORDS, "{}f".format)

@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING
 
 from legs_loss.cli.shared.scene_arguments import add_images, add_resolution
-from legs_loss.system import cores
+from legs_loss.system.machine import cores
 
 if TYPE_CHECKING:
     from legs_loss.scenes import Scene

@@ -16,7 +16,7 @@ from typing import Dict, Sequence
 
 from legs_loss.cli.shared.scene_arguments import read_noted
 from legs_loss.lab.commands.arguments import add_scene_arguments, default_resolution
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 HELP = "train and compare several losses on a scene, with seeds, controls and intervals"
 

@@ -17,7 +17,7 @@ from typing import Any, Dict, List
 
 from legs_loss.cli.shared.scene_arguments import read_noted
 from legs_loss.lab.commands.arguments import add_scene_arguments, default_resolution
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 HELP = "train four losses on the embedded scene or your own: weight maps, a table and pictures"
 

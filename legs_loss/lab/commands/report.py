@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 HELP = "write a comparison as one HTML page"
 

@@ -12,7 +12,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 HELP = "make a COLMAP scene from photographs"
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
 
 from legs_loss.cli.shared.scene_arguments import add_images, add_resolution, read_noted
-from legs_loss.system import printable, say
+from legs_loss.system.terminal import printable, say
 
 if TYPE_CHECKING:
     from legs_loss.lab.training.trainer import Progress, TrainConfig

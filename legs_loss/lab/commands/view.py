@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from legs_loss.cli.shared.scene_arguments import say_notes
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 HELP = "view trained Gaussians in the browser"
 

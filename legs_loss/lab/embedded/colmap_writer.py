@@ -9,7 +9,7 @@ from typing import Any, Dict, Mapping, Tuple
 import numpy as np
 
 from legs_loss.scenes.model import Camera, PointCloud
-from legs_loss.system import write_whole
+from legs_loss.system.files import write_whole
 
 
 def write_colmap(root: Path, cameras: Mapping[str, Camera], points: PointCloud) -> None:

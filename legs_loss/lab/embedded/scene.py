@@ -17,7 +17,7 @@ from legs_loss.lab.embedded import textures
 from legs_loss.lab.embedded.colmap_writer import write_colmap
 from legs_loss.lab.embedded.raycast import Lamp, Quad, Sphere, Tube, bake_light, render
 from legs_loss.scenes.model import Camera, PointCloud
-from legs_loss.system import write_whole
+from legs_loss.system.files import write_whole
 
 LAMP = Lamp(np.array([-0.5, -0.6, 2.95]), 0.55)
 TARGET = np.array([0.0, 0.25, 0.98])

@@ -30,7 +30,7 @@ from legs_loss.lab.training.side_by_side import Arm, train_side_by_side
 from legs_loss.lab.training.trainer import Progress, TrainConfig, default_threshold
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
-from legs_loss.system import read_regular
+from legs_loss.system.files import read_regular
 from legs_loss.weights import Weights, weight_maps
 
 _LARGEST = 256 << 20  # bytes of a file of a comparison

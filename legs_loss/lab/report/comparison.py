@@ -13,7 +13,7 @@ from legs_loss.cli.shared.saving import label, save_figure
 from legs_loss.lab.report.html_pictures import as_bytes
 from legs_loss.lab.training.metrics import strongest
 from legs_loss.responses import normalise_response, response
-from legs_loss.system import write_whole
+from legs_loss.system.files import write_whole
 
 _INK = "#222222"
 

@@ -29,7 +29,7 @@ from legs_loss.lab.training.dataset import load_dataset, load_view, open_store, 
 from legs_loss.lab.training.trainer import TrainConfig
 from legs_loss.responses import levels_of
 from legs_loss.scenes import Scene, View
-from legs_loss.system import write_whole
+from legs_loss.system.files import write_whole
 
 LIMIT = 10_000_000  # bytes of a page
 VIEWS = 3  # shown unless others are asked for

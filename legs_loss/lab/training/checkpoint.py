@@ -14,7 +14,8 @@ import torch
 
 from legs_loss.errors import LegsError
 from legs_loss.lab.values import each, is_pair, is_scores, optional, with_names
-from legs_loss.system import FileLock, HeldError, open_regular, write_whole
+from legs_loss.system.files import open_regular, write_whole
+from legs_loss.system.locks import FileLock, HeldError
 from legs_loss.system.values import is_count, is_number, is_text
 
 CHECKPOINT = "checkpoint.npz"

@@ -37,7 +37,7 @@ from legs_loss.lab.training.dataset import (
 from legs_loss.lab.training.densify import RESET_OPACITY, Schedule, densify, prunable
 from legs_loss.lab.training.metrics import mean_scores, psnr, score
 from legs_loss.scenes import Camera, Scene
-from legs_loss.system import noted
+from legs_loss.system.ctrl_c import noted
 from legs_loss.weights import Weights
 
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # glibc's malloc.h

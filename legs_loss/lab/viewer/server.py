@@ -23,7 +23,7 @@ from legs_loss.scenes import View, image_tensor, load_training_image
 from legs_loss.scenes.user_maps import averaged, dimmed
 from legs_loss.spec import as_spec
 from legs_loss.store import MASK
-from legs_loss.system import say
+from legs_loss.system.terminal import say
 
 _CAMERAS = 40  # shown at most, spread evenly
 _PICTURE = 160  # pixels: the width of a camera's picture

@@ -151,15 +151,6 @@ def scene_levels(levels: Iterable[Tensor]) -> Tensor:
     return torch.stack(list(levels)).nanmedian(0).values
 
 
-def levels_of(images: Iterable[Tensor], spec: WeightSpec) -> Optional[Tensor]:
-    """Return the levels of a scene's images [C, H, W], [2]; None for a spec that is not normalised over the scene."""
-    if spec.over != "scene":
-        return None
-    return scene_levels(
-        response_levels(response(image, spec.operator, spec.p, False, spec.smooth), spec) for image in images
-    )
-
-
 def over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor] = None) -> Tensor:
     """Return the response normalised over its scene, E~ in [0, 1].
 

@@ -11,7 +11,7 @@ and with the map W * M * s / mean(M), divided by s, the share of the pixels with
 
 from __future__ import annotations
 
-from typing import Iterable, List, NamedTuple, Optional
+from typing import NamedTuple, Optional
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from legs_loss.autograd import is_compiling, is_transformed
 from legs_loss.curves import curve
 from legs_loss.errors import LegsError
 from legs_loss.images import check_values, read_layout
-from legs_loss.responses import levels_of, normalise_response, over_scene, percentile, response
+from legs_loss.responses import normalise_response, over_scene, percentile, response
 from legs_loss.spec import Spec, WeightSpec, as_spec
 
 
@@ -62,24 +62,6 @@ def weight_map(
     if spec.over == "scene":
         return layout.restored(weight_over_scene(strength, spec, scene))
     return layout.restored(weight_from_response(normalise_response(strength, spec.eps), spec))
-
-
-def weight_maps(images: Iterable[Tensor], spec: Spec = "legs") -> List[Tensor]:
-    """Return the weight maps [1, H, W] of a scene's images [C, H, W], whose sizes may differ.
-
-    Raises:
-        LegsError: as :func:`weight_map`.
-
-    Examples:
-        >>> sharp = (torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) > 0.9).float()
-        >>> from legs_loss.responses import gaussian_blur
-        >>> blurred = gaussian_blur(sharp, 2.0)
-        >>> [round(float(weight.mean()), 1) for weight in weight_maps([sharp, sharp, blurred], "legs-robust")]
-        [1.3, 1.3, 1.0]
-    """
-    spec, images = as_spec(spec), list(images)
-    scene = levels_of(images, spec)
-    return [weight_map(image, spec, False, scene) for image in images]
 
 
 def weight_over_scene(strength: Tensor, spec: WeightSpec, scene: Optional[Tensor] = None) -> Tensor:

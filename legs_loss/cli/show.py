@@ -46,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.cli.shared.scene_arguments import read_noted
     from legs_loss.cli.shared.sheet import save_sheet
     from legs_loss.errors import LegsError
+    from legs_loss.precompute.photograph import levels_of
     from legs_loss.precompute.user_maps import UserMaps, is_below
-    from legs_loss.responses import levels_of
     from legs_loss.scenes import View, image_tensor, load_training_image
     from legs_loss.spec import as_spec
     from legs_loss.store import MANIFEST

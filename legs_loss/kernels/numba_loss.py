@@ -15,9 +15,9 @@ from legs_loss.images import check_values
 from legs_loss.kernels.codes import CURVES
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, part, said
 from legs_loss.kernels.contract import Backend, Prepared, Terms
-from legs_loss.kernels.numba_response import extremes, operator_of
+from legs_loss.kernels.numba_response import Images, extremes, operator_of
 from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles, error_row
-from legs_loss.kernels.numba_weights import FORMULAS, Images, WeightSource, weights_of_row
+from legs_loss.kernels.numba_weights import FORMULAS, WeightSource, weights_of_row
 from legs_loss.spec import WeightSpec
 
 _ROWS = 16  # of a strip of the L1 alone

@@ -17,9 +17,14 @@ _ROWS = 32  # of a task
 _ZERO, _ONE, _FOUR, _EIGHT = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(8.0)
 
 
-class Shape(NamedTuple):
-    """The shape of contiguous images, [views, channels, height, width]."""
+class Images(NamedTuple):
+    """A prediction and its target, the photograph.
 
+    x, y: float32 [views * channels * height * width], in this order.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
     views: int
     channels: int
     height: int
@@ -53,8 +58,8 @@ def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
     views, channels, height, width = image.shape
     strips = -(-height // _ROWS)
     found = np.empty((views * strips, 3), np.float32)
-    shape = Shape(views, channels, height, width)
-    in_threads(_strips, views * strips, image.reshape(-1), shape, operator_of(spec), strips, found)
+    images = Images(image.reshape(-1), image.reshape(-1), views, channels, height, width)
+    in_threads(_strips, views * strips, images, operator_of(spec), strips, found)
     out, found = np.empty((views, 3), np.float32), found.reshape(views, strips, 3)
     for number, join in enumerate((np.minimum, np.maximum, np.add)):
         join.reduce(found[:, :, number], 1, out=out[:, number])
@@ -62,8 +67,8 @@ def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
 
 
 @compiled(fastmath=False)
-def _strips(counter, tasks, image, shape, operator, strips, found):  # type: ignore[no-untyped-def]
-    height, width = shape.height, shape.width
+def _strips(counter, tasks, images, operator, strips, found):  # type: ignore[no-untyped-def]
+    height, width = images.height, images.width
     row = np.empty(width, np.float32)
     low, high, excess = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     task = claimed(counter)
@@ -71,11 +76,11 @@ def _strips(counter, tasks, image, shape, operator, strips, found):  # type: ign
         view, strip = task // strips, task % strips
         low[:], high[:], excess[:] = np.float32(np.inf), _ZERO, _ZERO
         for i in range(strip * _ROWS, min((strip + 1) * _ROWS, height)):
-            response_row(image, shape, operator, view, i, np.int64(0), width, row)
+            response_row(images, operator, view, i, np.int64(0), width, row)
             _join_extremes(row, low, high)
-            for channel in range(shape.channels):
-                at = ((view * shape.channels + channel) * height + i) * width
-                _add_excess(image[at : at + width], excess)
+            for channel in range(images.channels):
+                at = ((view * images.channels + channel) * height + i) * width
+                _add_excess(images.y[at : at + width], excess)
         found[task, 0], found[task, 1], found[task, 2] = np.float32(np.inf), _ZERO, _ZERO
         for j in range(width):
             found[task, 0], found[task, 1] = min(found[task, 0], low[j]), max(found[task, 1], high[j])
@@ -107,9 +112,9 @@ def _folded(index, size):  # type: ignore[no-untyped-def]
 
 
 @part(fastmath=False)
-def response_row(image, shape, operator, view, row, left, right, out):  # type: ignore[no-untyped-def]
-    """Write the response of the pixels left <= j < right of a row of a view to out."""
-    channels, height, width = shape.channels, shape.height, shape.width
+def response_row(images, operator, view, row, left, right, out):  # type: ignore[no-untyped-def]
+    """Write the response of the pixels left <= j < right of a row of a photograph to out."""
+    image, channels, height, width = images.y, images.channels, images.height, images.width
     for j in range(right - left):
         out[j] = _ZERO
     first, last = max(left, 1), min(right, width - 1)

@@ -1,4 +1,4 @@
-"""The images of a call and the weights of their pixels, as the compiled functions take them.
+"""The weights of the pixels of a call, as the compiled functions take them.
 
 A weight map made from the target need not exist in memory: two numbers do, the least and the greatest response of the
 view. With them the weights are made row by row where they are used, from pixels that are in the cache already.
@@ -12,26 +12,12 @@ import numpy as np
 
 from legs_loss.kernels.codes import CURVES, formulas_in
 from legs_loss.kernels.compiling import inlined, part
-from legs_loss.kernels.numba_response import OperatorCode, Shape, response_row
+from legs_loss.kernels.numba_response import OperatorCode, response_row
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 # No sine, since numba's is slow: C5, as curves of the user's own, is applied by torch, to a map.
 _WORDS = {"x": "x", "sqrt": "np.sqrt", "unit": "_unit"}
 FORMULAS: Dict[str, str] = formulas_in(_WORDS, "np.float32({})".format)
-
-
-class Images(NamedTuple):
-    """A prediction and its target.
-
-    x, y: float32 [views * channels * height * width], in this order.
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-    views: int
-    channels: int
-    height: int
-    width: int
 
 
 class WeightSource(NamedTuple):
@@ -75,8 +61,7 @@ def weights_of_row(images, source, view, row, left, right, out):  # type: ignore
         for j in range(count):
             out[j] = _ONE
     else:
-        shape = Shape(images.views, images.channels, height, width)
-        response_row(images.y, shape, source.operator, view, row, left, right, out)
+        response_row(images, source.operator, view, row, left, right, out)
         _weigh(out, count, source.curve, source.beta, source.ranges[view, 0], source.ranges[view, 1])
     if source.map.size > 0:
         at = (row if source.map.size == height * width else view * height + row) * width + left

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from legs_loss.kernels.compiling import compiled
-from legs_loss.kernels.numba_response import Shape, operator_of, response_row
+from legs_loss.kernels.numba_response import Images, operator_of, response_row
 from legs_loss.spec import WeightSpec
 
 
@@ -20,12 +20,12 @@ def photograph_response(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
         first, last = max(top - 1, 0), min(bottom + 1, height)
         planes = image[first:last].transpose(2, 0, 1).astype(np.float32, order="C")
         planes /= full
-        shape = Shape(1, channels, last - first, width)
-        _rows_of(planes.reshape(-1), shape, operator_of(spec), top - first, out[top:bottom])
+        images = Images(planes.reshape(-1), planes.reshape(-1), 1, channels, last - first, width)
+        _rows_of(images, operator_of(spec), top - first, out[top:bottom])
     return out
 
 
 @compiled(fastmath=False)
-def _rows_of(image, shape, operator, first, out):  # type: ignore[no-untyped-def]
+def _rows_of(images, operator, first, out):  # type: ignore[no-untyped-def]
     for i in range(out.shape[0]):
-        response_row(image, shape, operator, np.int64(0), first + i, np.int64(0), shape.width, out[i])
+        response_row(images, operator, np.int64(0), first + i, np.int64(0), images.width, out[i])

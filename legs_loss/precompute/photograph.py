@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, Tuple
+from typing import Any, Dict, Iterable, Optional, Tuple
 
 import numpy as np
 import torch
 
 from legs_loss.kernels.available import BACKENDS
-from legs_loss.responses import response, response_levels
+from legs_loss.responses import response, response_levels, scene_levels
 from legs_loss.scenes import image_tensor
 from legs_loss.scenes.images import row_strips
 from legs_loss.spec import WeightSpec
@@ -54,3 +54,12 @@ def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
             with said("legs precompute", "1 to 5 s"):
                 return torch.from_numpy(photograph_response(image, spec))
     return response(image_tensor(image), spec.operator, spec.p, False, spec.smooth)[0]
+
+
+def levels_of(images: Iterable[torch.Tensor], spec: WeightSpec) -> Optional[torch.Tensor]:
+    """Return the levels of a scene's images [C, H, W], [2]; None for a spec that is not normalised over the scene."""
+    if spec.over != "scene":
+        return None
+    return scene_levels(
+        response_levels(response(image, spec.operator, spec.p, False, spec.smooth), spec) for image in images
+    )

@@ -21,7 +21,6 @@ from legs_loss.store.manifest import Entry as Entry
 from legs_loss.store.maps import is_intact as is_intact
 from legs_loss.store.maps import read_map as read_map
 from legs_loss.store.maps import stage as stage
-from legs_loss.store.reading import Damage as Damage
 from legs_loss.store.reading import Found as Found
 from legs_loss.store.reading import WeightStore as WeightStore
 from legs_loss.store.writing import StoreWriter as StoreWriter

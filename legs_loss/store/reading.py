@@ -20,13 +20,6 @@ from legs_loss.store.maps import is_intact, read_map
 from legs_loss.weights import weight_from_response, weight_over_scene
 
 
-class Damage(NamedTuple):
-    """The damage of a store: entries whose map is damaged or missing, and files that belong to no entry."""
-
-    damaged: List[Entry]
-    orphans: List[str]
-
-
 class Found(NamedTuple):
     """The view of one training image, and the entries for it: a response for a spec, the user's mask and weights."""
 
@@ -167,11 +160,11 @@ class WeightStore:
             weight = weight * self.user_map(users)
         return weight
 
-    def check(self) -> Damage:
-        """Read every map and compare checksums."""
+    def check(self) -> Tuple[List[Entry], List[str]]:
+        """Read every map; return the entries whose map is damaged or missing, and the files that belong to no entry."""
         entries = self.entries.values()
         damaged = [entry for entry in entries if not is_intact(self.path, entry)]
-        return Damage(damaged, sorted(path.name for path in leftovers(self.path, entries)))
+        return (damaged, sorted(path.name for path in leftovers(self.path, entries)))
 
 
 def _made_with(spec: WeightSpec) -> Tuple[Any, ...]:

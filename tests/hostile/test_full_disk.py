@@ -110,7 +110,7 @@ def test_precompute(disk, tmp_path, capsys):
         one_error(capsys, main(["precompute", str(scene), "--out", str(store), "--workers", "1"]))
         after = disk.state()
         assert all(after[name] == data for name, data in before.items() if name.endswith(".npy"))
-        assert WeightStore(store).check().damaged == []
+        assert WeightStore(store).check()[0] == []
     assert main(["precompute", str(scene), "--out", str(store), "--workers", "1"]) == 0
     assert len(WeightStore(store).entries) == 8
     assert not [name for name in disk.state() if ".writing" in name or name.endswith(".part")]
@@ -131,7 +131,7 @@ def test_precompute_by_a_cluster(disk, tmp_path):
             (line,) = [line for line in done.stderr.splitlines() if "error" in line]
             assert done.returncode == 2 and f"worker {address}" in line and FULL in line
             kept = len(WeightStore(store).entries)
-            assert 0 < kept < 8 and WeightStore(store).check().damaged == []
+            assert 0 < kept < 8 and WeightStore(store).check()[0] == []
         done = legs(*command)
         assert done.stdout.endswith(f": {8 - kept} made, {kept} up to date, 0 skipped\n"), done.stderr
         assert WeightStore(store).check() == ([], [])

@@ -17,14 +17,16 @@ from torch.nn.functional import conv2d, pad
 from legs_loss import LegsError, LEGSLoss, WeightSpec, configure, l1_loss, legs_loss, weight_map
 from legs_loss.cli import main
 from legs_loss.kernels.available import BACKENDS
+from legs_loss.lab.training.dataset import weight_maps
 from legs_loss.precompute import precompute
-from legs_loss.responses import gaussian_blur, levels_of, response, response_levels
+from legs_loss.precompute.photograph import levels_of
+from legs_loss.responses import gaussian_blur, response, response_levels
 from legs_loss.runtime import state
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
 from legs_loss.spec import PRESETS
 from legs_loss.store import MANIFEST, WeightStore
 from legs_loss.store.manifest import read_manifest
-from legs_loss.weights import weight_from_response, weight_maps
+from legs_loss.weights import weight_from_response
 from tests.support import start_run
 
 ROBUST = PRESETS["legs-robust"]

@@ -241,7 +241,7 @@ class TestWriters:
             put(folder, *views("a.png", "b.png"))
             finished = killed_at_line(line, lambda: put(folder, *views("a.png", "c.png"), shift=7))  # noqa: B023
             store = WeightStore(folder)
-            assert store.check().damaged == []
+            assert store.check()[0] == []
             content = {
                 entry.view: float(store.normalised_response(entry)[0, 0]) > 0 for entry in store.entries.values()
             }

@@ -22,11 +22,10 @@ from legs_loss.errors import LegsError
 from legs_loss.lab.experiments.arms import BASELINE, ArmSpec, needed, parse_arm
 from legs_loss.lab.experiments.running import Row, identity, read_json, versions, write_or_check
 from legs_loss.lab.training.checkpoint import alone_in, write_json
-from legs_loss.lab.training.dataset import load_view, split_views
+from legs_loss.lab.training.dataset import load_view, split_views, weight_maps
 from legs_loss.lab.training.trainer import TrainConfig
 from legs_loss.scenes import Scene, read_scene, training_size
 from legs_loss.spec import WeightSpec
-from legs_loss.weights import weight_maps
 
 __all__ = ["UpstreamComparison", "next_factor"]
 

@@ -48,14 +48,13 @@ class OutOfMemory(NotNow):
     """The card is full: torch computes this call, and the next one tries again."""
 
 
-def load_library(platform: str = sys.platform) -> Any:
+def load_library() -> Any:
     """Return the driver's library.
 
     Raises:
         OSError: there is none.
     """
-    name = "nvcuda.dll" if platform == "win32" else "libcuda.so.1"
-    return (ctypes.WinDLL if platform == "win32" else ctypes.CDLL)(name)  # type: ignore[attr-defined]
+    return ctypes.WinDLL("nvcuda.dll") if sys.platform == "win32" else ctypes.CDLL("libcuda.so.1")
 
 
 class CudaDriver:

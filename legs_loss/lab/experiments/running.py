@@ -24,14 +24,14 @@ from legs_loss.lab.experiments.arms import BASELINE, ArmSpec, needed, parse_arm
 from legs_loss.lab.experiments.baseline import prove_unweighted
 from legs_loss.lab.experiments.schema import ROW, SETTINGS, what_is_wrong
 from legs_loss.lab.training.checkpoint import CHECKPOINT, alone_in, write_json
-from legs_loss.lab.training.dataset import Dataset, load_dataset
+from legs_loss.lab.training.dataset import Dataset, load_dataset, weight_maps
 from legs_loss.lab.training.perceptual import network_name, use_lpips
 from legs_loss.lab.training.side_by_side import Arm, train_side_by_side
 from legs_loss.lab.training.trainer import Progress, TrainConfig, default_threshold
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.spec import WeightSpec
 from legs_loss.system.files import read_regular
-from legs_loss.weights import Weights, weight_maps
+from legs_loss.weights import Weights
 
 _LARGEST = 256 << 20  # bytes of a file of a comparison
 EVALUATIONS = 10  # of the held-out views during a run, for the plots

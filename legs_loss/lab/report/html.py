@@ -27,7 +27,7 @@ from legs_loss.lab.report.html_pictures import ViewPictures, draw_row, encode
 from legs_loss.lab.report.html_plots import by_gaussians, by_iterations
 from legs_loss.lab.training.dataset import load_dataset, load_view, open_store, split_views, with_user_maps
 from legs_loss.lab.training.trainer import TrainConfig
-from legs_loss.responses import levels_of
+from legs_loss.precompute.photograph import levels_of
 from legs_loss.scenes import Scene, View
 from legs_loss.system.files import write_whole
 

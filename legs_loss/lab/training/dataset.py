@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import List, NamedTuple, Optional, Tuple
+from typing import Iterable, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 import torch
@@ -12,10 +12,11 @@ from torch import Tensor
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
+from legs_loss.precompute.photograph import levels_of
 from legs_loss.scenes import Camera, Scene, View, image_tensor, load_training_image
-from legs_loss.spec import WeightSpec
+from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.store import Found, WeightStore
-from legs_loss.weights import weight_map, weight_maps
+from legs_loss.weights import weight_map
 
 HOLD_OUT = 8  # every 8th view, sorted by name, as usual for 3DGS
 
@@ -202,3 +203,21 @@ def _weights(store: Optional[WeightStore], views: List[TrainingView], spec: Weig
 
 def _found(store: WeightStore, view: TrainingView, spec: WeightSpec) -> Optional[Found]:
     return store.find_image(view.image, spec) or store.find_image(view.image[:1], spec)  # a gray photograph
+
+
+def weight_maps(images: Iterable[Tensor], spec: Spec = "legs") -> List[Tensor]:
+    """Return the weight maps [1, H, W] of a scene's images [C, H, W], whose sizes may differ.
+
+    Raises:
+        LegsError: as :func:`weight_map`.
+
+    Examples:
+        >>> sharp = (torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) > 0.9).float()
+        >>> from legs_loss.responses import gaussian_blur
+        >>> blurred = gaussian_blur(sharp, 2.0)
+        >>> [round(float(weight.mean()), 1) for weight in weight_maps([sharp, sharp, blurred], "legs-robust")]
+        [1.3, 1.3, 1.0]
+    """
+    spec, images = as_spec(spec), list(images)
+    scene = levels_of(images, spec)
+    return [weight_map(image, spec, False, scene) for image in images]

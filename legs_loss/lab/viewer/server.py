@@ -269,7 +269,7 @@ class _Cameras:
 
     def _weight(self, view: View) -> np.ndarray:
         """Return a weight map from black (1) to white (1 + beta), uint8 [H, W, 3]."""
-        from legs_loss.responses import levels_of
+        from legs_loss.precompute.photograph import levels_of
         from legs_loss.weights import weight_map
 
         if self.levels is None:  # of the views that are shown; None again where the preset needs none

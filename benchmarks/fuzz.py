@@ -259,7 +259,7 @@ def read_maps(folder: Path) -> None:
     data = {entry.file: (folder / "store" / entry.file).read_bytes() for entry in entries}
     true = [replace(e, bytes=len(data[e.file]) or 1, sha256=sha256(data[e.file]).hexdigest()) for e in entries]
     (folder / "store" / MANIFEST).write_bytes(manifest_bytes(true))
-    damaged = {entry.file for entry in WeightStore(folder / "store").check().damaged}
+    damaged = {entry.file for entry in WeightStore(folder / "store").check()[0]}
     for entry in true:
         with contextlib.suppress(LegsError):
             read_store(folder, [entry])

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Dict, Mapping, Optional, Sequence, Tuple
 
 from legs_loss import OPERATORS, LegsError, __version__
-from legs_loss.cli import Parser, exit_code
+from legs_loss.cli import Parser, exit_code, never_fail_to_print
 from legs_loss.errors import require
-from legs_loss.system.terminal import never_fail_to_print, say
+from legs_loss.system.terminal import say
 
 if TYPE_CHECKING:
     from legs_adapters.plan import Plan

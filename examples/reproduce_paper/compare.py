@@ -42,8 +42,8 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Train what is missing and print the tables; 2 for bad input."""
+    from legs_loss.cli import say_error
     from legs_loss.errors import LegsError
-    from legs_loss.system.terminal import say_error
 
     try:
         return run(parser().parse_args(argv))

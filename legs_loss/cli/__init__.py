@@ -15,7 +15,7 @@ from legs_loss._version import __version__
 from legs_loss.cli.shared.parser import Parser as Parser
 from legs_loss.errors import LegsError
 from legs_loss.system.entry_points import plugins
-from legs_loss.system.terminal import never_fail_to_print, say, say_error
+from legs_loss.system.terminal import say
 
 COMMANDS = ("masks", "precompute", "export", "show", "info", "env")
 
@@ -61,6 +61,22 @@ def exit_code(command: str, work: Callable[[], int], so_far: Callable[[], str] =
         where = f"{error.filename}: " if error.filename is not None else ""
         say(f"{command}: error: {where}{error.strerror or str(error)[:500]}{so_far()}", sys.stderr)
     return 2
+
+
+def never_fail_to_print() -> None:
+    """Print characters that the terminal's encoding lacks as escapes, instead of raising an error."""
+    for stream in (sys.stdout, sys.stderr):
+        reconfigure = getattr(stream, "reconfigure", None)  # replacements in tests and notebooks have none
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
+
+
+def say_error(command: str, error: Exception) -> None:
+    """Print a command's error to stderr: its message on one line, then the quoted lines, if any."""
+    message, *quoted = error.args or ("",)
+    say(f"{command}: error: {message}", sys.stderr)
+    for text in quoted:
+        say(text, sys.stderr, lines=True)
 
 
 def _parser() -> argparse.ArgumentParser:

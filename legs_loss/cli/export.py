@@ -8,9 +8,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Dict
+from typing import TYPE_CHECKING, Dict
 
 from legs_loss.system.terminal import say
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from legs_loss.spec import WeightSpec
+    from legs_loss.store import Entry, WeightStore
 
 HELP = "export final weights and masks as PNG for other programs"
 
@@ -33,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.errors import LegsError
     from legs_loss.scenes.user_maps import file_names, write_gray
     from legs_loss.spec import as_spec
-    from legs_loss.store import MASK, Entry, WeightStore
+    from legs_loss.store import MASK, WeightStore
 
     check_empty(args.out)
     folder = args.store / STORE_FOLDER
@@ -42,10 +48,10 @@ def run(args: argparse.Namespace) -> int:
     views: Dict[str, Entry] = {entry.view: entry for entry in fits}
     if not views:
         raise LegsError(f"{store.path} has no maps for this preset: run legs precompute with --preset {args.preset}")
-    largest = max(float(store.final_weight(entry, spec).max()) for entry in views.values())
+    largest = max(float(final_weight(store, entry, spec).max()) for entry in views.values())
     names = file_names(views)
     for view, entry in views.items():
-        share = store.final_weight(entry, spec) / np.float32(largest or 1.0)
+        share = final_weight(store, entry, spec) / np.float32(largest or 1.0)
         write_gray(args.out / "weights_8bit" / names[view], share)
         write_gray(args.out / "weights_16bit" / names[view], share, np.uint16)
         mask = store.beside(entry, MASK)
@@ -53,3 +59,13 @@ def run(args: argparse.Namespace) -> int:
             write_gray(args.out / "masks" / names[view], store.user_map(mask))
     say(f"{args.out}: {len(views)} maps; white is a weight of {largest:.6g}")
     return 0
+
+
+def final_weight(store: WeightStore, entry: Entry, spec: WeightSpec) -> np.ndarray:
+    """Return the weight map of an entry that fits a spec, times the user's weights and mask, float32 [H, W]."""
+    from legs_loss.store import MASK, WEIGHTS
+
+    weight: np.ndarray = store.weight(entry, spec)[0].numpy()
+    for users in filter(None, (store.beside(entry, kind) for kind in (MASK, WEIGHTS))):
+        weight = weight * store.user_map(users)
+    return weight

@@ -198,8 +198,7 @@ class Run:
 
     def tell_at_end(self) -> None:
         """Have the process's last line say what the masks of this run were used for."""
-        if not _masked or _masked[-1] is not self:
-            _masked.append(self)
+        _masked.append(self)
 
 
 class _Thread(threading.local):

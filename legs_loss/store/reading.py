@@ -153,13 +153,6 @@ class WeightStore:
             return weight_over_scene(made, spec, self.scene_levels(spec, values.size))
         return weight_from_response(made, spec)
 
-    def final_weight(self, entry: Entry, spec: WeightSpec) -> np.ndarray:
-        """Return the weight map of an entry that fits a spec, times the user's weights and mask, float32 [H, W]."""
-        weight: np.ndarray = self.weight(entry, spec)[0].numpy()
-        for users in filter(None, (self.beside(entry, kind) for kind in (MASK, WEIGHTS))):
-            weight = weight * self.user_map(users)
-        return weight
-
     def check(self) -> Tuple[List[Entry], List[str]]:
         """Read every map; return the entries whose map is damaged or missing, and the files that belong to no entry."""
         entries = self.entries.values()

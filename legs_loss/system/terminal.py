@@ -26,25 +26,9 @@ def printable(text: str, lines: bool = False) -> str:
     return shown if lines else shown.replace("\n", "\\n")
 
 
-def never_fail_to_print() -> None:
-    """Print characters that the terminal's encoding lacks as escapes, instead of raising an error."""
-    for stream in (sys.stdout, sys.stderr):
-        reconfigure = getattr(stream, "reconfigure", None)  # replacements in tests and notebooks have none
-        if reconfigure is not None:
-            reconfigure(errors="backslashreplace")
-
-
 def say(text: object, stream: Optional[TextIO] = None, end: str = "\n", lines: bool = False) -> None:
     """Print to stdout, or another stream, after :func:`printable`, and flush."""
     print(printable(str(text), lines), file=stream, end=end, flush=True)
-
-
-def say_error(command: str, error: Exception) -> None:
-    """Print a command's error to stderr: its message on one line, then the quoted lines, if any."""
-    message, *quoted = error.args or ("",)
-    say(f"{command}: error: {message}", sys.stderr)
-    for text in quoted:
-        say(text, sys.stderr, lines=True)
 
 
 def progress(total: int, what: str) -> Any:

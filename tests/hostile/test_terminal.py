@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from legs_loss import LegsError
+from legs_loss.cli import say_error
 from legs_loss.store import WeightStore
-from legs_loss.system.terminal import say_error
 from tests.patcher.support import checkout, files
 from tests.preloaded import run
 from tests.support import colmap_scene, legs_command, legs_environment, photograph, save

@@ -96,8 +96,8 @@ class _Prepared(Prepared):
 
         # Strides that the kernels cannot address are made contiguous first.
         self._copies = not _is_addressable(x), not _is_addressable(y)
-        self._task = task = _task_of(x, spec)
-        views, _, height, width = x.shape
+        views, channels, height, width = x.shape
+        self._task = task = Task(views=views, channels=channels, height=height, width=width)
         self._views, self._pixels = views, (height * width, views * height * width)  # a map's: for all views, for each
         x, y = x.contiguous() if self._copies[0] else x, y.contiguous() if self._copies[1] else y
         task.of_prediction, self._strides_of_prediction = Strides(*x.stride()), x.stride()[-len(self._shape) :]
@@ -106,6 +106,8 @@ class _Prepared(Prepared):
         self._ranged = task.count = task.chunks * task.views
         self._ranging: Tuple[_Launch, ...] = ()
         if spec is not None:
+            _, task.side, task.middle = STENCILS[spec.operator]
+            task.curve, task.beta, task.eps = CURVES.get(spec.curve, 0), spec.beta, spec.eps
             self._ranging = launch("range", weighted, self._ranged), launch("range_finish", weighted, views)
         task.l1_step, task.ssim_step = terms.l1 / x.numel(), 4.0 * terms.ssim / x.numel()
         task.constant = terms.constant
@@ -207,16 +209,6 @@ def chunks_of(images: Tensor) -> int:
 
 def _batch(images: Tensor) -> Tensor:
     return images.unsqueeze(0) if images.dim() == 3 else images
-
-
-def _task_of(images: Tensor, spec: Optional[WeightSpec]) -> Task:
-    """Return a task with the size of images [B, C, H, W] and the settings of a spec's weights."""
-    views, channels, height, width = images.shape
-    task = Task(views=views, channels=channels, height=height, width=width)
-    if spec is not None:
-        _, task.side, task.middle = STENCILS[spec.operator]
-        task.curve, task.beta, task.eps = CURVES.get(spec.curve, 0), spec.beta, spec.eps
-    return task
 
 
 def _is_addressable(images: Tensor) -> bool:

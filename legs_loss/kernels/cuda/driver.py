@@ -54,7 +54,8 @@ def load_library() -> Any:
     Raises:
         OSError: there is none.
     """
-    return ctypes.WinDLL("nvcuda.dll") if sys.platform == "win32" else ctypes.CDLL("libcuda.so.1")
+    name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+    return (ctypes.WinDLL if sys.platform == "win32" else ctypes.CDLL)(name)  # type: ignore[attr-defined]
 
 
 class CudaDriver:

@@ -62,7 +62,7 @@ class Flow:
         self.contexts: Dict[int, Tuple[cst.CSTNode, ...]] = {}
         self.conditions: Dict[int, Tuple[cst.Name | cst.Attribute, ...]] = {}
         self._reaching: Dict[int, Reaching] = {}
-        self._visited: Dict[int, Tuple[cst.CSTNode, int]] = {}  # with the number of definitions made before
+        self._visited: Dict[int, cst.CSTNode] = {}
         self._made: Dict[Tuple[int, str, str], Definition] = {}
         self._holders: Set[str] = set()  # places of which a part is defined: ``x`` and ``x.y`` of ``x.y['z']``
         self._around: Tuple[cst.CSTNode, ...] = ()
@@ -74,7 +74,7 @@ class Flow:
             self._bind(env, Definition(parameter.name.value, "parameter", parameter, parameter.default))
         self._visit(body, env)
         by_class: Dict[type, List[Any]] = {}  # isinstance on every node takes longer than the walk
-        for node, _ in self._visited.values():
+        for node in self._visited.values():
             by_class.setdefault(type(node), []).append(node)
         self.calls: List[cst.Call] = by_class.get(cst.Call, [])
         self.expressions: List[cst.CSTNode] = [*self.calls, *by_class.get(cst.BinaryOperation, ())]
@@ -195,7 +195,7 @@ class Flow:
         self.steps += 1
         if self.steps > self._most:
             return
-        self._visited.setdefault(id(node), (node, len(self._made)))
+        self._visited.setdefault(id(node), node)
         if self._around:
             self.contexts[id(node)] = self._around
         getattr(self, "_visit_" + type(node).__name__, self._parts)(node, env)

@@ -30,7 +30,7 @@ STRING = "|".join(
 )
 _TOKEN = re.compile(
     rf"(?P<string>{STRING})|\#[^\n]*|\\\r?\n|(?P<end>[\r\n;]+)|(?P<open>[(\[{{])|(?P<close>[)\]}}])|(?P<comma>,)"
-    r"|\b(?P<word>if|else|and|or|not|in|is|await|for|yield)\b|(?P<signs>[-+*/%@&|^~<>=!.]+)",
+    r"|(?P<word>if|else|and|or|not|in|is|await|for|yield)\b|\w+|(?P<signs>[-+*/%@&|^~<>=!.]+)",
     re.S,
 )
 _FIELD = re.compile(r"\{[^{}]*\}")
@@ -39,10 +39,11 @@ _Method = TypeVar("_Method", bound=Callable[..., Any])
 
 def remembered(method: _Method) -> _Method:
     """Let an object answer each question to a method once, and keep the answer, by its positional arguments."""
+    name = f"_known {method.__name__}"
 
     @functools.wraps(method)
     def ask(self: Any, *question: Any) -> Any:
-        known = vars(self).setdefault(f"_known {method.__name__}", {})
+        known = vars(self).setdefault(name, {})
         if question not in known:
             known[question] = method(self, *question)
         return known[question]

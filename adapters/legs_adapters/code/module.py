@@ -8,8 +8,8 @@ from typing import Callable, Dict, Iterable, Iterator, List, Optional, Sequence,
 import libcst as cst
 
 from legs_adapters.code.flow import Flow
-from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps
-from legs_adapters.code.parsing import STUB, Lines, Part, Place, body_part, outline_part, refused
+from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps, remembered
+from legs_adapters.code.parsing import STUB, Lines, Part, Place, body_part, outline_part, read_by_python
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import arguments, children, dotted
@@ -48,33 +48,31 @@ class Function:
         self.name: str = node.name.value if isinstance(node, cst.FunctionDef) else ""
         self._cut = cut
         self._part: Optional[Part] = None
-        self._body: Optional[cst.BaseSuite | cst.Module] = None
         self._inner: List[Function] = []
-        self._flow: Optional[Flow] = None
         around = parent.text if parent is not None and parent.parent is not None else module.outline_text
         self.text: str = around if cut is None else module.lines.data[cut].decode("utf-8")
 
     @property
+    @remembered
     def body(self) -> cst.BaseSuite | cst.Module:
         """Its statements, parsed on first use."""
-        if self._body is None:
-            self._body = self.node if isinstance(self.node, cst.Module) else self.node.body
-            if self._cut is not None and self.module.spend(parsing_steps(self.text)):
-                try:
-                    self._part = body_part(self.module.lines, self._cut)
-                    header = self._part.tree.body[0]
-                    assert isinstance(header, cst.FunctionDef)
-                    self._body = header.body
-                    self._inner = self.module.collect(self._body, self)
-                except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
-                    before = self.module.lines.place(self._cut.start, self._cut.start).line - 2
-                    self.module.failure = _failure(self.module.path, self.module.text, error, before)
-        return self._body
+        if self._cut is not None and self.module.spend(parsing_steps(self.text)):
+            try:
+                self._part = body_part(self.module.lines, self._cut)
+                header = self._part.tree.body[0]
+                assert isinstance(header, cst.FunctionDef)
+                self._inner = self.module.collect(header.body, self)
+                return header.body
+            except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
+                before = self.module.lines.place(self._cut.start, self._cut.start).line - 2
+                self.module.failure = _failure(self.module.path, self.module.text, error, before)
+        return self.node if isinstance(self.node, cst.Module) else self.node.body
 
     @property
+    @remembered
     def inner(self) -> List[Function]:
         """The functions that are defined in its body, and theirs, in source order."""
-        if self._cut is not None and self._body is None and _DEFINES.search(self.text):
+        if self._cut is not None and _DEFINES.search(self.text):
             assert self.body is not None  # which finds them
         return self._inner
 
@@ -90,17 +88,17 @@ class Function:
         return (scope._part or self.module.outline).place(node, brackets)
 
     @property
+    @remembered
     def flow(self) -> Flow:
         """Its reaching definitions, computed once."""
-        if self._flow is None:
-            parameters = self.node.params if isinstance(self.node, cst.FunctionDef) else None
-            try:
-                self._flow = Flow(self.body, parameters, self.module.budget.left(self.module.path))
-            except RecursionError as error:
-                self.module.failure = _failure(self.module.path, self.module.text, error)
-            if self._flow is None or not self.module.spend(self._flow.steps):
-                self._flow = Flow(cst.Module(body=[]), parameters)
-        return self._flow
+        parameters = self.node.params if isinstance(self.node, cst.FunctionDef) else None
+        try:
+            flow = Flow(self.body, parameters, self.module.budget.left(self.module.path))
+            if self.module.spend(flow.steps):
+                return flow
+        except RecursionError as error:
+            self.module.failure = _failure(self.module.path, self.module.text, error)
+        return Flow(cst.Module(body=[]), parameters)
 
     @property
     def parameters(self) -> List[str]:
@@ -175,7 +173,6 @@ class Module:
         self._by_word: Optional[Dict[str, List[Function]]] = None
         self._cuts: Iterator[Optional[slice]] = iter(cuts)
         self._functions = self.collect(self.outline.tree, self.top)
-        self._cuts = iter(())
 
     def collect(self, body: cst.CSTNode, parent: Function, owner: Optional[Class] = None) -> List[Function]:
         """Record what a body defines; return its functions, in source order."""
@@ -254,10 +251,11 @@ def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadabl
 
 def _failure(path: str, text: str, error: Exception, lines_before: int = 0) -> Unreadable:
     if isinstance(error, cst.ParserSyntaxError):
-        known = refused(text)
-        line = lines_before + error.raw_line if known is None or known.lineno is None else known.lineno
-        why = f"line {line}: Python reads it, and LibCST does not" if known is None else f"line {line}: {known.msg}"
-        return Unreadable(path, f"does not parse ({why})")
+        known, line = read_by_python(text.encode("utf-8")), lines_before + error.raw_line
+        why = "Python reads it, and LibCST does not"
+        if isinstance(known, SyntaxError):
+            line, why = known.lineno or line, known.msg
+        return Unreadable(path, f"does not parse (line {line}: {why})")
     if isinstance(error, RecursionError):
         return Unreadable(path, "is nested too deeply")
     return Unreadable(path, f"cannot be parsed: {type(error).__name__}")

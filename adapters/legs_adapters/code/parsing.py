@@ -27,7 +27,6 @@ STUB = re.compile("0#x*")  # what stands for a body
 _FORM_FEED = re.compile(rb"^[ \t\f]*\f[ \t\f]*(?=\r?$)", re.M)  # LibCST loses these lines: comments, to it
 _NEWLINE = re.compile(rb"\r\n|\r|\n")
 _LONE_RETURN = re.compile(rb"\r(?!\n)")
-_BODY = re.compile(rb"([ \t]*)(.*?)((?:\r\n|\n)?)\Z", re.S)  # its indentation, its statements, its end
 _COMPOUND = (ast.stmt, ast.excepthandler, getattr(ast, "match_case", ast.stmt))
 
 
@@ -140,10 +139,10 @@ def outline_part(lines: Lines) -> Tuple[Part, List[Optional[slice]]]:
     """
     outline, cuts = bytearray(lines.data), _cuts(lines)
     for cut in filter(None, cuts):
-        body = _BODY.match(lines.data[cut])
-        assert body is not None
-        indent, statements, end = body.groups()
-        outline[cut] = indent + b"0#".ljust(len(statements), b"x")[: len(statements)] + end
+        body = lines.data[cut]
+        statements = body.lstrip(b" \t").rstrip(b"\r\n")
+        stub = b"0#".ljust(len(statements), b"x")[: len(statements)]
+        outline[cut] = body.replace(statements, stub)
     return Part(lines, bytes(outline)), cuts
 
 
@@ -158,29 +157,19 @@ def body_part(lines: Lines, cut: slice) -> Part:
     return Part(lines, header + lines.data[cut], cut.start - len(header))
 
 
-def refused(text: str) -> Optional[SyntaxError]:
-    """Return what this Python says of a text that it does not parse; None where it does, or cannot say."""
+def read_by_python(data: bytes) -> ast.AST | Exception:
+    """Return a file as this Python parses it, or the error: it is newer, or deeper than its parser goes."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            ast.parse(text)
-    except SyntaxError as error:
+            return ast.parse(data)
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         return error
-    except (ValueError, RecursionError, MemoryError):
-        pass
-    return None
 
 
 def _cuts(lines: Lines) -> List[Optional[slice]]:
-    if _LONE_RETURN.search(lines.data) is not None:
-        return []
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            tree = ast.parse(lines.data)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return []  # newer than this Python: LibCST knows; or deeper than its parser goes
-    return [_cut(lines, node) for node in _functions(tree)]
+    tree = read_by_python(lines.data) if _LONE_RETURN.search(lines.data) is None else None
+    return [_cut(lines, node) for node in _functions(tree)] if isinstance(tree, ast.AST) else []
 
 
 def _functions(node: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:

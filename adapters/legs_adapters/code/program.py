@@ -10,7 +10,7 @@ from typing import Dict, Iterable, Iterator, List, NamedTuple, Optional, Tuple
 import libcst as cst
 
 from legs_adapters.code.checkout import Checkout, imported_name
-from legs_adapters.code.limits import Budget
+from legs_adapters.code.limits import Budget, remembered
 from legs_adapters.code.module import CALLED, Class, Function, Module
 from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.sources import Source
@@ -51,18 +51,14 @@ class Program(Checkout):
         super().__init__(sources, budget)
         self._returning_self = frozenset(returning_self)
         self._wrapping = tuple("." + name for name in wrapping)
-        # by expression and depth; each may be asked from many places, and asks for many others
-        self._resolved: Dict[Function, Dict[Tuple[int, int], Tuple[object, List[Reference]]]] = {}
+        self._joined: Dict[Tuple[Reaching, int], List[Reference]] = {}  # by a join of definitions and the depth
 
+    @remembered
     def resolve(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[Reference]:
         """Return what an expression may refer to; empty where it is unknown."""
-        if depth > _MAX_DEPTH:
+        if depth > _MAX_DEPTH or not function.module.spend(1):
             return []
-        known = self._resolved.setdefault(function, {})
-        if (id(node), depth) not in known:
-            found = self._resolve(function, node, depth + 1) if function.module.spend(1) else ()
-            known[id(node), depth] = node, list(dict.fromkeys(found))  # the node, lest another gets its id
-        return known[id(node), depth][1]
+        return list(dict.fromkeys(self._resolve(function, node, depth + 1)))
 
     def _resolve(self, function: Function, node: cst.CSTNode, depth: int) -> Iterable[Reference]:
         if isinstance(node, cst.Name):
@@ -96,13 +92,12 @@ class Program(Checkout):
 
     def _of(self, where: Function, reaching: Reaching, depth: int) -> List[Reference]:
         """Return what definitions may bind their place to; of each join it is found once."""
-        known = self._resolved.setdefault(where, {})
-        for join in reaching.joins(lambda part: (id(part), depth) in known):
+        for join in reaching.joins(lambda part: (part, depth) in self._joined):
             found = [self._of(where, part, depth) for part in join.parts if where.module.spend(1)]
-            known[id(join), depth] = join, list(dict.fromkeys(ref for some in found for ref in some))
+            self._joined[join, depth] = list(dict.fromkeys(ref for some in found for ref in some))
         if isinstance(reaching, Definition):
             return self.of_definition(where, reaching, depth)
-        return known[id(reaching), depth][1]
+        return self._joined[reaching, depth]
 
     def of_definition(self, where: Function, definition: Definition, depth: int = 0) -> List[Reference]:
         """Return what a definition may bind its place to."""

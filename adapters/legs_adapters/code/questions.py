@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from dataclasses import dataclass, field
 from typing import Any, Callable, Dict, List, Optional, Set, Tuple, TypeVar
 
 from legs_adapters.code.module import Function
@@ -14,18 +15,18 @@ _S = TypeVar("_S")
 _A = TypeVar("_A")
 
 
+@dataclass(eq=False)
 class _Question:
     """A question that is not settled yet, its answer so far, and those who were given that."""
 
-    def __init__(self, order: int, function: Function, subject: Any, ask: Callable[[Function, Any], Any]) -> None:
-        self.order = order
-        self.function = function
-        self.subject = subject
-        self.ask = ask
-        self.answer: Any = None
-        self.readers: Set[_Question] = set()
-        self.turns = 0
-        self.is_waiting = False
+    order: int
+    function: Function
+    subject: Any
+    ask: Callable[[Function, Any], Any]
+    answer: Any
+    readers: Set[_Question] = field(default_factory=set)
+    turns: int = 0
+    is_waiting: bool = False
 
 
 class Questions:
@@ -53,8 +54,7 @@ class Questions:
             return self._known[key]
         question = self._asked.get(key)
         if question is None:
-            question = self._asked[key] = _Question(len(self._asked), function, subject, ask)
-            question.answer = nothing
+            question = self._asked[key] = _Question(len(self._asked), function, subject, ask, nothing)
             if self._reader is None:
                 self._settle(question)
                 return question.answer

@@ -20,9 +20,9 @@ def returned(function: Function) -> Optional[cst.CSTNode]:
         if isinstance(statement, cst.SimpleStatementLine):
             work[:0] = statement.body
         elif isinstance(statement, cst.Return):
-            return _filled(statement.value, names) if statement.value is not None else None
+            return _filled(function, statement.value, names) if statement.value is not None else None
         elif isinstance(statement, cst.Assign) and isinstance(statement.targets[0].target, cst.Name):
-            names[statement.targets[0].target.value] = _filled(statement.value, names)
+            names[statement.targets[0].target.value] = _filled(function, statement.value, names)
         elif not isinstance(statement, (cst.Assert, cst.Pass)) and not _is_text(statement):
             return None
     return None
@@ -32,18 +32,13 @@ def _is_text(statement: cst.CSTNode) -> bool:
     return isinstance(statement, cst.Expr) and isinstance(statement.value, (cst.SimpleString, cst.ConcatenatedString))
 
 
-def _filled(node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> cst.BaseExpression:
+def _filled(function: Function, node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> cst.BaseExpression:
     """Return an expression with the values of local names in their place."""
+    reads = set(map(id, function.flow.reads_in(node)))
 
     class Fill(cst.CSTTransformer):
         def leave_Name(self, original_node: cst.Name, updated_node: cst.Name) -> cst.BaseExpression:
-            return names.get(original_node.value, updated_node)
-
-        def leave_Attribute(self, original_node: cst.Attribute, updated_node: cst.Attribute) -> cst.BaseExpression:
-            return updated_node.with_changes(attr=original_node.attr)
-
-        def leave_Arg(self, original_node: cst.Arg, updated_node: cst.Arg) -> cst.Arg:
-            return updated_node.with_changes(keyword=original_node.keyword)
+            return names.get(original_node.value, updated_node) if id(original_node) in reads else updated_node
 
     filled = node.visit(Fill()) if names else node
     assert isinstance(filled, cst.BaseExpression)

@@ -276,13 +276,14 @@ class Purposes:
             return [(function, node)]
         return [leaf for entry in entries for leaf in self._leaves(function, entry, depth + 1)]
 
+    @remembered
     def _draws_a_model(self, function: Function, depth: int) -> bool:
         """Return whether a function gives a renderer Gaussians by their name, or calls one that does."""
         calls = function.flow.calls
         if any(set(words(call_name(call))) & RENDERERS and words_in(call) & GAUSSIANS for call in calls):
             return True
-        inner = [each for call in calls for each in callees(self.program, function, call)] if depth < 2 else []
-        return any(self._draws_a_model(each, depth + 1) for each in inner)
+        inner = (each for call in calls for each in callees(self.program, function, call))
+        return depth < 2 and any(self._draws_a_model(each, depth + 1) for each in inner)
 
 
 def _round(function: Function, node: cst.CSTNode, depth: int) -> _Round:

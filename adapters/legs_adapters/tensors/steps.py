@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Iterable
 
 import libcst as cst
@@ -37,6 +38,7 @@ def has_step(function: Function) -> bool:
     return "step" in function.text and any(map(is_step, function.flow.calls))
 
 
+@functools.lru_cache(maxsize=64)  # a term asks about what is called after it, and the next term again
 def reads_gradients(function: Function) -> bool:
     """Return whether a function reads gradients, ``xyz.grad``; not where they are only compared, assigned or reset."""
     parts = list(walk_expressions(function.body)) if "grad" in function.text else []

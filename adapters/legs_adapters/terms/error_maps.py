@@ -16,6 +16,8 @@ from legs_adapters.tensors.gradients import no_grad_around
 from legs_adapters.tensors.operations import EXTREMES, LEAVES, SIZES, TRANSFORMS
 from legs_adapters.terms.form import Form
 
+_USING = (cst.Attribute, cst.AugAssign, cst.BinaryOperation, cst.Call, cst.Comparison)  # isinstance is slow for others
+
 
 class _Uses:
     """The uses of a function's expressions, by their ids, found in one walk over it; and the values of its names."""
@@ -27,7 +29,7 @@ class _Uses:
         changed: List[cst.CSTNode] = []  # compared, squared, or scaled: a weight moves the threshold
         compared: List[cst.CSTNode] = []
         numbers: List[cst.CSTNode] = []
-        for part in walk_expressions(function.body):
+        for part in (part for part in walk_expressions(function.body) if type(part) in _USING):
             if isinstance(part, cst.Comparison):
                 compared += [part.left, *(each.comparator for each in part.comparisons)]
             elif isinstance(part, cst.BinaryOperation) and isinstance(part.operator, cst.Power):

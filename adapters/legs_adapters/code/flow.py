@@ -70,8 +70,7 @@ class Flow:
         self._loop_ends: Dict[int, Env] = {}  # by a loop's id: what its end hands back to its start
         self._exits: List[List[Env]] = []  # of the loops around: where a break or a continue leaves the body
         env = Env()
-        for parameter in every_parameter(parameters) if parameters is not None else ():
-            self._bind(env, Definition(parameter.name.value, "parameter", parameter, parameter.default))
+        self._bind_parameters(env, parameters or cst.Parameters())
         self._visit(body, env)
         by_class: Dict[type, List[Any]] = {}  # isinstance on every node takes longer than the walk
         for node in self._visited.values():
@@ -114,12 +113,9 @@ class Flow:
 
     def unchanged(self, *nodes: cst.CSTNode) -> bool:
         """Return whether the names in expressions are not reassigned anywhere in the body."""
-        for part in (part for node in nodes for part in walk_expressions(node)):
-            if isinstance(part, cst.Name) and self.reaching(part):
-                everywhere = {d for d in self.definitions.get(part.value, []) if d.kind != "store"}
-                if not everywhere.issubset(self.reaching(part)):
-                    return False
-        return True
+        found = [(read, self.reaching(read)) for node in nodes for read in self.reads_in(node)]
+        made = [({d for d in self.definitions[read.value] if d.kind != "store"}, some) for read, some in found if some]
+        return all(every.issubset(some) for every, some in made)
 
     def loops_around(self, node: cst.CSTNode) -> List[cst.CSTNode]:
         """Return the loops around a node of the body, the innermost first."""
@@ -134,6 +130,10 @@ class Flow:
             for other in [other for other in env if other.startswith((place + ".", place + "["))]:
                 del env[other]
         env[place] = definition
+
+    def _bind_parameters(self, env: Env, parameters: cst.Parameters) -> None:
+        for parameter in every_parameter(parameters):
+            self._bind(env, Definition(parameter.name.value, "parameter", parameter, parameter.default))
 
     def _add(self, env: Env, definition: Definition) -> None:
         definition = self._first(definition)
@@ -362,8 +362,7 @@ class Flow:
 
     def _visit_Lambda(self, node: cst.Lambda, env: Env) -> None:
         inner = self._copy(env)
-        for parameter in every_parameter(node.params):
-            self._bind(inner, Definition(parameter.name.value, "parameter", parameter, parameter.default))
+        self._bind_parameters(inner, node.params)
         self._visit(node.body, inner)
 
     def _visit_ListComp(self, node: cst.BaseSimpleComp | cst.DictComp, env: Env) -> None:

@@ -7,7 +7,7 @@ and the field's words in the names along it. A name with "depth" or "feature" ou
 
 from __future__ import annotations
 
-from typing import Dict, FrozenSet, List, Optional, Tuple
+from typing import FrozenSet, List, Optional, Tuple
 
 import libcst as cst
 
@@ -49,12 +49,11 @@ class Meanings:
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
-        self.rows: Dict[Tuple[int, int], bool] = {}  # see `is_rows`
-        self._questions = Questions()
+        self.questions: Questions = Questions()
 
     def meaning(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Return the meaning of an expression."""
-        return self._questions.answer(function, node, self._of, UNKNOWN)
+        return self.questions.answer(function, node, self._of, UNKNOWN)
 
     def origin(self, function: Function, node: cst.CSTNode) -> Meaning:
         """Return the meaning from a name's definitions, without the name itself."""
@@ -68,7 +67,7 @@ class Meanings:
         return self._joined(self._reached(*found) if found is not None else frozenset())
 
     def _reached(self, function: Function, reaching: Reaching) -> FrozenSet[Meaning]:
-        return self._questions.answer(function, reaching, self._ways, frozenset())
+        return self.questions.answer(function, reaching, self._ways, frozenset())
 
     def _joined(self, ways: FrozenSet[Meaning]) -> Meaning:
         """Return the meaning of what can come by several ways."""
@@ -95,7 +94,7 @@ class Meanings:
             return Meaning("mask", None)
         if is_of_neighbours(node, function.flow.value_of):
             return Meaning("gradient", self.meaning(function, node.left).role)  # type: ignore[attr-defined]
-        return mix((self.meaning(function, part) for part in _parts(node)), isinstance(node, cst.BinaryOperation))
+        return mix((self.meaning(function, part) for part in parts_of(node)), isinstance(node, cst.BinaryOperation))
 
     def _name(self, function: Function, node: cst.Name, flow: Meaning) -> Meaning:
         """Return the meaning of a name, of its words and of what is assigned to it."""
@@ -258,7 +257,7 @@ def _table_of(function: Function, node: cst.CSTNode) -> Optional[cst.Dict]:
     return table if isinstance(table, cst.Dict) else None
 
 
-def _parts(node: cst.CSTNode) -> List[cst.CSTNode]:
+def parts_of(node: cst.CSTNode) -> List[cst.CSTNode]:
     """Return the parts of an operation whose meanings are those of the whole."""
     if isinstance(node, (cst.BinaryOperation, cst.BooleanOperation)):
         parts: List[cst.CSTNode] = [node.left, node.right]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import List, Optional, Tuple
+from typing import Iterator, List, Optional, Tuple
 
 import libcst as cst
 
@@ -13,8 +13,6 @@ from legs_adapters.code.syntax import arguments, call_name, constant, key_of, wa
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.words import PICKING
 from legs_adapters.tensors.operations import JOINS, KEEPS_AXES
-
-_DEPTH = 4
 
 
 def is_mask(meanings: Meanings, function: Function, element: cst.SubscriptElement) -> bool:
@@ -35,61 +33,55 @@ def makes_mask(call: cst.Call) -> bool:
     return bool(set(words(call_name(call))) & PICKING) or call_name(call) == "quantile"
 
 
-def is_rows(meanings: Meanings, function: Function, node: Optional[cst.CSTNode | Reaching], depth: int = 0) -> bool:
-    """Return whether an expression, or what reaches it, is a list of pixels, ``image.reshape(-1, 3)``."""
-    if node is None or depth > _DEPTH:
-        return False
-    known = meanings.rows
-    if isinstance(node, Reaching) and not isinstance(node, Definition):
-        for join in node.joins(lambda part: (id(part), depth) in known):
-            known[id(join), depth] = any(is_rows(meanings, function, part, depth) for part in join.parts)
-    if (id(node), depth) not in known:
-        known[id(node), depth] = function.module.spend(1) and _is_rows(meanings, function, node, depth)
-    return known[id(node), depth]
+def is_rows(meanings: Meanings, function: Function, side: cst.CSTNode) -> bool:
+    """Return whether a side of a term, or what reaches it, is a list of pixels, ``image.reshape(-1, 3)``."""
+
+    def rows(where: Function, node: cst.CSTNode | Reaching) -> bool:
+        indices = node.slice if isinstance(node, cst.Subscript) and not isinstance(key_of(node), str) else ()
+        if node is not side and any(is_mask(meanings, where, index) for index in indices):
+            return True  # of a side itself, the images are written where both carry the mask
+        parts = [*_made_from(where, node), *_entries(meanings, where, node)]
+        return _flattens(node) or any(meanings.questions.answer(*part, rows, False) for part in parts)
+
+    return meanings.questions.answer(function, side, rows, False)
 
 
-def _is_rows(meanings: Meanings, function: Function, node: cst.CSTNode | Reaching, depth: int) -> bool:
-    parts: List[Optional[cst.CSTNode]] = []
+def _made_from(function: Function, node: cst.CSTNode | Reaching) -> List[Tuple[Function, cst.CSTNode | Reaching]]:
+    """Return what is a list of pixels where the whole is one."""
+    parts: List[Optional[cst.CSTNode | Reaching]] = []
     if isinstance(node, Definition):
         if node.kind == "mutate" and isinstance(node.value, cst.Call):
-            parts = [*arguments(node.value)[0]]  # crops = [], then crops.append(crop.flatten())
-        elif node.kind == "assign":
-            parts = [node.value]
+            parts += arguments(node.value)[0]  # crops = [], then crops.append(crop.flatten())
+        parts += [node.value] if node.kind == "assign" else []
+    elif isinstance(node, Reaching):
+        parts += node.parts
     elif isinstance(node, cst.BinaryOperation):
-        parts = [node.left, node.right]
+        parts += [node.left, node.right]
     elif isinstance(node, cst.Subscript):
-        if depth and not isinstance(key_of(node), str) and any(is_mask(meanings, function, e) for e in node.slice):
-            return True  # with a name: where both carry it, the images themselves are written
-        if any(is_rows(meanings, maker, value, depth + 1) for maker, value in _entries(meanings, function, node)):
-            return True
-        parts = [node.value]
+        parts += [node.value]
     elif isinstance(node, cst.Name):
-        return is_rows(meanings, function, function.flow.reaching(node), depth)
+        parts += [function.flow.reaching(node)]
     elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute):
-        if _flattens(node):
-            return True
-        parts = [*arguments(node)[0][:1]] if call_name(node) in JOINS else []
+        parts += arguments(node)[0][:1] if call_name(node) in JOINS else []
         parts += [node.func.value] if call_name(node) in KEEPS_AXES else []
-    return any(is_rows(meanings, function, part, depth + 1) for part in parts)
+    return [(function, part) for part in parts if part is not None]
 
 
-def _entries(meanings: Meanings, function: Function, node: cst.Subscript) -> List[Tuple[Function, cst.CSTNode]]:
-    """Return the values that ``package = render_all(...)`` writes under the key of ``package["mouths"]``."""
-    key, call = key_of(node), function.flow.value_of(node.value)
-    if not isinstance(key, str) or not isinstance(call, cst.Call):
-        return []
-    elements = [
-        (maker, element)
-        for maker in callees(meanings.program, function, call)
-        for part in walk_expressions(maker.body)
-        if isinstance(part, cst.Dict)
-        for element in part.elements
-    ]
-    return [(m, e.value) for m, e in elements if isinstance(e, cst.DictElement) and constant(e.key) == key]
+def _entries(
+    meanings: Meanings, function: Function, node: cst.CSTNode | Reaching
+) -> Iterator[Tuple[Function, cst.CSTNode]]:
+    """Yield the values that ``package = render_all(...)`` writes under the key of ``package["mouths"]``."""
+    if isinstance(node, cst.Subscript) and isinstance(key_of(node), str):
+        call = function.flow.value_of(node.value)
+        for maker in callees(meanings.program, function, call) if isinstance(call, cst.Call) else ():
+            literal = [part for part in walk_expressions(maker.body) if isinstance(part, cst.DictElement)]
+            yield from ((maker, each.value) for each in literal if constant(each.key) == key_of(node))
 
 
-def _flattens(node: cst.Call) -> bool:
+def _flattens(node: object) -> bool:
     """Return whether a call makes rows: ``image.flatten()``, ``image.reshape(3, -1)``, ``torch.masked_select(...)``."""
+    if not isinstance(node, cst.Call) or not isinstance(node.func, cst.Attribute):
+        return False
     if call_name(node) in ("reshape", "view"):
         sizes = [constant(value) for value in arguments(node)[0]]
         return -1 in sizes and len(sizes) < 3

@@ -5,12 +5,11 @@ No name of a variable counts. What is not followed for certain is not known.
 
 from __future__ import annotations
 
-from typing import AbstractSet, Dict, FrozenSet, Tuple
+from typing import AbstractSet, FrozenSet
 
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.program import Program
 from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.syntax import attribute_chain, call_name, code, constant, root_of, words, words_in
 from legs_adapters.lexicon.calls import CallReading, meaning_of_call, meaning_returned
@@ -18,20 +17,14 @@ from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import BACKGROUND, DATA, GAUSSIANS, RENDERERS, SPLATS
-from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.operations import PICTURE_FUNCTIONS, VIEWS
 
 RENDERING = Meaning("image", "render")
 PHOTOGRAPH = Meaning("image", "target")
-_DEPTH = 4
 
 
 class Ways(Meanings):
     """Answer for the expressions of one program as `Meanings` does, without the names of variables."""
-
-    def __init__(self, program: Program, training: Training) -> None:
-        super().__init__(program, training)
-        self._holding: Dict[Tuple[int, int], bool] = {}  # by the id of an expression or a join, and the depth
 
     def _name(self, function: Function, node: cst.Name, flow: Meaning) -> Meaning:
         return flow
@@ -82,33 +75,28 @@ class Ways(Meanings):
         texts += [run.module.path + code(run.body) for reference in found for run in self.program.run_by(reference)]
         return bool(GAUSSIANS & words_in(call)) or any(map(SPLATS.search, texts))
 
-    def _holds_data(self, function: Function, node: cst.CSTNode | Reaching, depth: int = 0) -> bool:
+    def _holds_data(self, function: Function, node: cst.CSTNode | Reaching) -> bool:
         """Return whether an object is a camera or a dataset's entry, by its name or those of what it is taken from.
 
         A camera of a view that was warped, or that nobody photographed, is none: ``pseudo_cam``.
         """
-        known = self._holding
-        for join in node.joins(lambda part: (id(part), depth) in known) if isinstance(node, Reaching) else ():
-            known[id(join), depth] = any(self._holds_data(function, part, depth) for part in join.parts)
-        if (id(node), depth) not in known:
-            known[id(node), depth] = function.module.spend(1) and self._holds(function, node, depth)
-        return known[id(node), depth]
+        return self.questions.answer(function, node, self._holds, False)
 
-    def _holds(self, function: Function, node: cst.CSTNode | Reaching, depth: int) -> bool:
+    def _holds(self, function: Function, node: cst.CSTNode | Reaching) -> bool:
         if isinstance(node, Reaching):
-            value = node.value if isinstance(node, Definition) else None
-            return value is not None and self._holds_data(function, value, depth + 1)
+            parts = [node.value] if isinstance(node, Definition) else node.parts
+            return any(part is not None and self._holds_data(function, part) for part in parts)
         chain = list(attribute_chain(node))
         names = [root_of(part) for part in chain if isinstance(part, (cst.Name, cst.Attribute))]
-        if depth > _DEPTH or "warp" in map(kind_of_words, names):
+        if "warp" in map(kind_of_words, names):
             return False
         root, call = chain[-1], chain[-2] if len(chain) > 1 else None
         if any(DATA & set(words(name)) for name in names):
             return "render" not in map(role_of_words, names)
         if isinstance(call, cst.Call) and call.args and call_name(call) in PICTURE_FUNCTIONS:
-            return self._holds_data(function, call.args[0].value, depth + 1)
+            return self._holds_data(function, call.args[0].value)
         found = self.program.lookup(function, root)
-        return found is not None and self._holds_data(*found, depth)
+        return found is not None and self._holds_data(*found)
 
     # -- definitions
 

@@ -5,8 +5,9 @@ An L1 whose gradients update only poses is tracking; one whose gradients are onl
 
 from __future__ import annotations
 
+import itertools
 import re
-from typing import Dict, List, Optional, Sequence, Set, Tuple
+from typing import Any, Callable, Dict, List, Optional, Sequence, Set, Tuple, TypeVar
 
 import libcst as cst
 
@@ -31,13 +32,13 @@ from legs_adapters.tensors.operations import NEW_TENSORS
 from legs_adapters.tensors.steps import has_step, is_backward, is_step, may_step, reads_gradients
 from legs_adapters.terms.findings import Evidence
 
+_T = TypeVar("_T")
 _DEPTH = 3
 # With the words of whose method runs it, and the calls that made those.
 _Step = Tuple[Function, cst.Call, Set[str], List[Tuple[Function, cst.Call]]]
 _Value = Tuple[Function, cst.CSTNode]
 _STEPS = re.compile(r"step(?:(?!step)\w)*\s*\(")
 _CALLED = re.compile(r"\b(\w+)\s*\(")
-_Round = Tuple[Function, Tuple[int, ...], int]
 _SETS_RATES = re.compile(r"""\[["']lr["']\]\s*[-+*/]?=[^=]|add_param_group|CyclicLR|OneCycleLR""")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 
@@ -48,25 +49,25 @@ class Purposes:
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
-        self._known: Dict[_Round, Optional[Evidence]] = {}
-        self._moving: Dict[_Round, bool] = {}
+        self._known: Dict[Tuple[str, Function, Tuple[int, ...], int], Any] = {}
 
     def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Evidence]:
         """Return the evidence that the backward pass of an expression trains no Gaussians; None where it may."""
         score = self.training.scores(node)
         if score is not None:
             return Evidence("no-step", "scoring", [score])
-        known = _round(function, node, depth)
-        if known not in self._known:
-            self._known[known] = self._purpose(function, node, depth)
-        return self._known[known]
+        return self._once(self._purpose, function, node, depth)
 
     def moves_gaussians(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
         """Return whether an optimiser that steps after the backward pass of an expression is known to have them."""
-        known = _round(function, node, depth)
-        if known not in self._moving:
-            self._moving[known] = self._moves(function, node, depth)
-        return self._moving[known]
+        return self._once(self._moves, function, node, depth)
+
+    def _once(self, ask: Callable[..., _T], function: Function, node: cst.CSTNode, depth: int) -> _T:
+        """Ask once for the terms of a round of a loop: the step after them is the same."""
+        known = ask.__name__, function, tuple(map(id, function.flow.loops_around(node))), depth
+        if known not in self._known:
+            self._known[known] = ask(function, node, depth)
+        return self._known[known]
 
     def _moves(self, function: Function, node: cst.CSTNode, depth: int) -> bool:
         if not any(map(is_backward, function.flow.calls)):
@@ -76,7 +77,9 @@ class Purposes:
 
     def _purpose(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[Evidence]:
         if not any(map(is_backward, function.flow.calls)):
-            return self._of_callers(function, depth)
+            sites = self.training.sites.get(function, []) if depth < _DEPTH else []
+            purposes = [self.purpose(caller, call, depth + 1) for caller, call in sites]
+            return purposes[0] if len({purpose and purpose.rule for purpose in purposes}) == 1 else None
         own, steps = self._after(function, node)
         if own is not None:
             return Evidence("no-step", "scoring", [(function, own)])
@@ -121,12 +124,11 @@ class Purposes:
         runs = [each for each in found if not any(map(is_backward, each.flow.calls))]
         steps = [step for each in runs for inner in each.flow.calls for step in self._steps(each, inner, depth + 1)]
         holder = call.func.value if isinstance(call.func, cst.Attribute) else None
-        makers = (
-            [(by, each.value) for by, each in _definitions(self.program, function, holder)] if holder and steps else []
-        )
+        if holder is None or not steps:
+            return steps
+        makers = [(by, each.value) for by, each in _definitions(self.program, function, holder)]
         made = [(by, value) for by, value in makers if isinstance(value, cst.Call)]
-        receiver = words_in(holder) if holder is not None else set()
-        return [(where, step, said | receiver, by + made) for where, step, said, by in steps]
+        return [(where, step, said | words_in(holder), by + made) for where, step, said, by in steps]
 
     @remembered
     def _stepping(self) -> Set[str]:
@@ -139,11 +141,6 @@ class Purposes:
                 known |= found
                 found = {name for name, called in calls if called & found}
         return known
-
-    def _of_callers(self, function: Function, depth: int) -> Optional[Evidence]:
-        sites = self.training.sites.get(function, []) if depth < _DEPTH else []
-        purposes = [self.purpose(caller, call, depth + 1) for caller, call in sites]
-        return purposes[0] if len({purpose and purpose.rule for purpose in purposes}) == 1 else None
 
     def _may_train(self, function: Function, call: cst.Call, depth: int, read: bool) -> bool:
         """Return whether a step may follow a call, in its function or then in the callers.
@@ -213,22 +210,25 @@ class Purposes:
         for where, definition in _definitions(self.program, function, optimiser):
             made = definition.value
             if definition.kind == "parameter" and depth < _DEPTH:
-                passed = given_to(self.program, where, definition.place)
-                for caller, value in ((caller, value) for caller, value in passed if value is not None):
-                    found += self._given(caller, value, makers, depth + 1) or [(caller, value)]
-            calls = [(where, made)]
+                for caller, value in given_to(self.program, where, definition.place):
+                    if value is not None:
+                        found += self._given(caller, value, makers, depth + 1) or [(caller, value)]
+            values = [(where, made)]
             if definition.kind == "element" and made is not None:  # for each in optimizers.values()
                 held = [each for part in attribute_chain(made) for each in _definitions(self.program, where, part)]
-                calls = [(holder, entry) for holder, each in held for entry in _entries(each.value)]
-            for maker in callees(self.program, where, made) if isinstance(made, cst.Call) else ():
-                for each in (each for each in maker.flow.returns if isinstance(each, cst.Call)):
-                    of = _optimised(each)
-                    passed_on = maker.given(made, of.value) if isinstance(of, cst.Name) else None  # type: ignore[arg-type]
-                    found += [(where, passed_on)] if passed_on is not None else []
-            known = [(by, of) for by, of in ((by, _optimised(each)) for by, each in calls) if of is not None]
-            for by, of in known if len(known) == len(calls) else ():
-                found += self._passed(where, of, makers) or [(by, of)]
+                values = [(holder, entry) for holder, each in held for entry in _entries(each.value)]
+            known = [self._made_with(*each) for each in values]
+            for by, of in itertools.chain(*known) if all(known) else ():
+                found += self._passed(by, of, makers) or [(by, of)]
         return found
+
+    def _made_with(self, where: Function, made: Optional[cst.CSTNode]) -> List[_Value]:
+        """Return what an optimiser is made with, in a helper too; nothing for what makes none."""
+        of = _optimised(made)
+        helpers = callees(self.program, where, made) if isinstance(made, cst.Call) and of is None else []
+        inner = [(helper, _optimised(value)) for helper in helpers for value in helper.flow.returns]
+        passed = [helper.given(made, own.value) for helper, own in inner if isinstance(own, cst.Name)]  # type: ignore[arg-type]
+        return [(where, each) for each in [of, *passed] if each is not None]
 
     def _passed(self, where: Function, of: cst.CSTNode, makers: Sequence[Tuple[Function, cst.Call]]) -> List[_Value]:
         """Return what a parameter of a constructor was given, where calls are known that made the object."""
@@ -251,30 +251,34 @@ class Purposes:
 
     def _leaves(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[_Value]:
         """Return the parameters in ``[{"params": [a, b]}, c]``, or in a name of such a list."""
-        entries: List[cst.CSTNode] = []
+        if self._is_still(node):
+            return []
+        entries = self._within(function, node) if depth <= _DEPTH else []
+        return [leaf for each in entries for leaf in self._leaves(*each, depth + 1)] if entries else [(function, node)]
+
+    def _within(self, function: Function, node: cst.CSTNode) -> List[_Value]:
+        """Return what a list, a group of parameters, or a name of a list has in it; nothing for anything else."""
+        entries: List[Optional[cst.CSTNode]] = []
         if isinstance(node, (cst.List, cst.Tuple)):
             entries = [element.value for element in node.elements]
-        elif self._is_still(node):
-            return []
         elif isinstance(node, cst.Dict):
             literal = [each for each in node.elements if isinstance(each, cst.DictElement)]
             entries = [each.value for each in literal if constant(each.key) == "params"]
         elif isinstance(node, cst.Name):
             values = function.flow.assigned(node)
-            entries = [value for value in values if isinstance(value, (cst.List, cst.Tuple))]
-            made = [value for value in values if isinstance(value, cst.Call)]
-            helpers = [helper for value in made for helper in callees(self.program, function, value)]
-            lists = [(by, of) for by in helpers for of in by.flow.returns if isinstance(of, (cst.List, cst.Tuple))]
-            if lists and not entries and depth < _DEPTH:
-                return [leaf for several in lists for leaf in self._leaves(*several, depth + 1)]
+            helpers = [
+                each
+                for value in values
+                if isinstance(value, cst.Call)
+                for each in callees(self.program, function, value)
+            ]
+            lists = [(function, value) for value in values] + [(by, of) for by in helpers for of in by.flow.returns]
+            return [each for each in lists if isinstance(each[1], (cst.List, cst.Tuple))]
         elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) == "values":
-            table = function.flow.value_of(node.func.value)
-            entries = [each for each in _entries(table) if each is not None]
+            entries = _entries(function.flow.value_of(node.func.value))
         elif isinstance(node, cst.Call) and call_name(node) == "list":
             entries = [arg.value for arg in node.args]
-        if not entries or depth > _DEPTH:
-            return [(function, node)]
-        return [leaf for entry in entries for leaf in self._leaves(function, entry, depth + 1)]
+        return [(function, each) for each in entries if each is not None]
 
     @remembered
     def _draws_a_model(self, function: Function, depth: int) -> bool:
@@ -284,11 +288,6 @@ class Purposes:
             return True
         inner = (each for call in calls for each in callees(self.program, function, call))
         return depth < 2 and any(self._draws_a_model(each, depth + 1) for each in inner)
-
-
-def _round(function: Function, node: cst.CSTNode, depth: int) -> _Round:
-    """Return what the terms of a round of a loop share: the step after them is the same."""
-    return function, tuple(map(id, function.flow.loops_around(node))), depth
 
 
 def _definitions(program: Program, function: Function, node: cst.CSTNode) -> List[Tuple[Function, Definition]]:

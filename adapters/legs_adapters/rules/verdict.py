@@ -12,6 +12,7 @@ from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import attribute_chain, call_name, key_of, one_line, same, words, words_in
+from legs_adapters.lexicon.depiction import parts_of
 from legs_adapters.lexicon.meaning import UNKNOWN, swapped
 from legs_adapters.lexicon.names import kind_of_words
 from legs_adapters.lexicon.ways import PHOTOGRAPH
@@ -77,12 +78,8 @@ class Verdicts:
         if others_read and not loss:
             return Left.at(function, place, Evidence("untrained", "untrained", term.here))
         if others_read:
-            alone = (
-                len(loss) == 1
-                and loss[0] not in others_read
-                and isinstance(function.flow.reaching(loss[0]), Definition)
-            )
-            if not alone or not function.flow.unchanged(form.first, form.second):
+            is_one = len(loss) == 1 and isinstance(function.flow.reaching(loss[0]), Definition)
+            if not is_one or loss[0] in others_read or not function.flow.unchanged(form.first, form.second):
                 reason = f"{one_line(form.node)} has other uses than the loss"
                 return _ByHand(reason, "weight a second error map, for the loss, and leave this one to its other uses")
             form = Reread(loss[0], form.call, form.first, form.second)
@@ -136,19 +133,9 @@ class Verdicts:
 
     def _why_by_hand(self, term: Term, by_hand: bool) -> Optional[_ByHand]:
         """Return why no edit gives the images their weights; None where one may."""
-        pair = term.pair
-        if swapped(pair.a, pair.b) is None and not by_hand:
-            sides = f"{one_line(pair.first)} and {one_line(pair.second)}"
-            return _ByHand(f"cannot tell which of {sides} is the rendering and which the photograph")
-        if "target" not in (pair.a.role, pair.b.role) and not by_hand:
-            return _ByHand(f"nothing shows that {one_line(term.target)} is a photograph")
-        if UNKNOWN in (pair.a, pair.b) and not by_hand:
-            return _ByHand(f"nothing shows that {one_line(term.prediction)} is a rendering")
-        made = None if by_hand else self._unknown_maker(term.function, term.target)
-        if made is not None:
-            return _ByHand(f"nothing shows what {one_line(made)} makes of the photograph")
-        if not by_hand and self._is_unknown_entry(term.function, term.prediction):
-            return _ByHand(f"nothing shows which pictures {one_line(term.prediction)} takes")
+        untold = "" if by_hand else self._untold(term)
+        if untold:
+            return _ByHand(untold)
         if term.has_rows:
             why = "the sides are lists of pixels: a weight map needs whole images"
             return _ByHand(why, "weight the L1 of the whole images, before pixels are picked or flattened")
@@ -159,31 +146,44 @@ class Verdicts:
             return _ByHand(why, _OF_DIFFERENCE)
         return None
 
+    def _untold(self, term: Term) -> str:
+        """Return what nothing shows of a term, and the user's word would; "" where all is shown."""
+        pair, target, prediction = term.pair, one_line(term.target), one_line(term.prediction)
+        if swapped(pair.a, pair.b) is None:
+            sides = f"{one_line(pair.first)} and {one_line(pair.second)}"
+            return f"cannot tell which of {sides} is the rendering and which the photograph"
+        if "target" not in (pair.a.role, pair.b.role):
+            return f"nothing shows that {target} is a photograph"
+        if UNKNOWN in (pair.a, pair.b):
+            return f"nothing shows that {prediction} is a rendering"
+        made = self._unknown_maker(term.function, term.target)
+        if made is not None:
+            return f"nothing shows what {one_line(made)} makes of the photograph"
+        is_told = not self._is_unknown_entry(term.function, term.prediction)
+        return "" if is_told else f"nothing shows which pictures {prediction} takes"
+
     def _unknown_maker(self, function: Function, target: cst.BaseExpression) -> Optional[cst.Call]:
         """Return what makes a target of a photograph, ``teacher(photo)``, where nothing shows what that does."""
         meaning = self.analysis.meanings.meaning
         work: List[Tuple[Function, cst.CSTNode]] = [(function, target)]
         for where, node in work:  # which grows
-            parts: List[cst.CSTNode] = where.flow.assigned(node)
-            if isinstance(node, cst.Call):
+            parts = [*where.flow.assigned(node), *parts_of(node)]
+            returned: List[Tuple[Function, cst.CSTNode]] = []
+            if isinstance(node, cst.Subscript):
+                parts = [node.value]
+            elif isinstance(node, cst.Call):
                 given = [arg.value for arg in node.args if not FILES & words_in(arg.value)]
                 if PHOTOGRAPH in [meaning(where, each) for each in given] and self._is_unknown(where, node):
                     return node
                 runs = callees(self.analysis.program, where, node)
-                new = [(callee, value) for callee in runs for value in callee.flow.returns]
-                work += [each for each in new if each not in work] if len(work) < _MOST else []
+                returned = [(callee, value) for callee in runs for value in callee.flow.returns]
                 parts = [*given, *attribute_chain(node.func)] if call_name(node) in KEEPS_PICTURES else []
-            elif isinstance(node, cst.Subscript):
-                parts = [node.value]
             elif isinstance(node, cst.BinaryOperation):  # photo * segment(photo): a mask
-                sides = [node.left, node.right]
-                are_calls = PHOTOGRAPH == meaning(where, node.left) == meaning(where, node.right)
-                parts = [side for side in sides if not (are_calls and isinstance(side, cst.Call))]
-            elif isinstance(node, cst.IfExp):
-                parts = [node.body, node.orelse]
-            pictures = [part for part in parts if meaning(where, part).kind in (None, "image")]  # no mask of it
+                shown = [part for part in parts if meaning(where, part) == PHOTOGRAPH]
+                parts = [part for part in parts if len(shown) < 2 or not isinstance(part, cst.Call)]
+            pictures = [(where, part) for part in parts if meaning(where, part).kind in (None, "image")]
             goes_on = where.module.spend(1 + len(parts)) and len(work) < _MOST
-            work += [(where, part) for part in pictures if (where, part) not in work] if goes_on else []
+            work += [each for each in pictures + returned if each not in work] if goes_on else []
         return None
 
     def _is_unknown(self, function: Function, call: cst.Call) -> bool:
@@ -199,13 +199,17 @@ class Verdicts:
         return name not in MODULES and not hasattr(builtins, name)
 
     def _is_unknown_entry(self, function: Function, side: cst.CSTNode) -> bool:
-        """Return whether a picture is under any key, or one in another that no word tells: ``package["out"]["D"]``."""
+        """Return whether it is under each key in turn, or one in another that no word tells: ``package["out"]["D"]``."""
         entry = function.flow.value_of(side) or side
-        keys = [key_of(part) for part in attribute_chain(entry) if isinstance(part, cst.Subscript)]
-        named = [kind_of_words(key) for key in keys if isinstance(key, str)]
-        is_untold = isinstance(entry, cst.Subscript) and len(named) > 1 and "image" not in named
-        is_untold = is_untold and self.analysis.meanings.meaning(function, entry).kind is None
-        return is_untold or _is_any_entry(function, entry)
+        if not isinstance(entry, cst.Subscript):
+            return False
+        named = [kind_of_words(key) for key in map(key_of, attribute_chain(entry)) if isinstance(key, str)]
+        if len(named) > 1 and "image" not in named and self.analysis.meanings.meaning(function, entry).kind is None:
+            return True
+        index = entry.slice[-1].slice  # package[name] of `for name in package`
+        looped = [made.value for made in function.flow.reaching(index.value)] if isinstance(index, cst.Index) else []
+        holders = [part for value in looped if value is not None for part in attribute_chain(value)]
+        return any(same(entry.value, holder) for holder in holders)
 
     def _why_photograph(self, term: Term) -> str:
         """Return what shows that a side is the photograph."""
@@ -215,11 +219,3 @@ class Verdicts:
             return f"{name} is {'' if is_place else 'made from '}the photograph"
         where = "a parameter, " if term.function.is_parameter(term.target) else ""
         return f"{name} is {where}the photograph by its name"
-
-
-def _is_any_entry(function: Function, entry: cst.CSTNode) -> bool:
-    """Return whether it is under each key of its holder in turn: ``package[name]`` of ``for name in package``."""
-    index = entry.slice[-1].slice if isinstance(entry, cst.Subscript) else None
-    looped = [made.value for made in function.flow.reaching(index.value)] if isinstance(index, cst.Index) else []
-    holders = [part for value in looped if value is not None for part in attribute_chain(value)]
-    return isinstance(entry, cst.Subscript) and any(same(entry.value, holder) for holder in holders)

@@ -93,32 +93,25 @@ def _number(call: CallReading) -> Optional[Meaning]:
     return UNKNOWN if is_number or call.name in ASKS else None
 
 
-def _extreme(call: CallReading) -> Optional[Meaning]:
-    """The brightest pixel, or of each pixel the brightest channel: a prior, no photograph."""
+def _reduced(call: CallReading) -> Optional[Meaning]:
+    """A number of the whole image, or one a channel; the brightest pixel, or the brightest channel of each: a prior."""
     of = call.owner or next(iter(call.positional), None)
+    positional = call.positional if call.owner is not None else call.positional[1:]
+    axes = [*positional, *(value for name, value in call.keywords.items() if name in ("dim", "axis"))]
+    if call.name in REDUCES and all(isinstance(constant(axis), tuple) for axis in axes):
+        return Meaning("parameter", None)
     if call.name not in EXTREMES or of is None:
         return None
-    meaning, axes = call.ask(of), call.positional[0 if call.owner is not None else 1 :]
+    meaning = call.ask(of)
     by_axis = "dim" in call.keywords or any(isinstance(constant(axis), int) for axis in axes)
     return meaning._replace(kind="parameter") if meaning.kind == "image" and by_axis else meaning
 
 
-def _reduced(call: CallReading) -> Optional[Meaning]:
-    """A number of the whole image, or one a channel."""
-    axes = call.positional if call.owner is not None else call.positional[1:]
-    axes = [*axes, *(value for name, value in call.keywords.items() if name in ("dim", "axis"))]
-    whole = call.name in REDUCES and all(isinstance(constant(axis), tuple) for axis in axes)
-    return Meaning("parameter", None) if whole else None
-
-
-def _statistic(call: CallReading) -> Optional[Meaning]:
-    is_statistic = STATISTICS & set(words(call.name)) and call.values
-    return Meaning("feature", call.ask(call.values[0]).role) if is_statistic else None
-
-
 def _filtered(call: CallReading) -> Optional[Meaning]:
+    """A statistic of a picture, or what a filter finds in it."""
     filters = call.name in ("conv2d", "filter2d", "spatial_gradient") and "stride" not in call.keywords
-    return Meaning("gradient", call.ask(call.values[0]).role) if filters and call.values else None
+    kind = "feature" if STATISTICS & set(words(call.name)) else "gradient" if filters else None
+    return Meaning(kind, call.ask(call.values[0]).role) if kind and call.values else None
 
 
 def _moved(call: CallReading) -> Optional[Meaning]:
@@ -232,6 +225,5 @@ def _of_owner(call: CallReading) -> Optional[Meaning]:
 
 
 _SURE: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
-    *(_number, _extreme, _reduced, _statistic, _filtered, _moved),
-    *(_keyed, _rendered, _named),
+    *(_number, _reduced, _filtered, _moved, _keyed, _rendered, _named),
 )

@@ -7,7 +7,7 @@ the syntax tree; a term that cannot be decided becomes a problem that needs a ma
 from __future__ import annotations
 
 import re
-from typing import Any, Dict, FrozenSet, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, FrozenSet, Iterable, Iterator, List, Optional, Sequence, Set, Tuple, Union
 
 from legs_adapters.code.limits import Budget
 from legs_adapters.code.module import Function, Module
@@ -76,7 +76,9 @@ class _Finder:
     def __init__(self, analysis: Analysis, by_hand: Sequence[Tuple[str, int]], bar: Any) -> None:
         self.analysis = analysis
         self.bar = bar
-        self.by_hand = set(by_hand)
+        self.by_hand: Dict[str, List[int]] = {}  # the lines that the user named, by their file
+        for path, line in dict.fromkeys(by_hand):
+            self.by_hand.setdefault(path, []).append(line)
         self.verdicts = Verdicts(analysis)
         self.found = Findings([], [], [], [], [], [], analysis.program)
         self.doubtful: List[Tuple[Left, Problem]] = []
@@ -106,57 +108,52 @@ class _Finder:
             quoted = {id(left) for left, _ in self.doubtful}
             found.left[:] = [left for left in found.left if id(left) not in quoted]
         elif not self.by_hand:
-            found.doubts.extend(problem for left, problem in self.doubtful if self._trains_alone(left))
+            paths = self._open()
+            doubted = [(left, one) for left, one in self.doubtful if RULES[left.rule].is_doubted_beside_sites]
+            found.doubts.extend(problem for left, problem in doubted if left.path in paths)
         found.unreadable.extend(program.unreadable[path] for path in sorted(program.unreadable))
         return found._replace(unsettled=self._unsettled())
 
     def _unsettled(self) -> FrozenSet[str]:
         """Return the files that train Gaussians, and whose loss has no term that is weighted or reported."""
-        found, training = self.found, self.analysis.training
-        entries: List[Any] = [*found.sites, *found.patched, *found.problems, *found.doubts]
-        above = [site.scope for site in found.sites]
+        training = self.analysis.training
+        above = [site.scope for site in self.found.sites]
         for function in above:  # which grows
             above += [caller for caller, _ in training.sites.get(function, ()) if caller not in above]
-        settled = {entry.path for entry in entries} | {function.module.path for function in above}
-        open_roots = [root for root in training.roots if root.module.path not in settled]
-        about = [] if self.by_hand else [root for root in open_roots if self.analysis.splats.is_about(root)]
-        return frozenset(root.module.path for root in about)
+        paths = set() if self.by_hand else self._open() - {function.module.path for function in above}
+        roots = [root for root in training.roots if root.module.path in paths]
+        return frozenset(root.module.path for root in roots if self.analysis.splats.is_about(root))
 
-    def _trains_alone(self, left: Left) -> bool:
-        """Return whether its file trains, and has no term that is weighted or reported as a problem."""
+    def _open(self) -> Set[str]:
+        """Return the files that train, and have no term that is weighted or reported."""
         found = self.found
-        entries: List[Any] = [*found.sites, *found.patched, *found.problems]
-        is_settled = any(entry.path == left.path for entry in entries)
-        trains = any(root.module.path == left.path for root in self.analysis.training.roots)
-        return trains and RULES[left.rule].is_doubted_beside_sites and not is_settled
+        entries: List[Any] = [*found.sites, *found.patched, *found.problems, *found.doubts]
+        return {root.module.path for root in self.analysis.training.roots} - {entry.path for entry in entries}
 
     def _module(self, module: Module) -> None:
         found = self.found
         entries: List[_Entry] = []
-        patched: List[Left] = []
         may_have = self.analysis.prospects.may_have
-        is_named = any(path == module.path for path, _ in self.by_hand)
+        is_named = module.path in self.by_hand
         for function in module.scopes(lambda text: is_named or may_have(text) or _MAY_HAVE_L1.search(text)):
             if not module.spend(len(function.text) // _TEXT):
                 return
             entries += self._entries(function)
-            nodes = patched_nodes(self.analysis.program, function)
-            patched += [Left.at(function, function.place(node), "patched") for node in nodes]
         lists: Dict[type, List[Any]] = {Site: found.sites, Problem: found.problems, Left: found.left}
-        for _, entry in sorted(entries, key=lambda item: (item[0].line, item[0].column)):
-            lists[type(entry)].append(entry)
-        found.patched.extend(sorted(patched, key=lambda entry: entry.line))
+        for _, entry in sorted(entries, key=lambda item: item[0]):
+            is_patched = isinstance(entry, Left) and entry.reason == "patched"
+            (found.patched if is_patched else lists[type(entry)]).append(entry)
 
     def _entries(self, function: Function) -> Iterator[_Entry]:
         """Yield the verdict on each L1 in a function, with its place."""
         yield from self._of_forms(function)
         if self.by_hand:
             yield from self._of_named_lines(function)
-        callbacks = self.analysis.callbacks.assigned_in(function)
-        found: List[Tuple[Form, Union[Site, Left]]]
-        found = [(form, self.verdicts.decide_callback(function, form)) for form in callbacks]
-        registered = self.analysis.callbacks.registered_in(function)
-        found += [(form, self.verdicts.callable(function, form)) for form in registered]
+        for node in patched_nodes(self.analysis.program, function):
+            yield function.place(node), Left.at(function, function.place(node), "patched")
+        callbacks, decide = self.analysis.callbacks, self.verdicts
+        found = [(form, decide.decide_callback(function, form)) for form in callbacks.assigned_in(function)]
+        found += [(form, decide.callable(function, form)) for form in callbacks.registered_in(function)]
         for form, verdict in found:
             place = function.place(form.node)
             if not self.by_hand or self._is_chosen(function, place):
@@ -182,7 +179,7 @@ class _Finder:
         """Return the terms on named lines: of several on one those that no rule skips, or not as of another kind."""
         kinds, meant = {rule.id for rule in KINDS}, []
         places = [(f, function.place(f.node)) for f in self.analysis.forms.in_function(function)]
-        for line in (line for path, line in self.by_hand if path == function.module.path):
+        for line in self.by_hand.get(function.module.path, ()):
             named = [form for form, place in places if place.line <= line <= place.last_line]
             why = [first(Term(self.analysis, function, form)) for form in named] if len(named) > 1 else []
             clear = [form for form, evidence in zip(named, why) if evidence is None]
@@ -211,5 +208,4 @@ class _Finder:
                 return
 
     def _is_chosen(self, function: Function, place: Place) -> bool:
-        path = function.module.path
-        return any(path == chosen and place.line <= line <= place.last_line for chosen, line in self.by_hand)
+        return any(place.line <= line <= place.last_line for line in self.by_hand.get(function.module.path, ()))

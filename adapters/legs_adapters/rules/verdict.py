@@ -199,7 +199,7 @@ class Verdicts:
         return name not in MODULES and not hasattr(builtins, name)
 
     def _is_unknown_entry(self, function: Function, side: cst.CSTNode) -> bool:
-        """Return whether it is under each key in turn, or one in another that no word tells: ``package["out"]["D"]``."""
+        """Return whether it is under each key in turn, or one in another that no word tells: ``pkg["out"]["D"]``."""
         entry = function.flow.value_of(side) or side
         if not isinstance(entry, cst.Subscript):
             return False

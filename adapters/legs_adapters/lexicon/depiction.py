@@ -144,15 +144,24 @@ class Meanings:
 
     def _member(self, function: Function, node: cst.Attribute | cst.Subscript, name: str) -> Meaning:
         """Return the meaning of an attribute or an entry: of its words, what is assigned to it, and who holds it."""
-        local = self._flow(function, node) if function.flow.reaching(node) else UNKNOWN
-        if local == UNKNOWN and isinstance(node, cst.Attribute) and dotted(node.value) == "self":
-            owner = self.program.owner_of(function)
-            stores = owner.stores(name) if owner is not None else []
-            local = mix(self._definition(method, definition) for method, definition in stores[:6])
+        local = self._kept(function, node)
         role = role_of_words(name) or local.role
         if role is None and not BACKGROUND & set(words(name)):
             role = self._role_of_holder(function, node.value)
         return Meaning(more_special(kind_of_words(name), local.kind), role)
+
+    def _kept(self, function: Function, node: cst.Attribute | cst.Subscript) -> Meaning:
+        """Return the meaning of what is assigned to a member here, or to ``self.name`` anywhere in its class."""
+        local = self._flow(function, node) if function.flow.reaching(node) else UNKNOWN
+        own = node.attr.value if isinstance(node, cst.Attribute) and dotted(node.value) == "self" else ""
+        owner = self.program.owner_of(function) if own and local == UNKNOWN else None
+        stores = owner.stores(own)[:6] if owner is not None else []
+        kept = [self._definition(*each) for each in stores]
+        table = function.flow.value_of(node.value)
+        literal = table.elements if isinstance(table, cst.Dict) and local == UNKNOWN else ()
+        named = [each for each in literal if isinstance(each, cst.DictElement) and constant(each.key) == key_of(node)]
+        kept += [self.meaning(function, each.value) for each in named]
+        return self._joined(frozenset(kept)) if kept else local
 
     def _role_of_holder(self, function: Function, node: cst.CSTNode) -> Optional[str]:
         """Return the role from the container: ``outputs["rgb"]`` is rendered, ``batch["rgb"]`` a target."""

@@ -58,16 +58,6 @@ class Ways(Meanings):
         is_photograph = kind == "image" and says != "render" and self._holds_data(function, node.value)
         return Meaning(kind, "target" if is_photograph else None)
 
-    def _kept(self, function: Function, node: cst.Attribute | cst.Subscript) -> Meaning:
-        """Return the meaning of what is assigned to a member here, or to ``self.name`` anywhere in its class."""
-        if function.flow.reaching(node):
-            return self._flow(function, node)
-        owner = self.program.owner_of(function)
-        if owner is None or not isinstance(node, cst.Attribute) or not isinstance(node.value, cst.Name):
-            return UNKNOWN
-        stores = owner.stores(node.attr.value) if node.value.value == "self" else []
-        return _agreed({self._definition(method, definition) for method, definition in stores})
-
     def _draws_splats(self, function: Function, call: cst.Call) -> bool:
         """Return whether a renderer is known to draw Gaussians: by what it is given, or where and how it is defined."""
         found = self.program.resolve(function, call.func)

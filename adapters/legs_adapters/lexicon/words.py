@@ -70,9 +70,8 @@ RENDER = RENDERERS | word_set(
     """
 )
 LAID_OVER = word_set("mask masks valid weight weights diff error errors")
-OF_PICTURES = word_set(
-    "sky sh shs prior time light dx dy"
-)  # a mask, for example, unless something shows that it is an image
+# A mask, for example, unless something shows that it is an image.
+OF_PICTURES = word_set("sky sh shs prior time light dx dy")
 FILES = word_set("file filename name path")  # of a picture: where it is, no picture
 BACKGROUND = word_set("bg bkgd background backgrounds")  # a colour to lay things over, whoever keeps it
 PICKING = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
@@ -108,13 +107,8 @@ _SHOWING = word_set("render validate validation")
 # A function's first word, where it does not train ...
 NOT_TRAINING = _SHOWING | word_set("eval evaluate test inference")
 # ... and any word of one through which nothing is trained.
-REPORTING = (
-    EVALUATING
-    | _SHOWING
-    | word_set(
-        "testing report reports metric metrics valid visualize vis benchmark check gradcheck compare psnr quality"
-    )
-)
+_REPORTS = word_set("testing report reports metric metrics valid visualize vis benchmark check gradcheck")
+REPORTING = EVALUATING | _SHOWING | _REPORTS | word_set("compare psnr quality")
 SCORING = word_set(
     "score scores scoring importance densify densification prune pruning sensitivity sample sampling error"
 )

@@ -142,7 +142,8 @@ class _Finder:
         lists: Dict[type, List[Any]] = {Site: found.sites, Problem: found.problems, Left: found.left}
         for _, entry in sorted(entries, key=lambda item: item[0]):
             is_patched = isinstance(entry, Left) and entry.reason == "patched"
-            (found.patched if is_patched else lists[type(entry)]).append(entry)
+            kept: List[Any] = found.patched if is_patched else lists[type(entry)]
+            kept.append(entry)
 
     def _entries(self, function: Function) -> Iterator[_Entry]:
         """Yield the verdict on each L1 in a function, with its place."""

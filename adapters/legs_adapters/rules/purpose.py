@@ -34,8 +34,8 @@ from legs_adapters.terms.findings import Evidence
 
 _T = TypeVar("_T")
 _DEPTH = 3
-# With the words of whose method runs it, and the calls that made those.
-_Step = Tuple[Function, cst.Call, Set[str], List[Tuple[Function, cst.Call]]]
+# With the optimiser, the words of whose method runs it, and the calls that made those.
+_Step = Tuple[Function, cst.Call, cst.BaseExpression, Set[str], List[Tuple[Function, cst.Call]]]
 _Value = Tuple[Function, cst.CSTNode]
 _STEPS = re.compile(r"step(?:(?!step)\w)*\s*\(")
 _CALLED = re.compile(r"\b(\w+)\s*\(")
@@ -84,7 +84,7 @@ class Purposes:
         if own is not None:
             return Evidence("no-step", "scoring", [(function, own)])
         moved, first = [self._moved(step) for step in steps], [step[:2] for step in steps[:1]]
-        if steps and not any(map(self._moves_any, steps)):
+        if steps and all(self._moved_by(step) == [] for step in steps):
             return Evidence("no-step", "scoring", first)
         if steps and all(some & (POSES | EMBEDDING) and not some & MODELS for some in moved):
             return Evidence("pose-step", "tracking", first)
@@ -113,8 +113,8 @@ class Purposes:
 
     def _steps(self, function: Function, call: cst.Call, depth: int = 0) -> List[_Step]:
         """Return the steps of a call: its own, or those of the functions that it calls and that take no gradient."""
-        if is_step(call):
-            return [(function, call, set(), [])]
+        if isinstance(call.func, cst.Attribute) and is_step(call):
+            return [(function, call, call.func.value, set(), [])]
         name = call_name(call)
         if name not in self._stepping() or depth > _DEPTH:
             return []
@@ -128,7 +128,7 @@ class Purposes:
             return steps
         makers = [(by, each.value) for by, each in _definitions(self.program, function, holder)]
         made = [(by, value) for by, value in makers if isinstance(value, cst.Call)]
-        return [(where, step, said | words_in(holder), by + made) for where, step, said, by in steps]
+        return [(where, step, of, said | words_in(holder), by + made) for where, step, of, said, by in steps]
 
     @remembered
     def _stepping(self) -> Set[str]:
@@ -167,24 +167,20 @@ class Purposes:
 
     def _moved(self, step: _Step) -> Set[str]:
         """Return the words in an optimiser's name, and in the parameters that it was made with."""
-        function, call, said, makers = step
-        assert isinstance(call.func, cst.Attribute)
-        optimiser = call.func.value
+        function, _, optimiser, said, makers = step
         name = set(words(optimiser.attr.value)) if isinstance(optimiser, cst.Attribute) else set()
         found = said | (name if name & POSES else words_in(optimiser))  # gaussians.optimizer_cam moves cameras
         for where, given in self._given(function, optimiser, makers):
             leaves = [leaf for _, leaf in self._leaves(where, given)]
-            found |= set().union(*map(self._named_in, [given, *where.flow.assigned(given), *leaves]))
+            leaves += where.flow.assigned(given) if leaves == [given] else []  # a name of no list
+            found |= set().union(*map(_named_in, leaves))
         return found - PLUMBING
 
-    def _named_in(self, given: cst.CSTNode) -> Set[str]:
-        """Return the words of what is given; of ``[cam.pose for cam in scene.cameras]`` those of the pose."""
-        if self._is_still(given):
-            return set()
-        if isinstance(given, (cst.List, cst.Tuple, cst.Dict)):
-            return set().union(*(self._named_in(each.value) for each in given.elements))
-        elements = words_in(given.elt) - PLUMBING if isinstance(given, cst.ListComp) else set()
-        return elements if elements & (POSES | EMBEDDING | MODELS) else words_in(given)
+    def _moved_by(self, step: _Step) -> Optional[List[_Value]]:
+        """Return the parameters of an optimiser; None where those are not known."""
+        function, _, optimiser, _, makers = step
+        given = self._given(function, optimiser, makers)
+        return [leaf for each in given for leaf in self._leaves(*each)] if given else None
 
     def _is_still(self, node: cst.CSTNode) -> bool:
         """Return whether it is a group of parameters with the rate 0, in a checkout that sets no rate later."""
@@ -195,12 +191,6 @@ class Purposes:
     @remembered
     def _sets_rates(self) -> bool:
         return any(_SETS_RATES.search(source.text) for source in self.program.sources.values())
-
-    def _moves_any(self, step: _Step) -> bool:
-        """Return whether an optimiser may move anything: not where the rate of each group is 0."""
-        assert isinstance(step[1].func, cst.Attribute)
-        given = self._given(step[0], step[1].func.value, step[3])
-        return not given or any(self._leaves(*each) for each in given)
 
     def _given(
         self, function: Function, optimiser: cst.CSTNode, makers: Sequence[Tuple[Function, cst.Call]], depth: int = 0
@@ -241,8 +231,7 @@ class Purposes:
 
     def _is_beside(self, step: _Step) -> bool:
         """Return whether an optimiser has tensors alone that are made for it, none for each Gaussian."""
-        assert isinstance(step[1].func, cst.Attribute)
-        leaves = [leaf for given in self._given(step[0], step[1].func.value, step[3]) for leaf in self._leaves(*given)]
+        leaves = [leaf for leaf in self._moved_by(step) or () if not isinstance(leaf[1], cst.SimpleString)]
         values: List[Tuple[Function, Optional[cst.CSTNode]]] = []
         for leaf in leaves:
             made = [(where, each.value) for where, each in _definitions(self.program, *leaf)]
@@ -263,7 +252,7 @@ class Purposes:
             entries = [element.value for element in node.elements]
         elif isinstance(node, cst.Dict):
             literal = [each for each in node.elements if isinstance(each, cst.DictElement)]
-            entries = [each.value for each in literal if constant(each.key) == "params"]
+            entries = [each.value for each in literal if constant(each.key) in ("params", "name")]
         elif isinstance(node, cst.Name):
             values = function.flow.assigned(node)
             helpers = [
@@ -273,7 +262,7 @@ class Purposes:
                 for each in callees(self.program, function, value)
             ]
             lists = [(function, value) for value in values] + [(by, of) for by in helpers for of in by.flow.returns]
-            return [each for each in lists if isinstance(each[1], (cst.List, cst.Tuple))]
+            return [each for each in lists if isinstance(each[1], (cst.List, cst.Tuple, cst.Dict))]
         elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) == "values":
             entries = _entries(function.flow.value_of(node.func.value))
         elif isinstance(node, cst.Call) and call_name(node) == "list":
@@ -306,6 +295,12 @@ def _optimised(made: Optional[cst.CSTNode]) -> Optional[cst.CSTNode]:
         return None
     positional, keywords, _ = arguments(made)
     return keywords.get("params") or next(iter(positional), None)
+
+
+def _named_in(given: cst.CSTNode) -> Set[str]:
+    """Return the words of what is given; of ``[cam.pose for cam in scene.cameras]`` those of the pose."""
+    elements = words_in(given.elt) - PLUMBING if isinstance(given, cst.ListComp) else set()
+    return elements if elements & (POSES | EMBEDDING | MODELS) else words_in(given)
 
 
 def _entries(value: Optional[cst.CSTNode]) -> List[Optional[cst.CSTNode]]:

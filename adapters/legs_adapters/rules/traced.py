@@ -212,8 +212,13 @@ class _Join:
         """Report a term that is not weighted, where no photometric one was decided on its line."""
         if any(candidate.key in self.settled for candidate in stack):
             return
-        if not stack:
-            return self._without_form(traced)
+        if not stack:  # that of a photograph is said: it is squared, or compiled
+            here = self._line(traced.frames[0])
+            is_said = traced.kind not in ("l1", "signed") and not traced.why_other
+            if is_said and here.path in self.analysis.program.sources:
+                self.entries.append(Left(*here, traced.text(self._name(traced, [])), (here,)))
+                self.settled.add((here.path, here.line))
+            return
         own = [candidate for candidate in stack if not self._is_definition(candidate)] or stack
         candidate = own[0]
         place, text = candidate.function.place(candidate.form.node), traced.text(self._name(traced, [candidate]))
@@ -225,13 +230,6 @@ class _Join:
             why = Evidence("", text + self._differs(candidate, self.found.sites, "weighted"), ())
             self.entries.append(Left.at(candidate.function, place, why))
         self.settled.update(candidate.key for candidate in own)
-
-    def _without_form(self, traced: Traced) -> None:
-        """Report a photograph's loss that is no L1: squared, or compiled."""
-        here = self._line(traced.frames[0])
-        if traced.kind not in ("l1", "signed") and not traced.why_other and here.path in self.analysis.program.sources:
-            self.entries.append(Left(*here, traced.text(self._name(traced, [])), (here,)))
-            self.settled.add((here.path, here.line))
 
     @staticmethod
     def _differs(candidate: _Candidate, read: Sequence[Any], said: str) -> str:

@@ -260,16 +260,11 @@ class Watch:
                 found.append((record, key, leaves_under(node)))
                 if key[-1] is not None and not self.terms[key]["is_rival"]:
                     known.append((match, picture, self.terms[key]))
-        self._rivals(known)
-        return found
-
-    @staticmethod
-    def _rivals(known: List[Tuple[Any, Any, Dict[str, Any]]]) -> None:
-        """Mark what is less like a file than another picture under the same loss, and no part or exposure of that."""
         known.sort(key=lambda each: -each[0].detail)
-        for at, (match, picture, term) in enumerate(known):
+        for at, (match, picture, term) in enumerate(known):  # less like a file than another picture under the same loss
             best = next((b for other, b, _ in known[:at] if other.path == match.path), None)
-            term["is_rival"] |= best is not None and is_another(picture, best)
+            term["is_rival"] |= best is not None and is_another(picture, best)  # no part or exposure of that
+        return found
 
     def _term(self, record: _Record, kind: str) -> Any:
         """Return a term's key, its picture's match, that picture; those of the same frames, kind, target are one."""

@@ -61,15 +61,12 @@ class Journal(NamedTuple):
         data = read_file(root, JOURNAL)
         if data is None:
             return cls({}, {})
-        try:
-            return cls._parsed(data)
-        except ValueError as error:
-            advice = "nothing was changed; restore the files from git, and remove it"
-            raise LegsError(f"{root / JOURNAL} cannot be read ({error}): {advice}") from None
+        advice = "nothing was changed; restore the files from git, and remove it"
+        return cls._parsed(data, f"{root / JOURNAL} cannot be read", f": {advice}")
 
     @classmethod
-    def _parsed(cls, data: bytes) -> Journal:
-        """Check a journal's bytes, which are read or about to be written; a ValueError says what is wrong."""
+    def _parsed(cls, data: bytes, problem: str, advice: str) -> Journal:
+        """Check a journal's bytes, which are read or about to be written; a LegsError says what is wrong with them."""
         try:
             if len(data) > MAX_FILE_BYTES:
                 raise ValueError(f"larger than {MAX_FILE_BYTES >> 20} MiB")
@@ -81,8 +78,8 @@ class Journal(NamedTuple):
                 raise ValueError("written by another version of legs-patch: undo with that version")
             files = _read_files(content["files"])
             created = {_only(name, name == SETTINGS_FILE): _checksums(at) for name, at in content["created"].items()}
-        except (LegsError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
-            raise ValueError(str(error)) from None
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
+            raise LegsError(f"{problem} ({error}){advice}") from None
         return cls(files, created, data)
 
     def add(self, path: str, layer: Layer) -> None:
@@ -101,13 +98,8 @@ class Journal(NamedTuple):
         files = {path: [_written(layer) for layer in layers] for path, layers in sorted(self.files.items())}
         content: Dict[str, Any] = {"note": _NOTE, "version": _VERSION, "files": files, "created": self.created}
         data = (json.dumps(content, indent=1) + "\n").encode("utf-8")
-        try:
-            self._parsed(data)
-        except ValueError as error:
-            raise LegsError(
-                f"{JOURNAL} could not be read again ({error}), so nothing was written: undo the earlier patches first, "
-                "or leave large files out by --exclude"
-            ) from None
+        advice = "undo the earlier patches first, or leave large files out by --exclude"
+        self._parsed(data, f"{JOURNAL} could not be read again", f", so nothing was written: {advice}")
         return data
 
     def is_as_written(self, path: str, data: bytes) -> bool:

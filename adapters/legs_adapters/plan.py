@@ -137,11 +137,8 @@ def _check_named(root: Path, findings: Findings, name: str, line: int, exclude: 
     if is_site or (name, line) in [(entry.path, entry.line) for entry in findings.patched]:
         return
     reasons = [why_left_out(root, name, exclude), *(one.reason for one in findings.unreadable if one.path == name)]
-    reasons += [
-        f"{problem.reason}; {problem.way}"
-        for problem in findings.problems
-        if (problem.path, problem.line) == (name, line)
-    ]
+    here = [problem for problem in findings.problems if (problem.path, problem.line) == (name, line)]
+    reasons += [f"{problem.reason}; {problem.way}" for problem in here]
     why = next(filter(None, reasons), "there is no difference, absolute value or call of two images")
     raise LegsError(f"{name}:{line}: {why}")
 

@@ -198,7 +198,6 @@ OURS = (
     "undo.py",
     "journal.py",
     "replace.py",
-    "inside.py",
     "locks.py",
     "ctrl_c.py",
     "contextlib.py",

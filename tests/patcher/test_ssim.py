@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("libcst")
 
 from legs_adapters.plan import plan
-from legs_adapters.terms.ssim.forms import FORMS, form_of
+from legs_adapters.terms.ssim import FORMS, form_of
 
 from legs_loss.lab.embedded import write_embedded_scene
 from tests.code.support import function, program

@@ -27,27 +27,26 @@ _ENVIRONMENT = {
 def changed_files(root: Path, files: Mapping[str, bytes]) -> List[str]:
     """Return which of these files differ from the last commit, in more than their line ends.
 
-    The git of a nested checkout is asked about its files. A file that was never committed counts as unchanged; so do
-    all outside of git, and where git is missing. Whose the checkout is does not matter: nothing of it is run.
+    Git is asked in each file's own folder, so that of a nested checkout answers for its files. A file that was never
+    committed counts as unchanged; so do all outside of git, and where git is missing. Whose the checkout is does not
+    matter: nothing of it is run.
 
     Raises:
         LegsError: git times out.
     """
-    by_checkout: Dict[str, Dict[str, bytes]] = {}
-    for path, data in files.items():
-        above = [folder.as_posix() for folder in PurePosixPath(path).parents][:-1]
-        nested = next((folder for folder in above if os.path.lexists(str(root / folder / ".git"))), "")
-        by_checkout.setdefault(nested, {})[path[len(nested) :].lstrip("/")] = data
-    found = ((PurePosixPath(at), _changed(root, root / at, inner)) for at, inner in by_checkout.items())
+    by_folder: Dict[PurePosixPath, Dict[str, bytes]] = {}
+    for path in map(PurePosixPath, files):
+        by_folder.setdefault(path.parent, {})[path.name] = files[path.as_posix()]
+    found = ((at, _changed(root, root / at, inner)) for at, inner in by_folder.items())
     return [(at / name).as_posix() for at, names in found for name in names]
 
 
-def _changed(outer: Path, root: Path, files: Mapping[str, bytes]) -> List[str]:
-    """Return which files of one checkout differ from its last commit."""
+def _changed(root: Path, folder: Path, files: Mapping[str, bytes]) -> List[str]:
+    """Return which files of one folder differ from the last commit."""
     program = shutil.which("git")
-    if program is None or outer in Path(os.path.realpath(program)).parents:
+    if program is None or root in Path(os.path.realpath(program)).parents:
         return []  # a "." on the path, or Windows, finds programs in the folder one is in
-    command = [program, "--no-pager", *_SAFE, "-C", str(root), "ls-tree", "-z", "HEAD"]
+    command = [program, "--no-pager", *_SAFE, "-C", str(folder), "ls-tree", "-z", "HEAD"]
     try:
         listed = subprocess.run(
             [*command, "--", *files],
@@ -56,7 +55,7 @@ def _changed(outer: Path, root: Path, files: Mapping[str, bytes]) -> List[str]:
         ).stdout  # fmt: skip
     except subprocess.TimeoutExpired:
         raise LegsError(
-            f"git did not list the last commit of {root} within {_SECONDS} seconds; nothing was written: "
+            f"git did not list the last commit of {folder} within {_SECONDS} seconds; nothing was written: "
             "--force skips this check"
         ) from None
     except OSError:

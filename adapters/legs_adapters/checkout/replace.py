@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from typing import Callable, Dict, Iterator, List, Optional, Tuple
 
-from legs_adapters.checkout.inside import BY_DESCRIPTOR, folder_of
 from legs_adapters.code.folders import check_name
 from legs_loss import LegsError
 from legs_loss.system.ctrl_c import held_back
@@ -25,6 +24,8 @@ MAX_FILE_BYTES = 8 << 20  # of a file that is read here: no source, no journal i
 _LOCK, _STAGING = ".legs-patch.lock", ".legs-patch.tmp"
 _ACCESS = "system.posix_acl_access"
 _WAIT, _POLL = 30.0, 0.02  # seconds: a command holds the lock while it writes, and while git looks for changes
+# Windows has no descriptors of folders: there paths are checked, then used.
+_BY_DESCRIPTOR = {os.open, os.rename, os.unlink, os.stat} <= os.supports_dir_fd
 
 
 @contextlib.contextmanager
@@ -56,17 +57,16 @@ def _lock(root: Path, note: str, stop: Callable[[], None]) -> FileLock:
     until = time.monotonic() + _WAIT
     while True:
         try:
-            return FileLock(root / _LOCK, wait=0.0, note=note, remove=True)
+            return FileLock(root / _LOCK, wait=_POLL, note=note, remove=True)
         except HeldError as error:
+            who = f": {error}" if str(error) else ""
             if time.monotonic() > until:
-                who = f": {error}" if str(error) else ""
                 raise LegsError(
                     f"another legs-patch is running in {root}{who}; nothing was changed: wait for it"
                 ) from None
         except OSError as error:
             raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
         stop()
-        time.sleep(_POLL)
 
 
 def replace_files(root: Path, changes: Changes, stop: Callable[[], None] = lambda: None) -> None:
@@ -118,12 +118,36 @@ def read_file(root: Path, path: str) -> Optional[bytes]:
     if os.path.normcase(os.path.realpath(full)) != os.path.normcase(full):
         raise LegsError(f"{path} is a link or below one: legs-patch does not follow links")
     try:
-        with folder_of(root, path) as (folder, name):
+        with _folder_of(root, path) as (folder, name):
             return read_regular(name, MAX_FILE_BYTES, folder)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise LegsError(f"{full} cannot be read: {error.strerror}; nothing was changed") from None
+
+
+@contextlib.contextmanager
+def _folder_of(root: Path, path: str) -> Iterator[Tuple[Optional[int], str]]:
+    """Open the folder of a file, part by part, none of them a link, even while somebody swaps one for a link.
+
+    Yield its descriptor, and the file's name in it; where the system has no such descriptors, None and the whole path:
+    functions of ``os`` take both as they take the first two. An OSError meanwhile names the whole path.
+    """
+    if not _BY_DESCRIPTOR:
+        yield None, str(root / path)
+        return
+    *folders, name = path.split("/")
+    options = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
+    folder: Optional[int] = None
+    try:
+        with contextlib.ExitStack() as opened:  # each is closed once, wherever Ctrl-C comes
+            for part in (str(root), *folders):
+                folder = os.open(part, options, dir_fd=folder)
+                opened.callback(os.close, folder)
+            yield folder, name
+    except OSError as error:
+        error.filename = str(root / path)
+        raise
 
 
 def _check(path: str, found: Optional[bytes], expected: Optional[bytes]) -> None:
@@ -134,18 +158,18 @@ def _check(path: str, found: Optional[bytes], expected: Optional[bytes]) -> None
 def _stage(root: Path, path: str, data: bytes) -> str:
     """Write what a file is to become to the staging folder, with owner, mode and attributes that the file has."""
     staged = f"{_STAGING}/{secrets.token_hex(8)}"
-    with folder_of(root, staged) as (folder, name):
+    with _folder_of(root, staged) as (folder, name):
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         with os.fdopen(os.open(name, flags, 0o666, dir_fd=folder), "wb") as file:
             file.write(data)
             file.flush()
-            with contextlib.suppress(FileNotFoundError), folder_of(root, path) as (target, old):
+            with contextlib.suppress(FileNotFoundError), _folder_of(root, path) as (target, old):
                 with open_regular(old, target) as before:
                     found = os.fstat(before.fileno())
                     mode = _keep_owner(file.fileno(), found)
                     _keep_attributes(before.fileno(), file.fileno())
                 # Last: giving a file away takes bits of its mode.
-                os.chmod(file.fileno() if BY_DESCRIPTOR else name, mode)
+                os.chmod(file.fileno() if _BY_DESCRIPTOR else name, mode)
             os.fsync(file.fileno())
     return staged
 
@@ -182,7 +206,7 @@ def _keep_attributes(before: int, after: int) -> None:
 
 def _put(root: Path, path: str, expected: Optional[bytes], staged: Optional[str]) -> None:
     """Put a staged file in place of the one that is expected there; None removes that."""
-    with folder_of(root, path) as (folder, name):
+    with _folder_of(root, path) as (folder, name):
         try:
             found = read_regular(name, MAX_FILE_BYTES, folder)
         except FileNotFoundError:
@@ -191,7 +215,7 @@ def _put(root: Path, path: str, expected: Optional[bytes], staged: Optional[str]
         if staged is None:
             os.unlink(name, dir_fd=folder)
             return
-        with folder_of(root, staged) as (source, new):
+        with _folder_of(root, staged) as (source, new):
             os.replace(new, name, src_dir_fd=source, dst_dir_fd=folder)
 
 

@@ -12,7 +12,7 @@ from legs_adapters.tensors.gradients import no_grad_around
 from legs_adapters.terms.findings import Evidence, Findings, Left, Site
 from legs_adapters.terms.kinds.ssim import Ssim
 from legs_adapters.terms.patched import patched_nodes
-from legs_adapters.terms.ssim.calls import proven_ssim
+from legs_adapters.terms.ssim import proven_ssim
 from legs_adapters.terms.writing import PACKAGE
 
 

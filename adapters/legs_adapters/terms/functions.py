@@ -22,7 +22,7 @@ from legs_adapters.code.syntax import (
 )
 from legs_adapters.lexicon.names import TORCH_L1, has_perceptual_name, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
-from legs_adapters.tensors.absolute import abs_argument, is_difference, mean_of
+from legs_adapters.tensors.absolute import abs_argument, absolute_value, is_difference
 from legs_adapters.tensors.operations import ASKS, LIKE, LIMITS, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
 from legs_adapters.terms.prospects import Prospects
 from legs_adapters.terms.writing import PACKAGE
@@ -90,11 +90,10 @@ class L1Functions:
 
     def _shape_of(self, function: Function, node: cst.Call, depth: int) -> Optional[str]:
         """Return what a returned call makes of the two: "mean" or "none", None for anything else."""
-        pair, meant = function.parameters[:2], mean_of(node)
-        difference = abs_argument(meant or node)
-        if isinstance(difference, cst.BinaryOperation) and is_difference(difference):
-            sides = {code(side).strip("() ") for side in (difference.left, difference.right)}
-            return ("none" if meant is None else "mean") if sides == set(pair) else None
+        pair, found = function.parameters[:2], absolute_value(node)
+        if found is not None and isinstance(found.argument, cst.BinaryOperation) and is_difference(found.argument):
+            sides = {code(side).strip("() ") for side in (found.argument.left, found.argument.right)}
+            return found.makes if sides == set(pair) else None
         references = self.program.resolve(function, node.func)
         if [code(arg.value) for arg in node.args[:2]] != pair or len(references) != 1:
             return None

@@ -1,4 +1,4 @@
-"""Recognise the functions of a checkout that are 3DGS's SSIM: by their code, in a table of the forms it is met in.
+"""Recognise calls of functions of a checkout that are 3DGS's SSIM: by their code, in a table of its forms.
 
 The form of a function is its text and that of the functions of the checkout that it calls, word by word: every
 operation, constant, default and argument. Local names, functions' names, comments, docstrings, spaces and how torch is
@@ -18,6 +18,8 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
+from legs_adapters.code.syntax import constant, every_parameter
+from legs_adapters.terms.form import Form
 
 # The hash of a form, and a repository that has it. Each was evaluated on small images of several shapes:
 # it is the mean SSIM with an 11x11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2 and C2 = 0.03^2.
@@ -31,8 +33,27 @@ FORMS: Dict[str, str] = {
 }
 
 MAX_FUNCTIONS = 8
+_NO_LITERAL = object()
 _LAYOUT = (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
 _LEFT_OUT = (tokenize.COMMENT, tokenize.NL, tokenize.ENDMARKER, tokenize.ENCODING)
+
+
+def proven_ssim(program: Program, function: Function, form: Form) -> Optional[Function]:
+    """Return the function of a call, where it is 3DGS's SSIM and the further arguments are its defaults."""
+    assert form.callee is not None
+    target = _called(program, function, form.callee)
+    if target is None or not isinstance(target.node, cst.FunctionDef):
+        return None
+    others = list(every_parameter(target.node.params))[2:]
+    given = [(target.given(form.call, other.name.value), other.default) for other in others]
+    is_proven = all(value is None or _are_equal(value, default) for value, default in given)
+    return target if is_proven and len(target.parameters) >= 2 and form_of(program, target) in FORMS else None
+
+
+def _are_equal(value: cst.BaseExpression, default: Optional[cst.BaseExpression]) -> bool:
+    """Return whether an argument is the literal that its parameter has as its default."""
+    first, second = constant(value, _NO_LITERAL), constant(default, _NO_LITERAL)
+    return first is not _NO_LITERAL and (type(first), first) == (type(second), second)
 
 
 def form_of(program: Program, function: Function) -> Optional[str]:
@@ -52,9 +73,8 @@ def _form(program: Program, function: Function, functions: List[Function]) -> Op
     node = function.node
     if not isinstance(node, cst.FunctionDef) or function.owner is not None or function.decorators:
         return None
-    if any(
-        _called(program, function, call.func) for call in function.flow.calls if any(arg.keyword for arg in call.args)
-    ):
+    with_keywords = [call.func for call in function.flow.calls if any(arg.keyword for arg in call.args)]
+    if any(_called(program, function, called) for called in with_keywords):
         return None  # a keyword is a name of the other function's
     node = node.with_changes(body=function.body, leading_lines=())
     if node.get_docstring(clean=False) is not None:

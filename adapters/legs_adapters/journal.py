@@ -144,7 +144,7 @@ def _read_layer(content: Dict[str, Any], room: int) -> Layer:
     for start, end, text in sorted(content["edits"]):
         if type(start) is not int or type(end) is not int or not at <= start <= end <= len(original):
             raise ValueError(f"an edit of bytes {start!r} to {end!r} of {len(original)}")
-        edits.append(Edit(start, end, original[start:end], text.encode("utf-8")))
+        edits.append(Edit(start, end, text.encode("utf-8")))
         at = end
     return Layer(original, edits, _checksum(content["after"]))
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import json
-import re
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 from legs_adapters.checkout.comparing import unified_diff
@@ -120,5 +120,4 @@ def as_diff(changes: Changes) -> str:
 
 def _lines(data: Optional[bytes]) -> List[str]:
     """Return the lines of a file, each with "\\n"; splitlines() would also split at form feeds."""
-    text = (data or b"").decode("utf-8-sig", "replace")
-    return re.findall(r"[^\n]*\n|[^\n]+", text.replace("\r\n", "\n").replace("\r", "\n"))
+    return list(io.StringIO((data or b"").decode("utf-8-sig", "replace"), newline=None))

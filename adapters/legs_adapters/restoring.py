@@ -117,7 +117,7 @@ def _parts(layer: Layer, code: bytes, spend: Callable[[int], None]) -> Iterator[
     for edit in layer.edits:
         here, was = edit.start + shift, edit.start
         begun, end = here + len(edit.after) - len(edit.after.lstrip()), here + len(edit.after.rstrip())
-        shift += len(edit.after) - len(edit.before)
+        shift += len(edit.after) - (edit.end - edit.start)
         if spans and here <= spans[-1][3]:
             was, _, begun, ended = spans.pop()
             end = max(end, ended)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Mapping
 
 from legs_loss import OPERATORS, PRESETS, LegsError
-from legs_loss.errors import did_you_mean
+from legs_loss.spec import as_spec
 
 SETTINGS_FILE = "legs.toml"
 _HEAD = """\
@@ -38,11 +38,7 @@ def settings_text(root: Path, given: Mapping[str, Any]) -> str:
         LegsError: a setting is unknown or out of range, or the store's path is no text.
     """
     name = given.get("preset") or "legs"
-    if name not in PRESETS:
-        raise LegsError(
-            f"no preset is named {name!r}: choose one of {', '.join(PRESETS)}" + did_you_mean(name, PRESETS)
-        )
-    spec = replace(PRESETS[name], **{key: given[key] for key in ("beta", "curve", "operator") if key in given})
+    spec = replace(as_spec(name), **{key: given[key] for key in ("beta", "curve", "operator") if key in given})
     store = "path/to/legs_weights"
     if "store" in given:
         full = Path(os.path.abspath(os.path.expanduser(given["store"])))

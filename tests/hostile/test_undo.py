@@ -31,7 +31,7 @@ def layers(draw):
     original = draw(TEXTS).encode()
     ends = sorted(draw(st.lists(st.integers(0, len(original)), max_size=6)))
     whole = [at for at in ends if original[at : at + 1] < b"\x80"]
-    edits = [Edit(a, b, original[a:b], draw(TEXTS).encode()) for a, b in zip(whole[::2], whole[1::2])]
+    edits = [Edit(a, b, draw(TEXTS).encode()) for a, b in zip(whole[::2], whole[1::2])]
     return Layer(original, sorted(edits), digest(apply_edits(original, edits)))
 
 

@@ -190,7 +190,7 @@ class _Finder:
 
     def _is_noise(self, form: Form) -> bool:
         """Return whether a skipped term is an absolute difference that is no loss: of angles, of sizes."""
-        return form.callee is None and not form.is_mean and not self.analysis.training.includes(form.node)
+        return form.callee is None and form.makes != "mean" and not self.analysis.training.includes(form.node)
 
     def _of_named_lines(self, function: Function) -> Iterator[_Entry]:
         """Yield the first call of two arguments on a line that the user named and that has no other term."""

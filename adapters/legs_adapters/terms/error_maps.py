@@ -79,7 +79,7 @@ def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[c
     Returns:
         The reads that are the loss, and the others: a mask or a threshold is made of them.
     """
-    made = _uses(function).made.get(id(form.node)) if form.is_map else None
+    made = _uses(function).made.get(id(form.node)) if form.makes == "none" else None
     if made is None or "." in made.place:
         return [], []
     uses, every = _uses(function), _uses(function).reads_of(made)

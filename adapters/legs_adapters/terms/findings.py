@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any, Dict, FrozenSet, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import TYPE_CHECKING, Any, Container, Dict, FrozenSet, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 import libcst as cst
 
@@ -178,12 +178,11 @@ class Findings(NamedTuple):
             merged[kind] = sorted([*getattr(self, kind), *entries], key=lambda entry: (entry.path, entry.line))
         return self._replace(**merged)
 
-    def without(self, paths: Iterable[str]) -> None:
+    def without(self, paths: Container[str]) -> None:
         """Remove what was found in files that were then given up."""
-        given_up = set(paths)
         everything: Tuple[List[Any], ...] = (self.sites, self.left, self.problems, self.doubts, self.patched)
         for entries in everything:
-            entries[:] = [entry for entry in entries if entry.path not in given_up]
+            entries[:] = [entry for entry in entries if entry.path not in paths]
 
     @property
     def unweighted(self) -> List[Tuple[Use, Site]]:

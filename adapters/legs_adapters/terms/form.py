@@ -38,16 +38,6 @@ class Form:
     term: ClassVar[str] = ""
     done: ClassVar[str] = "is weighted"
 
-    @property
-    def is_map(self) -> bool:
-        """Return whether the term is an unreduced error map."""
-        return self.makes == "none"
-
-    @property
-    def is_mean(self) -> bool:
-        """Return whether the term is the plain mean."""
-        return self.makes == "mean"
-
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Return the edits that weight the term."""
         raise NotImplementedError(type(self).__name__)

@@ -21,7 +21,6 @@ class Edit(NamedTuple):
 
     start: int
     end: int
-    before: bytes
     after: bytes
 
 
@@ -29,7 +28,7 @@ def apply_edits(data: bytes, edits: Sequence[Edit]) -> bytes:
     """Return the file's bytes with the edits made."""
     parts, at = [], 0
     for edit in sorted(edits):
-        assert edit.start >= at and data[edit.start : edit.end] == edit.before
+        assert edit.start >= at
         parts += [data[at : edit.start], edit.after]
         at = edit.end
     return b"".join([*parts, data[at:]])
@@ -60,8 +59,7 @@ class Text:
 
     def replace(self, start: int, end: int, after: str) -> Edit:
         """Return the edit that replaces a span of bytes by a text."""
-        start, end = start + self._shift, end + self._shift
-        return Edit(start, end, self.source.data[start:end], after.encode("utf-8"))
+        return Edit(start + self._shift, end + self._shift, after.encode("utf-8"))
 
     def argument(self, node: cst.BaseExpression, index: str) -> str:
         """Return an image as written, without the index that it carries."""
@@ -90,6 +88,4 @@ def on_one_line(text: str) -> str:
 
 def residue(text: str) -> str:
     """Return what is kept of a text that is removed: its comments and its line breaks."""
-    if "\n" not in text and "\r" not in text:
-        return ""
     return "".join(part for _, part in _COMMENT_OR_BREAK.findall(text))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Sequence, Tuple, TypeVar
+from typing import NamedTuple, Sequence, Tuple
 
 import libcst as cst
 
@@ -10,8 +10,6 @@ from legs_adapters.code.syntax import code
 from legs_adapters.terms.text import flat, names_for_two, on_one_line
 
 PACKAGE = "legs_loss"
-
-_Side = TypeVar("_Side")
 
 
 class Writing(NamedTuple):
@@ -27,13 +25,9 @@ class Writing(NamedTuple):
     selection: str = ""
     in_place: bool = False
 
-    def ordered(self, first: _Side, second: _Side) -> Tuple[_Side, _Side]:
+    def ordered(self, first: str, second: str) -> Tuple[str, str]:
         """Return the two sides as prediction and target."""
         return (second, first) if self.swapped else (first, second)
-
-    def call(self, prediction: str, target: str, as_map: bool = False, own: str = "") -> str:
-        """Return the whole call of two images."""
-        return f"{PACKAGE}.l1_loss({prediction}, {target}{self.settings(as_map, own)})"
 
     def settings(self, as_map: bool = False, own: str = "") -> str:
         """Return the arguments after the two images, each with its comma.

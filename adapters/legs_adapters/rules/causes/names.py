@@ -95,7 +95,7 @@ class OtherName(Rule):
     def _is_outweighed(self, term: Term) -> bool:
         """Return whether it is the plain L1: no threshold may be taken of it, nor features beside it."""
         if self.id == "robust":
-            return not term.form.is_map
+            return term.form.makes != "none"
         is_step = term.function in term.analysis.training.roots  # its name says nothing of one term in it
         return self.id != "perceptual" or is_step or _are_proven(term.analysis, term.function)
 

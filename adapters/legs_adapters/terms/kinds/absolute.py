@@ -38,8 +38,8 @@ class Absolute(Form):
         left, right = text.span(self.first, True), text.span(self.second, True)
         sides = writing.ordered(*(text.argument(side, writing.selection) for side in (self.first, self.second)))
         middle = residue(text.between(left[1], right[0])) or " "
-        settings = writing.settings(as_map=bool(writing.selection) or self.is_map)
-        tail = writing.selection + (".mean()" if writing.selection and self.is_mean else "")
+        settings = writing.settings(as_map=bool(writing.selection) or self.makes == "none")
+        tail = writing.selection + (".mean()" if writing.selection and self.makes == "mean" else "")
         before, after = residue(text.between(start, left[0])), residue(text.between(right[1], end))
         arguments = f"{before}{sides[0]},{middle}{sides[1]}{settings}{after}"
         return [text.replace(start, end, f"{PACKAGE}.l1_loss({arguments}){tail}")]

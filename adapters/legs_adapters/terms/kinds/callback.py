@@ -37,7 +37,7 @@ class PassedByName(Form):
         """Write the weighted function in the name's place; what is not the plain mean is kept as ``own=``."""
         assert self.callee is not None
         function = f"{PACKAGE}.l1_loss"
-        if not self.is_mean:
+        if self.makes != "mean":
             function = f"lambda input, target: {function}(input, target, own={code(self.callee)})"
         return [text.replace(*text.span(self.node, True), function)]
 

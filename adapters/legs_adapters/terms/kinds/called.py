@@ -28,9 +28,7 @@ class Called(Form):
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
         """Find a call of an L1 function, by the function's body, or by its name where the body is not available."""
-        if len(call.args) < 2 or arguments(call)[2]:
-            return None
-        if not functions.may_be_called(function, call.func):
+        if len(call.args) < 2 or arguments(call)[2] or not functions.may_be_called(function, call.func):
             return None
         references = functions.program.resolve(function, call.func)
         if not (references or is_l1_name(call_name(call))) or has_perceptual_name(call_name(call)):
@@ -57,9 +55,9 @@ class Called(Form):
         sides = writing.ordered(*(text.argument(arg.value, writing.selection) for arg in (first, second)))
         edits += [text.replace(*text.span(arg), side) for arg, side in zip((first, second), sides)]
         tail = writing.selection if self.makes != "own" else ""
-        tail += ".mean()" if tail and self.is_mean else ""
+        tail += ".mean()" if tail and self.makes == "mean" else ""
         own = writing.own(self.call.func, self.extras) if self.makes == "own" else ""
-        settings = writing.settings(self.is_map or bool(tail), own)
+        settings = writing.settings(self.makes == "none" or bool(tail), own)
         after, end = text.span(second)[1], text.span(self.call.args[-1])[1]
         if settings or end != after:
             edits.append(text.replace(after, end, settings + residue(text.between(after, end))))

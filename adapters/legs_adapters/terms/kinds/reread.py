@@ -7,7 +7,7 @@ from typing import List
 
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.text import Edit, Text, on_one_line
-from legs_adapters.terms.writing import Writing
+from legs_adapters.terms.writing import PACKAGE, Writing
 
 
 @dataclass(frozen=True)
@@ -22,5 +22,5 @@ class Reread(Form):
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Write the weighted map in the read's place."""
         sides = (on_one_line(text.argument(side, writing.selection)) for side in (self.first, self.second))
-        call = writing.call(*writing.ordered(*sides), as_map=True)
-        return [text.replace(*text.span(self.node, True), call + writing.selection)]
+        arguments = f"{', '.join(writing.ordered(*sides))}{writing.settings(as_map=True)}"
+        return [text.replace(*text.span(self.node, True), f"{PACKAGE}.l1_loss({arguments}){writing.selection}")]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from pathlib import Path
-from typing import Iterator, Pattern, Sequence
+from typing import Dict, Iterator, Pattern, Sequence
 
 from legs_adapters.code.folders import first_of, walk
 from legs_adapters.lexicon.names import kind_of_words
@@ -90,6 +90,7 @@ def trained_instead(root: Path, exclude: Sequence[str], findings: Findings) -> I
     files = sorted(findings.program.sources.values(), key=lambda source: (source.path.count("/"), source.path))
     is_decided = bool(findings.sites or findings.patched)
     files = [source for source in files if not is_decided or source.path in findings.unsettled]
+    said: Dict[str, str] = {}  # of rows for one place the first
     for pattern, what in _INSTEAD if not is_decided else _BY_CHOICE:
         found = ((source, hit) for source in files for hit in _bounded(pattern).finditer(source.text))
         for source, hit in found:
@@ -97,8 +98,9 @@ def trained_instead(root: Path, exclude: Sequence[str], findings: Findings) -> I
             line = (before + source.text[hit.start() : hit.end() + _MOST_SIGNS].partition("\n")[0]).lstrip()
             of_images = _OF_PICTURES.search(line) and "loss" in (line.replace(hit.group(), "") + source.path).lower()
             if not line.startswith(("#", "def ")) and (of_images or what is not _SQUARED):
-                yield f"{source.path}:{source.text.count(chr(10), 0, hit.start()) + 1}: {what}"
+                said.setdefault(f"{source.path}:{source.text.count(chr(10), 0, hit.start()) + 1}", what)
                 break
+    yield from (f"{place}: {what}" for place, what in said.items())
     for path in [] if is_decided else list(walk(root, exclude, (".yaml", ".yml", ".json", ".toml")))[:_MOST_SETTINGS]:
         with contextlib.suppress(OSError):  # larger, or no file
             text = read_regular(root / path, _LARGEST).decode("utf-8", "replace")

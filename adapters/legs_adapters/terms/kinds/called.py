@@ -50,18 +50,14 @@ class Called(Form):
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the function, order the two images, and replace the further arguments by the settings."""
-        first, second = self.call.args[:2]
-        edits = [text.replace(*text.span(self.call.func, True), f"{PACKAGE}.l1_loss")]
-        sides = writing.ordered(*(text.argument(arg.value, writing.selection) for arg in (first, second)))
-        edits += [text.replace(*text.span(arg), side) for arg, side in zip((first, second), sides)]
+        function, call = text.span(self.call.func, True), text.span(self.call)
+        first, second, last = (text.span(self.call.args[at]) for at in (0, 1, -1))
+        sides = writing.ordered(*(text.argument(side, writing.selection) for side in (self.first, self.second)))
         tail = writing.selection if self.makes != "own" else ""
-        tail += ".mean()" if tail and self.makes == "mean" else ""
         own = writing.own(self.call.func, self.extras) if self.makes == "own" else ""
         settings = writing.settings(self.makes == "none" or bool(tail), own)
-        after, end = text.span(second)[1], text.span(self.call.args[-1])[1]
-        if settings or end != after:
-            edits.append(text.replace(after, end, settings + residue(text.between(after, end))))
-        if tail:
-            end = text.span(self.call)[1]
-            edits.append(text.replace(end, end, tail))
-        return edits
+        tail += ".mean()" if tail and self.makes == "mean" else ""
+        before, between = text.between(function[1], first[0]), text.between(first[1], second[0])
+        after = residue(text.between(second[1], last[1])) + text.between(last[1], call[1])
+        arguments = f"{before}{sides[0]}{between}{sides[1]}{settings}{after}"
+        return [text.replace(function[0], call[1], f"{PACKAGE}.l1_loss{arguments}{tail}")]

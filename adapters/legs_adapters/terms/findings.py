@@ -58,9 +58,8 @@ class Left(NamedTuple):
     def at(cls, function: Function, place: Place, why: str | Evidence) -> Left:
         """Return the term at a place as skipped: by a rule's evidence, or for another reason."""
         here = Line(function.module.path, place.line, function.module.lines.text(place.line))
-        if isinstance(why, str):
-            return cls(*here, why, (here,))
-        return cls(*here, why.reason, tuple(_lines(why.deciders)) or (here,), why.rule)
+        rule, reason, deciders = Evidence("", why, ()) if isinstance(why, str) else why
+        return cls(*here, reason, tuple(_lines(deciders)) or (here,), rule)
 
 
 def _lines(deciders: Sequence[Decider]) -> Iterator[Line]:

@@ -38,28 +38,30 @@ EXIT_CODES = (
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run ``legs-patch`` with these arguments (default: the process's own) and return its exit code."""
 
+    args = argparse.Namespace(folder="", undo=False)
+
     def work() -> int:
         never_fail_to_print()
         parser = Parser(prog="legs-patch", description=__doc__)
         add_arguments(parser)
         parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
         parser.offer_completion()
-        return run(parser.parse_args(argv))
+        return _run(parser.parse_args(argv, args))
 
-    return exit_code("legs-patch", work)
+    return exit_code("legs-patch", work, lambda: _so_far(args))
 
 
 def run(args: argparse.Namespace) -> int:
     """Patch, undo or verify, as the arguments say, and return the exit code."""
-    before = _journal(args.folder)
+    return exit_code("legs-patch", lambda: _run(args), lambda: _so_far(args))
 
-    def so_far() -> str:  # from the journal: a command writes all files and the journal, or nothing
-        if _journal(args.folder) == before:
-            return "; nothing was changed"
-        undo_it = f"; the patch was already written; undo it with: legs-patch --undo {args.folder}"
-        return "; the patch was already undone" if args.undo else undo_it
 
-    return exit_code("legs-patch", lambda: _run(args), so_far)
+def _so_far(args: argparse.Namespace) -> str:
+    """Return what was done so far, from the journal: a command writes all files and the journal, or nothing."""
+    if _journal(args.folder) == getattr(args, "before", _journal(args.folder)):
+        return "; nothing was changed"
+    undo_it = f"; the patch was already written; undo it with: legs-patch --undo {args.folder}"
+    return "; the patch was already undone" if args.undo else undo_it
 
 
 def check_libcst() -> None:
@@ -68,6 +70,7 @@ def check_libcst() -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    args.before = _journal(args.folder)
     if args.undo and (args.check or args.verify):
         raise LegsError("--undo can be combined with --diff and --force only")
     check_libcst()

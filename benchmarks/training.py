@@ -90,7 +90,7 @@ def measure(args):
     config = TrainConfig.from_dict(settings)
     data = load_dataset(read_scene(args.scene), config.weights, config.resolution, config.white_background)
     restored = TrainConfig.from_dict(facts["config"])
-    run = trainer._Training.restore(data, restored, args.run / "checkpoint.npz")
+    run = trainer._TrainingState.restore(data, restored, args.run / "checkpoint.npz")
     run.config, run.schedule = config, run.schedule._replace(densify_from=1 << 30, reset_every=1 << 30)
     getattr(trainer, "keep_freed_memory", int)()  # older checkouts have none
     took, sizes = {}, {}

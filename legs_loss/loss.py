@@ -11,7 +11,7 @@ from legs_loss.autograd import check_order, is_compiling, is_trained
 from legs_loss.counting import counted, note_graph, said, say_first
 from legs_loss.errors import LegsError
 from legs_loss.images import read_pair
-from legs_loss.kernels.backends import Plan, fused, plan_of
+from legs_loss.kernels.backends import LossPlan, fused, plan_of
 from legs_loss.kernels.contract import Terms, terms_of
 from legs_loss.responses import NEEDS_LEVELS
 from legs_loss.similarity import WINDOW_SIZE, d_ssim
@@ -137,7 +137,7 @@ def whole(lambda_dssim: float, padding: str) -> Optional[Terms]:
 
 
 def total_loss(
-    plan: Plan, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float, padding: str, made: str
+    plan: LossPlan, prediction: Tensor, target: Tensor, weights: Weights, lambda_dssim: float, padding: str, made: str
 ) -> Tensor:
     """Return :func:`legs_loss` of images [C, H, W] or [B, C, H, W], and count the step.
 

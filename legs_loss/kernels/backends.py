@@ -14,7 +14,7 @@ from legs_loss.autograd import is_transformed, is_wrapped
 from legs_loss.errors import LegsError
 from legs_loss.images import Layout, read_pair
 from legs_loss.kernels.available import BACKENDS, OUT_OF_MEMORY, forced_backend
-from legs_loss.kernels.contract import L1, DeviceFault, Failed, NotNow, Prepared, Terms, node
+from legs_loss.kernels.contract import L1, DeviceFault, Failed, NotNow, PreparedLoss, Terms, node
 from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
@@ -22,7 +22,7 @@ _PLAIN = {Tensor, torch.nn.Parameter}  # what others mean by their values only t
 _MOST = 256  # plans; a codebase with more shapes of images begins again
 
 
-class Plan(NamedTuple):
+class LossPlan(NamedTuple):
     """A loss of two images, worked out.
 
     Attributes:
@@ -39,7 +39,7 @@ class Plan(NamedTuple):
     layout: Layout
     terms: Optional[Terms] = None
     spec: Optional[WeightSpec] = None
-    prepared: Optional[Prepared] = None
+    prepared: Optional[PreparedLoss] = None
     makes: bool = False
     moved: bool = False
     plain: bool = False
@@ -47,7 +47,7 @@ class Plan(NamedTuple):
     found: Any = None
 
 
-_plans: Dict[Any, Plan] = {}
+_plans: Dict[Any, LossPlan] = {}
 
 
 def plan_of(
@@ -56,12 +56,12 @@ def plan_of(
     prediction: Tensor,
     target: Tensor,
     channels_last: Optional[bool] = None,
-) -> Tuple[Plan, Tensor, Tensor]:
+) -> Tuple[LossPlan, Tensor, Tensor]:
     """Return the plan of a loss, and its images as :func:`~legs_loss.images.read_pair` does, which checks them.
 
     Args:
         terms: None where torch is to compute, as in a graph that is compiled.
-        spec: as in a Plan.
+        spec: as in a LossPlan.
         prediction, target, channels_last: as for :func:`~legs_loss.legs_loss`.
     """
     if (
@@ -76,7 +76,7 @@ def plan_of(
         or target.requires_grad
     ):
         layout, prediction, target = read_pair(prediction, target, channels_last)
-        return Plan(layout, spec=spec), prediction, target
+        return LossPlan(layout, spec=spec), prediction, target
     wanted = prediction.requires_grad and torch.is_grad_enabled()
     given = (terms, spec, channels_last, wanted, BACKENDS.setting())
     one = (prediction.shape, prediction.stride(), prediction.dtype, prediction.device)
@@ -85,7 +85,7 @@ def plan_of(
     if plan is None or BACKENDS.found.get(plan.place) is not plan.found:
         layout, first, second = read_pair(prediction, target, channels_last)
         moved = first is not prediction or second is not target
-        plan = _new_plan(Plan(layout, terms, spec, moved=moved), terms, first, second, wanted)
+        plan = _new_plan(LossPlan(layout, terms, spec, moved=moved), terms, first, second, wanted)
         if plan.prepared is not None:
             if len(_plans) >= _MOST:
                 _plans.clear()
@@ -96,7 +96,7 @@ def plan_of(
     return plan, prediction, target
 
 
-def _new_plan(plan: Plan, terms: Terms, prediction: Tensor, target: Tensor, wanted: bool) -> Plan:
+def _new_plan(plan: LossPlan, terms: Terms, prediction: Tensor, target: Tensor, wanted: bool) -> LossPlan:
     """Return a plan with what a backend prepares for images [C, H, W] or [B, C, H, W], if one takes them."""
     spec, device = plan.spec, prediction.device
     backend = BACKENDS.ready(device, terms.name, spec)
@@ -119,7 +119,7 @@ def _new_plan(plan: Plan, terms: Terms, prediction: Tensor, target: Tensor, want
     return plan._replace(prepared=prepared, makes=makes, plain=plain, place=place, found=BACKENDS.found[place])
 
 
-def fused(plan: Plan, prediction: Tensor, target: Tensor, weights: Weights) -> Optional[Tensor]:
+def fused(plan: LossPlan, prediction: Tensor, target: Tensor, weights: Weights) -> Optional[Tensor]:
     """Return the loss that a plan is of, by its backend; None where torch computes it.
 
     Args:
@@ -146,7 +146,7 @@ def fused(plan: Plan, prediction: Tensor, target: Tensor, weights: Weights) -> O
 
 
 def fused_range(target: Tensor, spec: WeightSpec) -> Optional[Tensor]:
-    """Return the range of a target, see :class:`~legs_loss.kernels.contract.Prepared`, [B, 2] (one image: [1, 2]).
+    """Return the range of a target, see :class:`~legs_loss.kernels.contract.PreparedLoss`, [B, 2] (one image: [1, 2]).
 
     None where no backend makes the weights of this spec for this image by itself.
     """

@@ -58,7 +58,7 @@ def terms_of(lambda_dssim: float) -> Terms:
     return Terms(1.0 - lambda_dssim, -lambda_dssim, lambda_dssim)
 
 
-class Prepared:
+class PreparedLoss:
     """A loss of images [C, H, W] or [B, C, H, W] of one shape, strides, types and device: all that hangs on no value.
 
     The weighted L1 is the mean over pixels of the weight times the mean over channels of |prediction - target|; SSIM
@@ -116,7 +116,7 @@ class Backend:
 
     def prepare(
         self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, target: Tensor, wanted: bool
-    ) -> Prepared:
+    ) -> PreparedLoss:
         """Return a loss of such images, prepared; its gradient, too, if it is wanted.
 
         Args:
@@ -146,7 +146,7 @@ class _FusedLoss(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, prediction: Tensor, target: Tensor, map_: Any, range_: Any, prepared: Prepared) -> Tensor:
+    def forward(ctx: Any, prediction: Tensor, target: Tensor, map_: Any, range_: Any, prepared: PreparedLoss) -> Tensor:
         try:
             loss, gradient = prepared.compute(prediction, target, map_, range_)
         except Exception as error:

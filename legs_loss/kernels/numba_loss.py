@@ -14,7 +14,7 @@ from legs_loss.errors import LegsError
 from legs_loss.images import check_values
 from legs_loss.kernels.codes import CURVES
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, part, said
-from legs_loss.kernels.contract import Backend, Prepared, Terms
+from legs_loss.kernels.contract import Backend, PreparedLoss, Terms
 from legs_loss.kernels.numba_response import Images, extremes, operator_of
 from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles, error_row
 from legs_loss.kernels.numba_weights import FORMULAS, WeightSource, weights_of_row
@@ -34,14 +34,14 @@ class _NumbaBackend(Backend):
 
     def prepare(
         self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, target: Tensor, wanted: bool
-    ) -> Prepared:
-        return _Prepared(terms, spec, prediction, wanted)
+    ) -> PreparedLoss:
+        return _NumbaLoss(terms, spec, prediction, wanted)
 
 
 BACKEND: Backend = _NumbaBackend()
 
 
-class _Prepared(Prepared):
+class _NumbaLoss(PreparedLoss):
     """A loss of images of one shape."""
 
     def __init__(self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, wanted: bool) -> None:

@@ -25,7 +25,7 @@ from legs_loss._version import __version__
 from legs_loss.errors import LegsError, require
 
 Listener = Callable[[Any], None]
-Task = Callable[[Any, Listener], Any]
+Work = Callable[[Any, Listener], Any]
 Outcomes = Generator[Tuple[Any, Any], None, None]
 _PATIENCE = 30  # seconds for a scheduler to answer, and for its first worker
 _PATIENCE_AT_END = 5.0  # seconds; a process that is killed leaves numba's semaphore behind, and Python warns
@@ -35,7 +35,7 @@ _PILLOW = {"PILLOW_BLOCK_SIZE": "64m", "PILLOW_BLOCKS_MAX": "2"}
 
 
 def outcomes(
-    task: Task, arguments: Iterable[Any], listen: Listener, processes: int = 0, scheduler: Optional[str] = None
+    task: Work, arguments: Iterable[Any], listen: Listener, processes: int = 0, scheduler: Optional[str] = None
 ) -> Outcomes:
     """Yield each argument with the result of its task, or the LegsError that this ended in, in the order they end.
 
@@ -58,7 +58,7 @@ def outcomes(
             yield argument, _outcome(task, argument, listen)
 
 
-def _outcome(task: Task, argument: Any, tell: Listener) -> Any:
+def _outcome(task: Work, argument: Any, tell: Listener) -> Any:
     try:
         return task(argument, tell)
     except LegsError as error:
@@ -71,7 +71,7 @@ class _Process:
     One that dies costs one task, and when this process dies, it finds its pipe closed and ends.
     """
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Work) -> None:
         context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
         ours, theirs = context.Pipe()
         self.connection: Connection = ours
@@ -120,7 +120,7 @@ def _ensure_tracker() -> None:
     ensure_running()
 
 
-def _in_processes(task: Task, arguments: Iterable[Any], processes: int, listen: Listener) -> Outcomes:
+def _in_processes(task: Work, arguments: Iterable[Any], processes: int, listen: Listener) -> Outcomes:
     waiting = list(arguments)[::-1]
     crew: Dict[Any, Tuple[_Process, Any]] = {}  # by this side's end of their pipes
 
@@ -156,7 +156,7 @@ def _in_processes(task: Task, arguments: Iterable[Any], processes: int, listen: 
             process.end()
 
 
-def _work(connection: Any, task: Task) -> None:
+def _work(connection: Any, task: Work) -> None:
     """Run tasks until the parent has ended."""
     if not any(name in os.environ for name in _PILLOW):
         os.environ.update(_PILLOW)  # before Pillow is imported, which reads them
@@ -171,7 +171,7 @@ def _work(connection: Any, task: Task) -> None:
             connection.send((True, result))
 
 
-def _on_cluster(task: Task, arguments: Iterable[Any], scheduler: str, listen: Listener) -> Outcomes:
+def _on_cluster(task: Work, arguments: Iterable[Any], scheduler: str, listen: Listener) -> Outcomes:
     require("--scheduler", "cluster", "distributed")
     from distributed import Client, as_completed
 
@@ -208,7 +208,7 @@ def _outcome_there(future: Any) -> Any:
         return LegsError(f"a worker could not run it: {error}")
 
 
-def _on_worker(version: str, task: Task, argument: Any, topic: str) -> Any:
+def _on_worker(version: str, task: Work, argument: Any, topic: str) -> Any:
     """Run a task; errors name the worker."""
     from distributed import get_worker
 

@@ -43,7 +43,7 @@ _NOT_IN_A_GRAPH = (
 ViewName = Union[str, int, Sequence[Union[str, int]], None]
 
 
-class Run:
+class TrainingRun:
     """A training run.
 
     Args:
@@ -210,20 +210,20 @@ class _Thread(threading.local):
 
 thread: _Thread = _Thread()
 generation: int = 0  # how often the settings were replaced; compiled code is recompiled then
-_runs: Dict[int, Run] = {}  # the run of this generation
-_masked: Deque[Run] = deque(maxlen=1)  # the last run with masks
+_runs: Dict[int, TrainingRun] = {}  # the run of this generation
+_masked: Deque[TrainingRun] = deque(maxlen=1)  # the last run with masks
 _lock = threading.RLock()
 
 
-def current_run() -> Run:
+def current_run() -> TrainingRun:
     """Return this process's run; its settings are read at the first call."""
     return _runs.get(generation) or _run_of(generation)
 
 
-def _run_of(number: int) -> Run:
+def _run_of(number: int) -> TrainingRun:
     with _lock:
         if number not in _runs:
-            _runs[number] = Run(find_config(_main_file()))
+            _runs[number] = TrainingRun(find_config(_main_file()))
         return _runs[number]
 
 
@@ -263,7 +263,7 @@ for _constant in (refuse_masks, spec_to_compile):
     _constant._dynamo_marked_constant = True
 
 
-def _replace(run: Optional[Run]) -> None:
+def _replace(run: Optional[TrainingRun]) -> None:
     global generation
     with _lock:
         generation += 1
@@ -303,7 +303,7 @@ def configure(
         config = replace(config, spec=as_spec(spec), preset=preset, source="configure()")
     if store is not None:
         config = replace(config, store=Path(store))
-    _replace(Run(config, memo_bytes))
+    _replace(TrainingRun(config, memo_bytes))
 
 
 def active() -> bool:

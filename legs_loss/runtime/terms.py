@@ -18,7 +18,7 @@ from legs_loss.kernels.backends import fused, plan_of
 from legs_loss.kernels.contract import SSIM
 from legs_loss.loss import legs_loss, total_loss, whole
 from legs_loss.runtime import state
-from legs_loss.runtime.state import MASK, Run, current_run, refuse_masks, thread
+from legs_loss.runtime.state import MASK, TrainingRun, current_run, refuse_masks, thread
 from legs_loss.similarity import WINDOW_SIZE, ssim_map
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.weights import Weights
@@ -182,10 +182,10 @@ class LEGSLoss(torch.nn.Module):
         self.padding = padding
         self.renormalise = renormalise
         self.channels_last = channels_last
-        self._run: Optional[Run] = None
+        self._run: Optional[TrainingRun] = None
         if store is not None:
-            config = find_config(None, argv=[])
-            self._run = Run(replace(config, spec=self.spec, preset="LEGSLoss", store=Path(store), source="LEGSLoss()"))
+            config = replace(find_config(None, argv=[]), spec=self.spec, preset="LEGSLoss", source="LEGSLoss()")
+            self._run = TrainingRun(replace(config, store=Path(store)))
 
     def forward(
         self, prediction: Tensor, target: Tensor, weight: Optional[Tensor] = None, mask: Optional[Tensor] = None
@@ -196,7 +196,7 @@ class LEGSLoss(torch.nn.Module):
         settings = (self.lambda_dssim, self.padding, self.renormalise, self.channels_last)
         return legs_loss(prediction, target, self.spec, weight, mask, *settings)
 
-    def _by_store(self, run: Run, prediction: Tensor, target: Tensor, mask: Optional[Tensor]) -> Tensor:
+    def _by_store(self, run: TrainingRun, prediction: Tensor, target: Tensor, mask: Optional[Tensor]) -> Tensor:
         share, terms = self.lambda_dssim, whole(self.lambda_dssim, self.padding)
         plan, image, photograph = plan_of(terms, self.spec, prediction, target, self.channels_last)
         check_order(image, photograph)

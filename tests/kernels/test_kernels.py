@@ -341,7 +341,7 @@ class TestSelection:
         def broken(*_):
             raise RuntimeError("no such instruction\nsecond line")
 
-        monkeypatch.setattr("legs_loss.kernels.numba_loss._Prepared", broken)
+        monkeypatch.setattr("legs_loss.kernels.numba_loss._NumbaLoss", broken)
         for _ in range(3):
             assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         said = capfd.readouterr().err.replace(OF_THE_FIRST_STEP, "")
@@ -358,14 +358,14 @@ class TestSelection:
         assert "unavailable" not in capfd.readouterr().err
 
     def test_a_backend_that_fails_after_its_trial_is_left(self, chosen, monkeypatch, capfd):
-        own = numba_loss._Prepared.compute
+        own = numba_loss._NumbaLoss.compute
 
         def breaks_at_four_channels(self, prediction, *rest):
             if prediction.shape[0] == 4:
                 raise RuntimeError("out of resource: shared memory")
             return own(self, prediction, *rest)
 
-        monkeypatch.setattr(numba_loss._Prepared, "compute", breaks_at_four_channels)
+        monkeypatch.setattr(numba_loss._NumbaLoss, "compute", breaks_at_four_channels)
         assert used(legs_loss(*images((3, 20, 30)))) == "fused"
         for channels in (4, 4, 3):
             assert used(legs_loss(*images((channels, 20, 30)))) == "torch"
@@ -373,13 +373,13 @@ class TestSelection:
         assert said == "legs-loss: numba is unavailable, torch is used: RuntimeError: out of resource: shared memory\n"
 
     def test_a_backend_that_computes_something_else_is_found_out(self, chosen, monkeypatch, capfd):
-        own = numba_loss._Prepared.compute
+        own = numba_loss._NumbaLoss.compute
 
         def more(*given):
             loss, gradient = own(*given)
             return 1.01 * loss, gradient
 
-        monkeypatch.setattr(numba_loss._Prepared, "compute", more)
+        monkeypatch.setattr(numba_loss._NumbaLoss, "compute", more)
         assert used(legs_loss(*images((3, 20, 30)))) == "torch"
         assert "its trial of the loss gave" in capfd.readouterr().err
 

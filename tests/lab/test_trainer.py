@@ -318,7 +318,7 @@ def test_a_long_run_resets_opacities_and_prunes_wide_gaussians(scene: Scene, mon
     seen = []
     reset = Adam.reset_opacity
     monkeypatch.setattr(Adam, "reset_opacity", lambda self, value: (seen.append(self.steps), reset(self, value)))
-    run = trainer._Training.begin(load_dataset(scene, PRESETS["3dgs"]), SHORT, scene)
+    run = trainer._TrainingState.begin(load_dataset(scene, PRESETS["3dgs"]), SHORT, scene)
     for _ in range(20):
         run.step()
     assert float(run.adam.gaussians.opacities.detach().max()) == pytest.approx(0.01)

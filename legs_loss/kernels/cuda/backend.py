@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.kernels.codes import CURVES, NORMS, STENCILS
-from legs_loss.kernels.contract import Backend, Prepared, Terms
+from legs_loss.kernels.contract import Backend, PreparedLoss, Terms
 from legs_loss.kernels.cuda.driver import CudaDriver
 from legs_loss.kernels.cuda.modules import FORMULAS, PLAIN, BinaryCache, Modules, Variant, cache_folder
 from legs_loss.kernels.cuda.nvrtc import find_compiler
@@ -68,15 +68,15 @@ class CudaBackend(Backend):
 
     def prepare(
         self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, target: Tensor, wanted: bool
-    ) -> Prepared:
+    ) -> PreparedLoss:
         """Return the launches of a loss of such images."""
-        return _Prepared(self._open(target.device), terms, spec, prediction, target, wanted)
+        return _Launches(self._open(target.device), terms, spec, prediction, target, wanted)
 
 
 _Launch = Tuple[Any, int, int]  # a kernel, its blocks and threads
 
 
-class _Prepared(Prepared):
+class _Launches(PreparedLoss):
     """The launches of an operation: all but the addresses, which are written into a copy of its task."""
 
     def __init__(

@@ -147,7 +147,7 @@ def train(
     folder = None if out is None else Path(out)
     if resume and folder is None:
         raise LegsError("there is nothing to resume from without an output folder")
-    begun = None if resume else _Training.begin(data, config, scene)
+    begun = None if resume else _TrainingState.begin(data, config, scene)
     compile_step("legs train")
     keep_freed_memory()  # the arrays of a step are as large as those of the step before
     with alone_in(folder, make=not resume):
@@ -155,7 +155,7 @@ def train(
             resume = (folder / CHECKPOINT).is_file()
         elif folder is not None and not resume:
             check_new(folder)
-        run = begun if begun and not resume else _Training.restore(data, config, Path(out or ".") / CHECKPOINT)
+        run = begun if begun and not resume else _TrainingState.restore(data, config, Path(out or ".") / CHECKPOINT)
         run.caps, run.evaluate_every = caps, evaluate_every
         if folder is not None:
             write_json(folder / "cfg.json", config.as_dict())
@@ -193,7 +193,7 @@ def _points(scene: Scene) -> Tuple[np.ndarray, np.ndarray]:
     return points.xyz, points.rgb
 
 
-class _Training:
+class _TrainingState:
     """The state of a training between two iterations."""
 
     def __init__(self, data: Dataset, config: TrainConfig, adam: Adam) -> None:
@@ -216,11 +216,11 @@ class _Training:
         self.history: List[Dict[str, float]] = []
 
     @classmethod
-    def begin(cls, data: Dataset, config: TrainConfig, scene: Scene) -> _Training:
+    def begin(cls, data: Dataset, config: TrainConfig, scene: Scene) -> _TrainingState:
         return cls(data, config, Adam(Gaussians.from_points(*_points(scene), config.sh_degree)))
 
     @classmethod
-    def restore(cls, data: Dataset, config: TrainConfig, path: Path) -> _Training:
+    def restore(cls, data: Dataset, config: TrainConfig, path: Path) -> _TrainingState:
         arrays, facts = read_state(path)
         if facts["views"] != [view.name for view in data.train]:
             raise LegsError(f"{path}: this run was made from a scene with other views")

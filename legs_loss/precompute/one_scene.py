@@ -48,7 +48,6 @@ def precompute(
     resolution: int = -1,
     white_background: bool = False,
     workers: int = 1,
-    progress: bool = False,
     on_progress: Optional[Callable[[int, int], None]] = None,
     maps: UserMaps = NO_MAPS,
 ) -> Report:
@@ -63,7 +62,6 @@ def precompute(
         resolution: 3DGS's ``-r``, as for the training.
         white_background: 3DGS's ``-w``, likewise.
         workers: processes; 1 computes in this one. With more, a script needs its ``if __name__ == "__main__"``.
-        progress: show a bar on stderr.
         on_progress: called after each view with the number of views that are done, and of all.
         maps: the user's masks and weights, of which all are checked before any is written.
 
@@ -73,8 +71,6 @@ def precompute(
     Raises:
         LegsError: the store cannot be written or is damaged; bad settings; a mask or a map that cannot be used.
     """
-    from tqdm import tqdm
-
     default = scene.root / STORE_FOLDER
     out = default if out is None else Path(out)
     if out.is_symlink() and os.path.abspath(str(out)) == os.path.abspath(str(default)):  # the scene's, not the user's
@@ -100,10 +96,9 @@ def precompute(
         results = outcomes(work, tasks, print, workers if workers > 1 else 0)
         staged: List[Entry] = []
         due = time.monotonic()  # the first at once, so that there is a store
-        with closing(results), tqdm(total=len(tasks), desc="weight maps", unit="view", disable=not progress) as bar:
+        with closing(results):
             try:
                 for done, ((view, _), result) in enumerate(results, 1):
-                    bar.update()
                     if isinstance(result, UnwritableError):
                         raise LegsError(f"cannot write to {out}: {result}")
                     if isinstance(result, LegsError):

@@ -57,9 +57,7 @@ def unsharp_views(store: WeightStore) -> List[str]:
 def _alike(store: WeightStore) -> List[Entry]:
     """Return the entries of the response and size that most views have; of several, of those with levels."""
     groups: Dict[object, List[Entry]] = {}
-    for entry in store.entries.values():
-        if entry.is_users:
-            continue
+    for entry in (entry for entry in store.entries.values() if not entry.is_users):
         key = entry.operator, entry.p, entry.smooth, entry.percentile, entry.width * entry.height
         groups.setdefault(key, []).append(entry)
     return max(groups.values(), key=lambda entries: (len(entries), entries[0].strong is not None), default=[])

@@ -108,7 +108,8 @@ def _read(path: Path) -> Any:
         with open_regular(path) as file:
             cursor = _Cursor(file)
             found = binary(cursor)
-            cursor.finish()
+            if file.tell() != cursor.size:
+                raise ValueError(f"{cursor.size} bytes where its own counts say {file.tell()}")
             return found
     except OSError as error:
         raise LegsError(f"cannot read {path}: {error.strerror}") from None
@@ -139,7 +140,7 @@ def _rotation(quaternion: Tuple[float, ...]) -> np.ndarray:
 
 
 class _Cursor:
-    """Reads a binary file from front to back; the end of the file must be the end of the data."""
+    """Reads a binary file from front to back; at its end all of it must be read."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.file, self.size = file, os.fstat(file.fileno()).st_size
@@ -162,10 +163,6 @@ class _Cursor:
         if size > self.size - self.file.tell():
             raise ValueError("it ends too early")
         self.file.seek(size, os.SEEK_CUR)
-
-    def finish(self) -> None:
-        if self.file.tell() != self.size:
-            raise ValueError(f"{self.size} bytes where its own counts say {self.file.tell()}")
 
 
 def _cameras_bin(cursor: _Cursor) -> Dict[int, _Intrinsics]:

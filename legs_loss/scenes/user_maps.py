@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from pathlib import Path
-from typing import Any, Dict, Iterable, List, Sequence, Tuple, Type
+from typing import Dict, Iterable, List, Sequence, Tuple, Type
 
 import numpy as np
 
@@ -181,11 +181,6 @@ def averaged(values: np.ndarray, size: Tuple[int, int]) -> np.ndarray:
     if values.shape == (size[1], size[0]):
         return values
     return np.asarray(Image.fromarray(values).resize(size, _BOX))
-
-
-def dimmed(image: Any, mask: Any) -> Any:
-    """Return a photograph [3, H, W] with what its mask [H, W] leaves out at a quarter of its light; None: as it is."""
-    return image if mask is None else image * (0.25 + 0.75 * mask)
 
 
 def _check_ratio(map_size: Tuple[int, int], size: Tuple[int, int]) -> None:

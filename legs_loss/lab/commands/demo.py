@@ -17,7 +17,7 @@ from typing import Any, Dict, List
 
 from legs_loss.cli.shared.scene_arguments import read_noted
 from legs_loss.lab.commands.arguments import add_scene_arguments, default_resolution
-from legs_loss.system.terminal import say
+from legs_loss.system.terminal import progress, say
 
 HELP = "train four losses on the embedded scene or your own: weight maps, a table and pictures"
 
@@ -68,7 +68,8 @@ def run(args: argparse.Namespace) -> int:
 
     store = out / "legs_weights"  # not in the scene folder, which is the user's
     for spec in {PRESETS[name].operator: PRESETS[name] for name in METHODS}.values():
-        report = precompute(scene, store, spec, resolution, progress=True)
+        with progress(len(scene.views), "weight maps") as bar:
+            report = precompute(scene, store, spec, resolution, on_progress=lambda done, of: bar.update(done - bar.n))
         for view, reason in report.skipped.items():
             raise LegsError(f"{view}: {reason}")
 

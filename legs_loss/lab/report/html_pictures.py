@@ -15,10 +15,9 @@ from torch.nn.functional import avg_pool2d
 
 from legs_loss.errors import LegsError
 from legs_loss.lab.ply import read_ply
-from legs_loss.lab.training.dataset import TrainingView, shuffled
+from legs_loss.lab.training.dataset import TrainingView, dimmed, shuffled
 from legs_loss.lab.training.trainer import TrainConfig, draw, point_cloud, step_weights
 from legs_loss.scenes import image_tensor, open_image
-from legs_loss.scenes.user_maps import dimmed
 from legs_loss.weights import weight_map
 
 KINDS = ("rendering", "error", "weight")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Iterable, List, NamedTuple, Optional, Tuple
+from typing import Any, Iterable, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 import torch
@@ -221,3 +221,8 @@ def weight_maps(images: Iterable[Tensor], spec: Spec = "legs") -> List[Tensor]:
     spec, images = as_spec(spec), list(images)
     scene = levels_of(images, spec)
     return [weight_map(image, spec, False, scene) for image in images]
+
+
+def dimmed(image: Any, mask: Any) -> Any:
+    """Return a photograph [3, H, W] with what its mask [H, W] leaves out at a quarter of its light; None: as it is."""
+    return image if mask is None else image * (0.25 + 0.75 * mask)

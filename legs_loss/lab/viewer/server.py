@@ -16,11 +16,11 @@ from legs_loss.errors import LegsError, require
 from legs_loss.lab.conventions import SH_C0
 from legs_loss.lab.gaussians import Gaussians, rotations
 from legs_loss.lab.ply import read_ply
-from legs_loss.lab.training.dataset import open_store
+from legs_loss.lab.training.dataset import dimmed, open_store
 from legs_loss.lab.viewer.content import Content
 from legs_loss.lab.viewer.guard import Guard, check_address
 from legs_loss.scenes import View, image_tensor, load_training_image
-from legs_loss.scenes.user_maps import averaged, dimmed
+from legs_loss.scenes.user_maps import averaged
 from legs_loss.spec import as_spec
 from legs_loss.store import MASK
 from legs_loss.system.terminal import say

@@ -100,10 +100,10 @@ def weightings(target: Tensor) -> Contenders:
     """Return each way to the weights of a photograph as a function."""
     found: Contenders = {"weight_map": lambda: weight_map(target, LEGS)}
     if not target.is_cuda and BACKENDS.availability(target.device).backend is not None:
-        from legs_loss.kernels.numba_response import extremes
+        from legs_loss.kernels.numba_response import extremes, operator_of
 
         batch = target.unsqueeze(0).numpy()
-        found["its extremes by numba (all the kernel keeps)"] = lambda: extremes(batch, LEGS)
+        found["its extremes by numba (all the kernel keeps)"] = lambda: extremes(batch, operator_of(LEGS))
     try:
         import kornia
 

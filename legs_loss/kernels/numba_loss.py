@@ -92,8 +92,7 @@ class _NumbaLoss(PreparedLoss):
         return torch.from_numpy(self._range(_flat(target), target))
 
     def _range(self, flat: np.ndarray, target: Tensor) -> np.ndarray:
-        assert self.spec is not None
-        found = extremes(flat.reshape(self.sizes), self.spec)
+        found = extremes(flat.reshape(self.sizes), self.source.operator)
         if np.add.reduce(found[:, 2]) != 0.0:  # or NaN; overshoots are fine
             check_values(target)
         found[:, 1] -= found[:, 0]

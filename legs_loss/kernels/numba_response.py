@@ -50,7 +50,7 @@ def operator_of(spec: WeightSpec) -> OperatorCode:
     return OperatorCode(stencil, np.float32(side), np.float32(middle), NORMS[spec.p])
 
 
-def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
+def extremes(image: np.ndarray, operator: OperatorCode) -> np.ndarray:
     """Return the extremes of each view of float32 [B, C, H, W], as float32 [B, 3].
 
     The least and the greatest response; 0, or more (or NaN) where values exceed 1 in magnitude or are not finite.
@@ -59,7 +59,7 @@ def extremes(image: np.ndarray, spec: WeightSpec) -> np.ndarray:
     strips = -(-height // _ROWS)
     found = np.empty((views * strips, 3), np.float32)
     images = Images(image.reshape(-1), image.reshape(-1), views, channels, height, width)
-    in_threads(_strips, views * strips, images, operator_of(spec), strips, found)
+    in_threads(_strips, views * strips, images, operator, strips, found)
     out, found = np.empty((views, 3), np.float32), found.reshape(views, strips, 3)
     for number, join in enumerate((np.minimum, np.maximum, np.add)):
         join.reduce(found[:, :, number], 1, out=out[:, number])

@@ -30,7 +30,7 @@ pytest.importorskip("numba")
 
 from legs_loss.kernels import numba_loss
 from legs_loss.kernels.codes import STENCILS
-from legs_loss.kernels.numba_response import extremes
+from legs_loss.kernels.numba_response import extremes, operator_of
 from legs_loss.precompute.compiled import photograph_response
 
 fused_loss = by_signature(numba_loss.BACKEND)
@@ -172,7 +172,7 @@ class TestResponse:
         spec = WeightSpec(operator=operator, p=p)
         for shape in ((1, 3, 1, 1), (1, 3, 1, 40), (2, 1, 5, 2), (1, 4, 33, 9), (1, 3, 40, 10), (2, 3, 70, 67)):
             image = torch.rand(shape)
-            found = torch.from_numpy(extremes(image.numpy(), spec))
+            found = torch.from_numpy(extremes(image.numpy(), operator_of(spec)))
             expected = response(image, operator, p, False)[:, 0].flatten(1)
             torch.testing.assert_close(found[:, 0], expected.amin(1), rtol=3e-7, atol=0.0)
             torch.testing.assert_close(found[:, 1], expected.amax(1), rtol=3e-7, atol=0.0)
@@ -182,12 +182,12 @@ class TestResponse:
     def test_values_beyond_one_are_noticed(self, value, excess):
         image = torch.rand(2, 3, 40, 50)
         image[1, 2, 39, 49] = value
-        assert extremes(image.numpy(), WeightSpec())[:, 2].tolist() == [0.0, excess]
+        assert extremes(image.numpy(), operator_of(WeightSpec()))[:, 2].tolist() == [0.0, excess]
 
     def test_a_nan_is_noticed(self):
         image = torch.rand(2, 3, 40, 50)
         image[1, 0, 0, 0] = float("nan")
-        assert np.isnan(extremes(image.numpy(), WeightSpec())[:, 2]).tolist() == [False, True]
+        assert np.isnan(extremes(image.numpy(), operator_of(WeightSpec()))[:, 2]).tolist() == [False, True]
 
     @pytest.mark.parametrize(("dtype", "channels"), [(np.uint8, 3), (np.uint16, 1)])
     @pytest.mark.parametrize("size", [(1, 1), (2, 900), (700, 523)])
@@ -211,7 +211,7 @@ class TestResponse:
     @pytest.mark.parametrize("operator", COMPILED)
     def test_a_constant_image_has_exactly_none(self, operator, value):
         image = torch.full((1, 3, 19, 31), value)
-        assert extremes(image.numpy(), WeightSpec(operator=operator)).tolist() == [[0.0, 0.0, 0.0]]
+        assert extremes(image.numpy(), operator_of(WeightSpec(operator=operator))).tolist() == [[0.0, 0.0, 0.0]]
 
 
 @pytest.fixture

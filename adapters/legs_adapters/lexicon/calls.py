@@ -6,7 +6,7 @@ torch's operations do, then what a name says, then what the arguments are, then 
 
 from __future__ import annotations
 
-from typing import Callable, Dict, List, Optional, Tuple
+from typing import Callable, Dict, List, Optional
 
 import libcst as cst
 
@@ -224,6 +224,4 @@ def _of_owner(call: CallReading) -> Optional[Meaning]:
     return Meaning(kind, call.ask(call.owner).role if kind and call.owner is not None else None)
 
 
-_SURE: Tuple[Callable[[CallReading], Optional[Meaning]], ...] = (
-    *(_number, _reduced, _filtered, _moved, _keyed, _rendered, _named),
-)
+_SURE = (_number, _reduced, _filtered, _moved, _keyed, _rendered, _named)

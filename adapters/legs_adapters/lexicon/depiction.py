@@ -128,18 +128,17 @@ class Meanings:
 
     def _keys(self, function: Function, index: cst.CSTNode) -> List[str]:
         """Return the kinds of pictures that an index takes: in a loop over a literal, or by its function's calls."""
-        found: List[cst.CSTNode] = []
-        stored: List[object] = []
+        values: List[Optional[cst.CSTNode]] = []
+        keys: List[object] = []
         for made in function.flow.reaching(index.value) if isinstance(index, cst.Index) else ():
-            calls = self.training.sites.get(function, ()) if made.kind == "parameter" else ()
-            found += [given for given in (function.given(call, made.place) for _, call in calls) if given is not None]
+            if made.kind == "parameter":
+                values += [function.given(call, made.place) for _, call in self.training.sites.get(function, ())]
             looped = list(walk_expressions(made.value)) if made.kind == "element" and made.value is not None else []
-            tables = [
-                table for part in looped for table in function.flow.assigned(part) if isinstance(table, _LITERALS)
-            ]
-            found += [*looped, *(part for table in tables for part in walk_expressions(table))]
-            stored += [made.key for part in looped for made in function.flow.reaching(part) if made.kind == "store"]
-        keys = [*stored, *(constant(each) for each in found if isinstance(each, cst.SimpleString))]
+            tables = [table for part in looped for table in function.flow.assigned(part)]
+            held = [part for table in tables if isinstance(table, _LITERALS) for part in walk_expressions(table)]
+            values += looped + held
+            keys += [stored.key for part in looped for stored in function.flow.reaching(part) if stored.kind == "store"]
+        keys += map(constant, values)
         return [key for key in keys if isinstance(key, str) and kind_of_words(key) is not None]
 
     def _member(self, function: Function, node: cst.Attribute | cst.Subscript, name: str) -> Meaning:

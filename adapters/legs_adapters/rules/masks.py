@@ -86,8 +86,7 @@ class _Line(NamedTuple):
     """A line between two statements of a block, and the bytes that it covers: what follows it in the block."""
 
     pair: _Pair
-    after: Optional[cst.CSTNode]
-    before: cst.CSTNode
+    form: Masked
     start: int
     end: int
 
@@ -103,8 +102,9 @@ class _Line(NamedTuple):
     @property
     def site(self) -> Site:
         """The line as an edit."""
-        function, form = self.pair.function, self.pair.form(self.after, self.before)
-        return Site.at(function, form, f"{form.line}, before line {function.place(self.before).line}")
+        function, before = self.pair.function, self.form.before
+        assert before is not None
+        return Site.at(function, self.form, f"{self.form.line}, before line {function.place(before).line}")
 
 
 class _Finder:
@@ -244,8 +244,8 @@ class _Finder:
             end = places[after].end if after >= 0 else -1
             unbound = [some for some in unbound if not self._bind(function, block, [at for at in some if at < end])]
             if not here and not unbound:
-                last_one, before = block[after] if after >= 0 else None, block[after + 1]
-                return _Line(pair, last_one, before, places[after + 1].start, places[-1].end)
+                form = pair.form(block[after] if after >= 0 else None, block[after + 1])
+                return _Line(pair, form, places[after + 1].start, places[-1].end)
         return "no line before the term surely comes after both images"
 
     def _bind(self, function: Function, block: Sequence[cst.CSTNode], starts: Sequence[int]) -> bool:

@@ -13,9 +13,11 @@ import pytest
 cst = pytest.importorskip("libcst")
 
 from legs_adapters.code.module import Class, Function, Module, parse  # noqa: E402
+from legs_adapters.code.parsing import Lines, Part  # noqa: E402
 from legs_adapters.code.sources import Source, Unreadable  # noqa: E402
 from legs_adapters.code.syntax import code, walk_expressions  # noqa: E402
 from legs_adapters.terms.prospects import Prospects  # noqa: E402
+from libcst.metadata import ByteSpanPositionProvider, MetadataWrapper  # noqa: E402
 
 from tests.code.support import program  # noqa: E402
 
@@ -114,6 +116,20 @@ def test_every_node_stands_where_it_stands_in_the_file(newline: str, end: str) -
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_every_node_of_a_real_file_stands_where_it_stands(path: Path) -> None:
     check(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_the_span_of_every_node_is_that_of_libcst(path: Path) -> None:
+    """Its own provider, over the whole file: calls, arguments and statements begin and end where it says."""
+    data = path.read_bytes()
+    part = Part(Lines(data), data)
+    spans = MetadataWrapper(part.tree, unsafe_skip_copy=True).resolve(ByteSpanPositionProvider)
+    kinds = (cst.Arg, cst.BaseExpression, cst.BaseSmallStatement, cst.BaseStatement)
+    nodes = [node for node in spans if isinstance(node, kinds)]
+    assert len(nodes) > 100
+    for node in nodes:
+        place = part.place(node)
+        assert (place.start, place.end - place.start) == (spans[node].start, spans[node].length), code(node)
 
 
 def named(module: Module, name: str) -> Function:

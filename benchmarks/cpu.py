@@ -32,7 +32,7 @@ def main():
 
     import torch
     from legs_adapters.shims.inria import forks, taming
-    from legs_adapters.shims.inria.survey import Call, Interface
+    from legs_adapters.shims.inria.survey import Interface, InterfaceCall
     from legs_adapters.shims.modules import FasterGSCudaBackend as fastergs
     from legs_adapters.shims.modules import diff_gaussian_rasterization as inria
     from legs_adapters.shims.modules import diff_gaussian_rasterization_fastgs as fastgs
@@ -69,7 +69,7 @@ def main():
         interface = Interface()
         line = standing.__code__.co_firstlineno
         names = ("rendered_image", "radii", "rendered_depth", "rendered_alpha")
-        interface.calls = [Call(os.path.realpath(__file__), line, line + 40, names)]
+        interface.calls = [InterfaceCall(os.path.realpath(__file__), line, line + 40, names)]
         return module.module("diff_fork", interface)
 
     def direct(raw, columns):

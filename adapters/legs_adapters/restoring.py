@@ -31,7 +31,7 @@ class _TooLongError(Exception):
     """The search takes more steps than a file may."""
 
 
-class _Part(NamedTuple):
+class _Piece(NamedTuple):
     """One call or line that a patch wrote.
 
     Attributes:
@@ -76,7 +76,7 @@ def _restored(layer: Layer, data: bytes, spend: Callable[[int], None]) -> Tuple[
     every = list(_parts(layer, code, spend))
     parts = {part.start: part for part in every if _NAMED.search(code, part.start, part.end)}
     left = bytearray(now)  # without what is put back
-    places: List[Tuple[int, int, _Part]] = []
+    places: List[Tuple[int, int, _Piece]] = []
     for around in _AROUND:
         for part in parts.values():
             first, last = bisect_left(starts, part.start), bisect_left(starts, part.end)
@@ -110,7 +110,7 @@ def _restored(layer: Layer, data: bytes, spend: Callable[[int], None]) -> Tuple[
     return data, f"it was edited since, and {stays}"
 
 
-def _parts(layer: Layer, code: bytes, spend: Callable[[int], None]) -> Iterator[_Part]:
+def _parts(layer: Layer, code: bytes, spend: Callable[[int], None]) -> Iterator[_Piece]:
     """Yield what a patch wrote; edits within one call are one part."""
     shift = 0
     spans: List[Tuple[int, int, int, int]] = []  # of the parts, in the original and in the patched text
@@ -124,7 +124,7 @@ def _parts(layer: Layer, code: bytes, spend: Callable[[int], None]) -> Iterator[
         end = _end(code, begun, end, spend)
         spans.append((was, max(edit.end, end - shift), begun, end))
     for was, until, begun, end in spans:
-        yield _Part(begun, end, layer.original[was:until], was)
+        yield _Piece(begun, end, layer.original[was:until], was)
 
 
 def _code(text: bytes) -> bytes:

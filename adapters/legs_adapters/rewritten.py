@@ -94,7 +94,7 @@ def install(sources: Dict[str, bytes]) -> None:
     A process that is spawned (`torch.multiprocessing.spawn`, DataLoader workers) starts as a new Python, which imports
     the script again: it installs the same sources before.
     """
-    sys.meta_path.insert(0, Finder(sources))
+    sys.meta_path.insert(0, SourceFinder(sources))
     call_when_spawned(install, sources)
     spawn: Any = multiprocessing.spawn
 
@@ -113,11 +113,11 @@ def call_when_spawned(function: Callable[[Any], None], argument: Any) -> None:
     """Let each process that this one spawns call a module's function before it does anything else."""
     spawn: Any = multiprocessing.spawn
     prepare = spawn.get_preparation_data
-    call = _Call(function, argument)
+    call = _SpawnedCall(function, argument)
     spawn.get_preparation_data = lambda name: {**prepare(name), f"legs {function.__name__}": call}
 
 
-class _Call:
+class _SpawnedCall:
     """A call that is made where this is unpickled."""
 
     def __init__(self, function: Callable[[Any], None], argument: Any) -> None:
@@ -154,7 +154,7 @@ class Loader(importlib.machinery.SourceFileLoader):
         return self.source_to_code(data, self.path)
 
 
-class Finder:
+class SourceFinder:
     """Find modules as Python does, and replace the loader of rewritten ones."""
 
     def __init__(self, sources: Dict[str, bytes]) -> None:

@@ -350,8 +350,8 @@ def test_deeper_than_the_stack(tmp_path, monkeypatch):
             raise RecursionError
         return self._as_before(function)
 
-    monkeypatch.setattr(find._Finder, "_as_before", find._Finder._entries, raising=False)
-    monkeypatch.setattr(find._Finder, "_entries", entries)
+    monkeypatch.setattr(find._Search, "_as_before", find._Search._entries, raising=False)
+    monkeypatch.setattr(find._Search, "_entries", entries)
     other = "from utils.loss_utils import l1_loss\nx = l1_loss(a, b)\n"
     found = module.plan(beside(tmp_path, {"other.py": other}))
     assert [(one.path, one.reason) for one in found.findings.unreadable] == [("other.py", "is nested too deeply")]

@@ -9,7 +9,7 @@ pytest.importorskip("numba")
 pytest.importorskip("scipy")
 
 from legs_adapters.shims.inria import forks
-from legs_adapters.shims.inria.survey import Call, Interface
+from legs_adapters.shims.inria.survey import Interface, InterfaceCall
 from legs_adapters.shims.missing import MissingShim
 
 from tests.lab import oracle
@@ -21,7 +21,7 @@ def forked(results, extra=(), **more):
     interface = Interface()
     interface.fields = list(extra)
     lines = (forked_call.__code__.co_firstlineno, forked_call.__code__.co_firstlineno + 20)
-    interface.calls = [Call(__file__, *lines, tuple(results))]
+    interface.calls = [InterfaceCall(__file__, *lines, tuple(results))]
     module = forks.module("diff_fork", interface)
     given, fields = gaussians(), camera()
     settings = module.GaussianRasterizationSettings(**fields, **more)

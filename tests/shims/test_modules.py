@@ -19,7 +19,7 @@ from legs_adapters.shims.finder import build, table_for
 from legs_adapters.shims.inria import forks, taming
 from legs_adapters.shims.inria.relocation import compute_relocation
 from legs_adapters.shims.inria.sparse_adam import SparseGaussianAdam
-from legs_adapters.shims.inria.survey import Call, Interface
+from legs_adapters.shims.inria.survey import Interface, InterfaceCall
 from legs_adapters.shims.missing import MissingShim
 from legs_adapters.shims.modules import diff_gaussian_rasterization as inria
 from legs_adapters.shims.modules import fused_ssim, lpips, simple_knn, torch_scatter, torchvision
@@ -224,8 +224,8 @@ class TestOthers:
 
     def test_a_fork_s_own_rasterizer_is_not_inria_s(self):
         plain, more, scored = Interface(), Interface(), Interface()
-        plain.calls = [Call("a.py", 1, 2, ("image", "radii"))]
-        more.calls = [Call("a.py", 1, 2, ("image", "radii", "depth"))]
+        plain.calls = [InterfaceCall("a.py", 1, 2, ("image", "radii"))]
+        more.calls = [InterfaceCall("a.py", 1, 2, ("image", "radii", "depth"))]
         scored.fields = ["pixel_weights"]
         name = "diff_gaussian_rasterization"
         for interface, home in ((plain, inria), (more, forks), (scored, taming)):

@@ -62,7 +62,7 @@ class Lines:
 
 
 @dataclass
-class _Writing(CodegenState):
+class _TokenCount(CodegenState):
     """The tokens that LibCST writes, and which are a node's, by its id: LibCST's own spans take twice as long."""
 
     spans: Dict[int, Tuple[int, int]] = field(default_factory=dict)
@@ -108,7 +108,7 @@ class Part:
             ValueError: LibCST would write another text than it read.
         """
         if not self._spans:
-            writing = _Writing(self.tree.default_indent, self.tree.default_newline)
+            writing = _TokenCount(self.tree.default_indent, self.tree.default_newline)
             with held_back():  # in there LibCST would make a KeyError of Ctrl-C
                 self.tree._codegen(writing)
             written = "".join(writing.tokens).encode(self.tree.encoding)

@@ -64,7 +64,7 @@ def find(
     with progress(len(named), "files read") as bar:  # half of a file when it is parsed, half when it was judged
         program.when_read = lambda path: bar.update(0.5 * (path in named))
         analysis = Analysis(program)
-        found = _Finder(analysis, by_hand, bar).run()
+        found = _Search(analysis, by_hand, bar).run()
     found = with_trace(found, analysis, trace) if trace is not None and not by_hand else found
     left = found.left
     found = with_ssims(found, analysis, by_hand) if ssim or masks else found
@@ -72,7 +72,7 @@ def find(
     return with_masks(found, analysis) if masks else found
 
 
-class _Finder:
+class _Search:
     def __init__(self, analysis: Analysis, by_hand: Sequence[Tuple[str, int]], bar: Any) -> None:
         self.analysis = analysis
         self.bar = bar

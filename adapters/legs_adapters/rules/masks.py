@@ -44,25 +44,25 @@ _MOST = 100  # expressions that a rendering is followed through
 
 def with_masks(found: Findings, analysis: Analysis) -> Findings:
     """Return findings with the lines that mask the renderings of their terms, and with those to be written by hand."""
-    finder = _Finder(analysis)
+    masking = _MaskLines(analysis)
     for site in found.sites:
         form = site.form
         sides = (form.second, form.first) if site.swapped else (form.first, form.second)
         whole = [side.value if site.selection and isinstance(side, cst.Subscript) else side for side in sides]
-        pair = _Pair(site.scope, form.node, whole[0], whole[1])
+        pair = _ImagePair(site.scope, form.node, whole[0], whole[1])
         if isinstance(form, PassedByName):
-            finder.problems.append(pair.problem(site.scope, form.node, "the L1 is called elsewhere"))
+            masking.problems.append(pair.problem(site.scope, form.node, "the L1 is called elsewhere"))
         elif not form.term:
-            finder.look_at(pair)
+            masking.look_at(pair)
     for entry in found.patched:
-        finder.look_at_patched(entry)
-    lines, problems = finder.settled()
+        masking.look_at_patched(entry)
+    lines, problems = masking.settled()
     edited = {id(part) for site in found.sites for part in walk_expressions(site.form.node)}
-    left = [entry for line in lines for entry in finder.diluted(line, edited)]
+    left = [entry for line in lines for entry in masking.diluted(line, edited)]
     return found.with_more(sites=[line.site for line in lines], problems=problems, left=left)
 
 
-class _Pair(NamedTuple):
+class _ImagePair(NamedTuple):
     """The two images of a term, without the index by a mask that both carry; and the term, in its function."""
 
     function: Function
@@ -82,10 +82,10 @@ class _Pair(NamedTuple):
         return Problem.at(function, function.place(node), f"not masked: {why}", advice)
 
 
-class _Line(NamedTuple):
+class _MaskLine(NamedTuple):
     """A line between two statements of a block, and the bytes that it covers: what follows it in the block."""
 
-    pair: _Pair
+    pair: _ImagePair
     form: Masked
     start: int
     end: int
@@ -107,11 +107,11 @@ class _Line(NamedTuple):
         return Site.at(function, self.form, f"{self.form.line}, before line {function.place(before).line}")
 
 
-class _Finder:
+class _MaskLines:
     def __init__(self, analysis: Analysis) -> None:
         self.analysis = analysis
-        self.lines: Dict[Tuple[Function, Optional[str]], List[_Line]] = {}  # by the rendering's function and place
-        self.unnamed: List[_Pair] = []
+        self.lines: Dict[Tuple[Function, Optional[str]], List[_MaskLine]] = {}  # by the rendering's function and place
+        self.unnamed: List[_ImagePair] = []
         self.problems: List[Problem] = []
         self._spans: Dict[int, List[Place]] = {}  # of the statements of a block, by its id
 
@@ -123,9 +123,9 @@ class _Finder:
             for call in function.flow.calls:
                 sides = arguments(call)[0]
                 if call.func in weighted and function.place(call.func).line == entry.line and len(sides) >= 2:
-                    self.look_at(_Pair(function, call, sides[0], sides[1]))
+                    self.look_at(_ImagePair(function, call, sides[0], sides[1]))
 
-    def look_at(self, pair: _Pair) -> None:
+    def look_at(self, pair: _ImagePair) -> None:
         """Take in a term: the line of its rendering, or a problem."""
         made = pair.function.flow.value_of(pair.prediction)
         resolve = self.analysis.program.resolve
@@ -142,7 +142,7 @@ class _Finder:
             covered = any(one.start == line.start and one.covers(pair.prediction) for one in known)
             known += [] if covered else [line]
 
-    def diluted(self, line: _Line, edited: Set[int]) -> Iterator[Left]:
+    def diluted(self, line: _MaskLine, edited: Set[int]) -> Iterator[Left]:
         """Yield the calls that get both images of a line after it, and are no terms of ours: not in what is edited."""
         function, resolve = line.pair.function, self.analysis.program.resolve
         pair = {path_of(line.pair.prediction), path_of(line.pair.target)}
@@ -158,7 +158,7 @@ class _Finder:
             corrected = f"(1.0 - (1.0 - {term}) / {share})" if is_similarity else f"{term} / {share}"
             yield Left.at(function, place, f"diluted by masked pixels if it is a mean over all; write {corrected}")
 
-    def settled(self) -> Tuple[List[_Line], List[Problem]]:
+    def settled(self) -> Tuple[List[_MaskLine], List[Problem]]:
         """Return the lines that mask every term, and the problems; where one is not written, others may leak."""
         kept = [line for lines in self.lines.values() for line in lines]
         left = None
@@ -176,7 +176,7 @@ class _Finder:
                 self.problems.append(pair.problem(pair.function, pair.node, "the rendering has no name"))
         return kept, list(dict.fromkeys(self.problems))
 
-    def _leak(self, pair: _Pair) -> Optional[Decider]:
+    def _leak(self, pair: _ImagePair) -> Optional[Decider]:
         """Return a read that takes what a rendering is made of into the loss, and comes after no line."""
         work: List[Tuple[Function, cst.CSTNode]] = [(pair.function, pair.prediction)]
         found: List[Tuple[Function, Optional[cst.CSTNode]]]
@@ -226,7 +226,7 @@ class _Finder:
                 found.setdefault(path, []).append((call, given))
         return found
 
-    def _line(self, pair: _Pair) -> Union[_Line, str]:
+    def _line(self, pair: _ImagePair) -> Union[_MaskLine, str]:
         """Return the line, in the outermost block in which both images are defined before the term; or why not."""
         function, reaching = pair.function, pair.function.flow.reaching
         parts = [part for side in (pair.prediction, pair.target) for part in walk_expressions(side)]
@@ -245,7 +245,7 @@ class _Finder:
             unbound = [some for some in unbound if not self._bind(function, block, [at for at in some if at < end])]
             if not here and not unbound:
                 form = pair.form(block[after] if after >= 0 else None, block[after + 1])
-                return _Line(pair, form, places[after + 1].start, places[-1].end)
+                return _MaskLine(pair, form, places[after + 1].start, places[-1].end)
         return "no line before the term surely comes after both images"
 
     def _bind(self, function: Function, block: Sequence[cst.CSTNode], starts: Sequence[int]) -> bool:

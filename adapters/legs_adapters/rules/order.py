@@ -9,7 +9,7 @@ from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.terms.findings import Evidence
 
 ORDER: Tuple[Rule, ...] = (
-    definition.Definition(),
+    definition.InDefinition(),
     *kinds.KINDS,
     *untrained.UNTRAINED,
     *names.NAMES,

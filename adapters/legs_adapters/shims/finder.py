@@ -20,7 +20,7 @@ from legs_adapters.shims import modules
 from legs_adapters.shims.inria.survey import Interface
 from legs_adapters.shims.missing import complete
 
-__all__ = ["AMENDED", "Finder", "Shim", "build", "install", "table_for"]
+__all__ = ["AMENDED", "Shim", "ShimFinder", "build", "install", "table_for"]
 
 FORKS = "legs_adapters.shims.inria.forks"
 # The real module is imported, then completed by `amend(module)` of this shim.
@@ -62,7 +62,7 @@ def build(name: str, shim: Shim) -> types.ModuleType:
     return complete(name, home.__doc__, *(getattr(home, part) for part in home.__all__))
 
 
-class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+class ShimFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Find the shims of a table, and their submodules."""
 
     def __init__(self, table: Dict[str, Shim]) -> None:
@@ -136,8 +136,8 @@ def _is_for_a_library() -> bool:
     return "site-packages" in parts or "dist-packages" in parts
 
 
-def install(table: Optional[Dict[str, Shim]] = None) -> Finder:
+def install(table: Optional[Dict[str, Shim]] = None) -> ShimFinder:
     """Install the import hook before Python's own finders, and return it."""
-    finder = Finder(table_for() if table is None else table)
+    finder = ShimFinder(table_for() if table is None else table)
     sys.meta_path.insert(0, finder)
     return finder

@@ -11,7 +11,7 @@ from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
 
 
-class Definition(Rule):
+class InDefinition(Rule):
     """The term is in the body of the codebase's own L1 function, whose calls are decided one by one.
 
     skipped:

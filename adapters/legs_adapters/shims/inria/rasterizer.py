@@ -12,10 +12,10 @@ from legs_adapters.shims.missing import MissingShim, check_finite, refuse_unknow
 from legs_loss import LegsError
 from legs_loss.lab.rasterizer import NEAR, CompactBox, Drawn, Lens, Tensors, draw
 
-__all__ = ["Gaussians", "Rasterizer", "RasterizerBase", "check_one_of", "given_or_none"]
+__all__ = ["GivenGaussians", "Rasterizer", "RasterizerBase", "check_one_of", "given_or_none"]
 
 
-class Gaussians(NamedTuple):
+class GivenGaussians(NamedTuple):
     """Inputs of Inria's rasterizer: spherical harmonics or colours, scales and rotations or covariances.
 
     means3D [N, 3]; means2D [N, 2 to 4], which receives a gradient; opacities [N, 1]; shs [N, K, 3];
@@ -40,7 +40,7 @@ class RasterizerBase(nn.Module):
         inputs: the names of ``forward``'s arguments, in their order.
     """
 
-    inputs: Tuple[str, ...] = Gaussians._fields
+    inputs: Tuple[str, ...] = GivenGaussians._fields
 
     def __init__(self, raster_settings: Any) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class RasterizerBase(nn.Module):
 class Rasterizer(RasterizerBase):
     """Draw Gaussians from the view of its settings. A fork's differs in ``inputs``, `lens`, `clip` and `results`."""
 
-    inputs: Tuple[str, ...] = (*Gaussians._fields, "dc")
+    inputs: Tuple[str, ...] = (*GivenGaussians._fields, "dc")
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Draw, and return `results`."""
@@ -83,14 +83,14 @@ class Rasterizer(RasterizerBase):
         dc = given.pop("dc", None)  # the constant harmonic, which some forks pass separately
         if dc is not None and dc.numel():
             given["shs"] = dc if given["shs"] is None else torch.cat([dc, given["shs"]], 1)
-        gaussians = Gaussians(**{name: given[name] for name in Gaussians._fields})
+        gaussians = GivenGaussians(**{name: given[name] for name in GivenGaussians._fields})
         return self.results(self.draw(gaussians), given)
 
     def lens(self) -> Lens:
         """Return how the settings change the footprints."""
         return Lens()
 
-    def clip(self, gaussians: Gaussians) -> Optional[CompactBox]:
+    def clip(self, gaussians: GivenGaussians) -> Optional[CompactBox]:
         """Return a function that restricts Gaussians to fewer tiles, or None."""
         return None
 
@@ -108,10 +108,10 @@ class Rasterizer(RasterizerBase):
         """Return radii int32 [N], 0 for what is out of sight, before anything is drawn: Scaffold-GS and its family."""
         nothing = means3D.new_zeros(len(means3D), 3)
         with torch.no_grad():  # transparent Gaussians have a radius, and need no blending
-            gaussians = Gaussians(means3D, nothing, nothing[:, :1], None, nothing, scales, rotations, cov3D_precomp)
-            return self.draw(gaussians).radii
+            given = means3D, nothing, nothing[:, :1], None, nothing, scales, rotations, cov3D_precomp
+            return self.draw(GivenGaussians(*given)).radii
 
-    def draw(self, gaussians: Gaussians) -> Drawn:
+    def draw(self, gaussians: GivenGaussians) -> Drawn:
         """Draw, differentiable in everything but the view.
 
         Raises:

@@ -13,12 +13,12 @@ from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Se
 
 from legs_adapters.code.folders import walk
 
-__all__ = ["Call", "Interface", "survey"]
+__all__ = ["Interface", "InterfaceCall", "survey"]
 
 RASTERIZER, SETTINGS = "GaussianRasterizer", "GaussianRasterizationSettings"
 
 
-class Call(NamedTuple):
+class InterfaceCall(NamedTuple):
     """One call of a rasterizer: its file, its first and last line, and the names that its result is unpacked to."""
 
     path: str
@@ -37,7 +37,7 @@ class Interface:
 
     def __init__(self) -> None:
         self.fields: List[str] = []
-        self.calls: List[Call] = []
+        self.calls: List[InterfaceCall] = []
 
     def is_like(self, fields: Sequence[str], results: int) -> bool:
         """Return whether the code uses these settings only, and unpacks this number of results at each call."""
@@ -110,7 +110,7 @@ def _read(tree: ast.Module, path: str, found: Dict[str, Interface]) -> None:
         if module is not None:
             target = node.targets[0] if isinstance(node, ast.Assign) else None
             lines = [child.lineno for child in _children(node)]
-            found[module].calls.append(Call(path, min(lines), max(lines), _names(target)))
+            found[module].calls.append(InterfaceCall(path, min(lines), max(lines), _names(target)))
 
 
 def _called(node: Any, names: Dict[str, str]) -> Optional[str]:

@@ -11,7 +11,7 @@ from typing import Any, Dict, Tuple
 
 import torch
 
-from legs_adapters.shims.inria.rasterizer import Gaussians, Rasterizer
+from legs_adapters.shims.inria.rasterizer import GivenGaussians, Rasterizer
 from legs_adapters.shims.inria.settings import SETTINGS, settings_type
 from legs_adapters.shims.inria.sparse_adam import SparseGaussianAdam
 from legs_adapters.shims.inria.survey import Interface
@@ -27,7 +27,7 @@ class GaussianRasterizer(Rasterizer):
     """Draw Gaussians from the view of its settings."""
 
     module = "diff_gaussian_rasterization"
-    inputs: Tuple[str, ...] = (*Gaussians._fields[:3], "dc", *Gaussians._fields[3:])
+    inputs: Tuple[str, ...] = (*GivenGaussians._fields[:3], "dc", *GivenGaussians._fields[3:])
 
     def results(self, drawn: Drawn, given: Dict[str, Any]) -> Tuple[Any, ...]:
         """Return image, radii; counts, lists, listsRender, listsDistance; centres, depths, radii; and four sums.

@@ -12,7 +12,7 @@ from typing import Any, Dict, Tuple
 import torch
 from torch import Tensor
 
-from legs_adapters.shims.inria.rasterizer import Gaussians, Rasterizer
+from legs_adapters.shims.inria.rasterizer import GivenGaussians, Rasterizer
 from legs_adapters.shims.inria.settings import SETTINGS, settings_type
 from legs_adapters.shims.inria.sparse_adam import SparseGaussianAdam
 from legs_loss.lab.rasterizer import CompactBox, Drawn, Lens
@@ -29,13 +29,13 @@ GaussianRasterizationSettings: Any = settings_type(
 class GaussianRasterizer(Rasterizer):
     """Draw Gaussians from the view of its settings, each in the tiles of its compact box."""
 
-    inputs: Tuple[str, ...] = (*Gaussians._fields[:3], "dc", *Gaussians._fields[3:])
+    inputs: Tuple[str, ...] = (*GivenGaussians._fields[:3], "dc", *GivenGaussians._fields[3:])
 
     def lens(self) -> Lens:
         """Return a footprint that is not clipped to a square."""
         return Lens(square=EVERYWHERE)
 
-    def clip(self, gaussians: Gaussians) -> CompactBox:
+    def clip(self, gaussians: GivenGaussians) -> CompactBox:
         """Return FastGS's compact box."""
         return CompactBox(gaussians.opacities, self.raster_settings.mult)
 

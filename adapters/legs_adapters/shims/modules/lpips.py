@@ -31,7 +31,7 @@ def _unavailable(error: BaseException) -> None:
 
 def _real(name: str) -> Any:
     """Import the real module, without the shim."""
-    hook = next(found for found in sys.meta_path if isinstance(found, finder.Finder))
+    hook = next(found for found in sys.meta_path if isinstance(found, finder.ShimFinder))
     kept = {key: sys.modules.pop(key) for key in list(sys.modules) if key.split(".")[0] == name}
     entry = hook.table.pop(name)
     try:

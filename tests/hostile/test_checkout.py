@@ -72,7 +72,9 @@ def test_every_mode_ends(stranger, capsys):
 
 def test_verify_copies_what_is_a_file(stranger, monkeypatch, capsys):
     seen = []
-    monkeypatch.setattr(verifying, "_run", lambda root, *_: seen.append(sorted(os.listdir(str(root)))) or run_of_none())
+    monkeypatch.setattr(
+        verifying, "run_watched", lambda root, *_: seen.append(sorted(os.listdir(str(root)))) or run_of_none()
+    )
     monkeypatch.setattr(verifying, "_claims", lambda runs: {"all copied": True})
     monkeypatch.setattr(verifying, "check_imports", lambda *_: None)
     assert main(["--verify", str(stranger)]) == 0, capsys.readouterr()
@@ -95,7 +97,7 @@ def test_verify_beside_another(other, number, tmp_path, monkeypatch):
     root = checkout(tmp_path / "root", {**SOURCES, "train.py": SOURCES["one.py"]})
     assert main([str(root)]) == 0
     monkeypatch.setattr(verifying, "check_imports", lambda *_: None)
-    monkeypatch.setattr(verifying, "_run", look)
+    monkeypatch.setattr(verifying, "run_watched", look)
     monkeypatch.setattr(verifying, "_claims", lambda runs: {"whole": all(run.code == 0 for run in runs.values())})
     monkeypatch.setattr("legs_loss.lab.embedded.write_embedded_scene", lambda place, **_: place)
     monkeypatch.setattr("legs_loss.scenes.read_scene", lambda place: place)
@@ -112,9 +114,9 @@ def test_verify_beside_another(other, number, tmp_path, monkeypatch):
     assert found == {**SOURCES, "train.py": SOURCES["one.py"]}
 
 
-def look(root, words, *_):
+def look(root, _, command, *others):
     """Stand in for a training: exit code 0 where the copy is wholly patched, or wholly not."""
-    patched = "legs_loss.l1_loss" in (root / words[0]).read_text()
+    patched = "legs_loss.l1_loss" in (root / command.script).read_text()
     wanted = root.parent.name == "patched"
     return run_of_none()._replace(code=0 if patched == wanted else 1)
 

@@ -93,7 +93,7 @@ def filled(script: Path, text: Optional[str], given: Sequence[str], iterations: 
         LegsError: the text names anything else.
     """
     if text is None:
-        files = (script, *script.parent.glob("arguments/*.py"))
+        files = [path for path in (script, *script.parent.glob("arguments/*.py")) if path.is_file()]  # no pipe
         source = "\n".join(path.read_text(encoding="utf-8", errors="replace") for path in files)
         text = " ".join(words for word, words in _ARGUMENTS if word in source and words.split()[0] not in given)
     with socket.socket() as free:

@@ -39,7 +39,7 @@ class Views(torch.utils.data.Dataset):
         spec = legs_loss.WeightSpec()
         entry = self.store.find(self.names[index], *image.shape[1:], spec)
         loss = legs_loss.l1_loss(torch.zeros_like(image).requires_grad_(), image)  # counted in the worker, not here
-        return index, image, final_weight(self.store, entry, spec), loss.item()
+        return index, image, self.store.weight(entry, spec), loss.item()
 
 
 if __name__ == "__main__":

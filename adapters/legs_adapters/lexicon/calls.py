@@ -137,14 +137,14 @@ def picked_from(call: cst.Call, index: int = 0) -> int:
 
 def _keyed(call: CallReading) -> Optional[Meaning]:
     """The picture under the key that a call gives, ``drawn(camera, "depth")``, whatever other calls ask for."""
-    value_of = call.function.flow.value_of
     for callee in callees(call.program, call.function, call.node) if call.values else ():
         given = [(name, callee.given(call.node, name)) for name in callee.parameters]
-        said = {name: constant(value_of(value) or value) for name, value in given if value is not None}
+        said = {name: constant(call.function.flow.value_of(side) or side) for name, side in given if side is not None}
         keys = {name: key for name, key in said.items() if isinstance(key, str)}
         parts = walk_expressions(callee.body) if keys and callee.module.spend(callee.flow.steps) else ()
         names = [code(part.value) for part in parts if isinstance(part, cst.Index)]
-        for key in [keys[name] for name in names if name in keys][:1]:
+        key = next((keys[name] for name in names if name in keys), "")
+        if key:
             returned = mix(call.meaning_of(callee, value) for value in callee.flow.returns)
             if kind_of_words(key) is not None or returned.kind not in (None, "image"):  # the kind of another key
                 return Meaning(kind_of_words(key), role_of_words(key) or returned.role)

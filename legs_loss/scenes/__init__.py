@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Optional, Tuple, Union
@@ -37,28 +36,21 @@ def read_scene(path: Union[str, Path], images: Optional[str] = None) -> Scene:
     if not root.is_dir():
         what = f"{root} is a file" if root.exists() else f"there is no folder {root}"
         raise LegsError(f"{what}: a scene is a folder")
-    return replace(_read_scene(root, images), images=images)
-
-
-def _read_scene(root: Path, images: Optional[str]) -> Scene:
-    if (root / "sparse").is_dir():
-        return read_colmap(root, *_images_folder(root, images or "images"))
-    if find_transforms(root):
-        return read_transforms(root)
-    if images is None and not (root / "images").is_dir():
-        return read_folder(root, root, "")
-    return read_folder(root, *_images_folder(root, images or "images"))
+    is_colmap = (root / "sparse").is_dir()
+    if find_transforms(root) and not is_colmap:
+        scene = read_transforms(root)
+    elif is_colmap or images is not None or (root / "images").is_dir():
+        scene = (read_colmap if is_colmap else read_folder)(root, *_images_folder(root, images or "images"))
+    else:
+        scene = read_folder(root, root, "")
+    return replace(scene, images=images, views=tuple(sorted(scene.views, key=lambda view: view.name)))
 
 
 def _images_folder(root: Path, images: str) -> Tuple[Path, str]:
     """Return the folder of the photographs and the prefix of their names."""
-    folder = root / images  # pathlib keeps an absolute ``images`` as it is
-    if not folder.is_dir():
-        if not os.path.isdir(images):
-            raise LegsError(f"there is no folder {folder}: name the scene's images with --images")
-        folder = Path(images)
-    try:
-        prefix = folder.resolve().relative_to(root.resolve()).as_posix()
-    except ValueError:  # outside of the scene
-        prefix = folder.resolve().name
-    return folder, f"{prefix}/"
+    there = [folder for folder in (root / images, Path(images)) if folder.is_dir()]  # the scene's first
+    if not there:
+        raise LegsError(f"there is no folder {root / images}: name the scene's images with --images")
+    folder, top = there[0].resolve(), root.resolve()
+    inside = folder.relative_to(top).as_posix() if top in (folder, *folder.parents) else folder.name
+    return there[0], f"{inside}/"

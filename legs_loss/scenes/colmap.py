@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, Callable, Dict, Iterator, List, NamedTuple, Op
 import numpy as np
 
 from legs_loss.errors import LegsError
-from legs_loss.scenes.model import Camera, PointCloud, Scene, View
+from legs_loss.scenes.model import Camera, PointCloud, Scene, View, is_lens
 from legs_loss.system.files import open_regular, read_text
 
 # COLMAP's camera models in the order of their ids, each with its number of parameters.
@@ -28,9 +28,7 @@ _IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _POINT_LINE = "POINT3D_ID X Y Z R G B ERROR TRACK..."
 _LARGEST = 2 << 30  # bytes of a text, which is read whole; of a binary file as much is read as its counts say
 _LONGEST = 4096  # bytes of an image's name
-_SIDE = 1 << 20  # pixels
-_LONGEST_FOCAL, _FARTHEST_CAMERA = 1e9, 1e12  # pixels, and the scene's unit: what float32 can still compute with
-_FARTHEST = float(np.finfo(np.float32).max)
+_FARTHEST_CAMERA = 1e12  # in the scene's unit: what float32 can still compute with
 
 
 class _Intrinsics(NamedTuple):
@@ -43,8 +41,7 @@ class _Intrinsics(NamedTuple):
 class _Image(NamedTuple):
     name: str
     camera_id: int
-    quaternion: Tuple[float, ...]  # w, x, y, z: turns world axes into camera axes
-    translation: Tuple[float, ...]
+    pose: np.ndarray  # [4, 4], world -> camera
 
 
 def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
@@ -71,9 +68,8 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
         if not os.path.isfile(str(path)) and os.path.isfile(str(images / path.name)):  # pathlib's raise for some names
             path, name = images / path.name, path.name
         lens = cameras[image.camera_id]
-        views.append(View(f"{prefix}{name}", path, _pinhole(lens, image), camera_model=lens.model))
+        views.append(View(f"{prefix}{name}", path, _pinhole(lens, image.pose), camera_model=lens.model))
     points = partial(_read, points_file) if points_file.is_file() else None
-    views.sort(key=lambda view: view.name)
     return Scene(root, "colmap", tuple(views), points, notes=_larger_models(root, file.parent, len(views)))
 
 
@@ -117,26 +113,11 @@ def _read(path: Path) -> Any:
         raise LegsError(f"{path} is not as COLMAP writes it: {error}") from None
 
 
-def _pinhole(lens: _Intrinsics, image: _Image) -> Optional[Camera]:
-    if lens.model == "PINHOLE":
-        fx, fy, cx, cy = lens.params
-    elif lens.model == "SIMPLE_PINHOLE":
-        fx, cx, cy = lens.params
-        fy = fx
-    else:
+def _pinhole(lens: _Intrinsics, pose: np.ndarray) -> Optional[Camera]:
+    if lens.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
         return None
-    pose = np.eye(4)
-    pose[:3, :3] = _rotation(image.quaternion)
-    pose[:3, 3] = image.translation
-    return Camera(lens.width, lens.height, fx, fy, cx, cy, pose)
-
-
-def _rotation(quaternion: Tuple[float, ...]) -> np.ndarray:
-    """Return [3, 3] of a quaternion w, x, y, z of any length: v -> 2 u (u.v) + (w^2 - u.u) v + 2w u x v."""
-    w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
-    u = np.array([x, y, z])
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return 2 * np.outer(u, u) + (w * w - u @ u) * np.eye(3) + 2 * w * cross
+    *focal, cx, cy = lens.params
+    return Camera(lens.width, lens.height, focal[0], focal[-1], cx, cy, pose)
 
 
 class _Cursor:
@@ -250,10 +231,7 @@ def _points_txt(text: str) -> PointCloud:
 def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) -> _Intrinsics:
     if len(params) != MODELS.get(model, len(params)):
         raise ValueError(f"a camera of model {model} has {MODELS[model]} parameters, not {len(params)}")
-    focal = params[: 2 if model == "PINHOLE" else 1]
-    if not (
-        0 < width <= _SIDE and 0 < height <= _SIDE and _is_within(params, _LONGEST_FOCAL) and min(focal, default=1) > 0
-    ):
+    if not is_lens(width, height, params[: 2 if model == "PINHOLE" else 1], params):
         raise ValueError(f"a camera of {width}x{height} pixels with parameters {params}")
     return _Intrinsics(model, width, height, params)
 
@@ -265,26 +243,27 @@ def _image(_: Any, w: Any, x: Any, y: Any, z: Any, tx: Any, ty: Any, tz: Any, ca
     parts = name.replace("\\", "/").split("/")
     if ".." in parts or not parts[0] or os.path.isabs(name):
         raise ValueError(f"an image has the name {name!r}, which leads out of the scene")
-    image = _Image(name, int(camera_id), tuple(map(float, (w, x, y, z))), tuple(map(float, (tx, ty, tz))))
-    largest = max(map(abs, image.quaternion))
-    if not (
-        1e-150 < largest < 1e150
-        and _is_within(image.quaternion, 1e150)
-        and _is_within(image.translation, _FARTHEST_CAMERA)
-    ):
+    quaternion, translation = (np.array(values, np.float64) for values in ((w, x, y, z), (tx, ty, tz)))
+    if not (1e-150 < np.abs(quaternion).max() < 1e150 and np.abs(translation).max() < _FARTHEST_CAMERA):  # NaN is not
         raise ValueError(f"the pose of {name!r} is not a number")
-    return image
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = _rotation(quaternion), translation
+    return _Image(name, int(camera_id), pose)
 
 
-def _is_within(values: Tuple[float, ...], limit: float) -> bool:
-    return all(abs(value) < limit for value in values)  # of NaN, too, this is false
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Return [3, 3] of a quaternion w, x, y, z of any length: v -> 2 u (u.v) + (w^2 - u.u) v + 2w u x v."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    u = np.array([x, y, z])
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return 2 * np.outer(u, u) + (w * w - u @ u) * np.eye(3) + 2 * w * cross
 
 
 def _cloud(points: List[Any]) -> PointCloud:
     """Return points of x, y, z, red, green and blue."""
     table = np.asarray(points, dtype=np.float64).reshape(-1, 6)
     positions, colours = table[:, :3], table[:, 3:]
-    if not (np.abs(positions) <= _FARTHEST).all():
+    if not (np.abs(positions) <= np.finfo(np.float32).max).all():
         raise ValueError("a point is nowhere: its position is no number, or none that float32 can hold")
     if colours.size and (colours.min() < 0 or colours.max() > 255):
         raise ValueError("a point's colour is outside of 0..255")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Iterator, List, Sequence
+from typing import Iterator, Sequence
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes.images import is_readable
@@ -42,16 +42,11 @@ def read_folder(root: Path, images: Path, prefix: str) -> Scene:
 
     ``prefix`` goes before a view's name. Raises :class:`LegsError` where there is no image.
     """
-    views: List[View] = []
-    left: List[str] = []
-    for path in files_below(images, PHOTOGRAPHS):
-        name = f"{prefix}{path.relative_to(images).as_posix()}"
-        if is_readable(path):
-            views.append(View(name, path))
-        else:
-            left.append(name)
+    files = {f"{prefix}{path.relative_to(images).as_posix()}": path for path in files_below(images, PHOTOGRAPHS)}
+    views = tuple(View(name, path) for name, path in files.items() if is_readable(path))
+    left = [name for name, path in files.items() if not is_readable(path)]
     notes = (left_out(left),) if left else ()
     if not views:
         why = notes[0] if notes else f"no images ({', '.join(SUFFIXES)})"
         raise LegsError(f"{images} is not a scene: it has no sparse/ of COLMAP, no transforms.json and {why}")
-    return Scene(root, "folder", tuple(sorted(views, key=lambda view: view.name)), notes=notes)
+    return Scene(root, "folder", views, notes=notes)

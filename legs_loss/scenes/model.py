@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Callable, Iterator, Optional, Tuple
+from typing import Callable, Iterator, Optional, Sequence, Tuple
 
 import numpy as np
+
+_SIDE, _LONGEST = 1 << 20, 1e9  # pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +90,11 @@ class Scene:
         Raises :class:`LegsError` when the file is damaged.
         """
         return None if self.read_points is None else self.read_points()
+
+
+def is_lens(width: int, height: int, focal: Sequence[float], params: Sequence[float]) -> bool:
+    """Return whether a camera can have this size, focal lengths and other parameters, in pixels; NaN it cannot."""
+    return 0 < width <= _SIDE and 0 < height <= _SIDE and min(focal) > 0 and bool((np.abs(params) < _LONGEST).all())
 
 
 def view_names(view: str) -> Iterator[str]:

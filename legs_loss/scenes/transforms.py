@@ -7,7 +7,7 @@ import math
 import os
 import posixpath
 from pathlib import Path
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, Iterator, List, Optional
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -15,11 +15,11 @@ from numpy.linalg import LinAlgError
 from legs_loss.errors import LegsError
 from legs_loss.scenes.folder import SUFFIXES
 from legs_loss.scenes.images import image_size
-from legs_loss.scenes.model import Camera, Scene, View
+from legs_loss.scenes.model import Camera, Scene, View, is_lens
 from legs_loss.system.files import read_text
 
 _LARGEST = 1 << 30  # bytes
-_SIDE = 1 << 20  # pixels
+_SPLITS = ("train", "test", "val")
 # OpenGL's camera looks along -z with y up; OpenCV's along z with y down.
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -29,10 +29,8 @@ _WRONG = (ArithmeticError, ValueError, TypeError, LookupError, AttributeError, R
 
 def find_transforms(root: Path) -> List[Path]:
     """Return NeRF's ``transforms_{train,test,val}.json``, else ``transforms.json``; [] without any."""
-    if (root / "transforms_train.json").is_file():
-        files = [root / f"transforms_{split}.json" for split in ("train", "test", "val")]
-        return [file for file in files if file.is_file()]
-    return [file for file in [root / "transforms.json"] if file.is_file()]
+    files = [root / f"transforms_{split}.json" for split in _SPLITS]
+    return [file for file in (files if files[0].is_file() else [root / "transforms.json"]) if file.is_file()]
 
 
 def read_transforms(root: Path) -> Scene:
@@ -53,18 +51,14 @@ def read_transforms(root: Path) -> Scene:
         except _WRONG as error:
             message = f"no {error}" if isinstance(error, KeyError) else error
             raise LegsError(f"{file} is damaged or is not a file of camera poses: {message}") from None
-    return Scene(root, "transforms", tuple(sorted(views.values(), key=lambda view: view.name)))
+    return Scene(root, "transforms", tuple(views.values()))
 
 
-def _read_file(root: Path, file: Path) -> List[View]:
+def _read_file(root: Path, file: Path) -> Iterator[View]:
     common = json.loads(read_text(file, _LARGEST))
     one_split = file.stem.partition("_")[2] or None
-    splits = {
-        _image_name(root, name): split
-        for split in ("train", "test", "val")
-        for name in common.get(f"{split}_filenames") or ()
-    }
-    views = []
+    listed = {split: common.get(f"{split}_filenames") or () for split in _SPLITS}
+    splits = {_image_name(root, name): split for split, names in listed.items() for name in names}
     for frame in common["frames"]:
         name = _image_name(root, frame["file_path"])
         intrinsics = {**common, **frame}
@@ -72,8 +66,7 @@ def _read_file(root: Path, file: Path) -> List[View]:
         camera = _camera(intrinsics, root / name) if model in ("PINHOLE", "SIMPLE_PINHOLE") else None
         mask = intrinsics.get("mask_path")
         mask = None if mask is None else root / _image_name(root, mask)
-        views.append(View(name, root / name, camera, one_split or splits.get(name), model, True, mask))
-    return views
+        yield View(name, root / name, camera, one_split or splits.get(name), model, True, mask)
 
 
 def _image_name(root: Path, file_path: str) -> str:
@@ -98,13 +91,10 @@ def _model(intrinsics: Dict[str, Any]) -> str:
 
 def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
     """Return a frame's camera; None where its size is not written and the image cannot be opened."""
-    if "w" in intrinsics:
-        width, height = int(intrinsics["w"]), int(intrinsics["h"])
-    else:
-        try:
-            width, height = image_size(image)
-        except LegsError:  # the loader will report the error
-            return None
+    try:
+        width, height = (int(intrinsics[side]) for side in "wh") if "w" in intrinsics else image_size(image)
+    except LegsError:  # the loader will report the error
+        return None
     if "fl_x" in intrinsics:
         fx = float(intrinsics["fl_x"])
         fy = float(intrinsics.get("fl_y", fx))
@@ -113,7 +103,7 @@ def _camera(intrinsics: Dict[str, Any], image: Path) -> Optional[Camera]:
         angle = intrinsics.get("camera_angle_y")
         fy = fx if angle is None else height / 2 / math.tan(angle / 2)
     cx, cy = float(intrinsics.get("cx", width / 2)), float(intrinsics.get("cy", height / 2))
-    if not (0 < width <= _SIDE and 0 < height <= _SIDE and (np.abs([fx, fy, cx, cy]) < 1e9).all() and fx > 0 < fy):
+    if not is_lens(width, height, (fx, fy), (fx, fy, cx, cy)):
         raise ValueError(f"{str(image)!r} has a camera of {width}x{height} pixels, focal lengths {fx:g}, {fy:g}")
     camera_to_world = np.asarray(intrinsics["transform_matrix"], dtype=np.float64)
     if camera_to_world.shape == (3, 4):

@@ -9,6 +9,7 @@ import argparse
 import functools
 import importlib
 import sys
+from contextlib import suppress
 from typing import Any, Callable, Dict, Optional, Sequence
 
 from legs_loss._version import __version__
@@ -66,9 +67,8 @@ def exit_code(command: str, work: Callable[[], int], so_far: Callable[[], str] =
 def never_fail_to_print() -> None:
     """Print characters that the terminal's encoding lacks as escapes, instead of raising an error."""
     for stream in (sys.stdout, sys.stderr):
-        reconfigure = getattr(stream, "reconfigure", None)  # replacements in tests and notebooks have none
-        if reconfigure is not None:
-            reconfigure(errors="backslashreplace")
+        with suppress(AttributeError):  # replacements in tests and notebooks have no such method
+            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
 
 
 def say_error(command: str, error: Exception) -> None:

@@ -6,13 +6,10 @@ import argparse
 import importlib
 import os
 import platform
-from typing import TYPE_CHECKING, Iterator, Tuple
+from typing import Iterator, Tuple
 
 from legs_loss._version import __version__
 from legs_loss.system.terminal import say
-
-if TYPE_CHECKING:
-    import torch
 
 HELP = "print versions, devices and the backend of the loss, for a bug report"
 
@@ -31,6 +28,8 @@ def run(args: argparse.Namespace) -> int:
 def _lines() -> Iterator[Tuple[str, str]]:
     import torch
 
+    from legs_loss.kernels.available import BACKENDS
+
     yield "legs-loss", __version__
     yield "python", f"{platform.python_version()}, {platform.platform()}"
     yield "torch", f"{torch.__version__}, {torch.get_num_threads()} threads"
@@ -38,9 +37,10 @@ def _lines() -> Iterator[Tuple[str, str]]:
     for name, package in (("numba", "numba"), ("fused-ssim", "fused_ssim")):
         yield name, _version(package)
     yield "LEGS_BACKEND", os.environ.get("LEGS_BACKEND") or "not set"
-    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    for device in devices:
-        yield f"loss on {device}", _backend(torch.device(device))
+    for kind in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
+        device = torch.device(kind)
+        trial = f"{BACKENDS.known[kind][0]}: {BACKENDS.availability(device).reason}"
+        yield f"loss on {kind}", f"{BACKENDS.chosen(device)}; {trial}"
 
 
 def _cuda() -> str:
@@ -62,10 +62,3 @@ def _version(package: str) -> str:
     except Exception as error:  # whatever a broken install raises
         return f"broken: {type(error).__name__}: {error}"
     return str(getattr(module, "__version__", "installed"))
-
-
-def _backend(device: torch.device) -> str:
-    from legs_loss.kernels.available import BACKENDS
-
-    name, _ = BACKENDS.known[device.type]
-    return f"{BACKENDS.chosen(device)}; {name}: {BACKENDS.availability(device).reason}"

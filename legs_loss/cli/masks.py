@@ -9,10 +9,10 @@ paint program, can make such a folder, too: legs precompute SCENE --masks DIR re
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Dict, List
 
+from legs_loss.cli.shared.scene_arguments import add_images, read_noted, say_notes, say_skipped
 from legs_loss.system.terminal import say
 
 if TYPE_CHECKING:
@@ -30,15 +30,9 @@ _BLUNT = 0.1  # of the contrast that a tenth of the photograph has
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", metavar="SCENE", type=Path, help="a scene, or a folder of photographs")
-    parser.add_argument(
-        "--from",
-        dest="kinds",
-        nargs="+",
-        required=True,
-        metavar="WHAT",
-        help=", ".join(("DIR", "FILE", "alpha", "mask_path", *_COMPUTED)),
-    )
-    parser.add_argument("--images", metavar="DIR", help='folder of the photographs, in the scene or a path ("images")')
+    what = ", ".join(("DIR", "FILE", "alpha", "mask_path", *_COMPUTED))
+    parser.add_argument("--from", dest="kinds", nargs="+", required=True, metavar="WHAT", help=what)
+    add_images(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="an empty or new folder; default: SCENE/masks")
 
 
@@ -47,7 +41,6 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from legs_loss.cli.shared.checks import check_empty
-    from legs_loss.cli.shared.scene_arguments import read_noted, say_skipped
     from legs_loss.errors import LegsError
     from legs_loss.precompute.user_maps import UserMaps, is_below
     from legs_loss.scenes.user_maps import file_names, find_maps, write_gray
@@ -61,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             views = tuple(view for view in views if not is_below(view.path, args.scene, UserMaps(kind)))
             folders[kind], strays = find_maps(args.scene, kind, views)
             if strays:
-                say(f"legs: note: {kind}: these match no photograph: {', '.join(map(str, strays[:3]))}", sys.stderr)
+                say_notes([f"{kind}: these match no photograph: {', '.join(map(str, strays[:3]))}"])
     names = file_names(view.name for view in views)
     mostly: List[str] = []
     skipped: Dict[str, str] = {}
@@ -78,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         write_gray(out / names[view.name], mask)
     say_skipped(skipped)
     if mostly:
-        say(f"legs: note: masked by more than half: {', '.join(mostly)}", sys.stderr)
+        say_notes([f"masked by more than half: {', '.join(mostly)}"])
     say(f"{out}: {len(views) - len(skipped)} masks, {len(skipped)} skipped")
     return 1 if skipped else 0
 

@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Dict, Iterable, Optional, Tuple
 
-from legs_loss.cli.shared.scene_arguments import add_images, add_resolution
+from legs_loss.cli.shared.scene_arguments import add_images, add_resolution, say_notes, say_skipped
 from legs_loss.system.machine import cores
 from legs_loss.system.terminal import say
 
@@ -33,40 +33,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     from legs_loss.spec import PRESETS
 
-    parser.add_argument(
-        "scene",
-        metavar="SCENE",
-        nargs="+",
-        help="a COLMAP scene, a scene with transforms.json or a folder of images; a glob; a .txt file of these",
-    )
+    what = "a COLMAP scene, a scene with transforms.json or a folder of images; a glob; a .txt file of these"
+    parser.add_argument("scene", metavar="SCENE", nargs="+", help=what)
     add_images(parser)
     add_resolution(parser, default=-1)
     parser.add_argument("-w", "--white_background", action="store_true", help="as in 3DGS: lay alpha over white")
     parser.add_argument("--preset", choices=PRESETS, default="legs", help="whose operator to use; default: legs")
-    parser.add_argument(
-        "--masks",
-        metavar="DIR|FILE|alpha|mask_path",
-        help="a folder of masks, one for all, the photographs' own alpha, or those that transforms.json names",
-    )
+    what = "a folder of masks, one for all, the photographs' own alpha, or those that transforms.json names"
+    parser.add_argument("--masks", metavar="DIR|FILE|alpha|mask_path", help=what)
     parser.add_argument("--weights", metavar="DIR", help="a folder of weights, .npy too, that multiply the preset's")
     parser.add_argument(
         "--weight_scale", type=float, default=1.0, metavar="W", help="of --weights: what white stands for; default: 1"
     )
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        help="the store's folder, or for several scenes the folder of their stores; default: SCENE/legs_weights, where "
-        "a training finds it",
-    )
+    what = "the store's folder, or for several scenes the folder of their stores"
+    parser.add_argument("--out", metavar="DIR", help=f"{what}; default: SCENE/legs_weights, where a training finds it")
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="of a dask cluster that shares the file system; a scene is a task"
     )
-    parser.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help=f"processes per scene; default: one per core ({cores()}), with --scheduler 1",
-    )
+    what = f"processes per scene; default: one per core ({cores()}), with --scheduler 1"
+    parser.add_argument("--workers", type=int, metavar="N", help=what)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -143,7 +128,7 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     for scene, store in zip(scenes, stores):
         maps = UserMaps(found(args.masks, scene), found(args.weights, scene), args.weight_scale)
         root, out = Path(os.path.abspath(str(scene))), Path(os.path.abspath(str(store)))
-        tasks[SceneTask(root, out, found(args.images, scene), maps, *settings)] = store
+        tasks[SceneTask(root, out, found(args.images, scene), maps, settings)] = store
     return tasks
 
 
@@ -166,20 +151,15 @@ def _refuse_photographs_of_a_scene(folder: Path) -> None:
 
 def _say(store: Path, report: Report) -> int:
     """Print the result of a scene; return 1 if any of it failed."""
-    from legs_loss.cli.shared.scene_arguments import say_skipped
     from legs_loss.precompute.sharpness import unsharp_views
     from legs_loss.store import MANIFEST, WeightStore
 
     say_skipped(report.skipped)
-    for note in report.notes:
-        say(f"legs: note: {note}", sys.stderr)
+    say_notes(report.notes)
     unsharp = unsharp_views(WeightStore(report.store)) if (report.store / MANIFEST).is_file() else []
     if unsharp:
-        say(
-            f"legs: note: {', '.join(unsharp)}: probably out of focus, moved or noisy compared with the others; each "
-            "map is normalised by its own range, so such photographs get larger weights",
-            sys.stderr,
-        )
+        what = "probably out of focus, moved or noisy compared with the others; each map is normalised by its own range"
+        say_notes([f"{', '.join(unsharp)}: {what}, so such photographs get larger weights"])
     for kind, count in report.user_maps.items():
         say(f"{store}: {count} {kind if kind.endswith('s') else kind + 's'} of your own")
     say(f"{store}: {len(report.made)} made, {len(report.kept)} up to date, {len(report.skipped)} skipped")

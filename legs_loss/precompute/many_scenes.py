@@ -7,7 +7,7 @@ import os
 import time
 from collections import Counter
 from pathlib import Path
-from typing import List, NamedTuple, Optional, Sequence
+from typing import List, NamedTuple, Optional, Sequence, Tuple
 
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
@@ -22,16 +22,16 @@ _LARGEST = 64 << 20  # bytes of a list
 
 
 class SceneTask(NamedTuple):
-    """A scene and the settings of :func:`~legs_loss.precompute.precompute`; paths are absolute, the same everywhere."""
+    """A scene, and :func:`~legs_loss.precompute.precompute`'s arguments; paths are absolute, the same everywhere.
+
+    ``settings`` are the spec, the resolution, whether the background is white, and the number of processes.
+    """
 
     scene: Path
     store: Path
     images: Optional[str]
     maps: UserMaps
-    spec: Spec
-    resolution: int
-    white_background: bool
-    workers: int
+    settings: Tuple[Spec, int, bool, int]
 
 
 def find_scenes(given: Sequence[str], lists: Sequence[Path] = ()) -> List[Path]:
@@ -110,5 +110,4 @@ def precompute_scene(task: SceneTask, tell: Listener) -> Report:
             due = time.monotonic() + _TELL_SECONDS
             tell({"scene": str(task.scene), "done": done, "of": of})
 
-    settings = task.spec, task.resolution, task.white_background, task.workers
-    return precompute(scene, task.store, *settings, on_progress=on_progress, maps=task.maps)
+    return precompute(scene, task.store, *task.settings, on_progress=on_progress, maps=task.maps)

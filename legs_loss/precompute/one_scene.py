@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import os
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Callable, Dict, Iterator, List, Optional, Union
 
+import numpy as np
+
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.precompute.executors import outcomes
 from legs_loss.precompute.one_view import UnwritableError, make
 from legs_loss.precompute.origin import note_scene
-from legs_loss.precompute.photograph import compile_response
+from legs_loss.precompute.photograph import response_map
 from legs_loss.precompute.user_maps import NO_MAPS, UserMaps, is_below, stage_user_maps
 from legs_loss.scenes import Scene, image_size, training_size
 from legs_loss.spec import Spec, as_spec
@@ -78,20 +80,21 @@ def precompute(
     spec = as_spec(spec)
     training_size(1 << 20, 1 << 20, resolution)  # a bad resolution is one error, not one a view
     report = Report(out)
-    views = {view.name: view for view in scene.views if not is_below(view.path, scene.root, maps)}
+    views = [view for view in scene.views if not is_below(view.path, scene.root, maps)]
     with StoreWriter(out) as writer:
-        mine = stage_user_maps(scene.root, list(views.values()), resolution, maps, writer.entries(), writer.staging)
-        if mine.added:  # all at once, before any response: what is found in the store is never without its mask
-            writer.commit(mine.added, mine.dropped)
-        report.user_maps = Counter(entry.operator for entry in mine.added)
-        report.notes += [*scene.notes, *mine.notes, *_shared_names(scene)]
-        known: Dict[str, List[Entry]] = {}
+        mine, notes = stage_user_maps(scene.root, views, resolution, maps, writer.entries(), writer.staging)
+        if mine:  # all at once, before any response: what is found in the store is never without its mask
+            writer.commit(mine, [entry for entry in writer.entries() if entry.is_users])
+        report.user_maps = Counter(entry.operator for entry in mine)
+        report.notes += [*scene.notes, *notes, *_shared_names(scene)]
+        known: Dict[str, List[Entry]] = defaultdict(list)
         for entry in writer.entries():
-            known.setdefault(entry.view, []).append(entry)
-        tasks = [(view, known.get(name, [])) for name, view in views.items()]
+            known[entry.view].append(entry)
+        tasks = [(view, known[view.name]) for view in views]
         if workers > 1 and any(not entries for _, entries in tasks):
             with suppress(LegsError):  # a photograph that cannot be read is skipped later, with the reason
-                compile_response(*training_size(*image_size(tasks[0][0].path), resolution), spec)
+                width, height = training_size(*image_size(views[0].path), resolution)
+                response_map(np.zeros((height, width, 3), np.uint8), spec)  # compiled once, not in each process
         work = partial(make, spec, resolution, white_background, out, writer.staging)
         results = outcomes(work, tasks, print, workers if workers > 1 else 0)
         staged: List[Entry] = []

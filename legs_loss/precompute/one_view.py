@@ -37,19 +37,12 @@ def make(
     try:
         source = os.stat(str(view.path))
         width, height = training_size(*image_size(view.path), resolution)
-        wanted: Dict[str, Any] = {
-            "view": view.name,
-            "width": width,
-            "height": height,
-            "operator": spec.operator,
-            "p": spec.p,
-            "eps": spec.eps,
-            "smooth": float(spec.smooth),
-            **({"percentile": float(spec.percentile)} if spec.over == "scene" else {}),
-            "background": ("white" if white_background else "black") if view.composited else None,
-            "source_bytes": source.st_size,
-            "source_mtime_ns": source.st_mtime_ns,
-        }
+        wanted: Dict[str, Any] = {"view": view.name, "width": width, "height": height}
+        wanted.update(operator=spec.operator, p=spec.p, eps=spec.eps, smooth=float(spec.smooth))
+        wanted.update(source_bytes=source.st_size, source_mtime_ns=source.st_mtime_ns)
+        wanted["background"] = ("white" if white_background else "black") if view.composited else None
+        if spec.over == "scene":
+            wanted["percentile"] = float(spec.percentile)
         known = [entry for entry in entries if entry.sample and wanted.items() <= vars(entry).items()]
         if any(is_intact(store, entry) for entry in known):
             return None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Optional
 
@@ -38,13 +39,9 @@ def scene_of_store(store: Path) -> Optional[Scene]:
         store: the store's folder.
     """
     root, images = store.resolve().parent, None
-    try:
+    with suppress(OSError, ValueError, TypeError, LookupError):  # none, or damaged
         note = json.loads(read_regular(store / NOTE, _LIMIT))
-        root = Path(note["scene"])
-        images = None if note["images"] is None else str(note["images"])
-    except (OSError, ValueError, TypeError, LookupError):
-        pass  # none, or damaged
-    try:
+        root, images = Path(note["scene"]), None if note["images"] is None else str(note["images"])
+    with suppress(LegsError):
         return read_scene(root, images)
-    except LegsError:
-        return None
+    return None

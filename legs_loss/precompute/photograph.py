@@ -37,12 +37,6 @@ def normalised_map_and_levels(image: np.ndarray, spec: WeightSpec) -> Tuple[np.n
     return normalised, levels
 
 
-def compile_response(width: int, height: int, spec: WeightSpec) -> None:
-    """Compile what photographs of a size need, once, before processes that would each compile it."""
-    if 3 * width * height >= _WORTH_COMPILING:
-        response_map(np.zeros((height, width, 3), np.uint8), spec)
-
-
 def response_map(image: np.ndarray, spec: WeightSpec) -> torch.Tensor:
     """Return E of a photograph uint8 or uint16 [H, W, C] as float32 [H, W]."""
     if image.size >= _WORTH_COMPILING and BACKENDS.chosen(torch.device("cpu"), "l1") == "numba":

@@ -38,14 +38,6 @@ class UserMaps(NamedTuple):
 NO_MAPS: UserMaps = UserMaps()
 
 
-class Staged(NamedTuple):
-    """Entries to add to a store and to remove from it, and notes for the user."""
-
-    added: List[Entry]
-    dropped: List[Entry]
-    notes: List[str]
-
-
 def is_below(path: Path, root: Path, maps: UserMaps) -> bool:
     """Return whether a file is one of the user's maps or lies in one of their folders, and so is no photograph."""
     places = [map_path(root, named).resolve() for named in (maps.masks, maps.weights) if named not in _OF_THE_SCENE]
@@ -54,8 +46,10 @@ def is_below(path: Path, root: Path, maps: UserMaps) -> bool:
 
 def stage_user_maps(
     root: Path, views: Sequence[View], resolution: int, maps: UserMaps, known: Sequence[Entry], staging: Path
-) -> Staged:
+) -> Tuple[List[Entry], List[str]]:
     """Read, check and stage all of the user's maps, at every size that the store has or is to have of a view.
+
+    Returns their entries, which take the place of all of the user's that the store has, and notes for the user.
 
     Args:
         root, views: of the scene.
@@ -70,31 +64,30 @@ def stage_user_maps(
     """
     if not 0.0 < maps.scale <= _LARGEST:
         raise LegsError(f"--weight_scale must be above 0 and at most {_LARGEST:g}, got {maps.scale:g}")
-    result = Staged([], [], [])
+    added: List[Entry] = []
+    notes: List[str] = []
     masked = sum(view.mask is not None for view in views)
     if masked and maps.masks is None:
-        result.notes.append(f"transforms.json names masks of {masked} photograph(s): --masks mask_path applies them")
+        notes.append(f"transforms.json names masks of {masked} photograph(s): --masks mask_path applies them")
     given = {kind: named for kind, named in ((MASK, maps.masks), (WEIGHTS, maps.weights)) if named is not None}
     for entry in known:
         if entry.is_users and entry.operator not in given:
             raise LegsError(
                 f"the store has maps of {_OPTIONS[entry.operator]}: give that option again, or delete the store"
             )
-    if not given:
-        return result
     sizes: Dict[str, Tuple[int, int]] = {}
-    for view in views:
+    for view in views if given else ():
         with suppress(LegsError):  # its photograph is skipped later, with the reason
             sizes[view.name] = image_size(view.path)
     views = [view for view in views if view.name in sizes]
-    trained = {view.name: {training_size(*sizes[view.name], resolution)} for view in views}
+    trained = {name: {training_size(*size, resolution)} for name, size in sizes.items()}
     for entry in known:
         if not entry.is_users and entry.view in trained:
             trained[entry.view].add((entry.width, entry.height))
     for kind, named in given.items():
         files, strays = find_maps(root, named, views, _SUFFIXES[kind])
         if strays:
-            result.notes.append(
+            notes.append(
                 f"{_OPTIONS[kind]}: {len(strays)} file(s) are left out, which have the name of no photograph of the "
                 f"scene, such as {strays[0]} (COLMAP leaves out photographs whose camera it did not find)"
             )
@@ -103,12 +96,11 @@ def stage_user_maps(
                 file, size = files[view.name], sizes[view.name]
                 values = read_mask(file, named, size) if kind == MASK else read_map_file(file, size)
                 for size in sorted(trained[view.name]):
-                    result.added.append(_staged(kind, view, file, averaged(values, size), maps.scale, staging))
+                    added.append(_staged(kind, view, file, averaged(values, size), maps.scale, staging))
         whole = [view.name for view in views if view.name not in files]
         if kind == MASK and whole:
-            result.notes.append(f"counted whole, without a mask: {', '.join(whole)}")
-        result.dropped.extend(entry for entry in known if entry.operator == kind)
-    return result
+            notes.append(f"counted whole, without a mask: {', '.join(whole)}")
+    return added, notes
 
 
 def _staged(kind: str, view: View, file: Path, values: np.ndarray, scale: float, staging: Path) -> Entry:

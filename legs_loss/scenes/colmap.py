@@ -147,15 +147,15 @@ class _Cursor:
 
 
 def _cameras_bin(cursor: _Cursor) -> Dict[int, _Intrinsics]:
-    cameras = {}
+    cameras = []
     for _ in range(cursor.take("Q")[0]):
         number, model, width, height = cursor.take("iiQQ")
         if not 0 <= model < len(MODELS):
             known = f"known here are 0 to {len(MODELS) - 1}"
             raise ValueError(f"camera {number} has model {model}; {known}: convert it to text (colmap model_converter)")
         name = list(MODELS)[model]
-        cameras[number] = _intrinsics(name, width, height, cursor.take(f"{MODELS[name]}d"))
-    return cameras
+        cameras.append(_camera(number, name, width, height, *cursor.take(f"{MODELS[name]}d")))
+    return dict(cameras)
 
 
 def _images_bin(cursor: _Cursor) -> List[_Image]:
@@ -194,10 +194,7 @@ def _rows(text: str, layout: str, read: Callable[[str, Lines], Any]) -> List[Any
 
 
 def _cameras_txt(text: str) -> Dict[int, _Intrinsics]:
-    def camera(number: str, model: str, width: str, height: str, *params: str) -> Tuple[int, _Intrinsics]:
-        return int(number), _intrinsics(model, int(width), int(height), tuple(map(float, params)))
-
-    return dict(_rows(text, _CAMERA_LINE, lambda line, _: camera(*line.split())))
+    return dict(_rows(text, _CAMERA_LINE, lambda line, _: _camera(*line.split())))
 
 
 def _images_txt(text: str) -> List[_Image]:
@@ -228,12 +225,14 @@ def _points_txt(text: str) -> PointCloud:
     return _cloud(_rows(text, _POINT_LINE, lambda line, _: point(*line.split(None, 7))))
 
 
-def _intrinsics(model: str, width: int, height: int, params: Tuple[float, ...]) -> _Intrinsics:
+def _camera(number: Any, model: str, width: Any, height: Any, *params: Any) -> Tuple[int, _Intrinsics]:
+    """Return a camera with its number, by the values of its line, or of its record."""
+    lens = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
     if len(params) != MODELS.get(model, len(params)):
         raise ValueError(f"a camera of model {model} has {MODELS[model]} parameters, not {len(params)}")
-    if not is_lens(width, height, params[: 2 if model == "PINHOLE" else 1], params):
-        raise ValueError(f"a camera of {width}x{height} pixels with parameters {params}")
-    return _Intrinsics(model, width, height, params)
+    if not is_lens(lens.width, lens.height, lens.params[: 2 if model == "PINHOLE" else 1], lens.params):
+        raise ValueError(f"a camera of {lens.width}x{lens.height} pixels with parameters {lens.params}")
+    return int(number), lens
 
 
 def _image(_: Any, w: Any, x: Any, y: Any, z: Any, tx: Any, ty: Any, tz: Any, camera_id: Any, name: str) -> _Image:

@@ -10,16 +10,11 @@ from legs_loss.errors import LegsError
 from legs_loss.scenes.images import is_readable
 from legs_loss.scenes.model import Scene, View
 
+_COMMON = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".jfif", ".jpe", ".gif", ".tga", ".ppm", ".pgm")
 # The formats of legs_loss.scenes.images; those that every decoder of photographs knows come first.
-SUFFIXES = (
-    *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".jfif", ".jpe", ".gif", ".tga", ".ppm", ".pgm"),
-    *(".jp2", ".j2k", ".jpf", ".jpx", ".avif", ".heic", ".heif", ".hif"),
-)
-# And photographs that are not read: raw ones, floats, layers.
-PHOTOGRAPHS = (
-    *SUFFIXES,
-    *(".jxl", ".exr", ".hdr", ".pfm", ".psd", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"),
-)
+SUFFIXES = (*_COMMON, ".jp2", ".j2k", ".jpf", ".jpx", ".avif", ".heic", ".heif", ".hif")
+_UNREAD = (".jxl", ".exr", ".hdr", ".pfm", ".psd", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
+PHOTOGRAPHS = (*SUFFIXES, *_UNREAD)  # with those that are not read: raw ones, floats, layers
 
 
 def files_below(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:

@@ -73,10 +73,14 @@ def load_training_image(view: View, resolution: int = -1, white_background: bool
     Raises:
         LegsError: no such file, a file that Pillow cannot decode, or floats.
     """
+    from PIL import Image
+
     with open_image(view.path) as image:
         size = training_size(image.width, image.height, resolution)
         if image.mode.startswith("I"):
-            return _deep_gray(image, size)
+            values = np.asarray(Image.fromarray(deep_gray(image)).resize(size))
+            # Pillow's cubic overshoots beside a step; 8-bit images are clipped by Pillow itself.
+            return np.clip(values, 0, 65535).astype(np.uint16)[:, :, None]
         if view.composited:
             prepared = _on_background(image.convert("RGBA"), 255 if white_background else 0)
         else:
@@ -102,10 +106,8 @@ def image_tensor(image: np.ndarray) -> Tensor:
         >>> image_tensor(np.full((1, 2, 3), 255, np.uint8)).shape
         torch.Size([3, 1, 2])
     """
-    channels_first = np.ascontiguousarray(image.transpose(2, 0, 1))
-    if image.dtype == np.uint8:
-        return torch.from_numpy(channels_first) / 255.0
-    return torch.from_numpy(channels_first.astype(np.float32)) / 65535.0
+    channels_first = image.transpose(2, 0, 1).astype(np.float32, order="C")
+    return torch.from_numpy(channels_first).div_(np.iinfo(image.dtype).max)
 
 
 @contextmanager
@@ -189,11 +191,9 @@ def _on_background(image: Any, background: int) -> Any:
     return Image.fromarray(flat)
 
 
-def _deep_gray(image: Any, size: Tuple[int, int]) -> np.ndarray:
-    from PIL import Image
-
+def deep_gray(image: Any) -> np.ndarray:
+    """Return the values of a gray image of 16 bits, int32 [H, W]."""
     values = np.asarray(image).astype(np.int32)
     if values.min() < 0 or values.max() > 65535:
         raise LegsError("a gray image of more than 16 bits: save it with 8 or 16 bits")
-    # Pillow's cubic overshoots beside a step; 8-bit images are clipped by Pillow itself.
-    return np.clip(np.asarray(Image.fromarray(values).resize(size)), 0, 65535).astype(np.uint16)[:, :, None]
+    return values

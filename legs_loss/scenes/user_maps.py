@@ -11,7 +11,7 @@ import numpy as np
 
 from legs_loss.errors import LegsError
 from legs_loss.scenes.folder import SUFFIXES, files_below
-from legs_loss.scenes.images import colour_mode, open_image
+from legs_loss.scenes.images import colour_mode, deep_gray, open_image
 from legs_loss.scenes.model import View
 from legs_loss.system.files import read_regular, write_whole
 
@@ -123,10 +123,7 @@ def read_map_file(path: Path, size: Tuple[int, int]) -> np.ndarray:
     with open_image(path) as image:
         _check_ratio(image.size, size)
         if image.mode.startswith("I"):
-            deep = np.asarray(image).astype(np.int64)
-            if deep.min() < 0 or deep.max() > 65535:
-                raise LegsError("more than 16 bits: save it with 8 or 16 bits")
-            return _unit(deep, 65535)
+            return _unit(deep_gray(image), 65535)
         mode = colour_mode(image)
         pixels = np.asarray(image.convert(mode)).astype(np.int16)
         if mode == "L":

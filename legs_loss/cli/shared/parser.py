@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from typing import Any, Iterator, NoReturn, Optional, Sequence
+from typing import Any, Iterator, NoReturn
 
 from legs_loss.errors import did_you_mean, require
 from legs_loss.system.terminal import printable
@@ -17,12 +17,12 @@ _FILES = {"FILE", "IMAGE", "PLY", "PNG", "SCRIPT"}
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser that proposes names for mistyped choices and options."""
 
-    def parse_args(self, args: Optional[Sequence[str]] = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Parse as argparse does; unknown arguments are an error of the sub-command."""
-        parsed, extra = self.parse_known_args(args, namespace)
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse as argparse does; unknown arguments are an error of the sub-command that was given them."""
+        parsed, extra = super().parse_known_args(args, namespace)
         if extra:
-            self._command(parsed).error(f"unrecognized arguments: {' '.join(extra)}")
-        return parsed
+            self.error(f"unrecognized arguments: {' '.join(extra)}")
+        return parsed, extra
 
     def error(self, message: str) -> NoReturn:
         """Print usage and message, and exit with 2."""
@@ -43,12 +43,6 @@ class Parser(argparse.ArgumentParser):
             choices=("bash", "zsh", "tcsh"),
             help="print the completion script of a shell, for its start-up file; needs shtab",
         )
-
-    def _command(self, parsed: argparse.Namespace) -> argparse.ArgumentParser:
-        for action in self._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                return action.choices[getattr(parsed, action.dest)]
-        return self
 
 
 class _PrintCompletion(argparse.Action):

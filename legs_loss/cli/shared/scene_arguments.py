@@ -41,6 +41,6 @@ def read_noted(path: Union[str, Path], images: Optional[str] = None) -> Scene:
 
 
 def say_notes(notes: Iterable[str]) -> None:
-    """Say on stderr what was left out of a scene."""
+    """Say sentences for the user on stderr, such as what was left out of a scene."""
     for note in notes:
         say(f"legs: note: {note}", sys.stderr)
